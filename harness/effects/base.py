@@ -1,0 +1,61 @@
+"""The interface of an effect: what a scene declares, bound to a mesh, contributes to the step's formula.
+
+An absent effect is an empty tuple: no flag, no branch, no allocation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.mesh.base import Mesh
+from solvers.problem import Energy, Positions
+
+
+class Force(Protocol):
+    """An external force, folded into the right-hand side once a step."""
+
+    def __call__(self, p: Positions, v: Positions, t: float) -> Positions:
+        """The force [N], shape (n, 3), at positions p [m], velocities v [m/s] and time t [s] of the step's start."""
+        ...
+
+
+class VelocityFilter(Protocol):
+    """A change of the velocity at the start of a step."""
+
+    def __call__(self, v: Positions) -> Positions:
+        """The changed velocity [m/s], shape (n, 3); anything linear in v."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pin:
+    """Vertices (q,) held at targets (q, 3) [m] with a penalty weight [N/m]; an infinite weight is exact."""
+
+    vertices: NDArray[np.int64]
+    targets: Positions
+    weight: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contribution:
+    """The places that the step formula has, and no others."""
+
+    energies: tuple[Energy, ...] = field(default=())
+    forces: tuple[Force, ...] = field(default=())
+    pins: tuple[Pin, ...] = field(default=())
+    filters: tuple[VelocityFilter, ...] = field(default=())
+
+
+class Effect(Protocol):
+    """A pydantic model with a literal `kind`."""
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        """What the effect contributes on this mesh with these vertex masses [kg] and dt [s], once a scene.
+
+        Raises InputError when the effect does not fit the mesh.
+        """
+        ...

@@ -1,0 +1,53 @@
+"""What goes wrong because of its input, and what goes wrong in a run."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+
+class SpringbenchError(Exception):
+    """Base of the errors that the command line answers with a message instead of a traceback."""
+
+    exit_code = 1
+
+
+class RunFailed(SpringbenchError):
+    """A run ended without an answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """One mistake in an input: what came, where, what was wanted, what to do."""
+
+    problem: str
+    file: Path | None = None
+    line: int | None = None
+    key: str = ""
+
+    def __str__(self) -> str:
+        place = "" if self.file is None else f"{self.file}:{self.line}: " if self.line else f"{self.file}: "
+        return f"{place}{self.key + ': ' if self.key else ''}{self.problem}"
+
+
+class InputError(SpringbenchError):
+    """The user's mistakes, all at once."""
+
+    exit_code = 2
+
+    def __init__(self, mistakes: Mistake | str | Sequence[Mistake]) -> None:
+        if isinstance(mistakes, str):
+            mistakes = Mistake(mistakes)
+        self.mistakes: tuple[Mistake, ...] = (
+            (mistakes,) if isinstance(mistakes, Mistake) else tuple(mistakes)
+        )
+        super().__init__("\n".join(map(str, self.mistakes)))
+
+
+def did_you_mean(came: object, allowed: Iterable[str]) -> str:
+    """`one of a, b, c` and the nearest name for a typo, as the end of a message."""
+    names = sorted(allowed)
+    near = difflib.get_close_matches(str(came), names, n=1)
+    return f"one of {', '.join(names)}" + (f"; did you mean {near[0]!r}?" if near else "")

@@ -1,0 +1,1 @@
+"""Meshes: generators with one number for the size, and files."""

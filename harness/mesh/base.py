@@ -1,0 +1,56 @@
+"""A mesh: vertices at rest, triangles to draw and to weigh, springs by family."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+STRETCH, SHEAR, BEND = "stretch", "shear", "bend"
+"""The families of springs: along the mesh's lines, across its cells, and from a vertex to the next but one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """A spring network at rest.
+
+    rest: (n, 3) [m], the rest positions and the start; springs: (m, 2), vertex indices, in a fixed order;
+    families: name of a family (STRETCH, SHEAR, BEND) -> the indices of its springs, a partition of range(m);
+    triangles: (f, 3), for pictures and wind, empty for a chain;
+    shares: (n,), the share of the total mass that each vertex carries, sums to 1;
+    dimension: 1 chain, 2 cloth, 3 solid; spacing: the typical rest length h [m];
+    resolution: vertices along the side that the mesh size counts; 0 for a mesh from a file;
+    parts: named sets of vertices (`corners`, `top`, `left`, ...), each (q,), sorted;
+    mass: (n,) [kg] where a file gives absolute masses, else None.
+    All arrays are read-only.
+    """
+
+    rest: NDArray[np.float64]
+    springs: NDArray[np.int64]
+    families: Mapping[str, NDArray[np.int64]]
+    triangles: NDArray[np.int64]
+    shares: NDArray[np.float64]
+    dimension: int
+    spacing: float
+    resolution: int = 0
+    parts: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    mass: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        arrays = [self.rest, self.springs, self.triangles, self.shares, self.mass]
+        for array in [*arrays, *self.families.values(), *self.parts.values()]:
+            if array is not None:
+                array.flags.writeable = False
+
+    @property
+    def size(self) -> float:
+        """The diagonal of the rest shape's bounding box [m]."""
+        return float(np.linalg.norm(np.ptp(self.rest, axis=0))) if len(self.rest) else 0.0
+
+    @property
+    def rest_lengths(self) -> NDArray[np.float64]:
+        """The rest length of each spring [m], shape (m,)."""
+        i, j = self.springs.T
+        return np.linalg.norm(self.rest[i] - self.rest[j], axis=1)

@@ -1,0 +1,9 @@
+"""The base of every model that a config is checked against: frozen, and unknown keys are refused."""
+
+from pydantic import BaseModel, ConfigDict
+
+
+class Model(BaseModel):
+    """A frozen pydantic model; unknown keys are errors, infinities and NaN are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)

@@ -1,0 +1,91 @@
+"""The interface between a run and its recordings, and between recordings and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.mesh.base import Mesh
+from solvers.problem import Positions
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One simulated step, as recorded: frame 0 is the start, before any step.
+
+    index; time [s]; positions (n, 3) [m]; energies [J] by name; residual [J^(1/2)]; iterations.
+    """
+
+    index: int
+    time: float
+    positions: Positions
+    energies: Mapping[str, float]
+    residual: float
+    iterations: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordingInfo:
+    """What does not change in a recording.
+
+    title: scene, size and solver in words; run_id; mesh; pinned: vertices (q,); time_step [s];
+    strain_range: the strain at the ends of the colour scale (0.1 is 10 %);
+    properties: everything else about the run and its machine, flat (scene, size, solver, iterations, cpu, ...).
+    """
+
+    title: str
+    run_id: str
+    mesh: Mesh
+    pinned: NDArray[np.int64]
+    time_step: float
+    strain_range: float
+    properties: Mapping[str, str | int | float | bool]
+
+
+class Recorder(Protocol):
+    """Takes the frames of one run, in order, and ends with a complete file or none."""
+
+    def frame(self, frame: Frame) -> None:
+        """Record one frame."""
+        ...
+
+    def convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
+        """Record the residual [J^(1/2)] and the objective [J] of each iteration within one frame."""
+        ...
+
+    def close(self, milliseconds: Mapping[str, Sequence[float]]) -> Path:
+        """Write the milliseconds of each phase by frame (from the timed pass; index 0 is frame 1), finish
+        the file under its final name and return that."""
+        ...
+
+    def abandon(self) -> None:
+        """Stop without leaving a file under the final name."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay:
+    """A recording read back: what pictures are drawn from.
+
+    frames: indices (k,); times (k,) [s]; positions (k, n, 3) float32 [m]; triangles (f, 3);
+    springs (m, 2); rest_lengths (m,) [m]; pinned (q,); strain_range; scalars: entity name -> (frames, values);
+    properties and title as recorded.
+    """
+
+    title: str
+    run_id: str
+    frames: NDArray[np.int64]
+    times: NDArray[np.float64]
+    positions: NDArray[np.float32]
+    triangles: NDArray[np.int64]
+    springs: NDArray[np.int64]
+    rest_lengths: NDArray[np.float64]
+    pinned: NDArray[np.int64]
+    strain_range: float
+    scalars: Mapping[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
+    properties: Mapping[str, str | int | float | bool]

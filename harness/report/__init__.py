@@ -1,0 +1,1 @@
+"""Pictures and plots, drawn from rows and recordings alone: nothing here simulates."""

@@ -1,0 +1,1 @@
+"""Potentials of the positions, one a file."""

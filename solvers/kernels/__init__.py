@@ -1,0 +1,1 @@
+"""Compiled (Numba) inner loops."""

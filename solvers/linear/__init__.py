@@ -1,0 +1,1 @@
+"""Factorisations of the constant matrix Q, one a file."""

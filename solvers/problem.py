@@ -1,0 +1,226 @@
+"""The interfaces between a scene and a solver: Energy, System, StepProblem, Solver.
+
+A step of implicit Euler minimises the incremental potential (Liu et al. 2013, eq. 6)
+
+    g(p) = sum of energies(p) + 1/(2 dt^2) |p - target|_M^2 - tr(p' f) + sum_pins w/2 |p_i - pin_i|^2
+
+over the positions p, with target = 2 p^t - p^(t-dt). `StepProblem` states it in plain NumPy and float64:
+it is the oracle from which every accuracy figure is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+Positions = NDArray[np.float64]
+"""Positions [m], shape (n, 3), float64, C-contiguous."""
+
+
+class Unsupported(Exception):
+    """A solver cannot minimise this system; the message says which part of it and why."""
+
+
+class NotPositiveDefinite(Exception):
+    """The system matrix has no Cholesky factor: a vertex has neither mass nor a spring nor a pin."""
+
+
+class Energy(Protocol):
+    """A potential [J] of positions [m]."""
+
+    def value(self, p: Positions) -> float:
+        """The energy [J] at p, shape (n, 3)."""
+        ...
+
+    def add_gradient(self, p: Positions, out: Positions) -> None:
+        """Add the gradient [N], shape (n, 3), to `out`."""
+        ...
+
+    def hessian(self, p: Positions) -> csr_array:
+        """The Hessian [N/m], shape (3n, 3n), the coordinates of a vertex side by side."""
+        ...
+
+
+@runtime_checkable
+class ProjectiveEnergy(Energy, Protocol):
+    """min over d of sum_e w_e/2 |(A p)_e - d_e|^2 with each d_e on a manifold (Bouaziz et al. 2014)."""
+
+    def stiffness(self, n: int) -> csr_array:
+        """The energy's share A'KA [N/m] of the system matrix, shape (n, n)."""
+        ...
+
+    def add_projection(self, p: Positions, out: Positions) -> None:
+        """Add A'K d(p) [N], shape (n, 3), its share of the right-hand side, to `out`."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pins:
+    """Pinned vertices: `vertices` (q,), sorted and unique; `weight` (q,) [N/m], infinite for an exact pin."""
+
+    vertices: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    weight: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def exact(self) -> NDArray[np.bool_]:
+        """Which pins are eliminated rows instead of penalties, shape (q,)."""
+        return np.isinf(self.weight)
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """What stays fixed in a run, and so is factorised once.
+
+    mass: (n,) [kg], zero is allowed where springs or pins hold the vertex; time_step: dt [s];
+    energies: potentials of the positions; pins: which vertices are pinned, and how.
+    """
+
+    mass: NDArray[np.float64]
+    time_step: float
+    energies: tuple[Energy, ...] = ()
+    pins: Pins = field(default_factory=Pins)
+
+    @property
+    def vertices(self) -> int:
+        """n, the number of vertices."""
+        return len(self.mass)
+
+    @cached_property
+    def free(self) -> NDArray[np.int64]:
+        """The vertices that are unknowns: all but the exactly pinned, shape (f,)."""
+        return np.setdiff1d(np.arange(self.vertices), self.pins.vertices[self.pins.exact])
+
+    @cached_property
+    def unpinned(self) -> NDArray[np.bool_]:
+        """Which vertices no pin holds, exact or penalty, shape (n,)."""
+        mask = np.ones(self.vertices, bool)
+        mask[self.pins.vertices] = False
+        return mask
+
+    @cached_property
+    def penalty(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.float64]]:
+        """The pins by penalty: which of `pins` they are (q,), their vertices and their weights [N/m]."""
+        soft = ~self.pins.exact
+        return soft, self.pins.vertices[soft], self.pins.weight[soft]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepProblem:
+    """What one step minimises. All arrays are float64 and are never written to.
+
+    target: 2 p^t - p^(t-dt), velocity filters included, (n, 3) [m]; force: (n, 3) [N];
+    pin_targets: where the pins want their vertices, (q, 3) [m], in the order of `system.pins`;
+    current: p^t with its pinned vertices on their targets, (n, 3) [m], the yardstick of the stop rule;
+    first_guess: where the iteration starts, (n, 3) [m].
+    """
+
+    system: System
+    target: Positions
+    force: Positions
+    pin_targets: Positions
+    current: Positions
+    first_guess: Positions
+
+    def terms(self, p: Positions) -> dict[str, float]:
+        """The terms [J] of the objective at p, by name: energies (their class's name), inertia, force, pins."""
+        s = self.system
+        values: dict[str, float] = {}
+        for energy in s.energies:
+            name = type(energy).__name__.lower()
+            values[name] = values.get(name, 0.0) + energy.value(p)
+        away = p - self.target
+        values["inertia"] = 0.5 / s.time_step**2 * float(s.mass @ np.einsum("ij,ij->i", away, away))
+        values["force"] = -float(np.einsum("ij,ij->", p, self.force))
+        soft, vertices, weight = s.penalty
+        sag = p[vertices] - self.pin_targets[soft]
+        values["pins"] = 0.5 * float(weight @ np.einsum("ij,ij->i", sag, sag))
+        return values
+
+    def value(self, p: Positions) -> float:
+        """The objective g(p) [J]; exact pins are taken to be on their targets."""
+        return sum(self.terms(p).values())
+
+    def magnitude(self, p: Positions) -> float:
+        """The sum of the terms' absolute values [J]: the scale of round-off in `value`."""
+        return sum(abs(term) for term in self.terms(p).values())
+
+    def gradient(self, p: Positions) -> Positions:
+        """The gradient of g at p [N], shape (n, 3); zero rows at exactly pinned vertices."""
+        s = self.system
+        out = s.mass[:, None] / s.time_step**2 * (p - self.target) - self.force
+        for energy in s.energies:
+            energy.add_gradient(p, out)
+        soft, vertices, weight = s.penalty
+        out[vertices] += weight[:, None] * (p[vertices] - self.pin_targets[soft])
+        out[s.pins.vertices[s.pins.exact]] = 0.0
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class StopRule:
+    """When a solve ends: after `iterations`, or before that once the residual is small enough.
+
+    The residual of an iteration from p to LG(p) is |p - LG(p)|_Q [J^(1/2)] over the unpinned vertices. With a
+    `tolerance` the solve ends when the residual is at most `tolerance` times its value at the current positions;
+    without one it does all iterations. `floor` is absolute: a residual that a mean displacement of `floor` times
+    the largest coordinate would cause ends the solve too (only where a tolerance is set), so that a
+    scene at rest stops at once.
+    """
+
+    iterations: int = 50
+    tolerance: float | None = None
+    floor: float = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Where a solve ended.
+
+    positions: (n, 3) [m]; iterations: how many were done; residual: |p - LG(p)|_Q [J^(1/2)] of the last
+    iteration, over the unpinned vertices; yardstick: the same at the current positions (nan when the rule
+    had no tolerance); stopped: "iterations", "tolerance" or "floor".
+    """
+
+    positions: Positions
+    iterations: int
+    residual: float
+    yardstick: float
+    stopped: str
+
+
+class Prepared(Protocol):
+    """A solver that has factorised, coloured and compiled what one system needs."""
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """Exact counts of what was built, by name (for example `nnz_system`, `nnz_factor`)."""
+        ...
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """The iterates, one more each time it is asked; a yielded array may be reused (copy to keep)."""
+        ...
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """The same iterates on the fast path, up to where `stop` ends them."""
+        ...
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """`local` and `global` as callables that do one such step at the first guess, to be timed apart."""
+        ...
+
+
+class Solver(Protocol):
+    """A frozen dataclass of a method's parameters."""
+
+    def prepare(self, system: System) -> Prepared:
+        """Factorise, colour, compile.
+
+        Raises Unsupported, before any work, for what the method cannot do, and NotPositiveDefinite.
+        """
+        ...
