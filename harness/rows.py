@@ -1,0 +1,93 @@
+"""The rows that a run leaves: one flat Parquet file a run, under `results/<sweep>/rows/`.
+
+`COLUMNS` is the schema and its documentation at once; `results/README.md` shows the same table.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+
+class Column(NamedTuple):
+    """One column: its name, Arrow type, unit ("" for none) and meaning."""
+
+    name: str
+    type: pa.DataType
+    unit: str
+    meaning: str
+
+
+_TEXT, _INT, _REAL = pa.string(), pa.int64(), pa.float64()
+
+COLUMNS = (
+    Column("run_id", _TEXT, "", "hash of all that determines the run's result and timing"),
+    Column("sweep", _TEXT, "", "name of the sweep, the stem of its file"),
+    Column("scene", _TEXT, "", "name of the scene, the stem of its file"),
+    Column("size", _INT, "", "mesh size of the sweep; 0 where the mesh comes from a file"),
+    Column("solver", _TEXT, "", "name of the solver"),
+    Column("parameters", _TEXT, "", "the solver's parameters, as JSON"),
+    Column("vertices", _INT, "", "vertices of the mesh"),
+    Column("springs", _INT, "", "springs of the mesh"),
+    Column("time_step", _REAL, "s", "the time step dt"),
+    Column("first_guess", _TEXT, "", "where each step's iteration starts: assignment, current or inertial"),
+    Column("max_iterations", _INT, "", "the iteration limit of a step"),
+    Column("tolerance", _REAL, "", "relative tolerance of the stop rule; null: all iterations are done"),
+    Column("threads", _INT, "", "threads of Numba and of BLAS"),
+    Column("phase", _TEXT, "", "prepare, step, local, global or run (the run as a whole)"),
+    Column("frame", _INT, "", "the step, from 1; null where the phase has none"),
+    Column("round", _INT, "", "repetition of the measurement, from 0; prepare: 0 is cold, later ones are warm"),
+    Column("seconds", _REAL, "s", "wall time of the phase; local and global: of one such step"),
+    Column("iterations", _INT, "", "iterations done in the step"),
+    Column("stopped", _TEXT, "", "what ended the step's iterations: iterations, tolerance or floor"),
+    Column("residual", _REAL, "J^(1/2)", "|p - LG(p)|_Q of the step's last iteration, unpinned vertices"),
+    Column("yardstick", _REAL, "J^(1/2)", "the residual at the step's start, which the tolerance refers to"),
+    Column("energy_springs", _REAL, "J", "elastic energy of the springs after the step"),
+    Column("energy_inertia", _REAL, "J", "inertia term of the step's objective"),
+    Column("energy_force", _REAL, "J", "external forces' term of the step's objective"),
+    Column("energy_pins", _REAL, "J", "pin penalty of the step's objective"),
+    Column("objective", _REAL, "J", "the step's objective, the sum of all terms"),
+    Column("largest_strain", _REAL, "", "largest |length / rest length - 1| of a spring after the step"),
+    Column("digest", _TEXT, "", "SHA-256 of the positions after the step (float64 bytes)"),
+    Column("nnz_system", _INT, "", "stored entries of the system matrix Q"),
+    Column("nnz_factor", _INT, "", "stored entries of its triangular factor, null where the library hides it"),
+    Column("status", _TEXT, "", "ok, unsupported, diverged or failed"),
+    Column("reason", _TEXT, "", "why the status is not ok"),
+    Column("machine", _TEXT, "", "id of the machine: hash of its processor, cores and memory"),
+    Column("cpu", _TEXT, "", "name of the processor"),
+    Column("cores", _INT, "", "cores this process may use"),
+    Column("memory_gib", _REAL, "GiB", "memory of the machine"),
+    Column("system", _TEXT, "", "operating system and its release"),
+    Column("versions", _TEXT, "", "versions of Python and the libraries, as JSON"),
+    Column("commit", _TEXT, "", "commit of the code, with -dirty where files differed from it"),
+    Column("code", _TEXT, "", "hash of the sources of solvers and harness: rows made by older code differ"),
+    Column("started", _TEXT, "", "when the run started, UTC, ISO 8601"),
+)
+
+SCHEMA = pa.schema([pa.field(c.name, c.type) for c in COLUMNS])
+Row = Mapping[str, Any]
+
+
+def write(path: Path, rows: Iterable[Row]) -> None:
+    """Write one run's rows under a partial name and rename: a kill leaves the whole file or none."""
+    rows = list(rows)
+    unknown = {key for row in rows for key in row} - set(SCHEMA.names)
+    if unknown:
+        raise ValueError(f"rows have no columns {sorted(unknown)}")
+    partial = path.with_name(f".{path.name}.partial")
+    with partial.open("wb") as file:
+        pq.write_table(pa.Table.from_pylist(rows, schema=SCHEMA), file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+
+
+def read(paths: Iterable[Path]) -> pa.Table:
+    """All rows of the files, in the order of the paths; files of an older schema get nulls."""
+    tables = [pq.read_table(path) for path in paths]
+    return pa.concat_tables([SCHEMA.empty_table(), *tables], promote_options="default")
