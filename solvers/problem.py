@@ -51,7 +51,7 @@ class Energy(Protocol):
 class ProjectiveEnergy(Energy, Protocol):
     """min over d of sum_e w_e/2 |(A p)_e - d_e|^2 with each d_e on a manifold (Bouaziz et al. 2014)."""
 
-    def stiffness(self, n: int) -> csr_array:
+    def stiffness_matrix(self, n: int) -> csr_array:
         """The energy's share A'KA [N/m] of the system matrix, shape (n, n)."""
         ...
 

@@ -1,0 +1,245 @@
+"""Local-global iterations over one prefactored matrix (Liu et al. 2013, section 4).
+
+    y = M target/dt^2 + f + w C'C p_pin                 once a step
+    local step   d_e = r_e (A p)_e / |(A p)_e|          each iteration
+    global step  Q p = A'K d + y
+
+An iteration from p to LG(p) is a preconditioned gradient step of length one, Q^-1 grad g(p) = p - LG(p), and the
+energy never rises in it, because A'KA - Hessian is positive semidefinite. Exact pins are eliminated: their rows
+leave Q, and their columns go to the right-hand side.
+
+Three backends differ in how they do the two steps, and in nothing else: `DenseLocalGlobal` with NumPy's matrices,
+`SparseLocalGlobal` with SciPy's, `CompiledLocalGlobal` with a compiled local step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from solvers import matrices
+from solvers.energies.springs import TINY, Springs
+from solvers.linear.factors import DenseCholesky, Factor, SimplicialCholesky, SparseLU
+from solvers.problem import (
+    Positions,
+    ProjectiveEnergy,
+    Solution,
+    StepProblem,
+    StopRule,
+    System,
+    Unsupported,
+)
+
+Project = Callable[[Positions, Positions, Positions], None]
+"""(p, y, out): write y + A'K d(p) to `out`."""
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedLocalGlobal:
+    """The iteration, over any backend's local step, factor and norm.
+
+    project: the local step; factor: of Q's free rows and columns; coupling: Q's free rows and exactly
+    pinned columns (f, x); norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins; trace: of the unpinned part
+    of Q [N/m].
+    """
+
+    system: System
+    project: Project
+    factor: Factor
+    coupling: csr_array
+    norm: Callable[[Positions], float]
+    trace: float
+    facts: dict[str, float]
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """The iterates from `problem.first_guess`; each yielded array is overwritten two iterations later."""
+        constant, b = self._constant(problem), np.empty_like(problem.target)
+        p, following = self._placed(problem.first_guess, problem), self._placed(problem.current, problem)
+        while True:
+            self._advance(p, constant, b, following)
+            p, following = following, p
+            yield p
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """Iterate until `stop` says so; without a tolerance only the last residual is computed."""
+        limit, yardstick = 0.0, float("nan")
+        previous = self._placed(problem.first_guess, problem)
+        floor = stop.floor * float(np.abs(previous).max(initial=0.0)) * self.trace**0.5
+        if stop.tolerance is not None:
+            yardstick = self._residual(next(self.iterates(self._restarted(problem))), problem.current)
+            limit = stop.tolerance * yardstick
+        p, residual, iteration, stopped = previous, float("nan"), 0, "iterations"
+        iterates = self.iterates(problem)
+        for iteration in range(1, stop.iterations + 1):
+            p = next(iterates)
+            if stop.tolerance is not None or iteration == stop.iterations:
+                residual = self._residual(p, previous)
+            if stop.tolerance is not None and residual <= max(limit, floor):
+                stopped = "tolerance" if residual <= limit else "floor"
+                break
+            previous = p
+        return Solution(p, iteration, residual, yardstick, stopped)
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """The local and the global step at the first guess, as callables to be timed apart."""
+        constant, b = self._constant(problem), np.empty_like(problem.target)
+        p = self._placed(problem.first_guess, problem)
+        out = p.copy()
+        self.project(p, constant, b)
+        return {"local": lambda: self.project(p, constant, b), "global": lambda: self._global(b, out)}
+
+    def _constant(self, problem: StepProblem) -> Positions:
+        """y, with the exact pins' columns of Q moved to the right-hand side."""
+        s = self.system
+        y = s.mass[:, None] / s.time_step**2 * problem.target + problem.force
+        soft, vertices, weight = s.penalty
+        y[vertices] += weight[:, None] * problem.pin_targets[soft]
+        if s.pins.exact.any():
+            y[s.free] -= self.coupling @ problem.pin_targets[s.pins.exact]
+        return y
+
+    def _advance(self, p: Positions, constant: Positions, b: Positions, out: Positions) -> None:
+        self.project(p, constant, b)
+        self._global(b, out)
+
+    def _global(self, b: Positions, out: Positions) -> None:
+        free = self.system.free
+        if len(free) == len(b):
+            self.factor.solve(b, out)
+        elif len(free):
+            solved = np.empty((len(free), 3))
+            self.factor.solve(b[free], solved)
+            out[free] = solved
+
+    def _placed(self, p: Positions, problem: StepProblem) -> Positions:
+        """A copy of p with the exactly pinned vertices on their targets, where they stay."""
+        placed = np.array(p, order="C")
+        exact = self.system.pins.exact
+        placed[self.system.pins.vertices[exact]] = problem.pin_targets[exact]
+        return placed
+
+    def _residual(self, p: Positions, previous: Positions) -> float:
+        e = previous - p
+        e[self.system.pins.vertices] = 0.0
+        return self.norm(e)
+
+    @staticmethod
+    def _restarted(problem: StepProblem) -> StepProblem:
+        """The same problem, started from the current positions."""
+        p = problem
+        return StepProblem(p.system, p.target, p.force, p.pin_targets, p.current, p.current)
+
+
+@dataclass(frozen=True)
+class DenseLocalGlobal:
+    """NumPy matrices and one dense Cholesky factor: for small meshes, and to be read beside the paper."""
+
+    def prepare(self, system: System) -> PreparedLocalGlobal:
+        """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
+        springs, n = only_springs(system, "dense"), system.vertices
+        _, vertices, weight = system.penalty
+        A = matrices.signed_incidence_matrix_dense(springs.edges, n)
+        M = matrices.mass_matrix_dense(system.mass)
+        C = matrices.selection_matrix_dense(vertices, n)
+        Q = matrices.system_matrix_dense(A, springs.stiffness, M, system.time_step, C, weight)
+        matrices.require_determined(system, csr_array(Q))
+        AtK = np.ascontiguousarray(A.T * springs.stiffness)
+        r, rest_direction = springs.rest_length[:, None], springs.rest_direction
+
+        def project(p: Positions, y: Positions, out: Positions) -> None:
+            v = A @ p
+            length = np.sqrt(np.einsum("ij,ij->i", v, v))[:, None]
+            d = r * np.where(length > TINY, v / np.maximum(length, TINY), rest_direction)
+            np.matmul(AtK, d, out=out)
+            out += y
+
+        free = system.free
+        exact = system.pins.vertices[system.pins.exact]
+        return PreparedLocalGlobal(
+            system,
+            project,
+            DenseCholesky(Q[np.ix_(free, free)]),
+            csr_array(Q[np.ix_(free, exact)]),
+            lambda e: float(np.sqrt(np.einsum("ij,ij->", e, Q @ e))),
+            float(np.diag(Q)[system.unpinned].sum()),
+            {"nnz_system": float(np.count_nonzero(Q)), "nnz_factor": len(free) * (len(free) + 1) / 2},
+        )
+
+
+@dataclass(frozen=True)
+class SparseLocalGlobal:
+    """SciPy sparse matrices and one sparse factorisation, for any projective energies."""
+
+    def prepare(self, system: System) -> PreparedLocalGlobal:
+        """Raises Unsupported for energies that are not projective, NotPositiveDefinite."""
+        energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
+        if len(energies) < len(system.energies):
+            others = {type(e).__name__ for e in system.energies if not isinstance(e, ProjectiveEnergy)}
+            raise Unsupported(f"sparse: local-global needs projective energies; not so: {', '.join(sorted(others))}")
+
+        def project(p: Positions, y: Positions, out: Positions) -> None:
+            out[:] = y
+            for energy in energies:
+                energy.add_projection(p, out)
+
+        return _prepared(system, energies, project, SparseLU, None)
+
+
+@dataclass(frozen=True)
+class CompiledLocalGlobal:
+    """A compiled local step in one pass over the vertices' springs, and a simplicial Cholesky factor."""
+
+    def prepare(self, system: System) -> PreparedLocalGlobal:
+        """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
+        from solvers.kernels.springs import Incidence  # Numba loads only where it is used
+
+        springs = only_springs(system, "numba")
+        incidence = Incidence.of(springs, system.vertices)
+        inertia = system.mass / system.time_step**2
+        return _prepared(
+            system,
+            [springs],
+            incidence.project,
+            SimplicialCholesky,
+            lambda e: incidence.energy_norm(e, inertia),
+        )
+
+
+def only_springs(system: System, solver: str) -> Springs:
+    """The system's springs as one energy; raises Unsupported where it has any other energy."""
+    others = {type(energy).__name__ for energy in system.energies if not isinstance(energy, Springs)}
+    if others:
+        raise Unsupported(f"{solver}: knows springs only; the scene has {', '.join(sorted(others))} as well")
+    return Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
+
+
+def _prepared(
+    system: System,
+    energies: list[ProjectiveEnergy] | list[Springs],
+    project: Project,
+    factorise: Callable[[csr_array], Factor],
+    norm: Callable[[Positions], float] | None,
+) -> PreparedLocalGlobal:
+    """The parts that the sparse backends share."""
+    Q = matrices.assemble(system, energies)
+    free = system.free
+    rows = Q if len(free) == system.vertices else csr_array(Q[free])
+    exact = system.pins.vertices[system.pins.exact]
+    inner = rows if len(free) == system.vertices else csr_array(rows[:, free])
+    factor = factorise(inner) if len(free) else DenseCholesky(np.eye(0))
+    facts = {"nnz_system": float(Q.nnz)}
+    if factor.nonzeros is not None:
+        facts["nnz_factor"] = float(factor.nonzeros)
+    return PreparedLocalGlobal(
+        system,
+        project,
+        factor,
+        csr_array(rows[:, exact]),
+        norm or (lambda e: float(np.sqrt(np.einsum("ij,ij->", e, Q @ e)))),
+        float(Q.diagonal()[system.unpinned].sum()),
+        facts,
+    )
+

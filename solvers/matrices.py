@@ -1,0 +1,132 @@
+"""The matrices of the method, dense and sparse (Liu et al. 2013, section 4.1; the assignment's functions).
+
+    A  signed incidence (m x n): +1 at i, -1 at j of spring (i, j)
+    M  masses (n x n), diagonal            C  selection of the pinned vertices (q x n)
+    Q = A'KA + M/dt^2 + C'WC               K, W: diagonal stiffnesses and pin weights
+
+The sparse ones are built from triplets once, hold no explicit zeros and never pass through a dense matrix.
+A self-loop (i = j) stretches nothing, so its row of A is empty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import reduce
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array, csr_array, dia_array
+from scipy.sparse.csgraph import connected_components
+
+from solvers.problem import NotPositiveDefinite, ProjectiveEnergy, System
+
+Dense = NDArray[np.float64]
+
+
+def signed_incidence_matrix_dense(springs: NDArray[np.int64], n: int) -> Dense:
+    """A for springs (m, 2) over n vertices, shape (m, n)."""
+    A = np.zeros((len(springs), n))
+    rows, (i, j) = np.arange(len(springs)), springs.T
+    A[rows, i] += 1.0
+    A[rows, j] -= 1.0
+    return A
+
+
+def signed_incidence_matrix_sparse(springs: NDArray[np.int64], n: int) -> csr_array:
+    """A for springs (m, 2) over n vertices, shape (m, n), with 2 entries a row."""
+    i, j = springs.T
+    rows = np.flatnonzero(i != j)
+    values = np.concatenate([np.ones(len(rows)), -np.ones(len(rows))])
+    entries = np.concatenate([rows, rows]), np.concatenate([i[rows], j[rows]])
+    return csr_array(coo_array((values, entries), shape=(len(springs), n)))
+
+
+def mass_matrix_dense(mass: ArrayLike) -> Dense:
+    """M from masses (n,) [kg], shape (n, n)."""
+    return np.diag(np.asarray(mass, float))
+
+
+def mass_matrix_sparse(mass: ArrayLike) -> csr_array:
+    """M from masses (n,) [kg], shape (n, n), with one entry for each vertex that has mass."""
+    return diagonal(np.asarray(mass, float))
+
+
+def selection_matrix_dense(pinned: NDArray[np.int64], n: int) -> Dense:
+    """C for pinned vertices (q,), shape (q, n)."""
+    C = np.zeros((len(pinned), n))
+    C[np.arange(len(pinned)), pinned] = 1.0
+    return C
+
+
+def selection_matrix_sparse(pinned: NDArray[np.int64], n: int) -> csr_array:
+    """C for pinned vertices (q,), shape (q, n), with one entry a row."""
+    q = len(pinned)
+    return csr_array(coo_array((np.ones(q), (np.arange(q), pinned)), shape=(q, n)))
+
+
+def rest_lengths(rest: Dense, springs: NDArray[np.int64]) -> Dense:
+    """r, the length of each spring [m] at the rest positions (n, 3), shape (m,)."""
+    i, j = springs.T
+    return np.linalg.norm(rest[i] - rest[j], axis=1)
+
+
+def system_matrix_dense(
+    A: Dense, stiffness: ArrayLike, M: Dense, time_step: float, C: Dense, weight: ArrayLike
+) -> Dense:
+    """Q [N/m], shape (n, n), from stiffnesses (m,) [N/m] and pin weights (q,) [N/m]; either may be one number."""
+    k, w = (np.reshape(np.asarray(x, float), (-1, 1)) for x in (stiffness, weight))
+    return A.T @ (k * A) + M / time_step**2 + C.T @ (w * C)
+
+
+def system_matrix_sparse(
+    A: csr_array, stiffness: ArrayLike, M: csr_array, time_step: float, C: csr_array, weight: ArrayLike
+) -> csr_array:
+    """Q [N/m], shape (n, n), as `system_matrix_dense`, with an entry for each vertex and two for each spring."""
+    K = diagonal(np.broadcast_to(np.asarray(stiffness, float), A.shape[0]))
+    W = diagonal(np.broadcast_to(np.asarray(weight, float), C.shape[0]))
+    return without_zeros(A.T @ K @ A + M / time_step**2 + C.T @ W @ C)
+
+
+def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> csr_array:
+    """Q of a system, shape (n, n): the energies' stiffness, masses and penalty pins.
+
+    Exact pins put nothing into Q; the caller takes the rows of `system.free`. Raises NotPositiveDefinite.
+    """
+    n = system.vertices
+    _, vertices, weight = system.penalty
+    held = system.mass / system.time_step**2 + np.bincount(vertices, weight, minlength=n)
+    shares = (energy.stiffness_matrix(n) for energy in energies)
+    Q = without_zeros(reduce(lambda total, share: total + share, shares, diagonal(held)))
+    require_determined(system, Q)
+    return Q
+
+
+def require_determined(system: System, Q: csr_array) -> None:
+    """Raise NotPositiveDefinite, with the vertices at fault, where nothing determines their positions.
+
+    Every component of the graph of Q needs a mass or a pin.
+    """
+    _, component = connected_components(Q, directed=False)
+    anchor = system.mass.copy()
+    anchor[system.pins.vertices] = 1.0
+    loose = np.flatnonzero(np.bincount(component, anchor)[component] <= 0.0)
+    if len(loose):
+        named = ", ".join(map(str, loose[:5])) + (", ..." if len(loose) > 5 else "")
+        raise NotPositiveDefinite(
+            f"{len(loose)} vertices ({named}) have no mass, and no spring leads from them to a mass or a pin: "
+            "nothing determines their positions; give them mass, pin them, or take them out of the mesh"
+        )
+
+
+def diagonal(values: Dense) -> csr_array:
+    """A diagonal matrix [any unit], shape (n, n), without entries for zeros."""
+    n = len(values)
+    return without_zeros(csr_array(dia_array((values[None, :], [0]), shape=(n, n))))
+
+
+def without_zeros(matrix: csr_array) -> csr_array:
+    """The matrix with duplicates summed, columns sorted and explicit zeros dropped."""
+    matrix = csr_array(matrix)
+    matrix.sum_duplicates()
+    matrix.eliminate_zeros()
+    return matrix

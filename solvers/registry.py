@@ -1,0 +1,18 @@
+"""The solvers by name. A new one is one file and one line here."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+SOLVERS = {
+    "dense": "solvers.local_global:DenseLocalGlobal",
+    "sparse": "solvers.local_global:SparseLocalGlobal",
+    "numba": "solvers.local_global:CompiledLocalGlobal",
+}
+
+
+def load(target: str) -> Any:
+    """The object that "module:name" names; its module is imported now and no sooner."""
+    module, _, name = target.partition(":")
+    return getattr(import_module(module), name)
