@@ -59,3 +59,9 @@ class Effect(Protocol):
         Raises InputError when the effect does not fit the mesh.
         """
         ...
+
+
+def steady(force: Positions) -> Force:
+    """A force (n, 3) [N] that never changes."""
+    force.flags.writeable = False
+    return lambda p, v, t: force
