@@ -1,0 +1,80 @@
+"""A scene bound to a mesh size: what the step formula needs, and nothing that the scene does not call for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.effects.base import Contribution, Force, Pin, VelocityFilter
+from harness.errors import InputError
+from harness.mesh.base import Mesh
+from harness.spec import SceneSpec
+from solvers.energies.springs import Springs
+from solvers.problem import Pins, Positions, System
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What is simulated.
+
+    mesh: at rest, which is also the start; system: what is factorised; forces and filters: the effects';
+    pin_targets: (q, 3) [m], in the order of `system.pins`; velocity: of every vertex at the start [m/s].
+    """
+
+    mesh: Mesh
+    system: System
+    forces: tuple[Force, ...]
+    filters: tuple[VelocityFilter, ...]
+    pin_targets: Positions
+    velocity: tuple[float, float, float]
+
+    @property
+    def springs(self) -> Springs:
+        """All springs that have stiffness, in the mesh's order."""
+        return Springs.joined([energy for energy in self.system.energies if isinstance(energy, Springs)])
+
+
+def build(spec: SceneSpec, size: int) -> Scene:
+    """Bind a scene to a mesh of one size; `size` means nothing to a mesh from a file.
+
+    Raises InputError where the scene's parts do not fit together.
+    """
+    mesh = spec.mesh.build(size)
+    mass = _mass(spec, mesh)
+    parts = [effect.bind(mesh, mass, spec.time_step) for effect in spec.effects]
+    pins, targets = _pins(parts)
+    energies = tuple(energy for part in parts for energy in part.energies)
+    return Scene(
+        mesh=mesh,
+        system=System(mass=mass, time_step=spec.time_step, energies=energies, pins=pins),
+        forces=tuple(force for part in parts for force in part.forces),
+        filters=tuple(one for part in parts for one in part.filters),
+        pin_targets=targets,
+        velocity=spec.velocity,
+    )
+
+
+def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
+    if spec.mass is not None:
+        return spec.mass * mesh.shares
+    if mesh.mass is None:
+        raise InputError("mass: missing; this mesh brings no masses, so give the total mass [kg]")
+    return mesh.mass
+
+
+def _pins(parts: list[Contribution]) -> tuple[Pins, Positions]:
+    """All pins by vertex; a vertex may be named twice if both times mean the same."""
+    pins: list[Pin] = [pin for part in parts for pin in part.pins]
+    if not pins:
+        return Pins(), np.empty((0, 3))
+    vertices = np.concatenate([pin.vertices for pin in pins])
+    weight = np.concatenate([np.full(len(pin.vertices), pin.weight) for pin in pins])
+    targets = np.concatenate([pin.targets for pin in pins])
+    unique, first, back = np.unique(vertices, return_index=True, return_inverse=True)
+    clash = (weight != weight[first][back]) | (targets != targets[first][back]).any(axis=1)
+    if clash.any():
+        vertex = int(vertices[clash][0])
+        raise InputError(f"pins: vertex {vertex} is pinned twice, to different places or with different weights")
+    return Pins(unique, weight[first]), targets[first]
