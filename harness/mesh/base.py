@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 STRETCH, SHEAR, BEND = "stretch", "shear", "bend"
-"""The families of springs: along the mesh's lines, across its cells, and from a vertex to the next but one."""
+"""The families of springs: along the mesh's lines, across its cells, from a vertex to the next but one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -17,11 +17,11 @@ class Mesh:
     """A spring network at rest.
 
     rest: (n, 3) [m], the rest positions and the start; springs: (m, 2), vertex indices, in a fixed order;
-    families: name of a family (STRETCH, SHEAR, BEND) -> the indices of its springs, a partition of range(m);
+    families: each of STRETCH, SHEAR, BEND -> the indices of its springs, a partition of range(m);
     triangles: (f, 3), for pictures and wind, empty for a chain;
     shares: (n,), the share of the total mass that each vertex carries, sums to 1;
-    dimension: 1 chain, 2 cloth, 3 solid; spacing: the typical rest length h [m];
-    resolution: vertices along the side that the mesh size counts; 0 for a mesh from a file;
+    dimension: 1 chain and truss, 2 cloth, 3 solid; spacing: the typical rest length h [m];
+    resolution: the mesh size, mostly vertices along a side; 0 for a mesh from a file;
     parts: named sets of vertices (`corners`, `top`, `left`, ...), each (q,), sorted;
     mass: (n,) [kg] where a file gives absolute masses, else None.
     All arrays are read-only.
