@@ -1,0 +1,241 @@
+"""Shaded renderings of a recording's frames: surface or tubes coloured by strain, pins, a soft shadow.
+
+All frames of a run share one camera, so that what moves in the pictures is the scene and not the viewer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFilter
+
+from harness.record.base import Replay
+from harness.report import opengl
+from harness.report.style import INK, PAGE, STRAIN_MAP
+
+Points = NDArray[np.floating]
+_HALF_ANGLE = np.radians(12.0)  # of the camera's view, vertically: long enough a lens for calm perspective
+_MARGIN = 0.06  # of the view, left free at each side
+_TUBES = 20_000  # springs; beyond that they are drawn as lines
+_MESH_LINES = 350  # pixels of the view for each vertex; with fewer, lines would hide the colours
+_SUPERSAMPLING = 2  # a pixel is the mean of 2 x 2: half the time of VTK's own anti-aliasing in software
+_SHADE = "#d3d0ca"  # where the ground is fully in shadow
+_MATERIAL: dict[str, Any] = {"ambient": 0.58, "diffuse": 0.48, "specular": 0.06, "specular_power": 18.0}
+_BLOWN_UP = 1e4  # coordinates this many times larger than the start's are drawn as if not finite
+
+
+def spring_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
+    """Strain length / rest length - 1 of each spring, shape (m,), 0 where the rest length is 0.
+
+    `frame` counts the recorded frames.
+    """
+    i, j = replay.springs.T
+    p = replay.positions[frame].astype(np.float64)
+    rest = replay.rest_lengths
+    stretch = np.linalg.norm(p[i] - p[j], axis=1) - rest
+    return np.divide(stretch, rest, out=np.zeros(len(rest)), where=rest > 0)
+
+
+def vertex_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
+    """The strain of the most strained spring at each vertex, with its sign, shape (n,)."""
+    strain = np.repeat(spring_strain(replay, frame), 2)
+    ends = replay.springs.ravel()
+    by_size = np.argsort(np.abs(strain))
+    out = np.zeros(replay.positions.shape[1])
+    out[ends[by_size]] = strain[by_size]  # the last write to a vertex, its largest strain, stays
+    return out
+
+
+def drawable_frames(replay: Replay) -> NDArray[np.int64]:
+    """The recorded frames before the first that is not finite (or has blown up beyond drawing)."""
+    start = replay.positions[0]
+    limit = _BLOWN_UP * max(float(np.abs(start).max(initial=0.0)), 1.0)
+    with np.errstate(invalid="ignore"):
+        good = (np.abs(replay.positions) <= limit).all(axis=(1, 2))
+    return np.arange(len(good) if good.all() else int(np.argmin(good)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A camera: `position` and `target` (3,) [m], y up, and the height `ground` [m] that the shadow falls on."""
+
+    position: Points
+    target: Points
+    ground: float
+
+
+def natural_angles(points: Points) -> tuple[float, float]:
+    """Azimuth and elevation [degrees] of a three-quarter view of points (q, 3): from the front of what is flat."""
+    x, y, z = np.ptp(points, axis=0)
+    azimuth = 32.0 if x >= z else 58.0
+    depth = min(x, z) / max(x, y, z, 1e-30)
+    return azimuth, 8.0 + 12.0 * min(2.0 * depth, 1.0)
+
+
+def frame_all(points: Points, *, aspect: float, angles: tuple[float, float] | None = None) -> View:
+    """The nearest camera that sees all points (q, 3) [m] from `angles`, in a view of width / height `aspect`.
+
+    A point with camera coordinates (a, b, c), c towards the viewer, is seen from (ea, eb, ec) where
+    |a - ea| <= tan (ec - c), and alike for b. Each pair of bounds is tight at one ec; the further one sees all.
+    """
+    azimuth, elevation = np.radians(natural_angles(points) if angles is None else angles)
+    towards = np.array(
+        [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)]
+    )
+    right = np.cross([0.0, 1.0, 0.0], towards)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(towards, right), towards])
+    low = points[:, 1].min()
+    ground = float(low - 0.02 * _extent(points))
+    a, b, c = axes @ np.concatenate([points, _cast(points, ground)]).astype(np.float64).T
+    tan = (1.0 - 2.0 * _MARGIN) * np.tan(_HALF_ANGLE)
+    eye, distance = np.zeros(3), 0.0
+    for k, (side, slope) in enumerate([(a, aspect * tan), (b, tan)]):
+        above, below = (side + slope * c).max(), (slope * c - side).max()
+        eye[k] = (above - below) / 2.0
+        distance = max(distance, (above + below) / (2.0 * slope))
+    middle = (c.min() + c.max()) / 2.0
+    eye[2] = max(distance, middle + 1e-3)
+    return View(eye @ axes, np.array([eye[0], eye[1], middle]) @ axes, ground)
+
+
+def _extent(p: Points) -> float:
+    """The diagonal of the points' bounding box [m], never zero."""
+    return max(float(np.linalg.norm(np.ptp(p, axis=0))), 1e-30)
+
+
+def _cast(p: Points, ground: float) -> Points:
+    """Where the light from the upper left casts the points (q, 3) on the ground."""
+    fall = p[:, 1] - ground
+    return np.stack([p[:, 0] + 0.18 * fall, np.full(len(p), ground), p[:, 2] - 0.22 * fall], axis=1)
+
+
+def _is_closed(triangles: NDArray[np.int64]) -> bool:
+    """Whether the surface bounds a solid: every edge has two triangles. Its sharp edges are drawn sharp."""
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    return bool((np.unique(edges @ [triangles.max() + 1, 1], return_counts=True)[1] == 2).all())
+
+
+def _ball(radius: float) -> pv.PolyData:
+    return pv.Sphere(radius=radius, theta_resolution=16, phi_resolution=12)
+
+
+class Studio:
+    """One off-screen window of `width` x `height` pixels, reused for all frames; a context manager.
+
+    Raises RunFailed where the system cannot draw.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        opengl.require()
+        self._pixels = width * height
+        size = [_SUPERSAMPLING * width, _SUPERSAMPLING * height]
+        self._plotter = pv.Plotter(off_screen=True, window_size=size, lighting="none")
+        self._plotter.set_background(PAGE)
+        self._plotter.disable_anti_aliasing()
+        # From the camera's upper left, so that every view is lit alike; the fill keeps the scale's colours true.
+        for place, strength in (((-1.2, 1.5, 1.6), 0.75), ((0.6, -0.3, 2.0), 0.4)):
+            light = pv.Light(position=place, intensity=strength, light_type="camera light")
+            self._plotter.add_light(light)
+
+    def __enter__(self) -> Studio:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._plotter.close()
+
+    def draw(self, replay: Replay, frame: int, view: View) -> NDArray[np.uint8]:
+        """A recorded frame as pixels (height, width, 3); its positions must be finite."""
+        plotter = self._plotter
+        plotter.clear_actors()
+        plotter.camera.position = tuple(view.position)
+        plotter.camera.focal_point = tuple(view.target)
+        plotter.camera.up = (0.0, 1.0, 0.0)
+        plotter.camera.view_angle = 2.0 * np.degrees(_HALF_ANGLE)
+        p = np.ascontiguousarray(replay.positions[frame], np.float32)
+        self._shadow(replay, p, view.ground)
+        if len(replay.triangles):
+            self._surface(replay, frame, p)
+        else:
+            self._springs(replay, frame, p)
+        self._pins(replay, p)
+        plotter.reset_camera_clipping_range()
+        plotter.render()
+        pixels = Image.fromarray(np.asarray(plotter.screenshot(None, return_img=True))[..., :3])
+        return np.asarray(pixels.reduce(_SUPERSAMPLING))
+
+    def _surface(self, replay: Replay, frame: int, p: NDArray[np.float32]) -> None:
+        mesh = pv.PolyData.from_regular_faces(p, replay.triangles)
+        mesh.point_data["strain"] = vertex_strain(replay, frame)
+        limit = replay.strain_range
+        self._plotter.add_mesh(
+            mesh,
+            scalars="strain",
+            cmap=STRAIN_MAP,
+            clim=(-limit, limit),
+            smooth_shading=True,
+            split_sharp_edges=_is_closed(replay.triangles),
+            feature_angle=50.0,
+            **_MATERIAL,
+            show_edges=len(p) * _MESH_LINES <= self._pixels,
+            edge_color=INK,
+            edge_opacity=0.2,
+            line_width=1.5,
+            show_scalar_bar=False,
+        )
+
+    def _springs(self, replay: Replay, frame: int, p: NDArray[np.float32]) -> None:
+        m = len(replay.springs)
+        lines = pv.PolyData(p, lines=np.c_[np.full(m, 2), replay.springs].ravel())
+        lines.cell_data["strain"] = spring_strain(replay, frame)
+        look: dict[str, Any] = {
+            "scalars": "strain",
+            "cmap": STRAIN_MAP,
+            "clim": (-replay.strain_range, replay.strain_range),
+            "show_scalar_bar": False,
+            **_MATERIAL,
+        }
+        if m > _TUBES:
+            self._plotter.add_mesh(lines, line_width=1.5, **look)
+            return
+        # Thin against a spring's length, visible against the scene.
+        radius = float(np.clip(0.07 * replay.rest_lengths.mean() / _extent(p), 0.0015, 0.007)) * _extent(p)
+        self._plotter.add_mesh(lines.tube(radius=radius, n_sides=12), smooth_shading=True, **look)
+        joints = pv.PolyData(p).glyph(geom=_ball(1.5 * radius), orient=False, scale=False)
+        self._plotter.add_mesh(joints, color="#8a8d92", smooth_shading=True, **_MATERIAL)
+
+    def _pins(self, replay: Replay, p: NDArray[np.float32]) -> None:
+        if len(replay.pinned):
+            radius = float(np.clip(0.3 * replay.rest_lengths.mean() / _extent(p), 0.004, 0.009)) * _extent(p)
+            pins = pv.PolyData(p[replay.pinned]).glyph(geom=_ball(radius), orient=False, scale=False)
+            self._plotter.add_mesh(pins, color=INK, smooth_shading=True, **_MATERIAL)
+
+    def _shadow(self, replay: Replay, p: NDArray[np.float32], ground: float) -> None:
+        """A soft shadow on the ground: the scene seen from the light, as a blurred picture on an unlit plane."""
+        flat = _cast(p, ground)[:, [0, 2]]
+        centre = (flat.min(axis=0) + flat.max(axis=0)) / 2
+        side = 1.5 * float(np.ptp(flat, axis=0).max()) + 0.2 * _extent(p)
+        pixels = 384
+        at = ((flat - centre) / side + 0.5) * pixels
+        stencil = Image.new("L", (pixels, pixels), 0)
+        pen = ImageDraw.Draw(stencil)
+        if len(replay.triangles):
+            for corners in at[replay.triangles].reshape(-1, 6).tolist():
+                pen.polygon(corners, fill=255)
+        else:
+            for ends in at[replay.springs].reshape(-1, 4).tolist():
+                pen.line(ends, fill=255, width=3)
+        dark = np.asarray(stencil.filter(ImageFilter.GaussianBlur(11)), np.float32)[..., None] / 255
+        page, shade = (np.array(pv.Color(c).int_rgb, np.float32) for c in (PAGE, _SHADE))
+        texture = pv.Texture((page + dark * (shade - page)).round().astype(np.uint8))
+        plane = pv.Plane(center=(centre[0], ground, centre[1]), direction=(0, 1, 0), i_size=side, j_size=side)
+        corner = (plane.points[:, [0, 2]] - centre) / side + 0.5
+        plane.active_texture_coordinates = np.c_[corner[:, 0], 1.0 - corner[:, 1]].astype(np.float32)
+        self._plotter.add_mesh(plane, texture=texture, lighting=False)
