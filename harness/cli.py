@@ -1,0 +1,174 @@
+"""The command line: `springbench run`, `list`, `query`, `schema`, `inspect`, `view`, `gate`.
+
+Exit codes: 0 all is well, 1 a run failed or a gate found a regression, 2 the user's mistake, 130 stopped by Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from harness.errors import InputError, SpringbenchError
+
+app = typer.Typer(
+    help="A laboratory for implicit time stepping of mass-spring systems.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+out, err = Console(), Console(stderr=True)
+
+Config = Annotated[Path, typer.Argument(help="A sweep or a scene (YAML), or an assignment's scene (JSON).")]
+Results = Annotated[Path, typer.Option(help="The folder that holds a folder for each sweep.")]
+Recordings = Annotated[list[Path], typer.Argument(help="Recordings (.rrd).")]
+
+
+@app.command()
+def run(
+    config: Config,
+    results: Results = Path("results"),
+    solver: Annotated[list[str] | None, typer.Option(help="For a scene: solvers; repeatable.")] = None,
+    size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
+    frames: Annotated[int | None, typer.Option(help="For a scene: how many steps.")] = None,
+    iterations: Annotated[int | None, typer.Option(help="For a scene: iteration limit of a step.")] = None,
+    tolerance: Annotated[float | None, typer.Option(help="For a scene: relative tolerance of a step.")] = None,
+    first_guess: Annotated[str | None, typer.Option(help="For a scene: assignment, current, inertial.")] = None,
+    threads: Annotated[int | None, typer.Option(help="For a scene: threads of Numba and BLAS.")] = None,
+    rounds: Annotated[int | None, typer.Option(help="For a scene: repetitions of the timed pass.")] = None,
+    positions: Annotated[
+        Path | None, typer.Option(help="Store the positions after every step (float64, .npz) of one run.")
+    ] = None,
+    again: Annotated[bool, typer.Option("--again", help="Do all runs, also those that are there.")] = False,
+) -> None:
+    """Do what is missing of a sweep, or of the one scene in a file."""
+    from harness.load import load_any
+    from harness.progress import display
+    from harness.report.timing_table import summary_table
+    from harness.sweep import failures, run_sweep
+
+    options = {
+        "frames": frames,
+        "iterations": iterations,
+        "tolerance": tolerance,
+        "first_guess": first_guess,
+        "threads": threads,
+        "rounds": rounds,
+    }
+    sweep = load_any(config, solvers=solver or (), sizes=size or (), **options)
+    _check_positions(positions)
+    folder = results / sweep.name
+    table = run_sweep(
+        sweep.name, sweep.runs(), folder, display(err), _say, again=again, positions=positions
+    )
+    out.print(summary_table(table))
+    _say(f"rows, recordings and pictures are in {folder}")
+    failed = failures(table)
+    for line in failed:
+        _say(line)
+    raise typer.Exit(1 if failed else 0)
+
+
+@app.command("list")
+def list_runs(config: Config, results: Results = Path("results")) -> None:
+    """Check a config, and show what would run and what is there already."""
+    from harness.load import load_any
+    from harness.sweep import plan
+
+    sweep = load_any(config)
+    table = Table("run", "scene", "size", "solver", "iterations", "frames", "threads", "state")
+    for p in plan(sweep.runs(), results / sweep.name):
+        r = p.run
+        state = p.state + (" (by other code)" if p.older else "")
+        cells = (p.files.rows.stem[-12:], r.scene_name, r.size, r.solver, r.iterations, r.frames, r.threads, state)
+        table.add_row(*map(str, cells))
+    out.print(table)
+
+
+@app.command()
+def query(
+    sql: Annotated[str, typer.Argument(help="A query over the table `rows`.")],
+    results: Results = Path("results"),
+    csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
+) -> None:
+    """Answer an SQL query over the rows of all sweeps."""
+    from harness.query import answer
+
+    table = answer(sql, results)
+    if csv:
+        table.to_csv(sys.stdout)
+    else:
+        table.show(out)
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of scenes and sweeps."""
+    from harness.schema import schema as config_schema
+
+    print(json.dumps(config_schema(), indent=2))
+
+
+@app.command()
+def inspect(
+    recordings: Recordings,
+    frame: Annotated[int | None, typer.Option(help="The frame to export; the last one if left out.")] = None,
+    export: Annotated[Path | None, typer.Option(help="Write one frame's mesh to this file (.vtp, ...).")] = None,
+    csv: Annotated[Path | None, typer.Option(help="Write the scalars to this file.")] = None,
+) -> None:
+    """Print what is in recordings, without a viewer; two are compared."""
+    from harness.report.inspect import inspect as inspect_recordings
+
+    inspect_recordings(recordings, frame=frame, export=export, csv=csv, console=out)
+
+
+@app.command()
+def view(recordings: Recordings) -> None:
+    """Open recordings in the Rerun viewer."""
+    from harness.report.inspect import view as view_recordings
+
+    view_recordings(recordings)
+
+
+@app.command()
+def gate(
+    base: Annotated[Path, typer.Argument(help="Stored benchmarks to compare with (.json).")],
+    new: Annotated[Path, typer.Argument(help="Stored benchmarks to judge (.json).")],
+) -> None:
+    """Compare two stored benchmark files; exit code 1 on a regression."""
+    from harness.report.gate import compare
+
+    raise typer.Exit(compare(base, new, out))
+
+
+def _say(line: str) -> None:
+    err.print(escape(line), highlight=False, soft_wrap=True)
+
+
+def _check_positions(path: Path | None) -> None:
+    if path and (path.suffix != ".npz" or not path.parent.is_dir()):
+        raise InputError(f"--positions: came {path}; wanted a file that ends in .npz, in a folder that exists")
+
+
+def main() -> None:
+    """The console script."""
+    try:
+        app()
+    except SpringbenchError as error:
+        for mistake in getattr(error, "mistakes", (error,)):
+            _say(f"springbench: {mistake}")
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        _say("springbench: stopped; what is complete is kept, and the same command goes on from there")
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,232 @@
+"""The composition root: turns the names of one run into objects, runs its passes, and leaves its files.
+
+The timed passes come first and record nothing. Recording, energies and pictures come from a second pass, whose
+final positions must equal the timed ones to the last bit. The rows are written last: where they are, all is.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness import machine, rows
+from harness.errors import RunFailed
+from harness.measure import Diverged, Measured, Settings, digest, measure, steps
+from harness.record.base import Frame, Recorder, RecordingInfo
+from harness.record.rerun import RerunRecorder
+from harness.scene import Scene, build
+from harness.spec import RunSpec
+from harness.trace import EnergyNorm, trace
+from solvers.problem import NotPositiveDefinite, Positions, StopRule, Unsupported
+from solvers.registry import SOLVERS, load
+
+Tick = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Files:
+    """Where a run leaves its files."""
+
+    rows: Path
+    recording: Path
+    picture: Path
+
+    @classmethod
+    def of(cls, run: RunSpec, folder: Path) -> Files:
+        """The files of a run in the folder of its sweep."""
+        label = run.label(machine.describe().id)
+        return cls(
+            folder / "rows" / f"{label}.parquet",
+            folder / "recordings" / f"{label}.rrd",
+            folder / "pictures" / f"{label}.png",
+        )
+
+
+def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = None) -> list[dict[str, Any]]:
+    """Do one run and write its files; a failure is a row with a status and a reason.
+
+    tick: told the name of the pass after each step; positions: where to store the positions after every step
+    (frames, n, 3) [m], float64. Returns the rows. Raises InputError for what the user can mend.
+    """
+    common = _common(run)
+    try:
+        with machine.pinned_threads(run.threads):
+            found = _passes(run, files, tick, positions)
+    except (Unsupported, NotPositiveDefinite, Diverged, RunFailed, MemoryError) as error:
+        found = [{"phase": "run", "status": _status(error), "reason": str(error) or type(error).__name__}]
+    result = [common | row for row in found]
+    rows.write(files.rows, result)
+    return result
+
+
+def _status(error: Exception) -> str:
+    return {Unsupported: "unsupported", Diverged: "diverged"}.get(type(error), "failed")
+
+
+def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
+    scene = build(run.scene, run.size)
+    counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
+    settings = Settings(
+        StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds
+    )
+    solver = load(SOLVERS[run.solver])(**run.parameters)
+    measured = measure(scene, solver, settings, tick)
+    by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
+    if by_frame[run.frames]["digest"] != measured.digest:
+        raise RunFailed("the recorded pass ended at other positions than the timed pass")
+    facts = {name: int(value) for name, value in measured.prepared.facts.items()}
+    return [
+        counts | facts | {"status": "ok", "phase": t.phase, "frame": t.frame, "round": t.round, "seconds": t.seconds}
+        | (by_frame[t.frame] if t.phase == "step" and t.frame else {})
+        for t in measured.timings
+    ]
+
+
+def _second_pass(
+    run: RunSpec,
+    files: Files,
+    scene: Scene,
+    measured: Measured,
+    settings: Settings,
+    tick: Tick,
+    positions: Path | None,
+) -> dict[int, dict[str, Any]]:
+    """Simulate again with everything that is looked at: energies, convergence, recording, positions."""
+    chosen = run.convergence_frames or {1, (run.frames + 1) // 2, run.frames}
+    stored = np.empty((run.frames, len(scene.mesh.rest), 3)) if positions else None
+    norm = EnergyNorm(scene.system)
+    found: dict[int, dict[str, Any]] = {}
+    with ExitStack() as cleanup:
+        recorder = _recorder(run, files, scene, measured)
+        if recorder:
+            cleanup.callback(recorder.abandon)
+            recorder.frame(Frame(0, 0.0, scene.mesh.rest, {}, float("nan"), 0))
+        for step in steps(scene, measured.prepared, settings):
+            p, terms = step.solution.positions, step.problem.terms(step.solution.positions)
+            s = step.solution
+            found[step.index] = {
+                **{f"energy_{name}": value for name, value in terms.items()},
+                "objective": sum(terms.values()),
+                "largest_strain": largest_strain(scene, p),
+                "iterations": s.iterations,
+                "stopped": s.stopped,
+                "residual": s.residual,
+                "yardstick": s.yardstick,
+                "digest": digest(p),
+            }
+            if stored is not None:
+                stored[step.index - 1] = p
+            if recorder:
+                time = step.index * scene.system.time_step
+                recorder.frame(Frame(step.index, time, p, terms, s.residual, s.iterations))
+                if step.index in chosen:
+                    curve = trace(measured.prepared, step.problem, norm, s.iterations)
+                    recorder.convergence(step.index, curve.residuals, curve.objective)
+            tick("second pass")
+        if recorder:
+            recorder.close(_milliseconds(measured, run.frames))
+    if positions and stored is not None:
+        save_positions(positions, stored)
+    return found
+
+
+def _recorder(run: RunSpec, files: Files, scene: Scene, measured: Measured) -> Recorder | None:
+    if not run.record:
+        return None
+    files.recording.parent.mkdir(parents=True, exist_ok=True)
+    here = machine.describe()
+    seconds = [t.seconds for t in measured.timings if t.phase == "step"]
+    properties = {
+        "sweep": run.sweep,
+        "scene": run.scene_name,
+        "size": run.size,
+        "solver": run.solver,
+        "parameters": json.dumps(dict(run.parameters)),
+        "vertices": len(scene.mesh.rest),
+        "springs": len(scene.springs.edges),
+        "time_step": run.scene.time_step,
+        "frames": run.frames,
+        "iterations": run.iterations,
+        "tolerance": run.tolerance or 0.0,
+        "first_guess": run.first_guess,
+        "threads": run.threads,
+        "milliseconds_per_step": 1e3 * float(np.median(seconds)),
+        "cpu": here.cpu,
+        "cores": here.cores,
+        "memory_gib": here.memory_gib,
+        "system": here.system,
+        "commit": machine.commit(),
+        **{f"version_{name}": version for name, version in machine.versions().items()},
+    }
+    size = f" {run.size}" if run.size else ""
+    return RerunRecorder(
+        files.recording,
+        RecordingInfo(
+            title=f"{run.scene_name}{size} - {run.solver}",
+            run_id=run.run_id(here.id),
+            mesh=scene.mesh,
+            pinned=scene.system.pins.vertices,
+            time_step=run.scene.time_step,
+            strain_range=run.strain_range,
+            properties=properties,
+        ),
+    )
+
+
+def _milliseconds(measured: Measured, frames: int) -> dict[str, list[float]]:
+    """The median over the rounds of each phase in each frame [ms]."""
+    by_phase: dict[str, list[list[float]]] = {}
+    for t in measured.timings:
+        if t.frame is not None:
+            by_phase.setdefault(t.phase, [[] for _ in range(frames)])[t.frame - 1].append(1e3 * t.seconds)
+    return {phase: [float(np.median(times)) for times in series] for phase, series in by_phase.items()}
+
+
+def largest_strain(scene: Scene, p: Positions) -> float:
+    """The largest |length / rest length - 1| of a spring at p (n, 3) [m]; 0 without springs."""
+    springs = scene.springs
+    i, j = springs.edges[springs.rest_length > 0.0].T
+    rest = springs.rest_length[springs.rest_length > 0.0]
+    return float(np.abs(np.linalg.norm(p[i] - p[j], axis=1) / rest - 1.0).max(initial=0.0))
+
+
+def save_positions(path: Path, positions: np.ndarray) -> None:
+    """Store positions (frames, n, 3) [m] under a partial name and rename."""
+    partial = path.with_name(f".{path.name}.partial.npz")
+    np.savez_compressed(partial, positions=positions)
+    os.replace(partial, path)
+
+
+def _common(run: RunSpec) -> dict[str, Any]:
+    """The columns that are the same in all rows of a run."""
+    here = machine.describe()
+    return {
+        "run_id": run.run_id(here.id),
+        "sweep": run.sweep,
+        "scene": run.scene_name,
+        "size": run.size,
+        "solver": run.solver,
+        "parameters": json.dumps(dict(run.parameters), sort_keys=True),
+        "time_step": run.scene.time_step,
+        "first_guess": run.first_guess,
+        "max_iterations": run.iterations,
+        "tolerance": run.tolerance,
+        "threads": run.threads,
+        "machine": here.id,
+        "cpu": here.cpu,
+        "cores": here.cores,
+        "memory_gib": here.memory_gib,
+        "system": here.system,
+        "versions": json.dumps(machine.versions(), sort_keys=True),
+        "commit": machine.commit(),
+        "code": machine.code_hash(),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
