@@ -1,0 +1,219 @@
+"""A run as a Rerun recording: one file that opens with its own layout.
+
+Topology is written once, positions each frame, scalars in bulk. The stream has no batching thread of its own:
+frames reach the disk every FLUSH frames, so a killed run leaves all but the last few. The file has a partial
+name until it is complete and has been read back.
+
+Entities: `/scene/mesh` (positions, exact to float32), `/scene/pins`, `/scene/springs`; `/energy/*`, `/residual`,
+`/iterations`, `/strain/largest`, `/milliseconds/*` by `frame` and `time`; `/convergence/*/frame_*` also by
+`iteration`; `/network` (springs, rest lengths, pins), `/run` (Markdown) and the recording's properties.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+
+from harness.errors import RunFailed
+from harness.record import blueprint
+from harness.record.base import Frame, RecordingInfo
+from harness.record.shading import Shading
+
+FLUSH = 5
+"""Frames between flushes: what a kill may cost, against a fixed cost of about 0.3 ms and 1.5 kB a flush."""
+
+SCALARS = 25
+"""Frames between batches of scalars, which cost about 1.2 kB each per entity."""
+
+_STRIPS = rr.components.LineStrip3DBatch([]).as_arrow_array().type
+
+
+class RerunRecorder:
+    """Records one run to `path`; implements `harness.record.base.Recorder`.
+
+    Raises RunFailed when the file cannot be written or, at the end, not be read back.
+    """
+
+    def __init__(self, path: Path, info: RecordingInfo) -> None:
+        self._path, self._info = path, info
+        self._shading = Shading(info.mesh, info.strain_range)
+        self._low, self._high = info.mesh.rest.min(axis=0), info.mesh.rest.max(axis=0)
+        self._scalars: dict[str, list[tuple[int, float]]] = {}
+        self._styled: set[str] = set()
+        self._frames = 0
+        self._pins: NDArray[np.float32] | None = None
+        self._springs_shown = False
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.rrd")
+        rr.set_strict_mode(True)  # without it a wrong shape is swallowed and logged as nothing
+        self._stream = rr.RecordingStream(
+            blueprint.application(info),
+            recording_id=info.run_id,
+            batcher_config=rr.ChunkBatcherConfig.NEVER(),
+            send_properties=False,
+        )
+        self._stream.set_log_time_enabled(False)
+        layout = blueprint.blueprint(info, self._low, self._high)
+        try:
+            self._stream.save(self._partial, default_blueprint=layout)
+        except RuntimeError as error:
+            raise RunFailed(f"{path}: the recording cannot be written: {error}") from error
+        self._log_once()
+        self._flush()
+
+    def frame(self, frame: Frame) -> None:
+        """Record one frame; its arrays are only read."""
+        with np.errstate(over="ignore"):
+            p = frame.positions.astype(np.float32)
+        strain, of_vertex = self._shading.strains(frame.positions)
+        self._stream.set_time("frame", sequence=frame.index)
+        self._stream.set_time("time", duration=frame.time)
+        self._log_mesh(p, self._shading.colours(of_vertex))
+        self._log_pins(p)
+        self._log_springs(p, strain)
+        self._add(frame.index, {f"/energy/{name}": value for name, value in frame.energies.items()})
+        largest = float(np.abs(strain).max(initial=0.0))
+        self._add(frame.index, {"/strain/largest": largest, "/iterations": frame.iterations})
+        self._add(frame.index, {"/residual": frame.residual, "/residual/log10": _log10(frame.residual)})
+        self._frames += 1
+        if self._frames % SCALARS == 0:
+            self._send_scalars()
+        if self._frames % FLUSH == 0 or self._frames == 1:
+            self._widen(p)
+            self._flush()
+
+    def convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
+        """Record the residual [J^(1/2)] and the objective [J] after each iteration of one frame, from the first."""
+        curves = {
+            "residual": residuals,
+            "log10_residual": [_log10(value) for value in residuals],
+            "objective": objective,
+        }
+        for name, values in curves.items():
+            entity = f"/convergence/{name}/frame_{frame:04d}"
+            self._style(entity, f"frame {frame}")
+            index = [
+                rr.TimeColumn("iteration", sequence=range(1, len(values) + 1)),
+                *self._times(np.full(len(values), frame)),
+            ]
+            self._stream.send_columns(entity, index, rr.Scalars.columns(scalars=np.asarray(values, float)))
+
+    def close(self, milliseconds: Mapping[str, Sequence[float]]) -> Path:
+        """Write the milliseconds of each phase by frame, from frame 1; finish the file and return its path."""
+        for phase, values in milliseconds.items():
+            self._scalars[f"/milliseconds/{phase}"] = list(enumerate(values, start=1))
+        self._send_scalars()
+        self._stream.send_blueprint(blueprint.blueprint(self._info, self._low, self._high))
+        self._flush()
+        self._stream.disconnect()
+        try:
+            RrdReader(self._partial).store().schema()
+        except Exception as error:
+            self.abandon()
+            raise RunFailed(f"{self._path}: the recording cannot be read back: {error}") from error
+        os.replace(self._partial, self._path)
+        return self._path
+
+    def abandon(self) -> None:
+        """Stop, and remove the partial file."""
+        self._stream.disconnect()
+        self._partial.unlink(missing_ok=True)
+
+    def _widen(self, p: NDArray[np.float32]) -> None:
+        """Keep the box of the positions, for the camera."""
+        low, high = p.min(axis=0), p.max(axis=0)
+        if np.isfinite(low).all() and np.isfinite(high).all():
+            self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
+
+    def _log_once(self) -> None:
+        info, mesh = self._info, self._info.mesh
+        self._stream.send_recording_name(info.title)
+        self._stream.send_property("run", rr.AnyValues(**info.properties))
+        numbers = {"time_step": info.time_step, "strain_range": info.strain_range}
+        network = {
+            "springs": mesh.springs.ravel().astype(np.uint32),
+            "rest_lengths": mesh.rest_lengths,
+            "pinned": info.pinned.astype(np.uint32),
+        }
+        self._stream.log("/network", rr.AnyValues(drop_untyped_nones=False, **network, **numbers), static=True)
+        document = rr.TextDocument(blueprint.run_document(info), media_type=rr.MediaType.MARKDOWN)
+        self._stream.log("/run", document, static=True)
+        self._stream.log("/scene", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
+        self._stream.log("/legend", rr.Image(blueprint.scale_image()), static=True)
+        if len(mesh.triangles):
+            triangles = mesh.triangles.astype(np.uint32)
+            self._stream.log("/scene/mesh", rr.Mesh3D.from_fields(triangle_indices=triangles), static=True)
+
+    def _log_mesh(self, p: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
+        if len(self._info.mesh.triangles):
+            normals = self._shading.normals(p)
+            fields = rr.Mesh3D.from_fields(vertex_positions=p, vertex_normals=normals, vertex_colors=colours)
+        else:
+            fields = rr.Points3D.from_fields(positions=p, colors=colours, radii=rr.Radius.ui_points(3))
+        self._stream.log("/scene/mesh", fields)
+
+    def _log_pins(self, p: NDArray[np.float32]) -> None:
+        pins = p[self._info.pinned]
+        if self._pins is None or not np.array_equal(pins, self._pins):
+            points = rr.Points3D(pins, radii=rr.Radius.ui_points(5), colors=(255, 200, 40))
+            self._stream.log("/scene/pins", points)
+            self._pins = pins
+
+    def _log_springs(self, p: NDArray[np.float32], strain: NDArray[np.float64]) -> None:
+        springs = self._info.mesh.springs
+        due = self._frames % blueprint.spring_cadence(self._info.mesh) == 0
+        if due and len(springs):
+            colours, radius = self._shading.colours(strain), rr.Radius.ui_points(1.5)
+            self._stream.log("/scene/springs", rr.LineStrips3D(_segments(p[springs]), colors=colours, radii=radius))
+        elif self._springs_shown:  # else they would stay where they were, over a mesh that moves on
+            self._stream.log("/scene/springs", rr.Clear(recursive=False))
+        self._springs_shown = due
+
+    def _add(self, frame: int, values: Mapping[str, float]) -> None:
+        for entity, value in values.items():
+            self._scalars.setdefault(entity, []).append((frame, value))
+
+    def _send_scalars(self) -> None:
+        for entity, rows in self._scalars.items():
+            if rows:
+                self._style(entity, entity.rsplit("/", 1)[-1])
+                frames, values = zip(*rows, strict=True)
+                index = self._times(np.array(frames))
+                self._stream.send_columns(entity, index, rr.Scalars.columns(scalars=np.array(values, float)))
+                rows.clear()
+
+    def _times(self, frames: NDArray[np.int64]) -> Iterable[rr.TimeColumn]:
+        return (
+            rr.TimeColumn("frame", sequence=frames),
+            rr.TimeColumn("time", duration=frames * self._info.time_step),
+        )
+
+    def _style(self, entity: str, name: str) -> None:
+        if entity not in self._styled:
+            self._styled.add(entity)
+            self._stream.log(entity, rr.SeriesLines(names=name, widths=1.5), static=True)
+
+    def _flush(self) -> None:
+        try:
+            self._stream.flush(timeout_sec=60)
+        except Exception as error:
+            raise RunFailed(f"{self._path}: the recording cannot be written: {error}") from error
+
+
+def _segments(ends: NDArray[np.float32]) -> pa.Array:
+    """Line strips of two points each from (m, 2, 3); the library's own way takes a Python loop over them."""
+    points = rr.components.Position3DBatch(ends.reshape(-1, 3)).as_arrow_array()
+    offsets = pa.array(np.arange(0, 2 * len(ends) + 1, 2, dtype=np.int32))
+    return pa.ListArray.from_arrays(offsets, points, type=_STRIPS)
+
+
+def _log10(value: float) -> float:
+    return math.log10(value) if value > 0 else math.nan

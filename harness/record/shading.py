@@ -1,0 +1,92 @@
+"""How a recorded mesh looks: strain to colour, and vertex normals, fast enough for every frame.
+
+The strain of a spring is length / rest length - 1. A vertex shows the incident strain of largest magnitude, with
+its sign, so that a single overstretched spring is seen. Normals are area-weighted. Both are rounded: the
+recording's compression then finds equal neighbours, and the rounding is too fine to be seen.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from matplotlib import colormaps
+from numba import njit
+from numpy.typing import NDArray
+
+from harness.mesh.base import Mesh
+from solvers.problem import Positions
+
+STRAIN_MAP = "RdBu_r"
+"""The diverging map of Matplotlib, safe for the colour-blind: blue compressed, white at rest, red stretched."""
+
+LEVELS = 65
+NORMAL_STEPS = 32
+NEUTRAL = (128, 128, 128, 255)
+"""The colour of a strain that is not a number."""
+
+
+def palette() -> NDArray[np.uint8]:
+    """The colours of the levels from most compressed to most stretched and, last, NEUTRAL: (LEVELS + 1, 4)."""
+    # The map's ends are so dark that shadow is lost on them, and its middle so bright that light is.
+    colours = colormaps[STRAIN_MAP](np.linspace(0.08, 0.92, LEVELS)) * (0.86, 0.86, 0.86, 1.0)
+    return np.vstack([(255 * colours).astype(np.uint8), np.array(NEUTRAL, np.uint8)])
+
+
+class Shading:
+    """Strains, colours and normals of one mesh."""
+
+    def __init__(self, mesh: Mesh, strain_range: float) -> None:
+        self._mesh, self._range = mesh, strain_range
+        self._palette, self._rest_lengths = palette(), mesh.rest_lengths
+
+    def strains(self, p: Positions) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The strain of each spring (m,), and of each vertex (n,) the one of largest magnitude among its springs.
+
+        Where a rest length is 0, or a vertex has no spring, it is 0.
+        """
+        of_spring, of_vertex = np.empty(len(self._rest_lengths)), np.zeros(len(p))
+        _strains(p.copy(), self._mesh.springs, self._rest_lengths, of_spring, of_vertex)
+        return of_spring, of_vertex
+
+    def colours(self, strain: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """RGBA of each strain, shape (len(strain), 4)."""
+        with np.errstate(invalid="ignore"):
+            level = np.rint((np.clip(strain / self._range, -1, 1) + 1) * (LEVELS - 1) / 2)
+        return self._palette[np.where(np.isnan(level), LEVELS, level).astype(np.intp)]
+
+    def normals(self, p: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The unit normal of each vertex, rounded to 1/32, shape (n, 3); zero where there is none."""
+        normals = np.zeros_like(p)
+        _normals(p, self._mesh.triangles, normals)
+        return normals
+
+
+# Positions come as writable copies: a read-only array is another type to Numba, and another compilation.
+@njit(cache=True, error_model="numpy")
+def _strains(p, springs, rest_lengths, of_spring, of_vertex):
+    for e in range(len(springs)):
+        i, j = springs[e]
+        x, y, z = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
+        r = rest_lengths[e]
+        strain = math.sqrt(x * x + y * y + z * z) / r - 1 if r > 0 else 0.0
+        of_spring[e] = strain
+        for v in (i, j):
+            if abs(strain) > abs(of_vertex[v]) or math.isnan(strain):
+                of_vertex[v] = strain
+
+
+@njit(cache=True, error_model="numpy")
+def _normals(p, triangles, out):
+    for i, j, k in triangles:
+        ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
+        bx, by, bz = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1], p[k, 2] - p[i, 2]
+        for v in (i, j, k):
+            out[v, 0] += ay * bz - az * by
+            out[v, 1] += az * bx - ax * bz
+            out[v, 2] += ax * by - ay * bx
+    for v in range(len(out)):
+        length = math.sqrt(out[v, 0] ** 2 + out[v, 1] ** 2 + out[v, 2] ** 2)
+        for c in range(3):
+            unit = out[v, c] / length
+            out[v, c] = round(unit * NORMAL_STEPS) / NORMAL_STEPS if math.isfinite(unit) else 0.0
