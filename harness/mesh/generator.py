@@ -48,14 +48,8 @@ class Generator(Model):
         """The mesh of a size that has been checked."""
 
     def _refusal(self, size: int, why: str) -> InputError:
-        largest = (
-            self.SMALLEST
-            - 1
-            + bisect_right(range(self.SMALLEST, MAX_VERTICES + 1), MAX_VERTICES, key=self.count)
-        )
-        allowed = (
-            f"{self.SMALLEST} to {largest}" if largest >= self.SMALLEST else "none with these proportions"
-        )
+        largest = self.SMALLEST - 1 + bisect_right(range(self.SMALLEST, MAX_VERTICES + 1), MAX_VERTICES, key=self.count)
+        allowed = f"{self.SMALLEST} to {largest}" if largest >= self.SMALLEST else "none with these proportions"
         kind = type(self).__name__.lower()
         return InputError(Mistake(f"{size} {why}; allowed for {kind}: {allowed} ({self.COUNTS})", key="size"))
 

@@ -104,7 +104,7 @@ class Net(_Sheet):
     """A net of ropes: square meshes that stand on a corner, and a rope around; no triangles.
 
     `size` knots along its top. Rows of `size` knots alternate with rows of `size - 1` knots half a mesh
-    lower; knots are numbered row pair by row pair. Springs, all STRETCH: from each knot of the short rows up
+    lower; knots are numbered row by row. Springs, all STRETCH: from each knot of the short rows up
     left, up right, down left, down right (one direction after another), then along top, bottom, left, right.
     Parts: top, bottom, left, right, boundary, corners, top_corners. Mass goes by length. Dimension 2, since
     a net with finer meshes is to stretch as much: its ropes are thinner.

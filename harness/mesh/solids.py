@@ -113,8 +113,7 @@ class Block(Generator):
             triangles=np.concatenate([lattice_triangles(side) for side in surface]),
             weights=reduce(np.multiply.outer, map(_owned, shape)).ravel(),
             dimension=3,
-            spacing=math.prod(side / (n - 1) for side, n in zip(self._sides(), shape, strict=True))
-            ** (1 / 3),
+            spacing=math.prod(side / (n - 1) for side, n in zip(self._sides(), shape, strict=True)) ** (1 / 3),
             resolution=size,
             parts={**box_parts(rest), "corners": index[:: 1 - shape[0], :: 1 - shape[1], :: 1 - shape[2]]},
         )

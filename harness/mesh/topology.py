@@ -5,7 +5,7 @@ Vertices are numbered through index arrays: `index[r, c]` is the vertex in row r
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -65,7 +65,8 @@ def fan(polygons: Indices) -> Indices:
 def lump(cells: Indices, measure: Points, n: int) -> Points:
     """Each cell's measure, (f,), dealt out equally to its corners, (f, k): weights of the vertices, (n,)."""
     corners = cells.shape[1]
-    return np.bincount(cells.ravel(), np.repeat(measure / corners, corners), minlength=n)
+    weights = np.bincount(cells.ravel(), np.repeat(measure / corners, corners), minlength=n)
+    return weights.astype(np.float64, copy=False)
 
 
 def by_length(rest: Points, pairs: Indices) -> Points:
@@ -127,8 +128,3 @@ def assemble(
         resolution=resolution,
         parts={name: np.unique(np.asarray(part, np.int64)) for name, part in parts.items()},
     )
-
-
-def joined(groups: Sequence[Indices], empty: Indices) -> Indices:
-    """The groups one after another; `empty` where there are none."""
-    return np.concatenate([empty, *groups])

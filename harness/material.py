@@ -1,0 +1,92 @@
+"""Stiffness of the springs [N/m] from material constants and a rule of how they follow the mesh.
+
+fixed        The constants are the stiffness of each spring [N/m], whatever the mesh.
+
+continuum    The material stays the same when the mesh is refined. With h the spacing:
+    dimension 1   k_e = EA / rest length; constants EA [N]. Springs in series add up to EA / L.
+    dimension 2   k_e constant; constants [N/m]. There are 1/h springs across a metre of width, each of length
+                  h, so that the force per width and strain is k h / h = k.
+    dimension 3   k_e = E h; constants [Pa]. There are 1/h^2 springs across a square metre, so that the force
+                  per area and strain is k h / h^2 = E. The lattice's own moduli are E times a factor of its
+                  springs (axes, faces' and cells' diagonals); half-empty boundary cells add a term of order h.
+    bending       k_e = 16 B / h^2, constant B [N m] (BEND springs, rest length 2h, in dimension 2).
+
+    Skip-one springs carry no bending energy of second order: a fold by the angle t shortens one by
+    2h (1 - cos(t/2)) = h t^2/4, and per length of fold there are 1/h of them, which store k h t^4/32. The sheet
+    that has the bending stiffness B and takes the same fold over one spacing stores B (t/h)^2 h/2 = B t^2/(2h).
+    The two agree at t = 1 rad for k = 16 B / h^2. The price: gentler bends are underestimated by the
+    factor t^2 (at a fixed curvature t = h * curvature, so that smooth bends get softer as the mesh is refined),
+    and the springs resist stretch too: they add 4 k_e to the membrane stiffness along the lines of the mesh,
+    64 B / h^2, which grows without bound. This rule is our own; where it matters, check the result
+    under refinement.
+
+liu2013      k_e = constant * (resolution - 1) / (reference - 1), constants [N/m] as they are at the size
+    `reference`: Liu et al. 2013 give their curtain 150, 300, 600, 1200 at 11, 21, 41, 81 vertices a side.
+    Proportional to 1/h, this stiffens a cloth that is refined; it exists to reproduce their figures. It needs a
+    mesh that has a size, so meshes from files are refused; the two other rules serve them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.errors import InputError, Mistake, did_you_mean
+from harness.mesh.base import BEND, SHEAR, STRETCH, Mesh
+
+Scale = Callable[[Mesh, str, int | None], NDArray[np.float64] | float]
+"""(mesh, family, reference) -> what turns a family's constant into stiffness, a number or one for each spring."""
+
+
+def spring_stiffness(
+    mesh: Mesh, *, rule: str, stretch: float, shear: float, bend: float, reference: int | None = None
+) -> NDArray[np.float64]:
+    """The stiffness of each spring, (m,) [N/m], from a constant for each family and one of `RULES`.
+
+    Raises InputError for an unknown rule, a constant that is not finite or below zero, a rule that does not fit
+    the mesh, and a `reference` that is missing (liu2013) or has no meaning (the others).
+    """
+    if rule not in RULES:
+        raise InputError(Mistake(f"unknown rule {rule!r}; wanted {did_you_mean(rule, RULES)}", key="rule"))
+    if reference is not None and rule != "liu2013":
+        raise InputError(Mistake(f"has no meaning for the rule {rule}; leave it out", key="reference"))
+    k = np.zeros(len(mesh.springs))
+    for family, constant in ((STRETCH, stretch), (SHEAR, shear), (BEND, bend)):
+        if not 0 <= constant < np.inf:
+            raise InputError(Mistake(f"{constant} is no stiffness; wanted a finite number >= 0", key=family))
+        springs = mesh.families.get(family)
+        if springs is not None and len(springs):
+            k[springs] = constant * RULES[rule](mesh, family, reference)
+    return k
+
+
+def _fixed(mesh: Mesh, family: str, reference: int | None) -> float:
+    return 1.0
+
+
+def _continuum(mesh: Mesh, family: str, reference: int | None) -> NDArray[np.float64] | float:
+    if family == BEND:
+        return 16 / mesh.spacing**2
+    if mesh.dimension > 1:
+        return 1.0 if mesh.dimension == 2 else mesh.spacing
+    lengths = mesh.rest_lengths[mesh.families[family]]
+    if not lengths.all():
+        raise InputError(
+            Mistake("the rule continuum needs springs of some length; a spring joins two equal points", key="rule")
+        )
+    return 1 / lengths
+
+
+def _liu2013(mesh: Mesh, family: str, reference: int | None) -> float:
+    if reference is None or reference < 2:
+        problem = f"came {reference}; liu2013 needs the mesh size, at least 2, at which the constants hold"
+        raise InputError(Mistake(problem, key="reference"))
+    if mesh.resolution < 2:
+        problem = f"liu2013 needs a mesh that has a size of at least 2, this one has {mesh.resolution or 'none'}"
+        raise InputError(Mistake(problem + "; use fixed or continuum", key="rule"))
+    return (mesh.resolution - 1) / (reference - 1)
+
+
+RULES: dict[str, Scale] = {"fixed": _fixed, "continuum": _continuum, "liu2013": _liu2013}
