@@ -8,23 +8,42 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from typer.core import TyperGroup
 
 from harness.errors import InputError, SpringbenchError
 
+out, err = Console(), Console(stderr=True)
+
+
+class _Commands(TyperGroup):
+    """Answers our own errors and Ctrl-C with a message and an exit code instead of a traceback."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except SpringbenchError as error:
+            for mistake in getattr(error, "mistakes", (error,)):
+                _say(f"springbench: {mistake}")
+            raise typer.Exit(error.exit_code) from error
+        except KeyboardInterrupt:
+            _say("springbench: stopped; what is complete is kept, and the same command goes on from there")
+            raise typer.Exit(130) from None
+
+
 app = typer.Typer(
+    cls=_Commands,
     help="A laboratory for implicit time stepping of mass-spring systems.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-out, err = Console(), Console(stderr=True)
 
 Config = Annotated[Path, typer.Argument(help="A sweep or a scene (YAML), or an assignment's scene (JSON).")]
 Results = Annotated[Path, typer.Option(help="The folder that holds a folder for each sweep.")]
@@ -65,9 +84,7 @@ def run(
     sweep = load_any(config, solvers=solver or (), sizes=size or (), **options)
     _check_positions(positions)
     folder = results / sweep.name
-    table = run_sweep(
-        sweep.name, sweep.runs(), folder, display(err), _say, again=again, positions=positions
-    )
+    table = run_sweep(sweep.name, sweep.runs(), folder, display(err), _say, again=again, positions=positions)
     out.print(summary_table(table))
     _say(f"rows, recordings and pictures are in {folder}")
     failed = failures(table)
@@ -87,7 +104,16 @@ def list_runs(config: Config, results: Results = Path("results")) -> None:
     for p in plan(sweep.runs(), results / sweep.name):
         r = p.run
         state = p.state + (" (by other code)" if p.older else "")
-        cells = (p.files.rows.stem[-12:], r.scene_name, r.size, r.solver, r.iterations, r.frames, r.threads, state)
+        cells = (
+            p.files.rows.stem[-12:],
+            r.scene_name,
+            r.size,
+            r.solver,
+            r.iterations,
+            r.frames,
+            r.threads,
+            state,
+        )
         table.add_row(*map(str, cells))
     out.print(table)
 
@@ -101,11 +127,11 @@ def query(
     """Answer an SQL query over the rows of all sweeps."""
     from harness.query import answer
 
-    table = answer(sql, results)
+    found = answer(sql, results)
     if csv:
-        table.to_csv(sys.stdout)
+        found.write_csv(sys.stdout)
     else:
-        table.show(out)
+        out.print(found.table())
 
 
 @app.command()
@@ -159,15 +185,7 @@ def _check_positions(path: Path | None) -> None:
 
 def main() -> None:
     """The console script."""
-    try:
-        app()
-    except SpringbenchError as error:
-        for mistake in getattr(error, "mistakes", (error,)):
-            _say(f"springbench: {mistake}")
-        sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        _say("springbench: stopped; what is complete is kept, and the same command goes on from there")
-        sys.exit(130)
+    app()
 
 
 if __name__ == "__main__":

@@ -87,9 +87,7 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
 
 def steps(scene: Scene, prepared: Prepared, settings: Settings) -> Iterator[Step]:
     """The run's steps; raises Diverged as soon as a position is not finite."""
-    run = simulate(
-        scene, prepared, settings.stop, first_guess=settings.first_guess, frames=settings.frames
-    )
+    run = simulate(scene, prepared, settings.stop, first_guess=settings.first_guess, frames=settings.frames)
     for step in run:
         if not np.isfinite(step.solution.positions).all():
             raise Diverged(f"positions are not finite from frame {step.index} on")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -74,17 +74,17 @@ def _status(error: Exception) -> str:
 def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
     scene = build(run.scene, run.size)
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
-    settings = Settings(
-        StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds
-    )
-    solver = load(SOLVERS[run.solver])(**run.parameters)
+    settings = Settings(StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
+    solver = load(SOLVERS[run.solver.name])(**run.solver.parameters)
     measured = measure(scene, solver, settings, tick)
     by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
     if by_frame[run.frames]["digest"] != measured.digest:
         raise RunFailed("the recorded pass ended at other positions than the timed pass")
     facts = {name: int(value) for name, value in measured.prepared.facts.items()}
     return [
-        counts | facts | {"status": "ok", "phase": t.phase, "frame": t.frame, "round": t.round, "seconds": t.seconds}
+        counts
+        | facts
+        | {"status": "ok", "phase": t.phase, "frame": t.frame, "round": t.round, "seconds": t.seconds}
         | (by_frame[t.frame] if t.phase == "step" and t.frame else {})
         for t in measured.timings
     ]
@@ -148,8 +148,8 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, measured: Measured) -> R
         "sweep": run.sweep,
         "scene": run.scene_name,
         "size": run.size,
-        "solver": run.solver,
-        "parameters": json.dumps(dict(run.parameters)),
+        "solver": run.solver.name,
+        "parameters": json.dumps(dict(run.solver.parameters)),
         "vertices": len(scene.mesh.rest),
         "springs": len(scene.springs.edges),
         "time_step": run.scene.time_step,
@@ -170,7 +170,7 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, measured: Measured) -> R
     return RerunRecorder(
         files.recording,
         RecordingInfo(
-            title=f"{run.scene_name}{size} - {run.solver}",
+            title=f"{run.scene_name}{size} - {run.solver.name}",
             run_id=run.run_id(here.id),
             mesh=scene.mesh,
             pinned=scene.system.pins.vertices,
@@ -213,8 +213,8 @@ def _common(run: RunSpec) -> dict[str, Any]:
         "sweep": run.sweep,
         "scene": run.scene_name,
         "size": run.size,
-        "solver": run.solver,
-        "parameters": json.dumps(dict(run.parameters), sort_keys=True),
+        "solver": run.solver.name,
+        "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
         "time_step": run.scene.time_step,
         "first_guess": run.first_guess,
         "max_iterations": run.iterations,

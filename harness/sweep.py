@@ -47,7 +47,7 @@ class Planned:
     def title(self) -> str:
         """The run in words."""
         size = f" {self.run.size}" if self.run.size else ""
-        return f"{self.run.scene_name}{size} {self.run.solver}"
+        return f"{self.run.scene_name}{size} {self.run.solver.name}"
 
 
 def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
@@ -171,15 +171,13 @@ def _distinct(p: Planned, group: list[Planned]) -> str:
     """The solver's name, with the options in which the group's runs differ."""
     varied = [
         f"{option.replace('_', ' ')} {getattr(p.run, option)}"
-        for option in ("parameters", "iterations", "tolerance", "first_guess", "threads", "frames", "rounds")
-        if len({str(getattr(other.run, option)) for other in group if other.run.solver == p.run.solver}) > 1
+        for option in ("solver", "iterations", "tolerance", "first_guess", "threads", "frames", "rounds")
+        if len({str(getattr(other.run, option)) for other in group if other.run.solver.name == p.run.solver.name}) > 1
     ]
-    return ", ".join([p.run.solver, *varied])
+    return ", ".join([p.run.solver.name, *varied])
 
 
 def failures(table: pa.Table) -> list[str]:
     """Scene, size, solver, status and reason of the runs that failed."""
     failed = [row for row in table.to_pylist() if row["status"] != "ok"]
     return [f"{r['scene']} {r['size']} {r['solver']}: {r['status']}: {r['reason']}" for r in failed]
-
-

@@ -41,9 +41,9 @@ Project = Callable[[Positions, Positions, Positions], None]
 class PreparedLocalGlobal:
     """The iteration, over any backend's local step, factor and norm.
 
-    project: the local step; factor: of Q's free rows and columns; coupling: Q's free rows and exactly
-    pinned columns (f, x); norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins; trace: of the unpinned part
-    of Q [N/m].
+    project: the local step; factor: of Q's free rows and columns; coupling: Q's free rows and exactly pinned
+    columns (f, x); norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins; trace: of the unpinned
+    part of Q [N/m]; facts: exact counts of what was built.
     """
 
     system: System
@@ -242,4 +242,3 @@ def _prepared(
         float(Q.diagonal()[system.unpinned].sum()),
         facts,
     )
-

@@ -82,8 +82,8 @@ def system_matrix_sparse(
     A: csr_array, stiffness: ArrayLike, M: csr_array, time_step: float, C: csr_array, weight: ArrayLike
 ) -> csr_array:
     """Q [N/m], shape (n, n), as `system_matrix_dense`, with an entry for each vertex and two for each spring."""
-    K = diagonal(np.broadcast_to(np.asarray(stiffness, float), A.shape[0]))
-    W = diagonal(np.broadcast_to(np.asarray(weight, float), C.shape[0]))
+    K = diagonal(np.broadcast_to(np.asarray(stiffness, float), len(A.indptr) - 1))
+    W = diagonal(np.broadcast_to(np.asarray(weight, float), len(C.indptr) - 1))
     return without_zeros(A.T @ K @ A + M / time_step**2 + C.T @ W @ C)
 
 

@@ -1,7 +1,7 @@
 """Wind as a force: a constant one, or the field of the University of Toronto assignment.
 
-The assignment's, with t the simulated time [s] at the step's start, b the length of the diagonal of the rest bounding box and
-phi = x / b + t at each vertex's current x:
+The assignment's, with t the simulated time [s] at the step's start, b the length of the diagonal of the rest
+bounding box and phi = x / b + t at each vertex's current x:
 
     f = (3 + 1.5 (1 + cos 5 phi),  1 + cos(0.3 + phi),  sin phi)     newtons a vertex
 

@@ -58,13 +58,17 @@ class Springs:
     @cached_property
     def _incidence(self) -> tuple[csr_array, csr_array]:
         """A over as many vertices as the springs name, and A'K."""
-        A = signed_incidence_matrix_sparse(self.edges, int(self.edges.max(initial=-1)) + 1)
+        A = signed_incidence_matrix_sparse(self.edges, self._named)
         return A, csr_array(A.T @ diagonal(self.stiffness))
+
+    @property
+    def _named(self) -> int:
+        return int(self.edges.max(initial=-1)) + 1
 
     def _vectors(self, p: Positions) -> tuple[Positions, NDArray[np.float64], Positions]:
         """v = A p (m, 3), the lengths |v| (m,) and the unit directions (m, 3)."""
         A, _ = self._incidence
-        v = A @ p[: A.shape[1]]
+        v = A @ p[: self._named]
         length = np.sqrt(np.einsum("ij,ij->i", v, v))
         unit = v / np.maximum(length, TINY)[:, None]
         zero = length <= TINY
@@ -80,13 +84,13 @@ class Springs:
         """Add the gradient A'K (A p - d) [N], shape (n, 3), to `out`."""
         v, _, unit = self._vectors(p)
         _, AtK = self._incidence
-        out[: AtK.shape[0]] += AtK @ (v - self.rest_length[:, None] * unit)
+        out[: self._named] += AtK @ (v - self.rest_length[:, None] * unit)
 
     def add_projection(self, p: Positions, out: Positions) -> None:
         """The local step: add A'K d(p) [N], shape (n, 3), to `out`."""
         _, _, unit = self._vectors(p)
         _, AtK = self._incidence
-        out[: AtK.shape[0]] += AtK @ (self.rest_length[:, None] * unit)
+        out[: self._named] += AtK @ (self.rest_length[:, None] * unit)
 
     def stiffness_matrix(self, n: int) -> csr_array:
         """A'KA [N/m], shape (n, n), its share of Q."""

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import cholespy
 import numpy as np
+from cholespy import CholeskySolverD, MatrixType  # pyright: ignore[reportAttributeAccessIssue]  (no stubs)
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
@@ -83,9 +83,7 @@ class SimplicialCholesky:
             raise NotPositiveDefinite(_REASON)
         pointers, columns = Q.indptr.astype(np.int32), Q.indices.astype(np.int32)
         try:
-            self._factor = cholespy.CholeskySolverD(
-                Q.shape[0], pointers, columns, Q.data, cholespy.MatrixType.CSR
-            )
+            self._factor = CholeskySolverD(len(pointers) - 1, pointers, columns, Q.data, MatrixType.CSR)
         except ValueError as error:
             raise NotPositiveDefinite(_REASON) from error
 

@@ -1,0 +1,54 @@
+"""SQL over the rows of all sweeps (DuckDB on the Parquet files)."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+import duckdb
+from rich.table import Table
+
+from harness import rows
+from harness.errors import InputError
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Names of columns and the rows of values that a query gave."""
+
+    columns: list[str]
+    values: list[tuple[Any, ...]]
+
+    def table(self) -> Table:
+        """The answer as a table to print."""
+        table = Table(*self.columns)
+        for row in self.values:
+            table.add_row(*("" if v is None else f"{v:.6g}" if isinstance(v, float) else str(v) for v in row))
+        return table
+
+    def write_csv(self, file: TextIO) -> None:
+        """Write the answer as CSV with all digits."""
+        writer = csv.writer(file)
+        writer.writerow(self.columns)
+        writer.writerows(self.values)
+
+
+def answer(sql: str, results: Path) -> Answer:
+    """What a query says of the table `rows`; it can read nothing else and write nothing.
+
+    Raises InputError where there are no rows, or with DuckDB's message where the query is wrong.
+    """
+    files = sorted(results.glob("*/rows/*.parquet"))
+    if not files:
+        raise InputError(f"{results}: holds no rows; run a sweep first, or name its folder with --results")
+    with duckdb.connect() as connection:
+        connection.register("rows", rows.read(files))
+        connection.execute("SET enable_external_access = false; SET lock_configuration = true")
+        try:
+            found = connection.execute(sql)
+            description = found.description or []
+            return Answer([column[0] for column in description], found.fetchall() if description else [])
+        except duckdb.Error as error:
+            raise InputError(f"query: {error}") from error
