@@ -19,9 +19,9 @@ _DIRECTION = np.array([0.62, 0.38, 0.78])
 
 
 def spring_cadence(mesh: Mesh) -> int:
-    """Springs are drawn in each so-manieth frame: all of them where there are few, for lines cost far more bytes
-    than vertices."""
-    return 1 if len(mesh.springs) <= 1024 else 30
+    """Springs are drawn in the frames that this number divides: in all where they are few, else so rarely that
+    they cost about 2.5 bytes a vertex and frame; vertices cost 15."""
+    return 1 if len(mesh.springs) <= 1024 else 10 * math.ceil(len(mesh.springs) / len(mesh.rest))
 
 
 def application(info: RecordingInfo) -> str:
@@ -32,7 +32,7 @@ def application(info: RecordingInfo) -> str:
 def scale_name(strain_range: float) -> str:
     """The colour scale in words."""
     percent = f"{100 * strain_range:g} %"
-    return f"Strain: blue = compressed {percent} or more, white = at rest, red = stretched {percent} or more"
+    return f"Strain: blue = compressed {percent} or more, grey = at rest, orange = stretched {percent} or more"
 
 
 def scale_image() -> NDArray[np.uint8]:
@@ -119,7 +119,7 @@ def run_document(info: RecordingInfo) -> str:
         **info.properties,
     }
     rows = "\n".join(f"| {key} | `{value}` |" for key, value in facts.items())
-    colours = f"## Colours\n\n{scale_name(info.strain_range)}, grey = not a number.\n\n"
+    colours = f"## Colours\n\n{scale_name(info.strain_range)}.\n\n"
     hint = (
         "A vertex shows the strain of largest magnitude among its springs. The springs themselves "
         f"(`/scene/springs`, in each frame that {spring_cadence(mesh)} divides) "

@@ -152,7 +152,7 @@ class RerunRecorder:
             triangles = mesh.triangles.astype(np.uint32)
             self._stream.log("/scene/mesh", rr.Mesh3D.from_fields(triangle_indices=triangles), static=True)
 
-    def _log_mesh(self, p: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
+    def _log_mesh(self, p: NDArray[np.float32], colours: NDArray[np.uint32]) -> None:
         if len(self._info.mesh.triangles):
             normals = self._shading.normals(p)
             fields = rr.Mesh3D.from_fields(vertex_positions=p, vertex_normals=normals, vertex_colors=colours)

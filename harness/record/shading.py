@@ -10,15 +10,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from matplotlib import colormaps
 from numba import njit
 from numpy.typing import NDArray
 
 from harness.mesh.base import Mesh
 from solvers.problem import Positions
 
-STRAIN_MAP = "RdBu_r"
-"""The diverging map of Matplotlib, safe for the colour-blind: blue compressed, white at rest, red stretched."""
+STRAIN_COLOURS = ("#0b4a86", "#5b9bd0", "#d9d7d2", "#ee8f45", "#a33b05")
+"""Strain at -range, -range/2, 0, range/2, range: blue compressed, grey at rest, orange stretched; safe for the
+colour-blind, and grey enough in the middle that light and shadow still show."""
 
 LEVELS = 65
 NORMAL_STEPS = 32
@@ -28,9 +28,10 @@ NEUTRAL = (128, 128, 128, 255)
 
 def palette() -> NDArray[np.uint8]:
     """The colours of the levels from most compressed to most stretched and, last, NEUTRAL: (LEVELS + 1, 4)."""
-    # The map's ends are so dark that shadow is lost on them, and its middle so bright that light is.
-    colours = colormaps[STRAIN_MAP](np.linspace(0.08, 0.92, LEVELS)) * (0.86, 0.86, 0.86, 1.0)
-    return np.vstack([(255 * colours).astype(np.uint8), np.array(NEUTRAL, np.uint8)])
+    stops = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)] + [255] for colour in STRAIN_COLOURS])
+    at = np.linspace(0, len(stops) - 1, LEVELS)
+    colours = np.stack([np.interp(at, range(len(stops)), channel) for channel in stops.T], axis=1)
+    return np.vstack([np.rint(colours), NEUTRAL]).astype(np.uint8)
 
 
 class Shading:
@@ -38,7 +39,8 @@ class Shading:
 
     def __init__(self, mesh: Mesh, strain_range: float) -> None:
         self._mesh, self._range = mesh, strain_range
-        self._palette, self._rest_lengths = palette(), mesh.rest_lengths
+        self._packed = palette().view(">u4").astype(np.uint32).ravel()
+        self._rest_lengths = mesh.rest_lengths
 
     def strains(self, p: Positions) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The strain of each spring (m,), and of each vertex (n,) the one of largest magnitude among its springs.
@@ -49,11 +51,11 @@ class Shading:
         _strains(p.copy(), self._mesh.springs, self._rest_lengths, of_spring, of_vertex)
         return of_spring, of_vertex
 
-    def colours(self, strain: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """RGBA of each strain, shape (len(strain), 4)."""
+    def colours(self, strain: NDArray[np.float64]) -> NDArray[np.uint32]:
+        """The colour of each strain as 0xRRGGBBAA, shape (len(strain),)."""
         with np.errstate(invalid="ignore"):
             level = np.rint((np.clip(strain / self._range, -1, 1) + 1) * (LEVELS - 1) / 2)
-        return self._palette[np.where(np.isnan(level), LEVELS, level).astype(np.intp)]
+        return self._packed[np.where(np.isnan(level), LEVELS, level).astype(np.intp)]
 
     def normals(self, p: NDArray[np.float32]) -> NDArray[np.float32]:
         """The unit normal of each vertex, rounded to 1/32, shape (n, 3); zero where there is none."""
@@ -66,7 +68,7 @@ class Shading:
 @njit(cache=True, error_model="numpy")
 def _strains(p, springs, rest_lengths, of_spring, of_vertex):
     for e in range(len(springs)):
-        i, j = springs[e]
+        i, j = springs[e, 0], springs[e, 1]
         x, y, z = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
         r = rest_lengths[e]
         strain = math.sqrt(x * x + y * y + z * z) / r - 1 if r > 0 else 0.0
@@ -78,7 +80,8 @@ def _strains(p, springs, rest_lengths, of_spring, of_vertex):
 
 @njit(cache=True, error_model="numpy")
 def _normals(p, triangles, out):
-    for i, j, k in triangles:
+    for t in range(len(triangles)):
+        i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
         bx, by, bz = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1], p[k, 2] - p[i, 2]
         for v in (i, j, k):

@@ -1,0 +1,288 @@
+"""Recordings read back, without a viewer: what pictures are drawn from and `springbench inspect` prints.
+
+A complete file is read through the index in its footer. A file without one (its run was killed) is scanned up to
+the last whole message. A recording is a header of 12 bytes and messages, each a kind and a length of 8 bytes,
+then that many bytes of payload.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import tempfile
+import warnings
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+from rerun.chunk import Chunk, LazyStore, RrdReader
+
+from harness.errors import InputError, Mistake
+from harness.record.base import Replay
+
+_MAGIC, _HEADER, _END = b"RRF2", 12, 0
+_ROW_ID = "rerun.controls.RowId"
+_POSITIONS = ("Mesh3D:vertex_positions", "Points3D:positions")
+_SCALAR = "Scalars:scalars"
+_NAME = "RecordingInfo:name"
+
+SCALARS = pa.schema(
+    [
+        ("entity", pa.string()),
+        ("frame", pa.int64()),
+        ("iteration", pa.int64()),
+        ("time", pa.float64()),
+        ("value", pa.float64()),
+    ]
+)
+"""Scalars in long form: entity, frame, iteration (null where there is none), simulated time [s], value."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Summary:
+    """What is in a recording without its positions.
+
+    complete: whether the run closed it; frames: indices of the recorded frames (k,); entities: the paths;
+    timelines: name -> (first, last); scalars: a table of the schema SCALARS.
+    """
+
+    path: Path
+    complete: bool
+    title: str
+    run_id: str
+    application: str
+    properties: dict[str, Any]
+    frames: NDArray[np.int64]
+    timelines: dict[str, tuple[float, float]]
+    entities: tuple[str, ...]
+    scalars: pa.Table
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """An open recording: its chunks, as often as they are asked for."""
+
+    path: Path
+    store: LazyStore | RrdReader
+    complete: bool
+    application: str
+    run_id: str
+
+    def chunks(self, *, content: str, components: Sequence[str] | None = None) -> Iterator[Chunk]:
+        """The chunks of the entities that `content` names, with these components only."""
+        return iter(self.store.stream().filter(content=content, components=components))
+
+
+def read_replay(path: Path, frames: Collection[int] | None = None) -> Replay:
+    """The recording at `path`, with all frames or only the chosen ones (-1 is the last), in order.
+
+    Raises InputError when the file is not the recording of a run or has not got a chosen frame.
+    """
+    with open_recording(path) as source:
+        network = _network(source)
+        wanted = None
+        if frames is not None:
+            known = np.array([index for index, _, _ in _positions(source, None)])
+            wanted = {_chosen(path, frame, known) for frame in frames}
+        found = {index: (time, p.copy()) for index, time, p in _positions(source, wanted)}
+        order = sorted(found)
+        times = np.array([found[index][0] for index in order])
+        positions = np.empty((len(order), len(found[order[0]][1]) if order else 0, 3), np.float32)
+        for k, index in enumerate(order):
+            positions[k] = found.pop(index)[1]  # so that memory never holds all frames twice
+        title, properties = _properties(source)
+        return Replay(
+            title=title,
+            run_id=source.run_id,
+            frames=np.array(order, np.int64),
+            times=times,
+            positions=positions,
+            triangles=_triangles(source),
+            springs=network["springs"].reshape(-1, 2).astype(np.int64),
+            rest_lengths=network["rest_lengths"].astype(np.float64),
+            pinned=network["pinned"].astype(np.int64),
+            strain_range=float(network["strain_range"][0]),
+            scalars=_by_frame(_scalars(source)),
+            properties=properties,
+        )
+
+
+def summary(path: Path) -> Summary:
+    """What is in the recording at `path`, a run's or several side by side.
+
+    Raises InputError when it is not a Rerun recording.
+    """
+    with open_recording(path) as source:
+        entities: set[str] = set()
+        times: dict[str, list[float]] = {}
+        for chunk in source.chunks(content="/**"):
+            entities.add(chunk.entity_path)
+            batch = chunk.to_record_batch()
+            for name in chunk.timeline_names:
+                values = _times(batch, name)
+                times.setdefault(name, []).extend((values.min(), values.max()))
+        title, properties = _properties(source)
+        frames = {index for index, _, _ in _positions(source, None)}
+        return Summary(
+            path=path,
+            complete=source.complete,
+            title=title,
+            run_id=source.run_id,
+            application=source.application,
+            properties=properties,
+            frames=np.array(sorted(frames), np.int64),
+            timelines={name: (float(min(values)), float(max(values))) for name, values in sorted(times.items())},
+            entities=tuple(sorted(entities)),
+            scalars=_scalars(source),
+        )
+
+
+@contextmanager
+def open_recording(path: Path) -> Iterator[Source]:
+    """The recording at `path`, for as long as the context lasts.
+
+    Raises InputError when the file is not a Rerun recording or nothing of it can be read.
+    """
+    if not path.is_file():
+        raise InputError(Mistake("there is no such file; a Rerun recording (.rrd) was expected", file=path))
+    with path.open("rb") as file:
+        start = file.read(len(_MAGIC))
+    if start != _MAGIC:
+        came = f"begins with {start!r}" if start else "is empty"
+        raise InputError(Mistake(f"{came} and so is not a Rerun recording (.rrd)", file=path))
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of files without a footer: `complete` says so
+        complete, end = _whole_messages(path)
+        readable = path
+        if not complete and end < path.stat().st_size:  # the library reads nothing of a file cut within a message
+            readable = Path(folder) / path.name
+            shutil.copyfile(path, readable)
+            os.truncate(readable, end)
+        try:
+            reader = RrdReader(readable)
+            runs = reader.recordings()
+            store = reader.store() if complete else reader
+        except (RuntimeError, ValueError) as error:
+            raise InputError(Mistake(f"cannot be read as a Rerun recording: {error}", file=path)) from error
+        if not runs:
+            raise InputError(Mistake("has nothing in it that can be read: it was cut at its start", file=path))
+        yield Source(path, store, complete, runs[0].application_id, runs[0].recording_id)
+
+
+def _whole_messages(path: Path) -> tuple[bool, int]:
+    """Whether the file has its end mark, and where its last whole message ends."""
+    size, place = path.stat().st_size, _HEADER
+    with path.open("rb") as file:
+        while place + 16 <= size:
+            file.seek(place)
+            kind, length = struct.unpack("<QQ", file.read(16))
+            if place + 16 + length > size:
+                break
+            if kind == _END:
+                return True, size
+            place += 16 + length
+    return False, place
+
+
+def _network(source: Source) -> dict[str, NDArray[Any]]:
+    """Springs, rest lengths, pins and the strain range."""
+    for chunk in source.chunks(content="/network"):
+        batch = chunk.to_record_batch()
+        names = [name for name in batch.schema.names if name != _ROW_ID]
+        return {name: _row(batch, name) for name in names}
+    names = f"application {source.application!r}"
+    problem = f"is a Rerun recording ({names}) but not of one run: it has no /network and /scene/mesh"
+    raise InputError(Mistake(problem, file=source.path))
+
+
+def _positions(source: Source, wanted: Collection[int] | None) -> Iterator[tuple[int, float, NDArray[np.float32]]]:
+    """Frame, time [s] and positions (n, 3) of the wanted frames, as they come in the file."""
+    for chunk in source.chunks(content="/scene/mesh", components=_POSITIONS):
+        batch = chunk.to_record_batch()
+        (name,) = set(_POSITIONS) & set(batch.schema.names)
+        for k, index in enumerate(_times(batch, "frame")):
+            if wanted is None or index in wanted:
+                yield int(index), float(_times(batch, "time")[k]), _row(batch, name, k).reshape(-1, 3)
+
+
+def _triangles(source: Source) -> NDArray[np.int64]:
+    for chunk in source.chunks(content="/scene/mesh", components=["Mesh3D:triangle_indices"]):
+        return _row(chunk.to_record_batch(), "Mesh3D:triangle_indices").reshape(-1, 3).astype(np.int64)
+    return np.empty((0, 3), np.int64)
+
+
+def _properties(source: Source) -> tuple[str, dict[str, Any]]:
+    title, properties = "", {}
+    for chunk in source.chunks(content="/__properties/**"):
+        batch = chunk.to_record_batch()
+        values = {name: batch[name][0].as_py()[0] for name in batch.schema.names if name != _ROW_ID}
+        if chunk.entity_path == "/__properties/run":
+            properties = values
+        title = values.get(_NAME, title)
+    return title, properties
+
+
+def _scalars(source: Source) -> pa.Table:
+    tables = [SCALARS.empty_table()]
+    for chunk in source.chunks(content="/**", components=[_SCALAR]):
+        batch = chunk.to_record_batch()
+        known = {name: _times(batch, name) for name in chunk.timeline_names if name in SCALARS.names}
+        columns = {
+            "entity": [chunk.entity_path] * batch.num_rows,
+            "frame": known.get("frame"),
+            "iteration": known.get("iteration"),
+            "time": known.get("time"),
+            "value": batch[_SCALAR].flatten(),
+        }
+        arrays = [
+            pa.nulls(batch.num_rows, field.type)
+            if columns[field.name] is None
+            else pa.array(columns[field.name], field.type)
+            for field in SCALARS
+        ]
+        tables.append(pa.Table.from_arrays(arrays, schema=SCALARS))
+    return pa.concat_tables(tables).sort_by(
+        [("entity", "ascending"), ("frame", "ascending"), ("iteration", "ascending")]
+    )
+
+
+def _by_frame(table: pa.Table) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """The scalars that have one value a frame: entity -> (frames, values)."""
+    table = table.filter(pc.is_null(table["iteration"]))
+    found = {}
+    for entity in table["entity"].unique().to_pylist():
+        rows = table.filter(pc.equal(table["entity"], entity))
+        found[entity] = rows["frame"].to_numpy(), rows["value"].to_numpy()
+    return found
+
+
+def _row(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:
+    """All numbers of one row of a component, flat."""
+    values = batch[name][row].values
+    while pa.types.is_nested(values.type):
+        values = values.flatten()
+    return values.to_numpy()
+
+
+def _times(batch: pa.RecordBatch, timeline: str) -> NDArray[Any]:
+    """The frames or iterations, or the times [s]."""
+    column = batch[timeline]
+    counts = column.cast(pa.int64()).to_numpy()
+    return counts / 1e9 if pa.types.is_duration(column.type) else counts
+
+
+def _chosen(path: Path, frame: int, known: NDArray[np.int64]) -> int:
+    """The frame's index, of the `known` ones; -1 is the last."""
+    if frame == -1 and len(known):
+        return int(known[-1])
+    if frame in known:
+        return frame
+    have = f"frames {known[0]} to {known[-1]} are" if len(known) else "no frame is"
+    raise InputError(Mistake(f"there is no frame {frame}; {have} recorded", file=path, key="frame"))
