@@ -25,7 +25,7 @@ _TUBES = 20_000  # springs; beyond that they are drawn as lines
 _MESH_LINES = 350  # pixels of the view for each vertex; with fewer, lines would hide the colours
 _SUPERSAMPLING = 2  # a pixel is the mean of 2 x 2: half the time of VTK's own anti-aliasing in software
 _SHADE = "#d3d0ca"  # where the ground is fully in shadow
-_MATERIAL: dict[str, Any] = {"ambient": 0.58, "diffuse": 0.48, "specular": 0.06, "specular_power": 18.0}
+_MATERIAL: dict[str, Any] = {"ambient": 0.62, "diffuse": 0.44, "specular": 0.06, "specular_power": 18.0}
 _BLOWN_UP = 1e4  # coordinates this many times larger than the start's are drawn as if not finite
 
 
@@ -84,9 +84,7 @@ def frame_all(points: Points, *, aspect: float, angles: tuple[float, float] | No
     |a - ea| <= tan (ec - c), and alike for b. Each pair of bounds is tight at one ec; the further one sees all.
     """
     azimuth, elevation = np.radians(natural_angles(points) if angles is None else angles)
-    towards = np.array(
-        [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)]
-    )
+    towards = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
     right = np.cross([0.0, 1.0, 0.0], towards)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(towards, right), towards])
@@ -133,13 +131,13 @@ class Studio:
 
     def __init__(self, width: int, height: int) -> None:
         opengl.require()
-        self._pixels = width * height
+        self._pixels, self._height = width * height, height
         size = [_SUPERSAMPLING * width, _SUPERSAMPLING * height]
         self._plotter = pv.Plotter(off_screen=True, window_size=size, lighting="none")
         self._plotter.set_background(PAGE)
         self._plotter.disable_anti_aliasing()
         # From the camera's upper left, so that every view is lit alike; the fill keeps the scale's colours true.
-        for place, strength in (((-1.2, 1.5, 1.6), 0.75), ((0.6, -0.3, 2.0), 0.4)):
+        for place, strength in (((-1.2, 1.5, 1.6), 0.7), ((0.6, -0.5, 2.0), 0.55)):
             light = pv.Light(position=place, intensity=strength, light_type="camera light")
             self._plotter.add_light(light)
 
@@ -205,15 +203,20 @@ class Studio:
         if m > _TUBES:
             self._plotter.add_mesh(lines, line_width=1.5, **look)
             return
-        # Thin against a spring's length, visible against the scene.
-        radius = float(np.clip(0.07 * replay.rest_lengths.mean() / _extent(p), 0.0015, 0.007)) * _extent(p)
+        radius = self._tube(replay, p)
         self._plotter.add_mesh(lines.tube(radius=radius, n_sides=12), smooth_shading=True, **look)
         joints = pv.PolyData(p).glyph(geom=_ball(1.5 * radius), orient=False, scale=False)
         self._plotter.add_mesh(joints, color="#8a8d92", smooth_shading=True, **_MATERIAL)
 
+    def _tube(self, replay: Replay, p: NDArray[np.float32]) -> float:
+        """The radius of a spring [m]: thin against its length and the scene, but no less than about a pixel."""
+        thin = min(0.07 * float(replay.rest_lengths.mean()), 0.007 * _extent(p))
+        return max(thin, 1.1 * _extent(p) / self._height)
+
     def _pins(self, replay: Replay, p: NDArray[np.float32]) -> None:
         if len(replay.pinned):
-            radius = float(np.clip(0.3 * replay.rest_lengths.mean() / _extent(p), 0.004, 0.009)) * _extent(p)
+            spaced = min(0.3 * float(replay.rest_lengths.mean()), 0.009 * _extent(p))
+            radius = max(spaced, 0.004 * _extent(p), 0.0 if len(replay.triangles) else 2.2 * self._tube(replay, p))
             pins = pv.PolyData(p[replay.pinned]).glyph(geom=_ball(radius), orient=False, scale=False)
             self._plotter.add_mesh(pins, color=INK, smooth_shading=True, **_MATERIAL)
 

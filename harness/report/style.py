@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
 
 from solvers.registry import SOLVERS
 
@@ -58,10 +56,3 @@ def marks(solvers: Iterable[str]) -> dict[str, Mark]:
     names = (*SOLVERS, *sorted(set(solvers) - set(SOLVERS)))
     # The marker moves on once more with each turn of the colours: 64 different pairs.
     return {name: Mark(_COLORS[i % 8], _MARKERS[(i + i // 8) % 8]) for i, name in enumerate(names)}
-
-
-def figure() -> Figure:
-    """An empty page of WIDTH x HEIGHT pixels, to be drawn on within `matplotlib.rc_context(RC)`."""
-    page = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI, facecolor=PAGE)
-    FigureCanvasAgg(page)
-    return page

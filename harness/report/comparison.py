@@ -1,0 +1,183 @@
+"""Solvers side by side: for each scene and size the final frames, one camera, one scale, and what they cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+from math import ceil
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from harness.record.base import Replay
+from harness.report.page import (
+    count,
+    header,
+    headline,
+    new_page,
+    paste,
+    quantity,
+    save,
+    shorten,
+    strain_scale,
+    text,
+)
+from harness.report.render import Studio, drawable_frames, frame_all, spring_strain
+from harness.report.style import HEIGHT, MUTED, RC, RULE, WIDTH, Mark, marks
+
+_LEFT, _TOP, _RIGHT, _BOTTOM = 40, 118, WIDTH - 40, HEIGHT - 28
+_HEADING, _CAPTION, _GAP = 26, 104, 16
+_ASPECT = 1.4  # of a tile, width / height, that suits most scenes
+_SLIMMEST = 1.05  # a tile is no taller than this allows: captions stay near their pictures
+
+
+class _Grid(NamedTuple):
+    """How panels and the tiles within one are laid out; `width` and `height` of a tile [pixels]."""
+
+    panel_columns: int
+    tile_columns: int
+    width: int
+    height: int
+
+
+def draw_comparison(replays: Mapping[str, Replay], path: Path) -> None:
+    """Draw the final frames of several runs to `path`, WIDTH x HEIGHT pixels, PNG.
+
+    replays: by a label that is used where a run names no solver; the first of each scene and size is
+    what the others' distances are taken from. Raises RunFailed where the system cannot draw, and
+    ValueError for no replays.
+    """
+    if not replays:
+        raise ValueError("a comparison needs at least one recording")
+    limit = max(replay.strain_range for replay in replays.values())
+    panels: dict[str, list[tuple[str, Replay]]] = {}
+    for label, replay in replays.items():
+        solver = str(replay.properties.get("solver", label))
+        panels.setdefault(headline(replay), []).append((solver, replace(replay, strain_range=limit)))
+    looks = marks(solver for panel in panels.values() for solver, _ in panel)
+    grid = _layout(len(panels), max(map(len, panels.values())))
+    rows = ceil(len(panels) / grid.panel_columns)
+    across = (_RIGHT - _LEFT + 2 * _GAP) / grid.panel_columns
+    tile_rows = ceil(max(map(len, panels.values())) / grid.tile_columns)
+    slack = (_BOTTOM - _TOP) / rows - _HEADING - tile_rows * (grid.height + _CAPTION)
+    down = (_BOTTOM - _TOP + _GAP) / rows
+    with matplotlib.rc_context(RC), Studio(grid.width, grid.height) as studio:
+        page = new_page()
+        _title(page, panels)
+        strain_scale(page, limit, pins=any(len(replay.pinned) for replay in replays.values()))
+        for k, (heading, panel) in enumerate(panels.items()):
+            row, column = divmod(k, grid.panel_columns)
+            left, top = round(_LEFT + column * across), round(_TOP + row * down + max(slack, 0) / 3)
+            if len(panels) > 1:
+                text(page, left + 2, top + 16, shorten(heading, int(across / 9)), size=11.5, weight="bold")
+            _panel(page, studio, panel, left, top + _HEADING, grid, looks)
+        save(page, path)
+
+
+def _layout(panels: int, tiles: int) -> _Grid:
+    """The grid with the largest tiles."""
+
+    def grid(panel_columns: int, tile_columns: int) -> _Grid:
+        columns = panel_columns * tile_columns
+        rows = ceil(panels / panel_columns) * ceil(tiles / tile_columns)
+        width = (_RIGHT - _LEFT - (columns + panel_columns) * _GAP) // columns
+        height = (_BOTTOM - _TOP - ceil(panels / panel_columns) * (_HEADING + _GAP)) // rows - _CAPTION
+        return _Grid(panel_columns, tile_columns, max(width, 48), max(min(height, int(width / _SLIMMEST)), 48))
+
+    choices = [grid(p, t) for p, t in product(range(1, panels + 1), range(1, tiles + 1))]
+    return max(choices, key=lambda g: min(g.width, _ASPECT * g.height))
+
+
+def _title(page: Figure, panels: Mapping[str, Sequence[tuple[str, Replay]]]) -> None:
+    meaning = "distance: the farthest vertex from the first solver's, in mean rest lengths"
+    if len(panels) > 1:
+        header(page, "Final frames, solver by solver", [meaning])
+        return
+    ((heading, panel),) = panels.items()
+    replay = panel[0][1]
+    size = f"{count(replay.positions.shape[1])} vertices, {count(len(replay.springs))} springs"
+    header(page, heading, [size, meaning])
+
+
+def _panel(
+    page: Figure,
+    studio: Studio,
+    panel: Sequence[tuple[str, Replay]],
+    left: int,
+    top: int,
+    grid: _Grid,
+    looks: Mapping[str, Mark],
+) -> None:
+    """The tiles of one scene and size, row by row; all with one camera."""
+    finite = [replay for _, replay in panel if _ends_finite(replay)]
+    points = np.concatenate([r.positions[-1] for r in finite] or [np.zeros((1, 3))])
+    view = frame_all(points, aspect=grid.width / grid.height)
+    for k, (solver, replay) in enumerate(panel):
+        row, column = divmod(k, grid.tile_columns)
+        x, y = left + column * (grid.width + _GAP), top + row * (grid.height + _CAPTION)
+        if _ends_finite(replay):
+            paste(page, studio.draw(replay, len(replay.frames) - 1, view), x, y)
+        else:
+            first = replay.frames[len(drawable_frames(replay))]
+            words = f"not finite\nfrom frame {first} on"
+            box = {"facecolor": "none", "edgecolor": RULE, "boxstyle": "round,pad=1.2"}
+            middle = x + grid.width / 2, y + grid.height / 2
+            text(page, *middle, words, size=10.5, ha="center", va="center", bbox=box)
+        _caption(page, solver, looks[solver], _facts(replay, panel[0]), x, y + grid.height, grid.width)
+
+
+def _caption(page: Figure, solver: str, mark: Mark, facts: Mapping[str, str], x: int, y: int, width: int) -> None:
+    """The solver's mark and name, and below them a small table: what, and how much."""
+    small = width < 210
+    dot = Line2D([(x + 8) / WIDTH], [1 - (y + 12) / HEIGHT], color=mark.color, marker=mark.marker, markersize=7)
+    page.add_artist(dot)
+    text(page, x + 20, y + 16, shorten(solver, int((width - 18) / 8.5)), size=9 if small else 10.5, weight="bold")
+    size, value_at = (7.5, 78) if small else (9, 112)
+    for line, (what, value) in enumerate(facts.items()):
+        at = y + 35 + line * (15 if small else 17)
+        text(page, x + 3, at, what, size=size, color=MUTED)
+        text(page, x + value_at, at, value, size=size)
+
+
+def _facts(replay: Replay, first: tuple[str, Replay]) -> dict[str, str]:
+    _, reference = first
+    final = len(replay.frames) - 1
+    finite = _ends_finite(replay)
+    strain = np.abs(spring_strain(replay, final)).max(initial=0.0) if finite else np.nan
+    distance = _distance(replay, reference)
+    cost = replay.properties.get("milliseconds_per_step")
+    return {
+        "ms a step": "–" if cost is None else quantity(float(cost)),
+        "largest strain": f"{100 * strain:.3g} %" if finite else "–",
+        "residual": _last(replay, "residual"),
+        "distance": "first" if replay is reference else "–" if np.isnan(distance) else f"{distance:.2g}",
+    }
+
+
+def _ends_finite(replay: Replay) -> bool:
+    return 0 < len(replay.frames) == len(drawable_frames(replay))
+
+
+def _distance(replay: Replay, reference: Replay) -> float:
+    """The largest distance of a vertex from the reference's, in mean rest lengths; NaN where they end apart."""
+    comparable = (
+        _ends_finite(replay)
+        and _ends_finite(reference)
+        and replay.frames[-1] == reference.frames[-1]
+        and replay.positions.shape[1] == reference.positions.shape[1]
+    )
+    if not comparable:
+        return np.nan
+    away = replay.positions[-1].astype(np.float64) - reference.positions[-1]
+    return float(np.linalg.norm(away, axis=1).max(initial=0.0) / replay.rest_lengths.mean())
+
+
+def _last(replay: Replay, name: str) -> str:
+    """The last recorded value of a scalar, in words."""
+    _, values = replay.scalars.get(f"/{name}", replay.scalars.get(name, ((), ())))
+    return f"{values[-1]:.1e}" if len(values) else "–"

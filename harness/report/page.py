@@ -1,0 +1,98 @@
+"""A page of WIDTH x HEIGHT pixels: its title, its scale of strain, type and pictures placed by the pixel."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from harness.record.base import Replay
+from harness.report.style import DPI, HEIGHT, INK, MUTED, PAGE, STRAIN_MAP, WIDTH
+
+
+def new_page() -> Figure:
+    """An empty page, to be drawn on within `matplotlib.rc_context(RC)`."""
+    page = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI, facecolor=PAGE)
+    FigureCanvasAgg(page)
+    return page
+
+
+def text(page: Figure, x: float, y: float, words: str, *, size: float, color: str = INK, **more: Any) -> None:
+    """Type with its baseline at pixel (x, y) from the upper left corner; size in points."""
+    page.text(x / WIDTH, 1 - y / HEIGHT, words, size=size, color=color, **more)
+
+
+def axes(page: Figure, left: float, top: float, width: float, height: float) -> Axes:
+    """Axes in a rectangle given in pixels from the upper left corner."""
+    return page.add_axes((left / WIDTH, 1 - (top + height) / HEIGHT, width / WIDTH, height / HEIGHT))
+
+
+def paste(page: Figure, pixels: NDArray[np.uint8], left: int, top: int) -> None:
+    """Put a picture on the page, pixel for pixel, with its upper left corner at (left, top)."""
+    page.figimage(pixels, xo=left, yo=HEIGHT - top - pixels.shape[0], origin="upper")
+
+
+def save(page: Figure, path: Path) -> None:
+    """Write the page under a partial name and rename it: a kill leaves the whole picture or none."""
+    partial = path.with_name(f".{path.name}.partial")
+    page.savefig(partial, format="png", dpi=DPI)
+    os.replace(partial, path)
+
+
+def header(page: Figure, headline: str, facts: Sequence[str], *, letters: int = 56) -> None:
+    """The title in the upper left corner, at most so many letters of it, and a line of facts below."""
+    text(page, 40, 50, shorten(headline, letters), size=21, weight="bold")
+    text(page, 41, 82, "   ·   ".join(facts), size=11.5, color=MUTED)
+
+
+def strain_scale(page: Figure, limit: float, *, pins: bool) -> None:
+    """The colour bar in the upper right corner: percent ticks below, what they mean in words above."""
+    left, top, width = 1180, 50, 380
+    bar = axes(page, left, top, width, 12)
+    bar.imshow(np.linspace(0, 1, 512)[None], cmap=STRAIN_MAP, aspect="auto", interpolation="bilinear")
+    bar.set_axis_off()
+    for place, word, align in ((0.0, "compressed", "left"), (0.5, "at rest", "center"), (1.0, "stretched", "right")):
+        text(page, left + place * width, top - 8, word, size=10, ha=align)
+    for place in (0.0, 0.25, 0.5, 0.75, 1.0):
+        percent = 100 * limit * (2 * place - 1)
+        align = {0.0: "left", 1.0: "right"}.get(place, "center")
+        label = f"{percent:+.3g} %".replace("-", "−") if percent else "0"
+        text(page, left + place * width, top + 31, label, size=9, color=MUTED, ha=align)
+    if pins:
+        text(page, left - 36, top + 12, "pinned", size=10, ha="right")
+        text(page, left - 96, top + 11, "●", size=11, ha="right")
+
+
+def headline(replay: Replay) -> str:
+    """The scene and its size in words."""
+    scene, size = replay.properties.get("scene"), replay.properties.get("size")
+    if scene is None:
+        return replay.title
+    return f"{scene}, size {size}" if size else str(scene)
+
+
+def clock(replay: Replay, frame: int) -> str:
+    """The time of a recorded frame in words."""
+    return f"{replay.times[frame]:.2f} s"
+
+
+def count(number: int) -> str:
+    """A whole number with thin spaces between thousands."""
+    return f"{number:,}".replace(",", "\u2009")
+
+
+def quantity(value: float) -> str:
+    """A number to three significant digits, without an exponent where people would not write one."""
+    return f"{value:.3g}" if value < 1000 else count(round(value))
+
+
+def shorten(words: str, limit: int) -> str:
+    """The words, or as many of their letters as fit into `limit` with an ellipsis."""
+    return words if len(words) <= limit else words[: limit - 1].rstrip() + "…"

@@ -1,0 +1,243 @@
+"""Milliseconds a step and of preparing against vertices, by solver; a pair of panels for each scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import ceil
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+
+from harness.report.page import axes, count, header, new_page, quantity, save, shorten, text
+from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark, marks
+from harness.report.timing_table import Run, labels, runs
+
+_LEFT, _TOP, _RIGHT, _BOTTOM = 40, 118, WIDTH - 40, HEIGHT - 30
+_COLUMNS = 4  # scenes side by side
+_NOTES = 4  # failures told in words at the foot; all are marked in the panels
+_LETTERS = 34  # of a direct label
+_LINE = 17  # pixels between direct labels
+_DASHES = ("-", (0, (5, 2)), (0, (1, 1.6)), (0, (6, 2, 1, 2)))  # the variants of one solver
+
+
+def draw_timing(table: pa.Table, path: Path, title: str) -> None:
+    """Draw the times of a sweep's runs to `path`, WIDTH x HEIGHT pixels, PNG.
+
+    table: rows (schema: `harness.rows.SCHEMA`). Runs that failed are crosses at the upper edge, and words.
+    """
+    found = runs(table)
+    names = labels(found)
+    looks = marks(run.solver for run in found)
+    scenes = list(dict.fromkeys(run.scene for run in found))
+    failed = [run for run in found if run.status != "ok"]
+    with matplotlib.rc_context(RC):
+        page = new_page()
+        header(page, title, _facts(table), letters=84)
+        bottom = _BOTTOM - _LINE * min(len(failed), _NOTES + 1)
+        columns = min(len(scenes), _COLUMNS) or 1
+        width, height = (_RIGHT - _LEFT) / columns, (bottom - _TOP) / (ceil(len(scenes) / columns) or 1)
+        for k, scene in enumerate(scenes):
+            row, column = divmod(k, columns)
+            box = (_LEFT + column * width, _TOP + row * height, width - 20, height - 12)
+            _scene(page, scene, found, names, looks, box)
+        _notes(page, failed, names, bottom)
+        save(page, path)
+
+
+def _facts(table: pa.Table) -> list[str]:
+    """The machine, and what the marks mean."""
+    cpus = sorted(set(table["cpu"].drop_null().to_pylist()))
+    threads = sorted(set(table["threads"].drop_null().to_pylist()))
+    facts = ["median and quartiles of all steps"]
+    if threads:
+        facts.append(f"{', '.join(map(str, threads))} thread{'s' if threads != [1] else ''}")
+    return facts + [shorten(cpu, 60) for cpu in cpus[:2]]
+
+
+def _scene(
+    page: Figure,
+    scene: str,
+    found: Sequence[Run],
+    names: Mapping[str, str],
+    looks: Mapping[str, Mark],
+    box: tuple[float, float, float, float],
+) -> None:
+    """The two panels of one scene within a box (left, top, width, height) in pixels; all scenes have the same
+    scales of time."""
+    left, top, width, height = box
+    text(page, left, top + 14, shorten(scene, int(width / 10)), size=12.5, weight="bold")
+    room = height - 56 - 64 - 44  # less the headings and the ticks of both panels
+    upper, lower = 0.64 * room, 0.36 * room
+    text(page, left, top + 40, "milliseconds a step", size=9.5, color=MUTED)
+    step = axes(page, left + 48, top + 52, width - 48, upper)
+    below = top + 52 + upper + 64
+    text(page, left, below - 12, "milliseconds to prepare, once a run: filled warm, open cold", size=9.5, color=MUTED)
+    prepare = axes(page, left + 48, below, width - 48, lower)
+    here = [run for run in found if run.scene == scene and run.vertices]
+    failed = [run for run in here if run.status != "ok"]
+    series: dict[str, list[Run]] = {}
+    for run in here:
+        if run.status == "ok":
+            series.setdefault(names[run.run_id], []).append(run)
+    sizes = sorted({run.vertices or 0 for run in here})
+    letters = max((min(len(name), _LETTERS) for name in series), default=0) + 6
+    labels_share = min(7.6 * letters / (width - 48), 0.42)
+    crosses = any(run.status != "ok" for run in found)
+    _scales(step, sizes, _times(found, "step", "lower", "upper"), labels_share, crosses=crosses)
+    _scales(prepare, sizes, _times(found, "cold", "warm"), labels_share)
+    prepare.set_xlabel("vertices", fontsize=9.5, loc="left")
+    ends = []
+    for (name, members), dash in zip(series.items(), _variants(series), strict=True):
+        look = looks[members[0].solver]
+        ends += _draw_steps(step, name, members, look, dash)
+        _draw_prepare(prepare, members, look)
+    _direct_labels(step, ends)
+    _crosses(step, failed, looks)
+    if not series:
+        step.text(0.5, 0.5, "no run succeeded", transform=step.transAxes, ha="center", color=MUTED)
+
+
+def _variants(series: Mapping[str, Sequence[Run]]) -> list:
+    """A dash for each series: the first of its solver is solid."""
+    solvers = [members[0].solver for members in series.values()]
+    return [_DASHES[solvers[:k].count(solver) % len(_DASHES)] for k, solver in enumerate(solvers)]
+
+
+def _times(found: Sequence[Run], *fields: str) -> list[float]:
+    """All times [ms] in these fields of the runs; at least two, so that there is always a scale."""
+    times = [getattr(run, field) for run in found for field in fields]
+    return [time for time in times if time] or [0.1, 10.0]
+
+
+def _scales(
+    ax: Axes, sizes: Sequence[int], times: Sequence[float], labels_share: float, *, crosses: bool = False
+) -> None:
+    """Logarithmic scales with room for direct labels at the right and, if need be, for crosses at the top."""
+    sizes = sizes or [1, 10]
+    first, last = (sizes[0] / 1.15, sizes[-1] * 1.15) if len(sizes) > 1 else (sizes[0] / 2, sizes[0] * 2)
+    ax.set_xscale("log")
+    ax.set_xlim(first, last * (last / first) ** (labels_share / (1 - labels_share)))
+    middle, ratio = np.sqrt(min(times) * max(times)), max(times) / min(times)
+    reach = np.sqrt(max(ratio**1.16, 10.0))  # at least a decade, so that noise looks like noise
+    low, high = middle / reach, middle * reach
+    ax.set_yscale("log")
+    ax.set_ylim(low, high * (high / low) ** (0.16 if crosses else 0.0))
+    ax.xaxis.set_major_locator(FixedLocator(_apart(ax, sizes)))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: count(round(value))))
+    wide = high / low > 300
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0), numticks=8 if wide else 12))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: quantity(value)))
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_minor_locator(NullLocator())
+    ax.tick_params(length=3, labelsize=9)
+    ax.grid(axis="y")
+    ax.set_axisbelow(True)
+
+
+def _apart(ax: Axes, sizes: Sequence[int]) -> list[int]:
+    """The sizes whose tick labels do not run into each other; the largest is always among them."""
+    at = {size: ax.transData.transform((size, 1.0))[0] for size in sizes}
+    kept = [sizes[-1]]
+    for size in reversed(sizes[:-1]):
+        if at[kept[-1]] - at[size] > 8.0 * len(count(kept[-1])):
+            kept.append(size)
+    return kept
+
+
+def _draw_steps(ax: Axes, name: str, members: Sequence[Run], look: Mark, dash) -> list:
+    """One line with its quartile band; returns where its direct label belongs, with its words and colour."""
+    timed = sorted((run for run in members if run.step), key=lambda run: run.vertices or 0)
+    if not timed:
+        return []
+    n, middle, low, high = (
+        np.array([getattr(run, field) for run in timed], float) for field in ("vertices", "step", "lower", "upper")
+    )
+    ax.fill_between(n, low, high, color=look.color, alpha=0.16, linewidth=0)
+    ax.vlines(n, low, high, color=look.color, alpha=0.5, linewidth=1.2)
+    ax.plot(n, middle, color=look.color, linestyle=dash, linewidth=1.8, marker=look.marker, markersize=6, mec=PAGE)
+    solver, comma, settings = name.partition(", ")
+    words = shorten(shorten(solver, 20) + comma + settings, _LETTERS)
+    if len(set(n)) > 1:
+        slope = np.polyfit(np.log(n), np.log(middle), 1)[0]
+        words += f"  $n^{{{slope:.1f}}}$"
+    return [(n[-1], middle[-1], words, look.color)]
+
+
+def _draw_prepare(ax: Axes, members: Sequence[Run], look: Mark) -> None:
+    for field, dash, face in (("cold", (0, (2, 2)), PAGE), ("warm", "-", look.color)):
+        timed = sorted((run.vertices, getattr(run, field)) for run in members if getattr(run, field))
+        if timed:
+            n, value = zip(*timed, strict=True)
+            ax.plot(
+                n,
+                value,
+                color=look.color,
+                linestyle=dash,
+                linewidth=1.3,
+                marker=look.marker,
+                markersize=5,
+                markerfacecolor=face,
+            )
+
+
+def _direct_labels(ax: Axes, ends: list) -> None:
+    """Names at the right of the lines' ends; where lines end at the same size, moved apart."""
+    for column in sorted({x for x, *_ in ends}):
+        here = sorted((end for end in ends if end[0] == column), key=lambda end: end[1])
+        wanted = ax.transData.transform([(x, y) for x, y, *_ in here])
+        at = _spread(wanted[:, 1], ax.bbox.y0 + 6, ax.bbox.y1 - 6)
+        for (x, y, words, color), height in zip(here, at, strict=True):
+            line = {"arrowstyle": "-", "color": color, "alpha": 0.45, "linewidth": 0.8, "shrinkA": 1, "shrinkB": 5}
+            ax.annotate(
+                words,
+                (x, y),
+                (wanted[0, 0] + 16, height),
+                textcoords="figure pixels",
+                va="center",
+                fontsize=9.5,
+                color=color,
+                arrowprops=line,
+            )
+
+
+def _spread(wanted: Sequence[float], bottom: float, top: float) -> list[float]:
+    """The sorted heights [pixels], at least _LINE apart: pushed up from below, then down from the top."""
+    at = list(wanted)
+    for k in range(1, len(at)):
+        at[k] = max(at[k], at[k - 1] + _LINE)
+    at[-1] = min(at[-1], top)
+    for k in reversed(range(len(at) - 1)):
+        at[k] = max(min(at[k], at[k + 1] - _LINE), bottom)
+    return at
+
+
+def _crosses(ax: Axes, failed: Sequence[Run], looks: Mapping[str, Mark]) -> None:
+    """A cross at the upper edge for each failed run; those of one size below each other."""
+    taken: dict[int, int] = {}
+    for run in failed:
+        size = run.vertices or 0
+        place = taken[size] = taken.get(size, -1) + 1
+        y = 1.0 - (9 + 15 * place) / ax.bbox.height
+        at = ax.get_xaxis_transform()
+        color = looks[run.solver].color
+        ax.plot([size], [y], "x", color=color, transform=at, markersize=7, markeredgewidth=2, clip_on=False)
+        status = ax.annotate(run.status, (size, y), (8, 0), xycoords=at, textcoords="offset points")
+        status.set(color=color, fontsize=8, va="center")
+
+
+def _notes(page: Figure, failed: Sequence[Run], names: Mapping[str, str], top: float) -> None:
+    """Which runs failed and why, at the foot of the page."""
+    for k, run in enumerate(failed[:_NOTES]):
+        where = f"{run.scene}, size {run.size}" if run.size else run.scene
+        why = f"{run.status}: {run.reason}" if run.reason else run.status
+        text(page, _LEFT, top + _LINE * (k + 1), "×", size=11, color=INK)
+        words = f"{names[run.run_id]} on {where} {why}"
+        text(page, _LEFT + 18, top + _LINE * (k + 1), shorten(" ".join(words.split()), 190), size=9)
+    if len(failed) > _NOTES:
+        rest = f"and {len(failed) - _NOTES} more, marked above"
+        text(page, _LEFT + 18, top + _LINE * (_NOTES + 1), rest, size=9, color=MUTED)
