@@ -6,24 +6,25 @@ continuum    The material stays the same when the mesh is refined. With h the sp
     dimension 1   k_e = EA / rest length; constants EA [N]. Springs in series add up to EA / L.
     dimension 2   k_e constant; constants [N/m]. There are 1/h springs across a metre of width, each of length
                   h, so that the force per width and strain is k h / h = k.
-    dimension 3   k_e = E h; constants [Pa]. There are 1/h^2 springs across a square metre, so that the force
-                  per area and strain is k h / h^2 = E. The lattice's own moduli are E times a factor of its
-                  springs (axes, faces' and cells' diagonals); half-empty boundary cells add a term of order h.
+    dimension 3   k_e = E h; constants [Pa]. There are 1/h^2 springs across a square metre, so that the
+                  force per area and strain is k h / h^2 = E. The moduli of the body are E times a factor of
+                  its lattice (diagonals add to the axes); springs on its surface, which have cells on one
+                  side only, add a term of order h.
     bending       k_e = 16 B / h^2, constant B [N m] (BEND springs, rest length 2h, in dimension 2).
 
-    Skip-one springs carry no bending energy of second order: a fold by the angle t shortens one by
-    2h (1 - cos(t/2)) = h t^2/4, and per length of fold there are 1/h of them, which store k h t^4/32. The sheet
-    that has the bending stiffness B and takes the same fold over one spacing stores B (t/h)^2 h/2 = B t^2/(2h).
-    The two agree at t = 1 rad for k = 16 B / h^2. The price: gentler bends are underestimated by the
-    factor t^2 (at a fixed curvature t = h * curvature, so that smooth bends get softer as the mesh is refined),
-    and the springs resist stretch too: they add 4 k_e to the membrane stiffness along the lines of the mesh,
-    64 B / h^2, which grows without bound. This rule is our own; where it matters, check the result
-    under refinement.
+    Skip-one springs have no quadratic bending energy about a flat sheet: a fold by the angle t shortens one
+    by 2h (1 - cos(t/2)), h t^2/4 to leading order, and a metre of fold has 1/h of them, which store
+    k h t^4/32. A sheet of bending stiffness B that takes the same fold over one spacing stores
+    B (t/h)^2 h/2 = B t^2/(2h). The two agree at t = 1 rad for k = 16 B / h^2. The price: gentler bends are
+    underestimated by the factor t^2 (a fixed curvature c makes t = c h, so that smooth bends get softer as
+    the mesh is refined), and the springs resist stretch too: they add 4 k_e = 64 B / h^2 to the membrane
+    stiffness along the lines of the mesh, without bound as h falls. So bending does not converge under
+    refinement, unlike the other constants. This rule is our own.
 
 liu2013      k_e = constant * (resolution - 1) / (reference - 1), constants [N/m] as they are at the size
     `reference`: Liu et al. 2013 give their curtain 150, 300, 600, 1200 at 11, 21, 41, 81 vertices a side.
-    Proportional to 1/h, this stiffens a cloth that is refined; it exists to reproduce their figures. It needs a
-    mesh that has a size, so meshes from files are refused; the two other rules serve them.
+    Proportional to 1/h, this stiffens a cloth that is refined; it exists to reproduce their figures. It
+    needs a mesh that has a size, so meshes from files are refused; the two other rules serve them.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from harness.errors import InputError, Mistake, did_you_mean
 from harness.mesh.base import BEND, SHEAR, STRETCH, Mesh
 
 Scale = Callable[[Mesh, str, int | None], NDArray[np.float64] | float]
-"""(mesh, family, reference) -> what turns a family's constant into stiffness, a number or one for each spring."""
+"""(mesh, family, reference) -> what a family's constant is multiplied by: one factor, or one a spring."""
 
 
 def spring_stiffness(
@@ -45,8 +46,8 @@ def spring_stiffness(
 ) -> NDArray[np.float64]:
     """The stiffness of each spring, (m,) [N/m], from a constant for each family and one of `RULES`.
 
-    Raises InputError for an unknown rule, a constant that is not finite or below zero, a rule that does not fit
-    the mesh, and a `reference` that is missing (liu2013) or has no meaning (the others).
+    Raises InputError for an unknown rule, a constant that is not finite or below zero, a rule that does not
+    fit the mesh, and a `reference` that is missing (liu2013) or has no meaning (the others).
     """
     if rule not in RULES:
         raise InputError(Mistake(f"unknown rule {rule!r}; wanted {did_you_mean(rule, RULES)}", key="rule"))
@@ -56,9 +57,7 @@ def spring_stiffness(
     for family, constant in ((STRETCH, stretch), (SHEAR, shear), (BEND, bend)):
         if not 0 <= constant < np.inf:
             raise InputError(Mistake(f"{constant} is no stiffness; wanted a finite number >= 0", key=family))
-        springs = mesh.families.get(family)
-        if springs is not None and len(springs):
-            k[springs] = constant * RULES[rule](mesh, family, reference)
+        k[mesh.families[family]] = constant * RULES[rule](mesh, family, reference)
     return k
 
 
@@ -73,9 +72,8 @@ def _continuum(mesh: Mesh, family: str, reference: int | None) -> NDArray[np.flo
         return 1.0 if mesh.dimension == 2 else mesh.spacing
     lengths = mesh.rest_lengths[mesh.families[family]]
     if not lengths.all():
-        raise InputError(
-            Mistake("the rule continuum needs springs of some length; a spring joins two equal points", key="rule")
-        )
+        problem = "continuum divides by rest lengths, and a spring joins two vertices in one place; use fixed"
+        raise InputError(Mistake(problem, key="rule"))
     return 1 / lengths
 
 

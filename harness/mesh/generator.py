@@ -28,20 +28,22 @@ class Generator(Model):
     """What the size counts, for messages."""
 
     def build(self, size: int) -> Mesh:
-        """The mesh of this size.
+        """The mesh of this size; raises InputError as `check` does, before anything is allocated."""
+        self.check(size)
+        return self.generate(size)
 
-        Raises InputError, before anything is allocated, for a size outside the range that the generator and
-        `MAX_VERTICES` allow.
-        """
+    def check(self, size: int) -> None:
+        """Raise InputError for a size outside the range that the generator and `MAX_VERTICES` allow."""
         if size < self.SMALLEST:
             raise self._refusal(size, "is too small")
+        if size > MAX_VERTICES:
+            raise self._refusal(size, "is too large")
         if (vertices := self.count(size)) > MAX_VERTICES:
             raise self._refusal(size, f"would give {vertices:,} vertices of at most {MAX_VERTICES:,}")
-        return self.generate(size)
 
     @abstractmethod
     def count(self, size: int) -> int:
-        """How many vertices the mesh of this size has; never falls as the size grows."""
+        """How many vertices a mesh of a size from SMALLEST to MAX_VERTICES has; never falls as it grows."""
 
     @abstractmethod
     def generate(self, size: int) -> Mesh:
