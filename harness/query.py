@@ -48,7 +48,8 @@ def answer(sql: str, results: Path) -> Answer:
         connection.execute("SET enable_external_access = false; SET lock_configuration = true")
         try:
             found = connection.execute(sql)
-            description = found.description or []
-            return Answer([column[0] for column in description], found.fetchall() if description else [])
         except duckdb.Error as error:
             raise InputError(f"query: {error}") from error
+        if found is None or found.description is None:
+            raise InputError("query: came without a statement; wanted one, such as SELECT count(*) FROM rows")
+        return Answer([column[0] for column in found.description], found.fetchall())

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from harness.errors import InputError, Mistake
+
 
 class Column(NamedTuple):
     """One column: its name, Arrow type, unit ("" for none) and meaning."""
@@ -88,6 +90,14 @@ def write(path: Path, rows: Iterable[Row]) -> None:
 
 
 def read(paths: Iterable[Path]) -> pa.Table:
-    """All rows of the files, in the order of the paths; files of an older schema get nulls."""
-    tables = [pq.read_table(path) for path in paths]
+    """All rows of the files, in the order of the paths; files of an older schema get nulls.
+
+    Raises InputError for a file that holds no rows.
+    """
+    tables = []
+    for path in paths:
+        try:
+            tables.append(pq.read_table(path))
+        except (pa.ArrowInvalid, OSError) as error:
+            raise InputError(Mistake(f"holds no rows ({error}); take it out of the results", path)) from error
     return pa.concat_tables([SCHEMA.empty_table(), *tables], promote_options="default")

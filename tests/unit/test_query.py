@@ -1,0 +1,49 @@
+"""Queries: SQL over the rows of all sweeps, and over nothing else."""
+
+from pathlib import Path
+
+import pytest
+
+from harness import rows
+from harness.errors import InputError
+from harness.query import answer
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """Two sweeps of one row each."""
+    for sweep, seconds in (("first", 0.5), ("second", 0.25)):
+        (tmp_path / sweep / "rows").mkdir(parents=True)
+        rows.write(tmp_path / sweep / "rows" / "a.parquet", [{"sweep": sweep, "seconds": seconds}])
+    return tmp_path
+
+
+def test_a_query_sees_the_rows_of_all_sweeps(results: Path):
+    found = answer("SELECT sweep, seconds FROM rows ORDER BY seconds", results)
+    assert found.columns == ["sweep", "seconds"]
+    assert found.values == [("second", 0.25), ("first", 0.5)]
+    assert found.table().row_count == 2
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "SELECT nothing FROM rows",
+        "SELEKT 1",
+        "SELECT * FROM read_text('/etc/hostname')",
+        "COPY rows TO 'stolen.csv'",
+        "SET enable_external_access = true",
+        "",
+    ],
+)
+def test_what_is_wrong_or_leaves_the_rows_is_the_users_mistake(results: Path, sql: str, monkeypatch):
+    monkeypatch.chdir(results)
+    before = sorted(results.rglob("*"))
+    with pytest.raises(InputError, match="query"):
+        answer(sql, results)
+    assert sorted(results.rglob("*")) == before
+
+
+def test_without_rows_the_answer_says_what_to_do(tmp_path: Path):
+    with pytest.raises(InputError, match="run a sweep first"):
+        answer("SELECT 1", tmp_path)
