@@ -223,10 +223,11 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], key: Key) -> str:
         return "is missing" if isinstance(detail["loc"][-1], str) else "has too few items"
     if kind == "extra_forbidden":
         owner = _model_at(model, key[:-1])
-        return f"unknown key; expected {did_you_mean(key[-1], owner.model_fields if owner else ())}"
+        allowed = owner.model_fields if owner else ()
+        return "unknown key; " + (f"expected {did_you_mean(key[-1], allowed)}" if allowed else "remove it")
     if kind == "value_error":
         return said.removeprefix("Value error, ")
-    wanted = said.removeprefix("Input should be ").replace("a valid array", "a list").replace("a valid ", "a ")
+    wanted = said.removeprefix("Input should be ").replace("a valid array", "a list")
     return f"came {quote(detail['input'])}{_CAME}{wanted}"
 
 

@@ -230,7 +230,7 @@ def parameters_model(name: str, solver: type) -> type[Model]:
     given: dict[str, Any] = {
         f.name: (hints[f.name], ... if f.default is MISSING else f.default) for f in fields(solver)
     }
-    return create_model(name, __base__=Model, **given)
+    return create_model(name, __base__=Model, __doc__=solver.__doc__, **given)
 
 
 def _check_name(document: Document) -> None:

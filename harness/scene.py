@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from harness.effects.base import Contribution, Force, Pin, VelocityFilter
-from harness.errors import InputError
+from harness.errors import InputError, Mistake
 from harness.mesh.base import Mesh
 from harness.spec import SceneSpec
 from solvers.energies.springs import Springs
@@ -43,7 +43,7 @@ def build(spec: SceneSpec, size: int) -> Scene:
     """
     mesh = spec.mesh.build(size)
     mass = _mass(spec, mesh)
-    parts = [effect.bind(mesh, mass, spec.time_step) for effect in spec.effects]
+    parts = [_bound(spec, i, mesh, mass) for i in range(len(spec.effects))]
     pins, targets = _pins(parts)
     energies = tuple(energy for part in parts for energy in part.energies)
     return Scene(
@@ -56,11 +56,18 @@ def build(spec: SceneSpec, size: int) -> Scene:
     )
 
 
+def _bound(spec: SceneSpec, i: int, mesh: Mesh, mass: NDArray[np.float64]) -> Contribution:
+    try:
+        return spec.effects[i].bind(mesh, mass, spec.time_step)
+    except InputError as error:
+        raise InputError([replace(mistake, key=f"effects[{i}]") for mistake in error.mistakes]) from error
+
+
 def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
     if spec.mass is not None:
         return spec.mass * mesh.shares
     if mesh.mass is None:
-        raise InputError("mass: missing; this mesh brings no masses, so give the total mass [kg]")
+        raise InputError(Mistake("is missing; this mesh brings no masses, so give the total [kg]", key="mass"))
     return mesh.mass
 
 

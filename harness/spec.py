@@ -70,11 +70,11 @@ class Camera(Model):
 
 
 class SceneFields(Model):
-    """A scene: a mesh, its mass and time step, and the effects that act on it."""
+    """The keys of a scene that mean the same in its file and in memory."""
 
     description: str = Field(default="", max_length=1000)
     """One sentence about the scene."""
-    mass: float | None = Field(default=None, ge=1e-12, le=1e12)
+    mass: float | None = Field(default=None, gt=0, le=1e12)
     """Total mass [kg]; may be left out where the mesh brings masses of its own."""
     time_step: TimeStep
     """Time step [s], a number or a fraction such as "1/30"."""
@@ -89,9 +89,9 @@ class SceneFields(Model):
 
 
 class SceneFile(SceneFields):
-    """A scene as its file has it; the classes that `kind` names check the mesh and the effects."""
+    """A scene: a mesh, its mass and time step, and the effects that act on it."""
 
-    mesh: Any
+    mesh: Any  # checked, like the effects, by the class that its kind names
     """The mesh; its `kind` says which."""
     effects: Any = ()
     """What acts on the mesh; only what is listed is simulated."""
@@ -204,11 +204,17 @@ class Include(Model):
     solver: Many[str] = ()
     """Names of solvers that the sweep lists."""
     iterations: Many[Iterations] = ()
+    """Iteration limits of a step."""
     tolerance: Many[Tolerance] = ()
+    """Relative tolerances; null is the run without one."""
     first_guess: Many[FirstGuess] = ()
+    """Where a step's iteration starts."""
     threads: Many[Threads] = ()
+    """Numbers of threads."""
     frames: Many[Frames] = ()
+    """Numbers of steps."""
     rounds: Many[Rounds] = ()
+    """Repetitions of the timed part."""
 
 
 class Exclude(Include):

@@ -1,0 +1,58 @@
+"""The JSON Schema (draft 2020-12) of scenes and sweeps, for editors; made of the models that check configs."""
+
+from __future__ import annotations
+
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, create_model
+from pydantic.json_schema import models_json_schema
+
+from harness.effects.table import EFFECTS
+from harness.load import parameters_model
+from harness.mesh.table import MESHES
+from harness.model import Model
+from harness.spec import SceneFile, SweepFields
+from solvers.registry import SOLVERS, load
+
+
+def schema() -> dict[str, Any]:
+    """The schema of a config, which is a scene or a sweep; it names every mesh, effect and solver."""
+    mesh = _one_of({kind: load(target) for kind, target in MESHES.items()}, "kind")
+    effect = _one_of({kind: load(target) for kind, target in EFFECTS.items()}, "kind")
+    solver = _one_of({name: parameters_model(name, load(target)) for name, target in SOLVERS.items()}, "name")
+    names: Any = Literal[tuple(SOLVERS)]
+    scene = create_model(
+        "Scene",
+        __base__=SceneFile,
+        mesh=(mesh, Field(description=SceneFile.model_fields["mesh"].description)),
+        effects=(
+            list[effect],  # pyright: ignore[reportInvalidTypeForm]
+            Field(default=[], description=SceneFile.model_fields["effects"].description),
+        ),
+    )
+    sweep = create_model(
+        "Sweep",
+        __base__=SweepFields,
+        solvers=(
+            list[names | solver],  # pyright: ignore[reportInvalidTypeForm]
+            Field(description=SweepFields.model_fields["solvers"].description),
+        ),
+    )
+    _, document = models_json_schema([(scene, "validation"), (sweep, "validation")])
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "springbench config",
+        "oneOf": [{"$ref": "#/$defs/Scene"}, {"$ref": "#/$defs/Sweep"}],
+        **document,
+    }
+
+
+def _one_of(models: dict[str, type[Model]], tag: str) -> Any:
+    """The union of models, told apart by the key `tag`, which is required and holds the model's name."""
+    tagged = [
+        create_model(name, __base__=model, __doc__=model.__doc__, **{tag: (Literal[name], ...)})  # pyright: ignore
+        for name, model in models.items()
+    ]
+    return Annotated[reduce(or_, tagged), Field(discriminator=tag)]
