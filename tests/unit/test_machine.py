@@ -152,7 +152,8 @@ def test_pinned_threads_are_restored_even_after_a_failure():
             raise ZeroDivisionError
 
     before = now()
-    pytest.raises(ZeroDivisionError, fail)
+    with pytest.raises(ZeroDivisionError):
+        fail()
     assert now() == before
 
 

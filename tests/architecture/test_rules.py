@@ -1,0 +1,93 @@
+"""The linters enforce the architecture; these tests run them, and show them what they must refuse."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import grimp
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+BIN = Path(sys.executable).parent
+
+
+def ruff(*arguments: str, text: str | None = None) -> list[tuple[str, str]]:
+    """The violations that `ruff check` finds, as (file, code)."""
+    command = [BIN / "ruff", "check", "--no-cache", "--output-format=json", *arguments]
+    told = subprocess.run(command, cwd=ROOT, input=text, capture_output=True, text=True)
+    assert told.returncode in (0, 1), told.stderr
+    return [(found["filename"], found["code"]) for found in json.loads(told.stdout)]
+
+
+def import_contracts(tree: Path) -> str:
+    """What the import linter says of the packages in the folder, empty where all contracts are kept."""
+    command = [BIN / "lint-imports", "--no-cache", "--no-logo"]
+    told = subprocess.run(command, cwd=tree, env={"PYTHONPATH": str(tree)}, capture_output=True, text=True)
+    return "" if told.returncode == 0 else told.stdout + told.stderr
+
+
+def test_the_code_keeps_the_rules_of_the_linter():
+    assert ruff() == []
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "code"),
+    [
+        ("harness/record/new.py", '"""Doc."""\n\nimport rerun as rr\n\nrr.init("app")\n', "TID251"),
+        ("harness/record/new.py", '"""Doc."""\n\nfrom rerun import log\n\nlog("a", 1)\n', "TID251"),
+        ("solvers/new.py", "x = 1\n", "D100"),
+        ("solvers/new.py", '"""Doc."""\n\n\nclass Public:\n    x = 1\n', "D101"),
+        ("harness/new.py", '"""Doc."""\n\n\ndef public() -> None:\n    return\n', "D103"),
+        ("harness/new.py", '"""Doc."""\n\n# TO' + "DO: later\n", "FIX002"),
+        ("tests/unit/test_new.py", "# FIX" + "ME: it fails\n", "FIX001"),
+    ],
+    ids=lambda value: value if isinstance(value, str) and value.isalnum() else "",
+)
+def test_the_linter_refuses(file: str, text: str, code: str):
+    assert code in {found for _, found in ruff(f"--stdin-filename={file}", "-", text=text)}
+
+
+def test_imports_go_down_the_rows_only():
+    assert import_contracts(ROOT) == ""
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    """A copy of the packages and of the contracts, to be spoiled."""
+    for package in ("harness", "solvers"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    return Path(shutil.copy(ROOT / "pyproject.toml", tmp_path)).parent
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "refused"),
+    [
+        ("solvers/matrices.py", "from harness import rows", "The solvers know nothing of the harness BROKEN"),
+        ("solvers/matrices.py", "import solvers.local_global", "The rows of the solvers BROKEN"),
+        ("solvers/local_global.py", "from time import perf_counter", "solvers is not allowed to import time"),
+        ("solvers/local_global.py", "import rerun", "solvers is not allowed to import rerun"),
+        ("harness/mesh/base.py", "import harness.run", "harness.mesh is not allowed to import harness.run"),
+        ("harness/effects/wind.py", "import harness.effects.gravity", "The effects do not know each other BROKEN"),
+        ("harness/report/style.py", "import harness.simulate", "harness.report is not allowed to import"),
+        ("harness/run.py", "import rerun", "Rerun is known in the recordings alone BROKEN"),
+        ("harness/scene.py", "import pyvista", "PyVista and Matplotlib are known in the reports alone BROKEN"),
+        ("harness/surprise.py", "", "harness.surprise"),
+    ],
+    ids=lambda value: value if isinstance(value, str) and value.endswith(".py") else "",
+)
+def test_the_import_linter_refuses(tree: Path, file: str, line: str, refused: str):
+    with (tree / file).open("a") as source:
+        source.write(f"\n{line}\n")
+    assert refused in " ".join(import_contracts(tree).split())
+
+
+def test_nothing_below_the_methods_imports_a_method():
+    # The methods are the modules of `solvers` that are no row of their own: they need no line in the contracts.
+    graph = grimp.build_graph("solvers")
+    below = {"energies", "integrators", "kernels", "linear", "matrices", "problem"}
+    methods = {module for module in graph.find_children("solvers") if module.split(".")[1] not in {*below, "registry"}}
+    assert "solvers.local_global" in methods
+    importers = set().union(*(graph.find_modules_that_directly_import(method) for method in methods))
+    assert importers <= methods

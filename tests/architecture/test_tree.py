@@ -1,0 +1,58 @@
+"""What the project's folder holds, and what its files may not say."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+MAX_LINES = 300
+TOP = {"harness", "solvers", "configs", "tests", "results"}
+TOP |= {"pyproject.toml", "README.md", "LICENSE", "CITATION.cff"}
+
+
+def project_files() -> list[Path]:
+    """The files that git tracks or would track, relative to the root."""
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    return [Path(name) for name in sorted(set(told.split("\0")) - {""}) if (ROOT / name).is_file()]
+
+
+FILES = project_files()
+
+
+def lines_that_match(pattern: str) -> list[str]:
+    """`file:line: text` for all lines of the project's text files in which the pattern occurs."""
+    found = []
+    for file in FILES:
+        content = (ROOT / file).read_bytes()
+        if b"\0" in content:
+            continue
+        lines = enumerate(content.decode().splitlines(), start=1)
+        found += [f"{file}:{number}: {line}" for number, line in lines if re.search(pattern, line)]
+    return found
+
+
+def test_the_top_level_is_fixed():
+    assert {file.parts[0] for file in FILES if not file.parts[0].startswith(".")} == TOP
+
+
+def test_no_source_has_more_than_300_lines():
+    sizes = {file: len((ROOT / file).read_text().splitlines()) for file in FILES if file.suffix == ".py"}
+    assert len(sizes) > 50
+    assert {str(file): size for file, size in sizes.items() if size > MAX_LINES} == {}
+
+
+# Written so that no pattern matches its own text.
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        pytest.param(r"(?<![\w.)}\]])/(home|root|tmp|Users|work|workspace|mnt|opt)/\w", id="path of one machine"),
+        pytest.param(r"https?://[^\s\"']*/(simple|packages|pool|-)/", id="download address of a registry"),
+        pytest.param(r"pypi\.org|pythonhosted\.org|registry\.npmjs|deb\.debian|crates\.io", id="registry"),
+        pytest.param(r"\b([T]ODO|[F]IXME|[X]XX)\b", id="unfinished"),
+    ],
+)
+def test_no_file_speaks_of(pattern: str):
+    assert lines_that_match(pattern) == []
