@@ -173,6 +173,8 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, measured: Measured) -> R
             title=f"{run.scene_name}{size} - {run.solver.name}",
             run_id=run.run_id(here.id),
             mesh=scene.mesh,
+            springs=scene.springs.edges,
+            rest_lengths=scene.springs.rest_length,
             pinned=scene.system.pins.vertices,
             time_step=run.scene.time_step,
             strain_range=run.strain_range,

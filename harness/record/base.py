@@ -33,7 +33,8 @@ class Frame:
 class RecordingInfo:
     """What does not change in a recording.
 
-    title: scene, size and solver in words; run_id; mesh; pinned: vertices (q,); time_step [s];
+    title: scene, size and solver in words; run_id; mesh; springs (m, 2) and their rest_lengths (m,) [m]: those of
+    the scene, which may be fewer than the mesh's; pinned: vertices (q,); time_step [s];
     strain_range: the strain at the ends of the colour scale (0.1 is 10 %);
     properties: everything else about the run and its machine, flat (scene, size, solver, iterations, cpu, ...).
     """
@@ -41,6 +42,8 @@ class RecordingInfo:
     title: str
     run_id: str
     mesh: Mesh
+    springs: NDArray[np.int64]
+    rest_lengths: NDArray[np.float64]
     pinned: NDArray[np.int64]
     time_step: float
     strain_range: float

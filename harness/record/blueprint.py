@@ -9,7 +9,6 @@ import numpy as np
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from harness.mesh.base import Mesh
 from harness.record.base import RecordingInfo
 from harness.record.shading import palette
 
@@ -18,10 +17,10 @@ _DIRECTION = np.array([0.62, 0.38, 0.78])
 """From where the camera looks: a little from above and from the side, y is up."""
 
 
-def spring_cadence(mesh: Mesh) -> int:
+def spring_cadence(info: RecordingInfo) -> int:
     """Springs are drawn in the frames that this number divides: in all where they are few, else so rarely that
     they cost about 2.5 bytes a vertex and frame; vertices cost 15."""
-    return 1 if len(mesh.springs) <= 1024 else 10 * math.ceil(len(mesh.springs) / len(mesh.rest))
+    return 1 if len(info.springs) <= 1024 else 10 * math.ceil(len(info.springs) / len(info.mesh.rest))
 
 
 def application(info: RecordingInfo) -> str:
@@ -40,16 +39,28 @@ def scale_image() -> NDArray[np.uint8]:
     return np.tile(np.repeat(palette()[:-1, :3], 12, axis=0), (24, 1, 1))
 
 
-def camera(low: NDArray[np.float64], high: NDArray[np.float64]) -> rrb.EyeControls3D:
-    """An orbiting eye that sees the box from `low` (3,) to `high` (3,) [m] as a whole."""
-    centre, size = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
-    eye = centre + 0.85 * size * _DIRECTION / np.linalg.norm(_DIRECTION)
-    return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=eye, look_target=centre, eye_up=(0, 1, 0))
+class Box:
+    """The box that the positions stay in, for the camera; it begins with those at rest."""
+
+    def __init__(self, rest: NDArray[np.floating]) -> None:
+        self._low, self._high = rest.min(axis=0), rest.max(axis=0)
+        self._limit = 10 * np.linalg.norm(self._high - self._low)
+
+    def add(self, p: NDArray[np.floating]) -> None:
+        """Widen the box to positions (n, 3) [m], unless they have blown up beyond showing."""
+        low, high = np.minimum(self._low, p.min(axis=0)), np.maximum(self._high, p.max(axis=0))
+        if np.linalg.norm(high - low) <= self._limit:
+            self._low, self._high = low, high
+
+    def eye(self) -> rrb.EyeControls3D:
+        """An orbiting eye that sees the box as a whole."""
+        centre, size = (self._low + self._high) / 2, float(np.linalg.norm(self._high - self._low)) or 1.0
+        eye = centre + 0.8 * size * _DIRECTION / np.linalg.norm(_DIRECTION)
+        kind = rrb.Eye3DKind.Orbital
+        return rrb.EyeControls3D(kind=kind, position=eye, look_target=centre, eye_up=(0, 1, 0))
 
 
-def scene_view(
-    root: str, name: str, springs_visible: bool, low: NDArray[np.float64], high: NDArray[np.float64]
-) -> rrb.Spatial3DView:
+def scene_view(root: str, name: str, box: Box, *, springs_visible: bool) -> rrb.Spatial3DView:
     """The mesh under `root`/scene; its springs are there to be switched on."""
     springs = f"{root}/scene/springs"
     return rrb.Spatial3DView(
@@ -57,7 +68,7 @@ def scene_view(
         name=name,
         background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=camera(low, high),
+        eye_controls=box.eye(),
         overrides={springs: rrb.EntityBehavior(visible=springs_visible)},
     )
 
@@ -67,18 +78,18 @@ def scale_view(strain_range: float, origin: str = "/legend") -> rrb.Spatial2DVie
     return rrb.Spatial2DView(origin=origin, name=scale_name(strain_range), background=BACKGROUND)
 
 
-def plot(name: str, contents: Sequence[str], corner: rrb.Corner2D = rrb.Corner2D.RightTop) -> rrb.TimeSeriesView:
+def plot(name: str, contents: Sequence[str], *, legend: bool = True) -> rrb.TimeSeriesView:
     """One plot of everything under the given paths."""
-    legend = rrb.PlotLegend(corner, visible=any("*" in path for path in contents))
-    return rrb.TimeSeriesView(origin="/", contents=list(contents), name=name, plot_legend=legend)
+    corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend)
+    return rrb.TimeSeriesView(origin="/", contents=list(contents), name=name, plot_legend=corner)
 
 
-def blueprint(info: RecordingInfo, low: NDArray[np.float64], high: NDArray[np.float64]) -> rrb.Blueprint:
-    """The layout of one recording whose positions stay in the box from `low` to `high`, each (3,) [m]."""
+def blueprint(info: RecordingInfo, box: Box) -> rrb.Blueprint:
+    """The layout of one recording."""
     series = rrb.Vertical(
         plot("Energy [J]", ["+ /energy/**"]),
-        plot("log10 of the residual [J^(1/2)]", ["+ /residual/log10"]),
-        plot("Largest strain of a spring", ["+ /strain/largest"]),
+        plot("log10 of the residual [J^(1/2)]", ["+ /residual/log10"], legend=False),
+        plot("Largest strain of a spring", ["+ /strain/largest"], legend=False),
         plot("Milliseconds by phase", ["+ /milliseconds/**"]),
         name="By frame",
     )
@@ -88,20 +99,17 @@ def blueprint(info: RecordingInfo, low: NDArray[np.float64], high: NDArray[np.fl
         name="Convergence (choose timeline: iteration)",
     )
     run = rrb.TextDocumentView(origin="/run", name="Run and machine")
-    triangles = len(info.mesh.triangles) > 0
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(
-                scene_view("", info.title, not triangles, low, high),
+                scene_view("", info.title, box, springs_visible=not len(info.mesh.triangles)),
                 scale_view(info.strain_range),
                 row_shares=[9, 1],
             ),
             rrb.Tabs(series, convergence, run, active_tab=0),
             column_shares=[3, 2],
         ),
-        rrb.TimePanel(state="collapsed", timeline="frame", fps=_frames_per_second(info.time_step)),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
+        *panels(info.time_step),
         auto_views=False,
     )
 
@@ -111,7 +119,7 @@ def run_document(info: RecordingInfo) -> str:
     mesh = info.mesh
     facts = {
         "vertices": len(mesh.rest),
-        "springs": len(mesh.springs),
+        "springs": len(info.springs),
         "triangles": len(mesh.triangles),
         "pinned vertices": len(info.pinned),
         "time step": f"{info.time_step:g} s",
@@ -122,12 +130,14 @@ def run_document(info: RecordingInfo) -> str:
     colours = f"## Colours\n\n{scale_name(info.strain_range)}.\n\n"
     hint = (
         "A vertex shows the strain of largest magnitude among its springs. The springs themselves "
-        f"(`/scene/springs`, in each frame that {spring_cadence(mesh)} divides) "
+        f"(`/scene/springs`, in each frame that {spring_cadence(info)} divides) "
         "are switched on by the eye in the blueprint panel.\n"
     )
     return f"# {info.title}\n\n| | |\n|-|-|\n{rows}\n\n{colours}{hint}"
 
 
-def _frames_per_second(time_step: float) -> float:
-    """Play in real time, as far as a screen can show it."""
-    return math.ceil(min(max(1 / time_step, 1.0), 120.0))
+def panels(time_step: float) -> tuple[rrb.TimePanel, rrb.SelectionPanel, rrb.BlueprintPanel]:
+    """Time by frame, played in real time as far as a screen can show it; nothing else in the way."""
+    fps = math.ceil(min(max(1 / time_step, 1.0), 120.0))
+    time = rrb.TimePanel(state="collapsed", timeline="frame", fps=fps)
+    return time, rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="hidden")

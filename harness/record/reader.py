@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 from rerun.chunk import Chunk, LazyStore, RrdReader
 
@@ -86,31 +85,31 @@ def read_replay(path: Path, frames: Collection[int] | None = None) -> Replay:
     Raises InputError when the file is not the recording of a run or has not got a chosen frame.
     """
     with open_recording(path) as source:
-        network = _network(source)
+        springs = network(source)
         wanted = None
         if frames is not None:
-            known = np.array([index for index, _, _ in _positions(source, None)])
+            known = np.array([index for index, _, _ in positions(source)])
             wanted = {_chosen(path, frame, known) for frame in frames}
-        found = {index: (time, p.copy()) for index, time, p in _positions(source, wanted)}
+        found = {index: (time, p.copy()) for index, time, p in positions(source, wanted)}
         order = sorted(found)
         times = np.array([found[index][0] for index in order])
-        positions = np.empty((len(order), len(found[order[0]][1]) if order else 0, 3), np.float32)
+        stacked = np.empty((len(order), len(found[order[0]][1]) if order else 0, 3), np.float32)
         for k, index in enumerate(order):
-            positions[k] = found.pop(index)[1]  # so that memory never holds all frames twice
-        title, properties = _properties(source)
+            stacked[k] = found.pop(index)[1]  # so that memory never holds all frames twice
+        title, facts = properties(source)
         return Replay(
             title=title,
             run_id=source.run_id,
             frames=np.array(order, np.int64),
             times=times,
-            positions=positions,
+            positions=stacked,
             triangles=_triangles(source),
-            springs=network["springs"].reshape(-1, 2).astype(np.int64),
-            rest_lengths=network["rest_lengths"].astype(np.float64),
-            pinned=network["pinned"].astype(np.int64),
-            strain_range=float(network["strain_range"][0]),
+            springs=springs["springs"].reshape(-1, 2).astype(np.int64),
+            rest_lengths=springs["rest_lengths"].astype(np.float64),
+            pinned=springs["pinned"].astype(np.int64),
+            strain_range=float(springs["strain_range"][0]),
             scalars=_by_frame(_scalars(source)),
-            properties=properties,
+            properties=facts,
         )
 
 
@@ -128,15 +127,15 @@ def summary(path: Path) -> Summary:
             for name in chunk.timeline_names:
                 values = _times(batch, name)
                 times.setdefault(name, []).extend((values.min(), values.max()))
-        title, properties = _properties(source)
-        frames = {index for index, _, _ in _positions(source, None)}
+        title, facts = properties(source)
+        frames = {index for index, _, _ in positions(source)}
         return Summary(
             path=path,
             complete=source.complete,
             title=title,
             run_id=source.run_id,
             application=source.application,
-            properties=properties,
+            properties=facts,
             frames=np.array(sorted(frames), np.int64),
             timelines={name: (float(min(values)), float(max(values))) for name, values in sorted(times.items())},
             entities=tuple(sorted(entities)),
@@ -191,8 +190,8 @@ def _whole_messages(path: Path) -> tuple[bool, int]:
     return False, place
 
 
-def _network(source: Source) -> dict[str, NDArray[Any]]:
-    """Springs, rest lengths, pins and the strain range."""
+def network(source: Source) -> dict[str, NDArray[Any]]:
+    """What does not change: springs (2m,), rest_lengths (m,), pinned (q,), strain_range (1,), time_step (1,)."""
     for chunk in source.chunks(content="/network"):
         batch = chunk.to_record_batch()
         names = [name for name in batch.schema.names if name != _ROW_ID]
@@ -202,7 +201,9 @@ def _network(source: Source) -> dict[str, NDArray[Any]]:
     raise InputError(Mistake(problem, file=source.path))
 
 
-def _positions(source: Source, wanted: Collection[int] | None) -> Iterator[tuple[int, float, NDArray[np.float32]]]:
+def positions(
+    source: Source, wanted: Collection[int] | None = None
+) -> Iterator[tuple[int, float, NDArray[np.float32]]]:
     """Frame, time [s] and positions (n, 3) of the wanted frames, as they come in the file."""
     for chunk in source.chunks(content="/scene/mesh", components=_POSITIONS):
         batch = chunk.to_record_batch()
@@ -218,15 +219,16 @@ def _triangles(source: Source) -> NDArray[np.int64]:
     return np.empty((0, 3), np.int64)
 
 
-def _properties(source: Source) -> tuple[str, dict[str, Any]]:
-    title, properties = "", {}
+def properties(source: Source) -> tuple[str, dict[str, Any]]:
+    """The title and what was recorded about the run and its machine."""
+    title, facts = "", {}
     for chunk in source.chunks(content="/__properties/**"):
         batch = chunk.to_record_batch()
         values = {name: batch[name][0].as_py()[0] for name in batch.schema.names if name != _ROW_ID}
         if chunk.entity_path == "/__properties/run":
-            properties = values
+            facts = values
         title = values.get(_NAME, title)
-    return title, properties
+    return title, facts
 
 
 def _scalars(source: Source) -> pa.Table:
@@ -255,12 +257,10 @@ def _scalars(source: Source) -> pa.Table:
 
 def _by_frame(table: pa.Table) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
     """The scalars that have one value a frame: entity -> (frames, values)."""
-    table = table.filter(pc.is_null(table["iteration"]))
-    found = {}
-    for entity in table["entity"].unique().to_pylist():
-        rows = table.filter(pc.equal(table["entity"], entity))
-        found[entity] = rows["frame"].to_numpy(), rows["value"].to_numpy()
-    return found
+    entities, frames, values = (table[name].to_numpy() for name in ("entity", "frame", "value"))
+    once = table["iteration"].is_null().to_numpy()
+    entities, frames, values = entities[once], frames[once].astype(np.int64), values[once]
+    return {str(entity): (frames[of], values[of]) for entity in np.unique(entities) for of in [entities == entity]}
 
 
 def _row(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:

@@ -12,19 +12,18 @@ Entities: `/scene/mesh` (positions, exact to float32), `/scene/pins`, `/scene/sp
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
-from rerun.chunk import RrdReader
 
-from harness.errors import RunFailed
 from harness.record import blueprint
 from harness.record.base import Frame, RecordingInfo
+from harness.record.partial import PartialFile
 from harness.record.shading import Shading
 
 FLUSH = 5
@@ -43,31 +42,20 @@ class RerunRecorder:
     """
 
     def __init__(self, path: Path, info: RecordingInfo) -> None:
-        self._path, self._info = path, info
-        self._shading = Shading(info.mesh, info.strain_range)
-        self._low, self._high = info.mesh.rest.min(axis=0), info.mesh.rest.max(axis=0)
+        self._info = info
+        self._shading = Shading(info)
+        self._box = blueprint.Box(info.mesh.rest)
         self._scalars: dict[str, list[tuple[int, float]]] = {}
         self._styled: set[str] = set()
         self._frames = 0
         self._pins: NDArray[np.float32] | None = None
         self._springs_shown = False
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.rrd")
-        rr.set_strict_mode(True)  # without it a wrong shape is swallowed and logged as nothing
-        self._stream = rr.RecordingStream(
-            blueprint.application(info),
-            recording_id=info.run_id,
-            batcher_config=rr.ChunkBatcherConfig.NEVER(),
-            send_properties=False,
-        )
-        self._stream.set_log_time_enabled(False)
-        layout = blueprint.blueprint(info, self._low, self._high)
-        try:
-            self._stream.save(self._partial, default_blueprint=layout)
-        except RuntimeError as error:
-            raise RunFailed(f"{path}: the recording cannot be written: {error}") from error
+        application = blueprint.application(info)
+        self._file = PartialFile(path, application, info.run_id, info.title)
+        self._stream = self._file.stream
+        self._stream.send_blueprint(blueprint.blueprint(info, self._box))  # for what a kill leaves
         self._log_once()
-        self._flush()
+        self._file.flush()
 
     def frame(self, frame: Frame) -> None:
         """Record one frame; its arrays are only read."""
@@ -87,8 +75,8 @@ class RerunRecorder:
         if self._frames % SCALARS == 0:
             self._send_scalars()
         if self._frames % FLUSH == 0 or self._frames == 1:
-            self._widen(p)
-            self._flush()
+            self._box.add(p)
+            self._file.flush()
 
     def convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
         """Record the residual [J^(1/2)] and the objective [J] after each iteration of one frame, from the first."""
@@ -111,39 +99,24 @@ class RerunRecorder:
         for phase, values in milliseconds.items():
             self._scalars[f"/milliseconds/{phase}"] = list(enumerate(values, start=1))
         self._send_scalars()
-        self._stream.send_blueprint(blueprint.blueprint(self._info, self._low, self._high))
-        self._flush()
-        self._stream.disconnect()
-        try:
-            RrdReader(self._partial).store().schema()
-        except Exception as error:
-            self.abandon()
-            raise RunFailed(f"{self._path}: the recording cannot be read back: {error}") from error
-        os.replace(self._partial, self._path)
-        return self._path
+        return self._file.finish(blueprint.blueprint(self._info, self._box))
 
     def abandon(self) -> None:
-        """Stop, and remove the partial file."""
-        self._stream.disconnect()
-        self._partial.unlink(missing_ok=True)
-
-    def _widen(self, p: NDArray[np.float32]) -> None:
-        """Keep the box of the positions, for the camera."""
-        low, high = p.min(axis=0), p.max(axis=0)
-        if np.isfinite(low).all() and np.isfinite(high).all():
-            self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
+        """Stop, and remove the partial file; nothing happens after `close`."""
+        self._file.abandon()
 
     def _log_once(self) -> None:
         info, mesh = self._info, self._info.mesh
-        self._stream.send_recording_name(info.title)
-        self._stream.send_property("run", rr.AnyValues(**info.properties))
-        numbers = {"time_step": info.time_step, "strain_range": info.strain_range}
-        network = {
-            "springs": mesh.springs.ravel().astype(np.uint32),
-            "rest_lengths": mesh.rest_lengths,
+        facts: dict[str, Any] = dict(info.properties)
+        self._stream.send_property("run", rr.AnyValues(**facts))
+        network: dict[str, Any] = {
+            "time_step": info.time_step,
+            "strain_range": info.strain_range,
+            "springs": info.springs.ravel().astype(np.uint32),
+            "rest_lengths": info.rest_lengths,
             "pinned": info.pinned.astype(np.uint32),
         }
-        self._stream.log("/network", rr.AnyValues(drop_untyped_nones=False, **network, **numbers), static=True)
+        self._stream.log("/network", rr.AnyValues(**network), static=True)
         document = rr.TextDocument(blueprint.run_document(info), media_type=rr.MediaType.MARKDOWN)
         self._stream.log("/run", document, static=True)
         self._stream.log("/scene", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
@@ -168,8 +141,8 @@ class RerunRecorder:
             self._pins = pins
 
     def _log_springs(self, p: NDArray[np.float32], strain: NDArray[np.float64]) -> None:
-        springs = self._info.mesh.springs
-        due = self._frames % blueprint.spring_cadence(self._info.mesh) == 0
+        springs = self._info.springs
+        due = self._frames % blueprint.spring_cadence(self._info) == 0
         if due and len(springs):
             colours, radius = self._shading.colours(strain), rr.Radius.ui_points(1.5)
             self._stream.log("/scene/springs", rr.LineStrips3D(_segments(p[springs]), colors=colours, radii=radius))
@@ -200,12 +173,6 @@ class RerunRecorder:
         if entity not in self._styled:
             self._styled.add(entity)
             self._stream.log(entity, rr.SeriesLines(names=name, widths=1.5), static=True)
-
-    def _flush(self) -> None:
-        try:
-            self._stream.flush(timeout_sec=60)
-        except Exception as error:
-            raise RunFailed(f"{self._path}: the recording cannot be written: {error}") from error
 
 
 def _segments(ends: NDArray[np.float32]) -> pa.Array:

@@ -13,10 +13,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from harness.mesh.base import Mesh
+from harness.record.base import RecordingInfo
 from solvers.problem import Positions
 
-STRAIN_COLOURS = ("#0b4a86", "#5b9bd0", "#d9d7d2", "#ee8f45", "#a33b05")
+STRAIN_COLOURS = ("#125490", "#64a2d6", "#d9d7d2", "#e5863b", "#943404")
 """Strain at -range, -range/2, 0, range/2, range: blue compressed, grey at rest, orange stretched; safe for the
 colour-blind, and grey enough in the middle that light and shadow still show."""
 
@@ -35,12 +35,12 @@ def palette() -> NDArray[np.uint8]:
 
 
 class Shading:
-    """Strains, colours and normals of one mesh."""
+    """Strains, colours and normals of one run's mesh."""
 
-    def __init__(self, mesh: Mesh, strain_range: float) -> None:
-        self._mesh, self._range = mesh, strain_range
+    def __init__(self, info: RecordingInfo) -> None:
+        self._range, self._triangles = info.strain_range, info.mesh.triangles
+        self._springs, self._rest_lengths = info.springs, info.rest_lengths
         self._packed = palette().view(">u4").astype(np.uint32).ravel()
-        self._rest_lengths = mesh.rest_lengths
 
     def strains(self, p: Positions) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The strain of each spring (m,), and of each vertex (n,) the one of largest magnitude among its springs.
@@ -48,7 +48,7 @@ class Shading:
         Where a rest length is 0, or a vertex has no spring, it is 0.
         """
         of_spring, of_vertex = np.empty(len(self._rest_lengths)), np.zeros(len(p))
-        _strains(p.copy(), self._mesh.springs, self._rest_lengths, of_spring, of_vertex)
+        _strains(p.copy(), self._springs, self._rest_lengths, of_spring, of_vertex)
         return of_spring, of_vertex
 
     def colours(self, strain: NDArray[np.float64]) -> NDArray[np.uint32]:
@@ -60,7 +60,7 @@ class Shading:
     def normals(self, p: NDArray[np.float32]) -> NDArray[np.float32]:
         """The unit normal of each vertex, rounded to 1/32, shape (n, 3); zero where there is none."""
         normals = np.zeros_like(p)
-        _normals(p, self._mesh.triangles, normals)
+        _normals(p, self._triangles, normals)
         return normals
 
 

@@ -1,0 +1,121 @@
+"""Recordings of one scene and size side by side in one file: a view for each solver, one plot for each quantity.
+
+The chunks of each recording are copied as they are, under the name of its solver.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from harness.record.blueprint import Box, panels, plot, scale_view, scene_view
+from harness.record.partial import PartialFile
+from harness.record.reader import Source, network, open_recording, positions, properties
+
+COLOURS = (0xE69F00FF, 0x56B4E9FF, 0x009E73FF, 0xCC79A7FF, 0xF0E442FF, 0xD55E00FF, 0x0072B2FF, 0x999999FF)
+"""The palette of Okabe and Ito, told apart by the colour-blind; clear on black first."""
+
+_QUANTITIES = {
+    "/residual/log10": "log10 of the residual [J^(1/2)]",
+    "/strain/largest": "Largest strain of a spring",
+    "/milliseconds/step": "Milliseconds of a step",
+    "/energy/springs": "Elastic energy [J]",
+    "/iterations": "Iterations of a step",
+}
+_SHOWN = 3
+"""How many of them are seen at once; the others share tabs with the convergence and the runs."""
+
+_CURVE = "/convergence/log10_residual/frame_"
+
+
+def side_by_side(out: Path, recordings: Mapping[str, Path], title: str) -> None:
+    """Write to `out` the recordings, by solver, side by side on one time line.
+
+    Raises InputError for a file that is not the recording of a run, RunFailed when `out` cannot be written.
+    """
+    file = PartialFile(out, f"springbench side by side {title}", title, title)
+    try:
+        runs = [_copy(file, path, name, COLOURS[k % len(COLOURS)]) for k, (name, path) in enumerate(recordings.items())]
+        document = rr.TextDocument(_table(title, runs), media_type=rr.MediaType.MARKDOWN)
+        file.stream.log("/runs", document, static=True)
+        file.finish(_layout(runs))
+    finally:
+        file.abandon()
+
+
+class _Run:
+    """One recording: where it went and what its views need to know."""
+
+    def __init__(self, name: str, source: Source) -> None:
+        fixed = network(source)
+        self.name, self.root = name, f"/{rr.escape_entity_path_part(name)}"
+        self.strain_range, self.time_step = float(fixed["strain_range"][0]), float(fixed["time_step"][0])
+        self.properties: dict[str, Any] = properties(source)[1]
+        self.entities: set[str] = set()
+        self.box: Box | None = None
+        for _, _, p in positions(source):
+            self.box = self.box or Box(p)
+            self.box.add(p)
+
+
+def _copy(file: PartialFile, path: Path, name: str, colour: int) -> _Run:
+    with open_recording(path) as source:
+        run = _Run(name, source)
+        for chunk in source.chunks(content="/**"):
+            run.entities.add(chunk.entity_path)
+            file.stream.send_chunks(chunk.with_entity_path(run.root + chunk.entity_path))
+    style = rr.SeriesLines(names=name, colors=colour, widths=1.5)
+    for entity in run.entities:
+        if entity in _QUANTITIES or entity.startswith(_CURVE):
+            file.stream.log(run.root + entity, style, static=True)
+    file.flush()
+    return run
+
+
+def _layout(runs: list[_Run]) -> rrb.Blueprint:
+    entities = set.union(*(run.entities for run in runs))
+    scenes = [
+        scene_view(run.root, run.name, run.box, springs_visible="/scene/mesh" not in run.entities)
+        for run in runs
+        if run.box
+    ]
+    known = [entity for entity in _QUANTITIES if entity in entities]
+    plots = [_plot(runs, entity, _QUANTITIES[entity], legend=entity == known[0]) for entity in known]
+    curves = [
+        _plot(
+            runs,
+            entity,
+            f"log10 residual in frame {int(entity.removeprefix(_CURVE))} (timeline: iteration)",
+            legend=True,
+        )
+        for entity in sorted(entities)
+        if entity.startswith(_CURVE)
+    ]
+    table = rrb.TextDocumentView(origin="/runs", name="Runs")
+    first = runs[0]
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Grid(*scenes, grid_columns=min(len(scenes), 4)),
+            scale_view(first.strain_range, f"{first.root}/legend"),
+            rrb.Horizontal(*plots[:_SHOWN], rrb.Tabs(*plots[_SHOWN:], *curves, table, active_tab=0)),
+            row_shares=[10, 1.3, 5],
+        ),
+        *panels(first.time_step),
+        auto_views=False,
+    )
+
+
+def _plot(runs: list[_Run], entity: str, name: str, *, legend: bool) -> rrb.TimeSeriesView:
+    return plot(name, [f"+ {run.root}{entity}" for run in runs if entity in run.entities], legend=legend)
+
+
+def _table(title: str, runs: list[_Run]) -> str:
+    """The runs' properties as Markdown, a column for each run."""
+    keys = dict.fromkeys(key for run in runs for key in run.properties)
+    rows = [[key, *(f"`{run.properties.get(key, '')}`" for run in runs)] for key in keys]
+    head = [["", *(run.name for run in runs)], ["-"] * (len(runs) + 1)]
+    return f"# {title}\n\n" + "\n".join(f"| {' | '.join(row)} |" for row in [*head, *rows])

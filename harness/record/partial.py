@@ -1,0 +1,71 @@
+"""A Rerun file that has a partial name until it is complete: a kill never leaves half a file under the final name.
+
+The stream has no batching thread of its own, which would slow down what runs beside it and lose its last
+batch in a kill: what is logged reaches the disk with `flush`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.chunk import RrdReader
+
+from harness.errors import RunFailed
+
+
+class PartialFile:
+    """An open recording stream into a partial file beside `path`.
+
+    Raises RunFailed, from any method, when the file cannot be written or, at the end, not be read back.
+    """
+
+    def __init__(self, path: Path, application: str, recording_id: str, title: str) -> None:
+        self._path = path
+        self._partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.rrd")
+        rr.set_strict_mode(True)  # without it a wrong shape is swallowed and logged as nothing
+        self.stream = rr.RecordingStream(
+            re.sub(r"[^\w .-]", "-", application),  # the viewer warns of other characters
+            recording_id=recording_id,
+            batcher_config=rr.ChunkBatcherConfig.NEVER(),
+            send_properties=False,
+        )
+        self.stream.set_log_time_enabled(False)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self.stream.save(self._partial)
+        except (OSError, RuntimeError) as error:
+            raise self._failure(error) from error
+        self.stream.send_recording_name(title)
+
+    def flush(self) -> None:
+        """Wait until all that was logged is in the file."""
+        try:
+            self.stream.flush(timeout_sec=60)
+        except Exception as error:
+            raise self._failure(error) from error
+
+    def finish(self, layout: rrb.Blueprint) -> Path:
+        """Close the file, read its footer back and give it its final name, which is returned."""
+        try:
+            self.stream.send_blueprint(layout)
+            self.flush()
+            self.stream.disconnect()
+            RrdReader(self._partial).store().schema()
+            os.replace(self._partial, self._path)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise self._failure(error) from error
+        finally:
+            self.abandon()
+        return self._path
+
+    def abandon(self) -> None:
+        """Stop and remove the partial file, where there still is one."""
+        self.stream.disconnect()
+        self._partial.unlink(missing_ok=True)
+
+    def _failure(self, error: Exception) -> RunFailed:
+        return RunFailed(f"{self._path}: the recording cannot be written: {error}")
