@@ -4,12 +4,14 @@ fixed        The constants are the stiffness of each spring [N/m], whatever the 
 
 continuum    The material stays the same when the mesh is refined. With h the spacing:
     dimension 1   k_e = EA / rest length; constants EA [N]. Springs in series add up to EA / L.
-    dimension 2   k_e constant; constants [N/m]. There are 1/h springs across a metre of width, each of length
-                  h, so that the force per width and strain is k h / h = k.
+    dimension 2   k_e constant; constants [N/m]. There are 1/h springs across a metre of width, so that the
+                  force per width and strain is k / h * h = k. With both diagonals, of constant s:
+                  C11 = k + s, C12 = C66 = s [N/m].
     dimension 3   k_e = E h; constants [Pa]. There are 1/h^2 springs across a square metre, so that the
-                  force per area and strain is k h / h^2 = E. The moduli of the body are E times a factor of
-                  its lattice (diagonals add to the axes); springs on its surface, which have cells on one
-                  side only, add a term of order h.
+                  force per area and strain is k h / h^2 = E. With the diagonals of a block, of constant S:
+                  C11 = E + 10/3 S, C12 = C66 = 7/3 S [Pa].
+    These are the limits. Springs on the boundary have cells on one side only and yet full stiffness, so that
+    a cloth of width W is stiffer by up to h / W, a block by up to that for each side of its cross-section.
     bending       k_e = 16 B / h^2, constant B [N m] (BEND springs, rest length 2h, in dimension 2).
 
     Skip-one springs have no quadratic bending energy about a flat sheet: a fold by the angle t shortens one

@@ -1,0 +1,208 @@
+"""Stiffness rules: their formulas, and that the continuum's material does not change with the mesh size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import spsolve
+
+from harness.errors import InputError
+from harness.material import RULES, spring_stiffness
+from harness.mesh.base import BEND, SHEAR, STRETCH, Mesh
+from harness.mesh.chain import Chain
+from harness.mesh.generator import Generator
+from harness.mesh.grid import Grid, Net
+from harness.mesh.solids import Block, Tower
+from harness.mesh.surfaces import Balloon, Skirt
+
+ROUND_OFF = 1e-9
+"""Relative error of a sparse solve with a few thousand unknowns and a condition number below 1e6."""
+
+
+def pull(mesh: Mesh, k: np.ndarray, *, fixed: np.ndarray, moved: np.ndarray, axis: int) -> float:
+    """The force [N] that holds `moved` at 1 m along `axis` while `fixed` stays, by the linear theory.
+
+    K = sum_e k_e n_e n_e' over the directions n_e of the springs at rest; coordinates of no stiffness stay put.
+    """
+    i, j = mesh.springs.T
+    direction = (mesh.rest[i] - mesh.rest[j]) / mesh.rest_lengths[:, None]
+    blocks = k[:, None, None] * direction[:, :, None] * direction[:, None, :]
+    rows, columns, values = [], [], []
+    for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+        rows.append(np.broadcast_to(3 * a[:, None, None] + np.arange(3)[None, :, None], blocks.shape).ravel())
+        columns.append(np.broadcast_to(3 * b[:, None, None] + np.arange(3)[None, None, :], blocks.shape).ravel())
+        values.append(sign * blocks.ravel())
+    n = 3 * len(mesh.rest)
+    stiffness = coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (n, n)).tocsr()
+    u = np.zeros(n)
+    u[3 * moved + axis] = 1.0
+    held = np.concatenate([3 * fixed + axis, 3 * moved + axis, 3 * fixed[:1], 3 * fixed[:1] + 1, 3 * fixed[:1] + 2])
+    flat = np.flatnonzero(np.ptp(mesh.rest, axis=0) == 0)
+    held = np.concatenate([held, *(np.arange(c, n, 3) for c in flat)])
+    if mesh.dimension == 3:  # the last rigid motion, a turn about the axis
+        held = np.append(held, 3 * fixed[-1] + (2 if axis == 0 else 0))
+    free = np.setdiff1d(np.arange(n), held)
+    if len(free):
+        u[free] = np.asarray(spsolve(stiffness[free][:, free].tocsc(), -(stiffness @ u)[free]))
+    return float((stiffness @ u)[3 * moved + axis].sum())
+
+
+def membrane(size: int, **material) -> float:
+    """Pulls a cloth of 1 m x 0.5 m along its length."""
+    mesh = Grid(width=1.0, height=0.5, diagonals="both", skip_one=material.get("bend", 0) > 0).build(size)
+    k = spring_stiffness(mesh, **({"rule": "continuum", "stretch": 100.0, "shear": 50.0, "bend": 0.0} | material))
+    return pull(mesh, k, fixed=mesh.parts["left"], moved=mesh.parts["right"], axis=0)
+
+
+def block(size: int, rule: str = "continuum") -> float:
+    """Pulls a block of 1 m x 0.5 m x 0.5 m along its length."""
+    mesh = Block(length=1.0, height=0.5, depth=0.5).build(size)
+    k = spring_stiffness(mesh, rule=rule, stretch=1000.0, shear=400.0, bend=0.0)
+    return pull(mesh, k, fixed=mesh.parts["left"], moved=mesh.parts["right"], axis=0)
+
+
+@pytest.mark.parametrize("size", [2, 3, 10, 101])
+def test_a_chain_of_any_size_is_the_same_spring(size):
+    mesh = Chain(length=2.0).build(size)
+    k = spring_stiffness(mesh, rule="continuum", stretch=50.0, shear=0.0, bend=0.0)
+    assert 1 / np.sum(1 / k) == pytest.approx(50.0 / 2.0, rel=ROUND_OFF)  # EA / L
+    assert pull(mesh, k, fixed=mesh.parts["first"], moved=mesh.parts["last"], axis=0) == pytest.approx(25.0)
+
+
+@pytest.mark.parametrize("size", [3, 5, 9])
+def test_a_cloth_of_threads_alone_has_the_membrane_stiffness_of_its_constant(size):
+    # threads along the pull at 1/h a metre and one more at the edge: k (W/h + 1) h / L; its limit is k W / L
+    h = 1 / (size - 1)
+    mesh = Grid(diagonals="none").build(size)
+    k = spring_stiffness(mesh, rule="continuum", stretch=100.0, shear=0.0, bend=0.0)
+    along = k[mesh.families[STRETCH]][: size * (size - 1)]
+    assert along.sum() * h**2 == pytest.approx(100.0 * (1 + h))
+
+
+@pytest.mark.parametrize(
+    ("measure", "sizes", "limit"),
+    [
+        # C11 = stretch + shear = 150, C12 = shear = 50 N/m; (C11 - C12^2 / C11) of width 0.5 m over 1 m
+        (membrane, (5, 9, 17), (150 - 50**2 / 150) * 0.5),
+        # C11 = stretch + (2 + 4/3) shear = 7000/3, C12 = (1 + 4/3) shear = 2800/3 Pa; Young's modulus by 0.25 m^2
+        (block, (5, 9, 13), (7000 - 2 * 2800**2 / (7000 + 2800)) / 3 * 0.25),
+    ],
+)
+def test_stretched_cloth_and_blocks_tend_to_the_continuum_of_their_lattice(measure, sizes, limit):
+    forces = [measure(size) for size in sizes]
+    assert all(a > b > limit for a, b in pairwise(forces))  # half-empty cells at the surface make coarse ones stiff
+    surplus = [force / limit - 1 for force in forces]
+    spacings = [1 / (size - 1) for size in sizes]
+    sides = 1 if measure is membrane else 2
+    assert all(s <= (1 + h / 0.5) ** sides - 1 for s, h in zip(surplus, spacings, strict=True))
+    # a parabola through three sizes, continued to h = 0; what is left is of third order, 0.001 to 0.01
+    assert np.polyfit(spacings, forces, 2)[-1] == pytest.approx(limit, rel=0.003)
+
+
+@pytest.mark.parametrize("t", [0.05, 1.0])
+def test_a_fold_stores_the_bending_energy_that_the_rule_promises(t):
+    # a sheet folded along its middle column; the exact shortening replaces its leading order, which at
+    # t = 1 rad is 1 % off: 2 (1 - cos(1/2)) = 0.2448 against 1/4, hence 4 % in energy; edge rows count fully
+    size, bending = 21, 3e-4
+    mesh = Grid(diagonals="none", skip_one=True).build(size)
+    k = spring_stiffness(mesh, rule="continuum", stretch=0.0, shear=0.0, bend=bending)
+    folded = mesh.rest.copy()
+    right = mesh.rest[:, 0] > 1e-9
+    folded[right] = mesh.rest[right] * [np.cos(t), 1, 1] + np.outer(mesh.rest[right, 0], [0, np.sin(t), 0])
+    i, j = mesh.springs.T
+    energy = 0.5 * k @ (np.linalg.norm(folded[i] - folded[j], axis=1) - mesh.rest_lengths) ** 2
+    h, rows = mesh.spacing, size
+    continuum = bending * t**2 / (2 * h) * rows * h
+    assert energy == pytest.approx(continuum * t**2, rel=0.045)
+
+
+def test_skip_one_springs_add_four_times_their_stiffness_to_the_membrane():
+    mesh = Grid(diagonals="none", skip_one=True).build(41)
+    k = spring_stiffness(mesh, rule="continuum", stretch=0.0, shear=0.0, bend=1.0)
+    strain = mesh.rest * [0.01, 0, 0]
+    i, j = mesh.springs.T
+    longer = np.abs(strain[i] - strain[j])[:, 0]
+    stiffness = 2 * (0.5 * k @ longer**2) / 0.01**2  # energy of a square metre = 1/2 stiffness strain^2
+    assert stiffness == pytest.approx(4 * k.max(), rel=0.01)  # rows lack one spring (2.5 %), edges add one (2.5 %)
+
+
+@pytest.mark.parametrize(
+    ("generator", "stretch", "shear", "bend"),
+    [
+        (Chain(length=3.0), lambda h: 1 / h, None, None),
+        (Grid(skip_one=True), lambda h: 1.0, lambda h: 1.0, lambda h: 16 / h**2),
+        (Net(), lambda h: 1.0, None, None),
+        (Skirt(), lambda h: 1.0, lambda h: 1.0, None),
+        (Balloon(), lambda h: 1.0, None, None),
+        (Block(), lambda h: h, lambda h: h, None),
+    ],
+    ids=lambda case: type(case).__name__,
+)
+def test_continuum_stiffness_follows_the_dimension(generator, stretch, shear, bend):
+    mesh = generator.build(7)
+    k = spring_stiffness(mesh, rule="continuum", stretch=2.0, shear=3.0, bend=5.0)
+    for family, constant, scale in ((STRETCH, 2.0, stretch), (SHEAR, 3.0, shear), (BEND, 5.0, bend)):
+        springs = mesh.families[family]
+        assert (scale is None) == (not len(springs))
+        if scale:
+            assert k[springs] == pytest.approx(constant * scale(mesh.spacing))
+
+
+def test_the_members_of_a_truss_are_bars():
+    mesh = Tower().build(3)
+    k = spring_stiffness(mesh, rule="continuum", stretch=2.0, shear=2.0, bend=0.0)
+    assert k * mesh.rest_lengths == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("generator", [Chain(), Grid(skip_one=True), Tower(), Block()], ids=lambda g: type(g).__name__)
+def test_fixed_stiffness_is_taken_as_it_is(generator: Generator):
+    mesh = generator.build(6)
+    k = spring_stiffness(mesh, rule="fixed", stretch=2.0, shear=0.0, bend=5.0)
+    for family, constant in ((STRETCH, 2.0), (SHEAR, 0.0), (BEND, 5.0)):
+        assert np.all(k[mesh.families[family]] == constant)
+
+
+@pytest.mark.parametrize(("size", "k"), [(11, 150), (21, 300), (41, 600), (81, 1200)])
+def test_the_rule_of_liu_2013_gives_the_stiffness_of_their_figure(size, k):
+    mesh = Grid(diagonals="one").build(size)
+    assert np.all(spring_stiffness(mesh, rule="liu2013", stretch=300.0, shear=300.0, bend=0.0, reference=21) == k)
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"rule": "continum"}, "rule"),
+        ({"rule": "liu2013"}, "reference"),
+        ({"rule": "liu2013", "reference": 1}, "reference"),
+        ({"rule": "fixed", "reference": 10}, "reference"),
+        ({"stretch": -1.0}, "stretch"),
+        ({"shear": float("nan")}, "shear"),
+        ({"bend": float("inf")}, "bend"),
+    ],
+)
+def test_senseless_materials_are_refused(changes, key):
+    arguments = {"rule": "fixed", "stretch": 1.0, "shear": 1.0, "bend": 1.0} | changes
+    with pytest.raises(InputError) as caught:
+        spring_stiffness(Grid().build(3), **arguments)
+    assert caught.value.mistakes[0].key == key
+
+
+@pytest.mark.parametrize("mesh", [replace(Grid().build(3), resolution=0), Balloon().build(1)], ids=["file", "size 1"])
+def test_the_rule_of_liu_2013_needs_a_mesh_that_has_a_size(mesh):
+    with pytest.raises(InputError, match="use fixed or continuum"):
+        spring_stiffness(mesh, rule="liu2013", stretch=1.0, shear=1.0, bend=0.0, reference=10)
+
+
+def test_a_bar_without_length_has_no_continuum_stiffness():
+    chain = Chain().build(3)
+    collapsed = replace(chain, rest=np.zeros((3, 3)))
+    with pytest.raises(InputError, match="two vertices in one place"):
+        spring_stiffness(collapsed, rule="continuum", stretch=1.0, shear=1.0, bend=0.0)
+
+
+def test_the_rules_are_those_a_scene_may_name():
+    assert set(RULES) == {"fixed", "continuum", "liu2013"}

@@ -1,0 +1,176 @@
+"""What every generator promises."""
+
+from __future__ import annotations
+
+from collections import Counter
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+from harness.errors import InputError
+from harness.mesh.base import BEND, SHEAR, STRETCH, Mesh
+from harness.mesh.chain import Chain
+from harness.mesh.generator import MAX_VERTICES, Generator
+from harness.mesh.grid import Grid, Net
+from harness.mesh.solids import Block, Tower
+from harness.mesh.surfaces import Balloon, Skirt
+from harness.mesh.table import MESHES
+
+ROUND_OFF = 1e-12
+"""A few thousand additions of numbers of order one in float64."""
+
+GENERATORS: list[Generator] = [
+    Chain(length=2.0, direction=(1.0, -1.0, 0.5)),
+    Grid(diagonals="none"),
+    Grid(width=1.5, height=0.7, diagonals="one", skip_one=True),
+    Grid(plane="vertical", skip_one=True),
+    Net(width=1.2, height=2.0),
+    Net(plane="vertical"),
+    Skirt(),
+    Balloon(radius=0.3),
+    Tower(),
+    Block(length=1.0, height=0.4, depth=0.6),
+]
+MESH_CASES = [
+    pytest.param(generator, generator.SMALLEST + extra, id=f"{type(generator).__name__}{k}-{extra}")
+    for k, generator in enumerate(GENERATORS)
+    for extra in (0, 1, 5)
+]
+
+
+@pytest.mark.parametrize("kind", MESHES)
+def test_the_table_names_a_model_of_that_kind(kind):
+    module, name = MESHES[kind].split(":")
+    model = getattr(import_module(module), name)
+    assert model.model_fields["kind"].default == kind
+
+
+@pytest.mark.parametrize(("generator", "size"), MESH_CASES)
+def test_springs_join_two_vertices_once(generator, size):
+    mesh = generator.build(size)
+    pairs = Counter(frozenset(pair) for pair in mesh.springs.tolist())
+    assert set(pairs.values()) == {1}
+    assert all(len(pair) == 2 for pair in pairs)
+    assert mesh.springs.min() == 0
+    assert mesh.springs.max() == len(mesh.rest) - 1
+
+
+@pytest.mark.parametrize(("generator", "size"), MESH_CASES)
+def test_families_are_a_partition_of_the_springs(generator, size):
+    mesh = generator.build(size)
+    assert set(mesh.families) == {STRETCH, SHEAR, BEND}
+    assert sorted(np.concatenate(list(mesh.families.values()))) == list(range(len(mesh.springs)))
+
+
+@pytest.mark.parametrize(("generator", "size"), MESH_CASES)
+def test_the_vertices_are_as_many_as_announced_and_joined_in_one_piece(generator, size):
+    mesh = generator.build(size)
+    assert len(mesh.rest) == generator.count(size)
+    reached, frontier = {0}, {0}
+    neighbours: dict[int, set[int]] = {}
+    for i, j in mesh.springs.tolist():
+        neighbours.setdefault(i, set()).add(j)
+        neighbours.setdefault(j, set()).add(i)
+    while frontier:
+        frontier = set().union(*(neighbours[v] for v in frontier)) - reached
+        reached |= frontier
+    assert len(reached) == len(mesh.rest)
+
+
+@pytest.mark.parametrize(("generator", "size"), MESH_CASES)
+def test_every_vertex_has_a_share_and_the_shares_sum_to_one(generator, size):
+    mesh = generator.build(size)
+    assert mesh.shares.shape == (len(mesh.rest),)
+    assert mesh.shares.min() > 0
+    assert mesh.shares.sum() == pytest.approx(1, abs=ROUND_OFF)
+
+
+@pytest.mark.parametrize(("generator", "size"), MESH_CASES)
+def test_parts_are_sorted_vertices(generator, size):
+    mesh = generator.build(size)
+    assert mesh.parts
+    for part in mesh.parts.values():
+        assert len(part)
+        assert np.all(np.diff(part) > 0)
+        assert part[0] >= 0
+        assert part[-1] < len(mesh.rest)
+
+
+@pytest.mark.parametrize(("generator", "size"), MESH_CASES)
+def test_arrays_have_the_promised_types_and_cannot_be_written_to(generator, size):
+    mesh = generator.build(size)
+    assert mesh.rest.dtype == np.float64
+    assert mesh.rest.flags.c_contiguous
+    assert mesh.springs.dtype == mesh.triangles.dtype == np.int64
+    for array in (mesh.rest, mesh.springs, mesh.triangles, mesh.shares, *mesh.families.values(), *mesh.parts.values()):
+        assert not array.flags.writeable
+
+
+@pytest.mark.parametrize(("generator", "size"), MESH_CASES)
+def test_neighbouring_triangles_agree_on_their_orientation(generator, size):
+    directed = Counter(directed_edges(generator.build(size)))
+    assert set(directed.values()) <= {1}  # two triangles that agree pass their common side in opposite directions
+
+
+@pytest.mark.parametrize(("generator", "size"), MESH_CASES)
+def test_building_again_gives_the_same_mesh(generator, size):
+    first, second = generator.build(size), generator.build(size)
+    assert np.array_equal(first.rest, second.rest)
+    assert np.array_equal(first.springs, second.springs)
+    assert np.array_equal(first.triangles, second.triangles)
+
+
+@pytest.mark.parametrize("generator", GENERATORS, ids=lambda g: type(g).__name__)
+def test_the_extent_does_not_depend_on_the_size(generator):
+    coarse, fine = generator.build(12), generator.build(24)
+    # rings and spheres of 12 vertices miss the extreme points of a circle by at most 1 - cos(pi/12) = 3.4 %
+    assert np.ptp(fine.rest, axis=0) == pytest.approx(np.ptp(coarse.rest, axis=0), rel=0.035, abs=ROUND_OFF)
+
+
+@pytest.mark.parametrize("generator", GENERATORS, ids=lambda g: type(g).__name__)
+def test_the_spacing_is_a_typical_rest_length_and_halves_with_twice_the_size(generator):
+    coarse, fine = generator.build(8), generator.build(16)
+    assert fine.rest_lengths.min() <= fine.spacing <= fine.rest_lengths.max()
+    if not isinstance(generator, Tower):  # its storeys get lower, its width stays
+        assert 0.4 < fine.spacing / coarse.spacing < 0.6  # (8 - 1)/(16 - 1) = 0.47 and rounded row counts
+
+
+@pytest.mark.parametrize(
+    ("generator", "size", "volume", "tolerance"),
+    [
+        (Balloon(radius=0.5), 16, np.pi / 6, 0.01),  # an inscribed polyhedron of 5120 facets lacks half a percent
+        (Block(length=1.0, height=0.5, depth=0.4), 11, 0.2, ROUND_OFF),
+    ],
+    ids=repr,
+)
+def test_closed_surfaces_enclose_their_volume(generator, size, volume, tolerance):
+    mesh = generator.build(size)
+    edges = set(directed_edges(mesh))
+    assert all((j, i) in edges for i, j in edges)
+    a, b, c = (mesh.rest[mesh.triangles[:, k]] for k in range(3))
+    assert np.einsum("ij,ij->", np.cross(a, b), c) / 6 == pytest.approx(volume, rel=tolerance)
+
+
+@pytest.mark.parametrize("generator", GENERATORS, ids=lambda g: type(g).__name__)
+@pytest.mark.parametrize("size", [-3, 0, 10**9, 10**400])
+def test_senseless_sizes_are_refused_with_what_is_allowed(generator, size):
+    with pytest.raises(InputError) as caught:
+        generator.build(size)
+    (mistake,) = caught.value.mistakes
+    assert mistake.key == "size"
+    assert mistake.problem.startswith(f"{size} ")
+    assert f"{generator.SMALLEST} to " in mistake.problem
+
+
+@pytest.mark.parametrize("generator", GENERATORS, ids=lambda g: type(g).__name__)
+def test_the_largest_size_named_is_the_largest_that_fits(generator):
+    with pytest.raises(InputError) as caught:
+        generator.build(generator.SMALLEST - 1)
+    largest = int(str(caught.value).split(" to ")[1].split()[0])
+    assert generator.count(largest) <= MAX_VERTICES < generator.count(largest + 1)
+
+
+def directed_edges(mesh: Mesh) -> list[tuple[int, int]]:
+    """The sides of the triangles in the direction in which they are passed."""
+    return [pair for a, b, c in mesh.triangles.tolist() for pair in ((a, b), (b, c), (c, a))]
