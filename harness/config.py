@@ -21,7 +21,8 @@ from ruamel.yaml.reader import ReaderError
 
 from harness.errors import InputError, Mistake, did_you_mean
 
-MAX_BYTES, MAX_NODES, MAX_DEPTH = 2**20, 100_000, 32
+MAX_BYTES, MAX_NODES, MAX_DEPTH = 2**18, 100_000, 32
+MAX_MISTAKES = 100
 
 Key = tuple[str | int, ...]
 """Where a value stands: the keys of mappings and the indices of lists on the way to it."""
@@ -54,7 +55,7 @@ class Document:
             return model.model_validate_json(json.dumps(data), strict=True)
         except ValidationError as error:
             problems: dict[Key, list[str]] = {}
-            for detail in error.errors():
+            for detail in error.errors()[: MAX_MISTAKES + 1]:
                 if detail["type"] == "too_short" and detail["input"]:
                     continue  # the list is short because its items were refused, which is reported
                 key = _place(detail, data)
@@ -77,8 +78,10 @@ class Document:
         return data[tag], {key: value for key, value in data.items() if key != tag}
 
     def error(self) -> InputError:
-        """All mistakes, sorted by line."""
-        return InputError(sorted(self.mistakes, key=lambda mistake: (str(mistake.file), mistake.line or 0)))
+        """All mistakes (the first MAX_MISTAKES of them), sorted by line."""
+        found = sorted(self.mistakes, key=lambda mistake: (str(mistake.file), mistake.line or 0))
+        more = [Mistake("... and more; mend these first", self.path)] if len(found) > MAX_MISTAKES else []
+        return InputError(found[:MAX_MISTAKES] + more)
 
 
 def read_bytes(path: Path) -> bytes:
@@ -116,10 +119,12 @@ def read_yaml(path: Path) -> Document:
         raise InputError(Mistake(problem, path, text.count("\n", 0, at) + 1)) from error
     except (YAMLError, ValueError) as error:
         line = error.problem_mark.line + 1 if isinstance(error, MarkedYAMLError) and error.problem_mark else None
-        problem = getattr(error, "problem", None) or "cannot be parsed"
+        parts = [getattr(error, name, None) for name in ("context", "problem")]
+        problem = ", ".join(filter(None, parts)) or "cannot be parsed"
         raise InputError(Mistake(f"is not YAML: {problem}", path, line)) from error
     document = Document(path, {})
     if not isinstance(node, MappingNode):
+        document.lines = {(): node.start_mark.line + 1} if node else {}
         document.report("should hold a mapping of keys to values; it is " + ("a value" if node else "empty"))
     else:
         document.data = _Converter(document).convert(node, (), 0)
@@ -184,7 +189,7 @@ class _Converter:
     def items(self, node: MappingNode, at: Key, depth: int) -> Iterator[tuple[str, Any]]:
         first: dict[str, int] = {}
         for name, value in node.value:
-            line = name.start_mark.line + 1
+            line, self.nodes = name.start_mark.line + 1, self.nodes + 1
             if not isinstance(name, ScalarNode):
                 self.document.report("the keys of a mapping should be plain words", at)
             elif name.value in first:

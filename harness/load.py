@@ -108,6 +108,8 @@ def scene_from_assignment(path: Path) -> SceneSpec:
 
 def _scene(document: Document) -> SceneSpec:
     data = document.data
+    if "scenes" in data and "mesh" not in data:
+        raise InputError(Mistake("is a sweep; a scene is wanted here", document.path))
     _check_name(document)
     own = document.check(SceneFile, data)
     mesh = _chosen(document, MESHES, data["mesh"], ("mesh",)) if "mesh" in data else None

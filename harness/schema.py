@@ -52,7 +52,7 @@ def schema() -> dict[str, Any]:
 def _one_of(models: dict[str, type[Model]], tag: str) -> Any:
     """The union of models, told apart by the key `tag`, which is required and holds the model's name."""
     tagged = [
-        create_model(name, __base__=model, __doc__=model.__doc__, **{tag: (Literal[name], ...)})  # pyright: ignore
+        create_model(name, __base__=model, __doc__=model.__doc__, **{tag: (Literal[name], ...)})  # pyright: ignore[reportCallIssue, reportArgumentType]
         for name, model in models.items()
     ]
     return Annotated[reduce(or_, tagged), Field(discriminator=tag)]

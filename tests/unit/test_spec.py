@@ -1,0 +1,264 @@
+"""Scenes and sweeps become runs: the grid, what is left out and added, and the names of runs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.errors import InputError
+from harness.load import Sweep, load_any, load_scene, load_sweep
+from harness.scene import build
+from harness.schema import schema
+from harness.spec import RunSpec
+
+ROOT = Path(__file__).resolve().parents[2]
+ASSIGNMENT = ROOT.parent / "shared" / "scenes"
+CONFIGS = [*sorted((ROOT / "configs").glob("*.yaml")), *sorted((ROOT / "configs" / "scenes").glob("*.yaml"))]
+
+CLOTH = """
+mesh: {kind: grid, width: 1}
+mass: 1
+time_step: 1/30
+frames: 5
+effects:
+  - {kind: springs, rule: fixed, stretch: 1e3}
+"""
+FILE = CLOTH.replace("{kind: grid, width: 1}", "{kind: file, path: mesh.obj}")
+OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+SWEEP = """
+scenes: [cloth.yaml, file.yaml]
+sizes: [4, 8]
+solvers: [sparse, dense]
+options: {iterations: [10, 20]}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name, text in {"cloth.yaml": CLOTH, "file.yaml": FILE, "mesh.obj": OBJ}.items():
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def sweep_of(folder: Path, text: str) -> Sweep:
+    (folder / "sweep.yaml").write_text(text)
+    return load_sweep(folder / "sweep.yaml")
+
+
+def points(runs: list[RunSpec]) -> list[tuple[str, int, str, int]]:
+    return [(run.scene_name, run.size, run.solver.name, run.iterations) for run in runs]
+
+
+GRID = [
+    *[("cloth", size, solver, its) for size in (4, 8) for solver in ("sparse", "dense") for its in (10, 20)],
+    *[("file", 0, solver, its) for solver in ("sparse", "dense") for its in (10, 20)],
+]
+
+
+def test_a_sweep_is_every_combination_in_the_order_of_its_lists(folder: Path) -> None:
+    assert points(sweep_of(folder, SWEEP).runs()) == GRID
+
+
+KEPT = {
+    "{solver: dense}": lambda s, n, v, i: v != "dense",
+    "{solver: dense, size_above: 4}": lambda s, n, v, i: not (v == "dense" and n > 4),
+    "{size_below: 8, scene: cloth}": lambda s, n, v, i: not (s == "cloth" and n < 8),
+    "{scene: cloth, size: [4, 8], iterations: 10}": lambda s, n, v, i: not (s == "cloth" and i == 10),
+    "{scene: file}, {iterations: 20}": lambda s, n, v, i: s != "file" and i != 20,
+    "{tolerance: null, iterations: 10}": lambda s, n, v, i: i != 10,
+    "{first_guess: current, frames: 5, solver: sparse}": lambda s, n, v, i: v != "sparse",
+}
+
+
+@pytest.mark.parametrize("entry", KEPT)
+def test_a_grid_point_that_matches_all_keys_of_an_exclude_is_left_out(folder: Path, entry: str) -> None:
+    runs = sweep_of(folder, f"{SWEEP}exclude: [{entry}]\n").runs()
+    assert points(runs) == [point for point in GRID if KEPT[entry](*point)]
+
+
+ADDED = {
+    "{scene: cloth, size: 16, solver: dense}": [("cloth", 16, "dense", 10)],
+    "{size: [16, 24], solver: dense, iterations: [5, 6]}": [
+        *[("cloth", size, "dense", its) for size in (16, 24) for its in (5, 6)],
+        *[("file", 0, "dense", its) for its in (5, 6)],
+    ],
+    "{scene: file, iterations: 7}": [("file", 0, "sparse", 7), ("file", 0, "dense", 7)],
+    "{scene: cloth, size: 8}": [],
+}
+
+
+@pytest.mark.parametrize("entry", ADDED)
+def test_an_include_adds_its_runs_and_no_run_twice(folder: Path, entry: str) -> None:
+    assert points(sweep_of(folder, f"{SWEEP}include: [{entry}]\n").runs()) == GRID + ADDED[entry]
+
+
+def test_an_include_survives_the_excludes(folder: Path) -> None:
+    text = f"{SWEEP}exclude: [{{scene: cloth}}]\ninclude: [{{scene: cloth, size: 4, solver: dense}}]\n"
+    assert points(sweep_of(folder, text).runs()) == [*GRID[8:], ("cloth", 4, "dense", 10)]
+
+
+def test_what_a_sweep_leaves_out_comes_from_the_scene_or_the_defaults(folder: Path) -> None:
+    (run,) = load_any(folder / "cloth.yaml", sizes=[4]).runs()
+    assert (run.sweep, run.scene_name, run.solver.name, run.size) == ("cloth", "cloth", "numba", 4)
+    assert (run.iterations, run.tolerance, run.first_guess, run.threads) == (50, None, "current", 1)
+    assert (run.frames, run.rounds, run.convergence_frames, run.strain_range) == (5, 2, None, 0.1)
+    assert run.scene.time_step == 1 / 30
+    assert run.record
+    assert run.pictures
+
+
+def test_options_of_the_command_line_make_the_grid_of_a_lone_scene(folder: Path) -> None:
+    runs = load_any(folder / "cloth.yaml", solvers=["dense", "sparse"], sizes=[4, 6], frames=2, tolerance=None).runs()
+    assert [(run.size, run.solver.name, run.frames) for run in runs] == [
+        (4, "dense", 2),
+        (4, "sparse", 2),
+        (6, "dense", 2),
+        (6, "sparse", 2),
+    ]
+
+
+def identified(folder: Path, text: str = "", machine: str = "machine", **options: Any) -> str:
+    if text:
+        (folder / "cloth.yaml").write_text(text)
+    (run,) = load_any(folder / "cloth.yaml", sizes=[4], **options).runs()
+    return run.run_id(machine)
+
+
+CHANGES = {
+    "frames": {"frames": 6},
+    "iterations": {"iterations": 51},
+    "tolerance": {"tolerance": 1e-3},
+    "first guess": {"first_guess": "inertial"},
+    "threads": {"threads": 2},
+    "rounds": {"rounds": 3},
+    "solver": {"solvers": ["dense"]},
+    "pictures": {"pictures": False},
+    "strain range": {"strain_range": 0.2},
+    "convergence frames": {"convergence_frames": [1]},
+    "machine": {"machine": "another"},
+    "mass": {"text": CLOTH.replace("mass: 1", "mass: 2")},
+    "time step": {"text": CLOTH.replace("1/30", "1/60")},
+    "mesh": {"text": CLOTH.replace("width: 1", "width: 2")},
+    "stiffness": {"text": CLOTH.replace("1e3", "1001")},
+    "an effect": {"text": CLOTH + "  - {kind: gravity}\n"},
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_all_that_determines_a_result_changes_the_run_id(folder: Path, change: str) -> None:
+    assert identified(folder) != identified(folder, **CHANGES[change])
+
+
+SAME = {
+    "comment": "# a comment\n" + CLOTH,
+    "description": CLOTH + "description: A cloth.\n",
+    "order of keys": "frames: 5\n" + CLOTH.replace("frames: 5\n", ""),
+    "spelling of a number": CLOTH.replace("1e3", "1000.0").replace("1/30", repr(1 / 30)),
+    "default spelled out": CLOTH.replace("fixed,", "fixed, bend: 0,"),
+    "default size": CLOTH + "default_size: 9\n",
+}
+
+
+@pytest.mark.parametrize("change", SAME)
+def test_what_means_the_same_keeps_the_run_id(folder: Path, change: str) -> None:
+    assert identified(folder) == identified(folder, SAME[change])
+
+
+def test_the_names_of_the_sweep_and_of_the_mesh_file_are_no_part_of_the_run_id(folder: Path) -> None:
+    (run,) = load_any(folder / "file.yaml").runs()
+    (folder / "mesh.obj").rename(folder / "renamed.obj")
+    (folder / "file.yaml").write_text(FILE.replace("mesh.obj", "renamed.obj"))
+    (again,) = load_any(folder / "file.yaml").runs()
+    assert replace(again, sweep="other").run_id("m") == run.run_id("m")
+
+
+def test_the_content_of_the_mesh_file_is_part_of_the_run_id(folder: Path) -> None:
+    (run,) = load_any(folder / "file.yaml").runs()
+    (folder / "mesh.obj").write_text(OBJ.replace("v 1 0 0", "v 1.0000001 0 0"))
+    (again,) = load_any(folder / "file.yaml").runs()
+    assert again.run_id("m") != run.run_id("m")
+
+
+def test_a_label_names_the_run_and_fits_a_file_name(folder: Path) -> None:
+    (run,) = load_any(folder / "cloth.yaml", sizes=[4]).runs()
+    assert run.label("m") == f"cloth-4-numba-{run.run_id('m')}"
+    assert len(run.run_id("m")) == 12
+    assert set(run.run_id("m")) <= set("0123456789abcdef")
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_every_shipped_config_asks_for_runs_and_names_its_schema(path: Path) -> None:
+    assert load_any(path).runs()
+    relative = "schema.json" if path.parent.name == "configs" else "../schema.json"
+    assert path.read_text().splitlines()[0] == f"# yaml-language-server: $schema={relative}"
+
+
+def test_the_committed_schema_is_the_models() -> None:
+    committed = json.loads((ROOT / "configs" / "schema.json").read_text())
+    assert committed == schema(), "write it anew: springbench schema > configs/schema.json"
+
+
+def test_the_schema_describes_every_key_of_a_scene_and_a_sweep() -> None:
+    definitions = schema()["$defs"]
+    for name in ("Scene", "Sweep", "Options", "Include", "Exclude"):
+        assert all(key.get("description") for key in definitions[name]["properties"].values()), name
+
+
+def test_a_scene_imports_the_effects_that_it_names_and_no_others(folder: Path) -> None:
+    code = (
+        "import json, sys; from pathlib import Path; from harness.load import load_scene;"
+        "load_scene(Path(sys.argv[1])); print(json.dumps([m for m in sys.modules if m.startswith('harness.effects.')]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(folder / "cloth.yaml")], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    expected = {"harness.effects.base", "harness.effects.table", "harness.effects.springs"}
+    assert set(json.loads(done.stdout)) == expected
+
+
+needs_assignment = pytest.mark.skipif(
+    not ASSIGNMENT.is_dir(), reason="the assignment's scenes are not beside the project"
+)
+
+# vertices, springs, stiffness, pins, total mass: the table of the assignment's README
+FACTS = {
+    "single-spring-horizontal": (2, 1, 500.0, 1, 2.0),
+    "horizontal-chain": (10, 9, 500.0, 2, 10.0),
+    "net": (61, 156, 300.0, 6, 61.0),
+    "flag": (3200, 12442, 1e5, 40, 2.0),
+}
+
+
+@needs_assignment
+@pytest.mark.parametrize("name", FACTS)
+def test_an_assignment_file_is_the_scene_with_its_conventions(name: str) -> None:
+    vertices, springs, stiffness, pins, mass = FACTS[name]
+    spec = load_scene(ASSIGNMENT / f"{name}.json")
+    scene = build(spec, 0)
+    assert (len(scene.mesh.rest), len(scene.springs.edges)) == (vertices, springs)
+    assert set(scene.springs.stiffness) == {stiffness}
+    assert len(scene.system.pins.vertices) == pins
+    assert set(scene.system.pins.weight) == {1e10}
+    # the table gives the flag's mass to two digits; the others are whole
+    assert scene.system.mass.sum() == pytest.approx(mass, rel=0.05 if name == "flag" else 1e-12)
+    p = scene.mesh.rest
+    force = sum(f(p, np.zeros_like(p), 0.0) for f in scene.forces)
+    assert np.array_equal(force, np.tile([0.0, -9.8, 0.0], (vertices, 1)))
+    assert (spec.time_step, spec.frames, spec.first_guess) == (1 / 30, 30, "assignment")
+    (run,) = load_any(ASSIGNMENT / f"{name}.json").runs()
+    assert (run.first_guess, run.iterations, run.size) == ("assignment", 50, 0)
+
+
+def test_mistakes_of_two_scenes_are_reported_together(folder: Path) -> None:
+    for name in ("one.yaml", "two.yaml"):
+        (folder / name).write_text(CLOTH.replace("mass: 1", "mass: -1"))
+    with pytest.raises(InputError) as caught:
+        sweep_of(folder, SWEEP.replace("cloth.yaml, file.yaml", "one.yaml, two.yaml"))
+    assert [mistake.file for mistake in caught.value.mistakes] == [folder / "one.yaml", folder / "two.yaml"]
