@@ -1,0 +1,177 @@
+"""What is in recordings, without a viewer: `springbench inspect`; and in the viewer: `springbench view`."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import rerun_cli
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from harness.errors import InputError, Mistake, RunFailed
+from harness.record.base import Replay
+from harness.record.reader import Summary, open_recording, read_replay, summary
+
+_SURFACE = (".obj", ".ply", ".stl", ".vtk", ".vtp")
+_LINES = (".vtk", ".vtp")
+_MILLISECONDS = "/milliseconds/"
+
+
+def inspect(paths: list[Path], *, frame: int | None, export: Path | None, csv: Path | None, console: Console) -> None:
+    """Print what is in each recording, and of two what differs.
+
+    frame: the frame that `export` writes, the last one if left out; export: mesh file of that frame, its format by
+    suffix; csv: file for the scalars in long form. Raises InputError for files that are no recordings, frames that
+    are not there, suffixes that are unknown, and where `export` or `csv` is asked of several recordings.
+    """
+    if len(paths) != 1 and (export or csv):
+        raise InputError(f"--export and --csv take one recording; {len(paths)} came")
+    if frame is not None and export is None:
+        raise InputError(Mistake("chooses the frame to export; name a file with --export too", key="--frame"))
+    for path in paths:
+        found = summary(path)
+        _print_summary(found, console)
+        if csv:
+            _write(csv, lambda target, table=found.scalars: pyarrow.csv.write_csv(table, target))
+            console.print(f"wrote {found.scalars.num_rows} values to {csv}", markup=False)
+    if export:
+        replay = read_replay(paths[0], [-1 if frame is None else frame])
+        _export(replay, paths[0], export)
+        console.print(f"wrote frame {replay.frames[0]} to {export}", markup=False)
+    if len(paths) == 2:
+        _print_difference(paths, console)
+
+
+def view(paths: list[Path]) -> None:
+    """Open recordings in the Rerun viewer and wait until it is closed.
+
+    Raises InputError for files that are no recordings, RunFailed where there is no display or no viewer.
+    """
+    for path in paths:
+        with open_recording(path):
+            pass
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise RunFailed(
+            "there is no display to open the viewer on; `springbench inspect` prints what is in a recording, "
+            "and `rerun FILE.rrd` shows it on a machine that has a screen"
+        )
+    binary = Path(rerun_cli.__file__).with_name("rerun.exe" if sys.platform == "win32" else "rerun")
+    if not binary.is_file():
+        raise RunFailed(f"the viewer is not installed: {binary} is missing; install rerun-sdk again")
+    done = subprocess.run([binary, *map(str, paths)], check=False)
+    if done.returncode:
+        raise RunFailed(f"the viewer ended with code {done.returncode}")
+
+
+def _print_summary(found: Summary, console: Console) -> None:
+    console.rule(Text(found.title or str(found.path)))
+    if not found.complete:
+        console.print(f"Not complete: its run was stopped. {len(found.frames)} frames can be read.", style="yellow")
+    console.print(_table(("run", ""), [("file", found.path), ("id", found.run_id), *found.properties.items()]))
+    rows = [(name, f"{first:g}", f"{last:g}") for name, (first, last) in found.timelines.items()]
+    frames = ("frames", f"{len(found.frames)} recorded", "")
+    console.print(_table(("timeline", "first", "last"), [*rows, *([frames] if len(found.frames) else [])]))
+    series = dict(_series(found.scalars))
+    phases = [
+        (entity, *_spread(values)) for entity, values in series.items() if _MILLISECONDS in entity and len(values)
+    ]
+    if phases:
+        console.print(_table(("milliseconds", "min", "median", "p95"), phases))
+    others = [
+        (entity, f"{values[0]:.6g}", f"{values[-1]:.6g}", f"{np.abs(values).max():.6g}")
+        for entity, values in series.items()
+        if _MILLISECONDS not in entity and len(values)
+    ]
+    console.print(_table(("by frame", "first", "last", "largest magnitude"), others))
+    console.print(Text("entities: " + ", ".join(found.entities)))
+
+
+def _print_difference(paths: list[Path], console: Console) -> None:
+    """How far apart two runs ended, and their times side by side."""
+    for path in paths:
+        read_replay(path, [-1])  # refuses what is not one run's recording
+    first, second = (summary(path) for path in paths)
+    common = np.intersect1d(first.frames, second.frames)
+    if not len(common):
+        raise InputError(f"{paths[0]} and {paths[1]} have no frame in common")
+    last = int(common[-1])
+    a, b = (read_replay(path, [last]) for path in paths)
+    console.rule("difference")
+    if a.positions.shape != b.positions.shape:
+        came = f"{a.positions.shape[1]} and {b.positions.shape[1]}"
+        raise InputError(f"{paths[0]} and {paths[1]} have {came} vertices: their positions cannot be compared")
+    apart = np.linalg.norm(a.positions[0].astype(np.float64) - b.positions[0], axis=1)
+    spacing = float(a.rest_lengths.mean()) if len(a.rest_lengths) else np.nan
+    figures = {"max": apart.max(), "rms": np.sqrt(np.mean(apart**2))}
+    rows = [(name, f"{value:.6g}", f"{value / spacing:.6g}") for name, value in figures.items()]
+    console.print(_table((f"positions in frame {last}", "metres", "mean rest lengths"), rows))
+    times = [dict(_series(found.scalars)) for found in (first, second)]
+    phases = sorted(entity for entity in set(times[0]) & set(times[1]) if _MILLISECONDS in entity)
+    rows = [
+        (entity, *(f"{np.median(of[entity]):.4g}" for of in times), f"{_ratio(times, entity):.4g}") for entity in phases
+    ]
+    if rows:
+        console.print(_table(("median milliseconds", "first", "second", "second / first"), rows))
+
+
+def _ratio(times: list[dict[str, NDArray[np.float64]]], entity: str) -> float:
+    return float(np.median(times[1][entity]) / np.median(times[0][entity]))
+
+
+def _series(scalars: pa.Table) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Each entity's finite values in the order of the frames, of those without iterations."""
+    once = scalars.filter(scalars["iteration"].is_null())
+    entities, values = once["entity"].to_numpy(), once["value"].to_numpy()
+    for entity in dict.fromkeys(entities):
+        of = values[entities == entity]
+        yield entity, of[np.isfinite(of)]
+
+
+def _spread(values: NDArray[np.float64]) -> tuple[str, str, str]:
+    low, middle, high = np.percentile(values, (0, 50, 95))
+    return f"{low:.4g}", f"{middle:.4g}", f"{high:.4g}"
+
+
+def _export(replay: Replay, recording: Path, export: Path) -> None:
+    allowed = _SURFACE if len(replay.triangles) else _LINES
+    if export.suffix not in allowed:
+        which = "a surface" if len(replay.triangles) else "springs without a surface"
+        problem = f"unknown suffix {export.suffix!r}; {recording.name} is {which}: one of {', '.join(allowed)}"
+        raise InputError(Mistake(problem, file=export))
+    import pyvista as pv  # slow to load, and most inspections export nothing
+
+    from harness.report.render import spring_strain, vertex_strain
+
+    points = replay.positions[0]
+    if len(replay.triangles):
+        mesh = pv.PolyData.from_regular_faces(points, replay.triangles)
+    else:
+        mesh = pv.PolyData(points, lines=np.insert(replay.springs, 0, 2, axis=1).ravel())
+        mesh.cell_data["strain"] = spring_strain(replay, 0)
+    mesh.point_data["strain"] = vertex_strain(replay, 0)
+    _write(export, mesh.save)
+
+
+def _write(target: Path, write: Callable[[Path], object]) -> None:
+    try:
+        write(target)
+    except OSError as error:
+        raise InputError(Mistake(f"cannot be written: {error.strerror or error}", file=target)) from error
+
+
+def _table(head: tuple[str, ...], rows: Sequence[tuple[object, ...]]) -> Table:
+    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
+    for k, name in enumerate(head):
+        table.add_column(name, justify="left" if k == 0 or head[0] == "run" else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(str(value)) for value in row))
+    return table
