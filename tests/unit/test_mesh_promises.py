@@ -153,7 +153,7 @@ def test_closed_surfaces_enclose_their_volume(generator, size, volume, tolerance
 
 
 @pytest.mark.parametrize("generator", GENERATORS, ids=lambda g: type(g).__name__)
-@pytest.mark.parametrize("size", [-3, 0, 10**9, 10**400])
+@pytest.mark.parametrize("size", [-3, 0, 10**9, 10**400], ids=["-3", "0", "1e9", "1e400"])
 def test_senseless_sizes_are_refused_with_what_is_allowed(generator, size):
     with pytest.raises(InputError) as caught:
         generator.build(size)
