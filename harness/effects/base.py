@@ -61,7 +61,7 @@ class Effect(Protocol):
         ...
 
 
-def steady(force: Positions) -> Force:
-    """A force (n, 3) [N] that never changes."""
+def steady(force: Positions) -> tuple[Force, ...]:
+    """A force (n, 3) [N] that never changes; none at all where it is zero everywhere."""
     force.flags.writeable = False
-    return lambda p, v, t: force
+    return (lambda p, v, t: force,) if force.any() else ()

@@ -19,4 +19,4 @@ class ConstantForce(Model):
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
         """The force on every vertex."""
-        return Contribution(forces=(steady(np.tile(np.array(self.force), (len(mass), 1))),))
+        return Contribution(forces=steady(np.tile(np.array(self.force), (len(mass), 1))))

@@ -36,21 +36,20 @@ class Wind(Model):
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
         """The field as one force; none at all for a strength of zero."""
         weight = self.strength * (np.ones(len(mass)) if self.per == "vertex" else mesh.shares)[:, None]
-        force = _FIELDS[self.field](self, weight, mesh.size or 1.0)
-        return Contribution(forces=(force,) if self.strength else ())
+        return Contribution(forces=_FIELDS[self.field](self, weight, mesh.size or 1.0) if self.strength else ())
 
 
-def _constant(wind: Wind, weight: NDArray[np.float64], diagonal: float) -> Force:
+def _constant(wind: Wind, weight: NDArray[np.float64], diagonal: float) -> tuple[Force, ...]:
     return steady(weight * np.array(wind.force))
 
 
-def _assignment(wind: Wind, weight: NDArray[np.float64], diagonal: float) -> Force:
+def _assignment(wind: Wind, weight: NDArray[np.float64], diagonal: float) -> tuple[Force, ...]:
     def force(p: Positions, v: Positions, t: float) -> Positions:
         phi = p[:, 0] / diagonal + t
         f = np.stack([3.0 + 1.5 * (1.0 + np.cos(5.0 * phi)), 1.0 + np.cos(0.3 + phi), np.sin(phi)], axis=1)
         return weight * f
 
-    return force
+    return (force,)
 
 
 _FIELDS = {"constant": _constant, "assignment": _assignment}
