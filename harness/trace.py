@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import islice
 
-import numpy as np
 from scipy.sparse import csr_array
 
-from solvers.matrices import assemble
+from solvers.matrices import assemble, energy_norm
 from solvers.problem import Positions, Prepared, ProjectiveEnergy, StepProblem, System
 
 
@@ -32,7 +31,7 @@ class EnergyNorm:
         """The norm of a displacement (n, 3) [m]."""
         e = e.copy()
         e[self._pinned] = 0.0
-        return float(np.sqrt(np.einsum("ij,ij->", e, self._Q @ e)))
+        return energy_norm(self._Q, e)
 
 
 def trace(prepared: Prepared, problem: StepProblem, norm: EnergyNorm, iterations: int) -> Convergence:

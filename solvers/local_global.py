@@ -163,7 +163,7 @@ class DenseLocalGlobal:
             project,
             DenseCholesky(Q[np.ix_(free, free)]),
             csr_array(Q[np.ix_(free, exact)]),
-            lambda e: float(np.sqrt(np.einsum("ij,ij->", e, Q @ e))),
+            lambda e: matrices.energy_norm(Q, e),
             float(np.diag(Q)[system.unpinned].sum()),
             {"nnz_system": float(np.count_nonzero(Q)), "nnz_factor": len(free) * (len(free) + 1) / 2},
         )
@@ -238,7 +238,7 @@ def _prepared(
         project,
         factor,
         csr_array(rows[:, exact]),
-        norm or (lambda e: float(np.sqrt(np.einsum("ij,ij->", e, Q @ e)))),
+        norm or (lambda e: matrices.energy_norm(Q, e)),
         float(Q.diagonal()[system.unpinned].sum()),
         facts,
     )

@@ -113,9 +113,15 @@ def require_determined(system: System, Q: csr_array) -> None:
     if len(loose):
         named = ", ".join(map(str, loose[:5])) + (", ..." if len(loose) > 5 else "")
         raise NotPositiveDefinite(
-            f"{len(loose)} vertices ({named}) have no mass, and no spring leads from them to a mass or a pin: "
-            "nothing determines their positions; give them mass, pin them, or take them out of the mesh"
+            f"nothing determines the positions of some vertices, {len(loose)} in all ({named}): they have no mass, and "
+            "no spring leads from them to a mass or a pin; give them mass, pin them, or take them out of the mesh"
         )
+
+
+def energy_norm(Q: Dense | csr_array, e: Dense) -> float:
+    """|e|_Q = sqrt(tr(e'Qe)) [J^(1/2)] of a displacement (n, 3) [m]."""
+    # Where stiffness outweighs inertia by all of float64's digits, round-off can make a sum of zero negative.
+    return float(np.sqrt(np.maximum(0.0, np.einsum("ij,ij->", e, Q @ e))))
 
 
 def diagonal(values: Dense) -> csr_array:

@@ -1,0 +1,108 @@
+"""A fill-reducing order by nested dissection (George 1973) of the graph of a sparse symmetric matrix.
+
+A separator is found from graph distances alone: breadth-first distances from four far-apart vertices a, b, c, d
+(a farthest-point choice, as in Harel and Koren's high-dimensional embedding 2002) stand for coordinates. The fields
+a - b, c - d, (a + c) - (b + d), ... are cut where their vertex boundary is smallest for the balance it gives,
+and the separator is then refined by moves of single vertices (Fiduccia and Mattheyses 1982; for separators: Ashcraft
+and Liu 1996). Small pieces are ordered by minimum degree, the separators around them counted (Pellegrini,
+Roman and Amestoy 2000: halo minimum degree).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from solvers.linear.minimum_degree import minimum_degree
+from solvers.linear.separator import distances, refine, smallest_cut
+
+_LEAF = 96
+"""Pieces up to this size are not cut further: below it a separator saves less than minimum degree does."""
+
+
+def nested_dissection(pointers: NDArray[np.int32], neighbours: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The order of elimination of a graph's vertices, shape (n,): entry i is the vertex that goes i-th.
+
+    pointers (n + 1,), neighbours: the graph in CSR form, symmetric, loops allowed.
+    """
+    n = len(pointers) - 1
+    order = np.arange(n, dtype=np.int32)
+    if n:
+        _dissect(pointers, neighbours, order, _LEAF)
+    return order
+
+
+@njit(cache=True)
+def _dissect(pointers, neighbours, order, leaf):
+    """Sort `order` into the order of elimination: of every piece, its parts first and its separator last."""
+    n = len(order)
+    owner = np.zeros(n, np.int32)  # the piece that a vertex is in; -1 once it is in a separator
+    dist = np.full((4, n), -1, np.int32)
+    local = np.full(n, -1, np.int32)
+    scratch = np.empty(n, np.int32)
+    stack = [(0, n, False)]  # first, end, known to be connected
+    pieces = 0
+    while len(stack) > 0:
+        first, end, connected = stack.pop()
+        piece = order[first:end]
+        pieces += 1
+        owner[piece] = pieces
+        if end - first <= leaf:
+            minimum_degree(pointers, neighbours, piece, local)
+            continue
+        if not connected:
+            _split_components(pointers, neighbours, owner, pieces, order, first, end, leaf, scratch, stack)
+            continue
+        distances(pointers, neighbours, owner, pieces, piece, dist, scratch)
+        side = smallest_cut(pointers, neighbours, owner, pieces, piece, dist, local)
+        if len(side) == 0:  # nearly complete: nothing separates it
+            minimum_degree(pointers, neighbours, piece, local)
+            continue
+        refine(pointers, neighbours, piece, side, local)
+        at = first
+        for part in range(3):
+            for i in range(end - first):
+                if side[i] == part:
+                    scratch[at] = piece[i]
+                    at += 1
+            if part < 2:
+                stack.append((at - np.sum(side == part), at, False))
+        for i in range(first, end):
+            order[i] = scratch[i]
+        for i in range(end - np.sum(side == 2), end):
+            owner[order[i]] = -1
+
+
+@njit(cache=True)
+def _split_components(pointers, neighbours, owner, piece, order, first, end, leaf, queue, stack):
+    """Gather the piece's components and push each; those that are small together, as many as fill a leaf."""
+    at, begun = first, first
+    for i in range(first, end):
+        root = order[i]
+        if owner[root] != piece:
+            continue
+        start = at
+        queue[at] = root
+        owner[root] = 0
+        at += 1
+        head = start
+        while head < at:
+            v = queue[head]
+            head += 1
+            for e in range(pointers[v], pointers[v + 1]):
+                u = neighbours[e]
+                if owner[u] == piece:
+                    owner[u] = 0
+                    queue[at] = u
+                    at += 1
+        if at - begun > leaf and start > begun:
+            stack.append((begun, start, False))
+            begun = start
+        if at - start > leaf:
+            stack.append((begun, at, True))
+            begun = at
+    if at > begun:
+        stack.append((begun, at, False))
+    for i in range(first, end):
+        order[i] = queue[i]

@@ -1,0 +1,233 @@
+"""A small vertex separator of a connected piece of a graph: cut a field of distances, then refine it.
+
+`piece` lists the vertices; `owner[v] == number` tells that v is one of them. A side is 0 or 1, or 2 for the separator.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_FIELDS = np.array(
+    [
+        [1, -1, 0, 0],
+        [0, 0, 1, -1],
+        [1, -1, 1, -1],
+        [1, -1, -1, 1],
+        [1, 0, 0, 0],
+        [0, 0, 1, 0],
+    ],
+    np.int32,
+)
+"""The sums of distances from the four far vertices that are tried as coordinates, one a row."""
+
+_SMALLEST_SIDE = 0.25
+"""The least share of the vertices that a side may have."""
+
+_PASSES = 4
+_PATIENCE = 60
+"""How many moves in a row may leave the separator no better before a pass of refinement ends."""
+
+
+@njit(cache=True)
+def _breadth_first(pointers, neighbours, owner, number, root, dist, queue):
+    """Graph distances from `root` within its piece into `dist`, which is -1 there; returns the count of vertices."""
+    queue[0] = root
+    dist[root] = 0
+    head, tail = 0, 1
+    while head < tail:
+        v = queue[head]
+        head += 1
+        for e in range(pointers[v], pointers[v + 1]):
+            u = neighbours[e]
+            if owner[u] == number and dist[u] < 0:
+                dist[u] = dist[v] + 1
+                queue[tail] = u
+                tail += 1
+    return tail
+
+
+@njit(cache=True)
+def distances(pointers, neighbours, owner, number, piece, dist, queue):
+    """Distances of the piece's vertices from four of them that lie far apart, into `dist` (4, n)."""
+    for v in piece:
+        dist[0, v] = -1
+    tail = _breadth_first(pointers, neighbours, owner, number, piece[0], dist[0], queue)
+    far = queue[tail - 1]
+    for k in range(4):
+        for v in piece:
+            dist[k, v] = -1
+        _breadth_first(pointers, neighbours, owner, number, far, dist[k], queue)
+        farthest = -1
+        for v in piece:
+            nearest = dist[0, v]
+            for i in range(1, k + 1):
+                nearest = min(nearest, dist[i, v])
+            if nearest > farthest:
+                farthest, far = nearest, v
+
+
+@njit(cache=True)
+def smallest_cut(pointers, neighbours, owner, number, piece, dist, field):
+    """The sides (len(piece),) of the best cut of any field, or an empty array where there is none.
+
+    A cut at t parts {field <= t} from the rest; its separator is the boundary of the lower side. `field` is scratch.
+    """
+    size = len(piece)
+    best = np.inf
+    best_row, best_cut = -1, 0
+    for row in range(len(_FIELDS)):
+        low, high = _combine(dist, _FIELDS[row], piece, field)
+        count = np.zeros(high - low + 2, np.int64)  # how many have this value
+        enter = np.zeros(high - low + 2, np.int64)  # differences of the size of the boundary
+        for v in piece:
+            value = field[v] - low
+            top = value
+            for e in range(pointers[v], pointers[v + 1]):
+                u = neighbours[e]
+                if owner[u] == number:
+                    top = max(top, field[u] - low)
+            count[value] += 1
+            enter[value] += 1
+            enter[top] -= 1
+        below, boundary = 0, 0
+        for cut in range(high - low):
+            below += count[cut]
+            boundary += enter[cut]
+            left, right = below - boundary, size - below
+            if min(left, right) >= _SMALLEST_SIDE * (size - boundary):
+                cost = boundary * (1.0 + 2.0 * ((left - right) / size) ** 2)
+                if cost < best:
+                    best, best_row, best_cut = cost, row, cut + low
+    if best_row < 0 or best > 0.4 * size:
+        for v in piece:
+            field[v] = -1
+        return np.empty(0, np.int8)
+    side = np.empty(size, np.int8)
+    _combine(dist, _FIELDS[best_row], piece, field)
+    for i in range(size):
+        v = piece[i]
+        side[i] = 1 if field[v] > best_cut else 0
+        if side[i] == 0:
+            for e in range(pointers[v], pointers[v + 1]):
+                u = neighbours[e]
+                if owner[u] == number and field[u] > best_cut:
+                    side[i] = 2
+    for v in piece:
+        field[v] = -1
+    return side
+
+
+@njit(cache=True)
+def _combine(dist, weights, piece, field):
+    """Write the weighted sum of distances to `field`; returns its least and greatest values."""
+    low, high = np.int32(2**31 - 1), np.int32(-(2**31) + 1)
+    for v in piece:
+        value = np.int32(0)
+        for k in range(4):
+            value += weights[k] * dist[k, v]
+        field[v] = value
+        low, high = min(low, value), max(high, value)
+    return low, high
+
+
+@njit(cache=True)
+def refine(pointers, neighbours, piece, side, local):
+    """Shrink the separator in `side` by moving its vertices to a side, which pulls their neighbours there in.
+
+    A pass moves each vertex once at most, always the one that shrinks the separator most (ties to the smaller side),
+    and then goes back to the best state it saw. `local` (n,) is -1 on entry and on return.
+    """
+    size = len(piece)
+    for i in range(size):
+        local[piece[i]] = i
+    counts = np.zeros(3, np.int64)
+    for i in range(size):
+        counts[side[i]] += 1
+    moved = np.zeros(size, np.bool_)
+    separator = np.empty(size, np.int64)
+    pull = np.zeros((size, 2), np.int64)  # how many neighbours on the other side a move to this side pulls in
+    trail = np.empty((size, 2), np.int64)  # vertex, side it had
+    for _ in range(_PASSES):
+        moved[:] = False
+        listed = 0
+        for i in range(size):
+            if side[i] == 2:
+                separator[listed] = i
+                listed += 1
+                _count_pull(pointers, neighbours, piece, side, local, i, pull)
+        best, best_gap, best_at, at = counts[2], abs(counts[0] - counts[1]), 0, 0
+        since = 0
+        limit = (1.0 - _SMALLEST_SIDE) * size
+        while since < _PATIENCE:
+            choice, choice_key, to = -1, -(1 << 60), 0
+            for k in range(listed):
+                i = separator[k]
+                for s in range(2):
+                    if counts[s] + 1 <= limit:
+                        key = (1 - pull[i, s]) * 2 + (1 if counts[s] < counts[1 - s] else 0)
+                        if key > choice_key:
+                            choice, choice_key, to = k, key, s
+            if choice < 0:
+                break
+            i = separator[choice]
+            listed -= 1
+            separator[choice] = separator[listed]
+            v = piece[i]
+            moved[i] = True
+            trail[at, 0], trail[at, 1] = i, 2
+            at += 1
+            side[i] = to
+            counts[2] -= 1
+            counts[to] += 1
+            for e in range(pointers[v], pointers[v + 1]):
+                j = local[neighbours[e]]
+                if j < 0 or j == i:
+                    continue
+                if side[j] == 2:
+                    pull[j, 1 - to] += 1
+                elif side[j] == 1 - to:
+                    trail[at, 0], trail[at, 1] = j, 1 - to
+                    at += 1
+                    side[j] = 2
+                    counts[2] += 1
+                    counts[1 - to] -= 1
+                    _count_pull(pointers, neighbours, piece, side, local, j, pull)
+                    if not moved[j]:
+                        separator[listed] = j
+                        listed += 1
+                    w = piece[j]
+                    for f in range(pointers[w], pointers[w + 1]):
+                        k = local[neighbours[f]]
+                        if k >= 0 and side[k] == 2 and k != j:
+                            pull[k, to] -= 1
+            gap = abs(counts[0] - counts[1])
+            if counts[2] < best or (counts[2] == best and gap < best_gap):
+                best, best_gap, best_at, since = counts[2], gap, at, 0
+            else:
+                since += 1
+            if at + 64 > size:
+                break
+        improved = best_at > 0
+        while at > best_at:
+            at -= 1
+            i, was = trail[at]
+            counts[side[i]] -= 1
+            counts[was] += 1
+            side[i] = was
+        if not improved:
+            break
+    for i in range(size):
+        local[piece[i]] = -1
+
+
+@njit(cache=True)
+def _count_pull(pointers, neighbours, piece, side, local, i, pull):
+    """Count i's neighbours on either side."""
+    v = piece[i]
+    pull[i, 0] = 0
+    pull[i, 1] = 0
+    for e in range(pointers[v], pointers[v + 1]):
+        j = local[neighbours[e]]
+        if j >= 0 and side[j] < 2:
+            pull[i, 1 - side[j]] += 1
