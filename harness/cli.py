@@ -19,6 +19,8 @@ from typer.core import TyperGroup
 from harness.errors import InputError, SpringbenchError
 
 out, err = Console(), Console(stderr=True)
+if not out.is_terminal:
+    out.width = 240  # a pipe or a file has no width of its own, and no cell should be cut there
 
 
 class _Commands(TyperGroup):
@@ -108,7 +110,7 @@ def list_runs(config: Config, results: Results = Path("results")) -> None:
             p.files.rows.stem[-12:],
             r.scene_name,
             r.size,
-            r.solver,
+            r.solver.name,
             r.iterations,
             r.frames,
             r.threads,
