@@ -5,6 +5,7 @@ The chunks of each recording are copied as they are, under the name of its solve
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ def side_by_side(out: Path, recordings: Mapping[str, Path], title: str) -> None:
     """
     file = PartialFile(out, f"springbench side by side {title}", title, title)
     try:
-        runs = [_copy(file, path, name, COLOURS[k % len(COLOURS)]) for k, (name, path) in enumerate(recordings.items())]
+        runs = [_copy(file, path, name, k) for k, (name, path) in enumerate(recordings.items())]
         document = rr.TextDocument(_table(title, runs), media_type=rr.MediaType.MARKDOWN)
         file.stream.log("/runs", document, static=True)
         file.finish(_layout(runs))
@@ -50,9 +51,10 @@ def side_by_side(out: Path, recordings: Mapping[str, Path], title: str) -> None:
 class _Run:
     """One recording: where it went and what its views need to know."""
 
-    def __init__(self, name: str, source: Source) -> None:
+    def __init__(self, name: str, k: int, source: Source) -> None:
         fixed = network(source)
-        self.name, self.root = name, f"/{rr.escape_entity_path_part(name)}"
+        # Entities take few characters unescaped; the number keeps names apart that differ in others.
+        self.name, self.root = name, f"/{k + 1}-{re.sub(r'[^A-Za-z0-9_.]+', '-', name)}"
         self.strain_range, self.time_step = float(fixed["strain_range"][0]), float(fixed["time_step"][0])
         self.properties: dict[str, Any] = properties(source)[1]
         self.entities: set[str] = set()
@@ -62,13 +64,13 @@ class _Run:
             self.box.add(p)
 
 
-def _copy(file: PartialFile, path: Path, name: str, colour: int) -> _Run:
+def _copy(file: PartialFile, path: Path, name: str, k: int) -> _Run:
     with open_recording(path) as source:
-        run = _Run(name, source)
+        run = _Run(name, k, source)
         for chunk in source.chunks(content="/**"):
             run.entities.add(chunk.entity_path)
             file.stream.send_chunks(chunk.with_entity_path(run.root + chunk.entity_path))
-    style = rr.SeriesLines(names=name, colors=colour, widths=1.5)
+    style = rr.SeriesLines(names=name, colors=COLOURS[k % len(COLOURS)], widths=1.5)
     for entity in run.entities:
         if entity in _QUANTITIES or entity.startswith(_CURVE):
             file.stream.log(run.root + entity, style, static=True)
