@@ -40,8 +40,10 @@ def unique_pairs(pairs: Indices) -> Indices:
     """Each unordered pair once, the lower vertex first, in lexicographic order, (k, 2)."""
     if not len(pairs):
         return NO_PAIRS
+    i, j = pairs.T
     base = int(pairs.max()) + 1
-    return np.stack(np.divmod(np.unique(pairs.min(axis=1) * base + pairs.max(axis=1)), base), axis=1)
+    codes = np.sort(np.minimum(i, j) * base + np.maximum(i, j))  # np.unique hashes them, ten times slower
+    return np.stack(np.divmod(codes[np.diff(codes, prepend=-1) > 0], base), axis=1)
 
 
 def sides(polygons: Indices) -> Indices:
