@@ -27,7 +27,15 @@ from harness.report.page import (
     strain_scale,
     text,
 )
-from harness.report.render import Studio, drawable_frames, frame_all, spring_strain
+from harness.report.render import (
+    Studio,
+    area_vectors,
+    drawable_frames,
+    frame_all,
+    natural_angles,
+    spacing,
+    spring_strain,
+)
 from harness.report.style import HEIGHT, MUTED, RC, RULE, WIDTH, Mark, marks
 
 _LEFT, _TOP, _RIGHT, _BOTTOM = 40, 118, WIDTH - 40, HEIGHT - 28
@@ -48,7 +56,7 @@ class _Grid(NamedTuple):
 def draw_comparison(replays: Mapping[str, Replay], path: Path) -> None:
     """Draw the final frames of several runs to `path`, WIDTH x HEIGHT pixels, PNG.
 
-    replays: by a label that is used where a run names no solver; the first of each scene and size is
+    replays: by a label that is used where the solver's name alone does not tell; the first of each scene and size is
     what the others' distances are taken from. Raises RunFailed where the system cannot draw, and
     ValueError for no replays.
     """
@@ -57,9 +65,8 @@ def draw_comparison(replays: Mapping[str, Replay], path: Path) -> None:
     limit = max(replay.strain_range for replay in replays.values())
     panels: dict[str, list[tuple[str, Replay]]] = {}
     for label, replay in replays.items():
-        solver = str(replay.properties.get("solver", label))
-        panels.setdefault(headline(replay), []).append((solver, replace(replay, strain_range=limit)))
-    looks = marks(solver for panel in panels.values() for solver, _ in panel)
+        panels.setdefault(headline(replay), []).append((label, replace(replay, strain_range=limit)))
+    looks = marks(_solver(label, replay) for label, replay in replays.items())
     grid = _layout(len(panels), max(map(len, panels.values())))
     rows = ceil(len(panels) / grid.panel_columns)
     across = (_RIGHT - _LEFT + 2 * _GAP) / grid.panel_columns
@@ -72,7 +79,7 @@ def draw_comparison(replays: Mapping[str, Replay], path: Path) -> None:
         strain_scale(page, limit, pins=any(len(replay.pinned) for replay in replays.values()))
         for k, (heading, panel) in enumerate(panels.items()):
             row, column = divmod(k, grid.panel_columns)
-            left, top = round(_LEFT + column * across), round(_TOP + row * down + max(slack, 0) / 3)
+            left, top = round(_LEFT + column * across), round(_TOP + row * down + max(slack, 0) / 2)
             if len(panels) > 1:
                 text(page, left + 2, top + 16, shorten(heading, int(across / 9)), size=11.5, weight="bold")
             _panel(page, studio, panel, left, top + _HEADING, grid, looks)
@@ -116,8 +123,13 @@ def _panel(
     """The tiles of one scene and size, row by row; all with one camera."""
     finite = [replay for _, replay in panel if _ends_finite(replay)]
     points = np.concatenate([r.positions[-1] for r in finite] or [np.zeros((1, 3))])
-    view = frame_all(points, aspect=grid.width / grid.height)
-    for k, (solver, replay) in enumerate(panel):
+    areas = np.concatenate([area_vectors(r, -1) for r in finite] or [np.zeros((0, 3))])
+    angles = natural_angles(points, areas)
+    view = frame_all(points, aspect=grid.width / grid.height, angles=angles)
+    solvers = [_solver(*entry) for entry in panel]
+    for k, (label, replay) in enumerate(panel):
+        # Runs of one solver that differ in their settings go by their labels.
+        name = solvers[k] if solvers.count(solvers[k]) == 1 else label
         row, column = divmod(k, grid.tile_columns)
         x, y = left + column * (grid.width + _GAP), top + row * (grid.height + _CAPTION)
         if _ends_finite(replay):
@@ -128,7 +140,7 @@ def _panel(
             box = {"facecolor": "none", "edgecolor": RULE, "boxstyle": "round,pad=1.2"}
             middle = x + grid.width / 2, y + grid.height / 2
             text(page, *middle, words, size=10.5, ha="center", va="center", bbox=box)
-        _caption(page, solver, looks[solver], _facts(replay, panel[0]), x, y + grid.height, grid.width)
+        _caption(page, name, looks[solvers[k]], _facts(replay, panel[0][1]), x, y + grid.height, grid.width)
 
 
 def _caption(page: Figure, solver: str, mark: Mark, facts: Mapping[str, str], x: int, y: int, width: int) -> None:
@@ -144,8 +156,11 @@ def _caption(page: Figure, solver: str, mark: Mark, facts: Mapping[str, str], x:
         text(page, x + value_at, at, value, size=size)
 
 
-def _facts(replay: Replay, first: tuple[str, Replay]) -> dict[str, str]:
-    _, reference = first
+def _solver(label: str, replay: Replay) -> str:
+    return str(replay.properties.get("solver", label))
+
+
+def _facts(replay: Replay, reference: Replay) -> dict[str, str]:
     final = len(replay.frames) - 1
     finite = _ends_finite(replay)
     strain = np.abs(spring_strain(replay, final)).max(initial=0.0) if finite else np.nan
@@ -174,10 +189,12 @@ def _distance(replay: Replay, reference: Replay) -> float:
     if not comparable:
         return np.nan
     away = replay.positions[-1].astype(np.float64) - reference.positions[-1]
-    return float(np.linalg.norm(away, axis=1).max(initial=0.0) / replay.rest_lengths.mean())
+    return float(np.linalg.norm(away, axis=1).max(initial=0.0) / spacing(replay))
 
 
 def _last(replay: Replay, name: str) -> str:
     """The last recorded value of a scalar, in words."""
-    _, values = replay.scalars.get(f"/{name}", replay.scalars.get(name, ((), ())))
+    if f"/{name}" not in replay.scalars:
+        return "–"
+    _, values = replay.scalars[f"/{name}"]
     return f"{values[-1]:.1e}" if len(values) else "–"

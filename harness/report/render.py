@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyvista as pv
@@ -23,7 +23,8 @@ _HALF_ANGLE = np.radians(12.0)  # of the camera's view, vertically: long enough 
 _MARGIN = 0.06  # of the view, left free at each side
 _TUBES = 20_000  # springs; beyond that they are drawn as lines
 _MESH_LINES = 350  # pixels of the view for each vertex; with fewer, lines would hide the colours
-_SUPERSAMPLING = 2  # a pixel is the mean of 2 x 2: half the time of VTK's own anti-aliasing in software
+_SUPERSAMPLING = 3  # a pixel is the mean of 3 x 3: faster than VTK's own anti-aliasing in software
+_JOINT = "#8a8d92"  # vertices of a network without triangles
 _SHADE = "#d3d0ca"  # where the ground is fully in shadow
 _MATERIAL: dict[str, Any] = {"ambient": 0.62, "diffuse": 0.44, "specular": 0.06, "specular_power": 18.0}
 _BLOWN_UP = 1e4  # coordinates this many times larger than the start's are drawn as if not finite
@@ -51,12 +52,17 @@ def vertex_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
     return out
 
 
+def spacing(replay: Replay) -> float:
+    """The mean rest length [m], or 1 where there are no springs."""
+    return float(replay.rest_lengths.mean()) if len(replay.rest_lengths) else 1.0
+
+
 def drawable_frames(replay: Replay) -> NDArray[np.int64]:
     """The recorded frames before the first that is not finite (or has blown up beyond drawing)."""
     start = replay.positions[0]
     limit = _BLOWN_UP * max(float(np.abs(start).max(initial=0.0)), 1.0)
     with np.errstate(invalid="ignore"):
-        good = (np.abs(replay.positions) <= limit).all(axis=(1, 2))
+        good = np.abs(replay.positions).max(axis=(1, 2), initial=0.0) <= limit  # not so for a NaN
     return np.arange(len(good) if good.all() else int(np.argmin(good)))
 
 
@@ -69,22 +75,44 @@ class View:
     ground: float
 
 
-def natural_angles(points: Points) -> tuple[float, float]:
-    """Azimuth and elevation [degrees] of a three-quarter view of points (q, 3): from the front of what is flat."""
+def natural_angles(points: Points, areas: Points) -> tuple[float, float]:
+    """Azimuth and elevation [degrees] of a three-quarter view of points (q, 3), y up.
+
+    areas: area vectors (f, 3) of the triangles; of the four corners, the view is from where most area shows.
+    """
     x, y, z = np.ptp(points, axis=0)
-    azimuth = 32.0 if x >= z else 58.0
-    depth = min(x, z) / max(x, y, z, 1e-30)
-    return azimuth, 8.0 + 12.0 * min(2.0 * depth, 1.0)
+    corner = 32.0 if x >= z else 58.0
+    elevation = 8.0 + 12.0 * min(2.0 * min(x, z) / max(x, y, z, 1e-30), 1.0)
+
+    def shown(azimuth: float) -> float:
+        # The front has a head start: between like views the choice must not hang on round-off.
+        return float(np.abs(areas @ _towards(azimuth, elevation)).sum()) * (1.05 if azimuth == corner else 1.0)
+
+    return max((corner, -corner, 180.0 - corner, corner - 180.0), key=shown), elevation
 
 
-def frame_all(points: Points, *, aspect: float, angles: tuple[float, float] | None = None) -> View:
-    """The nearest camera that sees all points (q, 3) [m] from `angles`, in a view of width / height `aspect`.
+def area_vectors(replay: Replay, frame: int) -> Points:
+    """Half the cross product of two sides of each triangle [m^2], shape (f, 3)."""
+    a, b, c = (replay.positions[frame][corner] for corner in replay.triangles.T)
+    return np.cross(b - a, c - a) / 2.0
+
+
+def _towards(azimuth: float, elevation: float) -> Points:
+    """The unit vector from the scene to the viewer at these angles [degrees]."""
+    azimuth, elevation = np.radians(azimuth), np.radians(elevation)
+    level = np.cos(elevation)
+    return np.array([np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level])
+
+
+def frame_all(points: Points, *, aspect: float, angles: tuple[float, float]) -> View:
+    """The nearest camera that sees all points (q, 3) [m] in a view of width / height `aspect`.
+
+    angles: azimuth and elevation [degrees] of the viewer.
 
     A point with camera coordinates (a, b, c), c towards the viewer, is seen from (ea, eb, ec) where
     |a - ea| <= tan (ec - c), and alike for b. Each pair of bounds is tight at one ec; the further one sees all.
     """
-    azimuth, elevation = np.radians(natural_angles(points) if angles is None else angles)
-    towards = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
+    towards = _towards(*angles)
     right = np.cross([0.0, 1.0, 0.0], towards)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(towards, right), towards])
@@ -119,8 +147,10 @@ def _is_closed(triangles: NDArray[np.int64]) -> bool:
     return bool((np.unique(edges @ [triangles.max() + 1, 1], return_counts=True)[1] == 2).all())
 
 
-def _ball(radius: float) -> pv.PolyData:
-    return pv.Sphere(radius=radius, theta_resolution=16, phi_resolution=12)
+def _balls(at: Points, radius: float) -> pv.PolyData:
+    """A sphere at each point (q, 3)."""
+    ball = pv.Sphere(radius=radius, theta_resolution=16, phi_resolution=12)
+    return cast(pv.PolyData, pv.PolyData(at).glyph(geom=ball, orient=False, scale=False))
 
 
 class Studio:
@@ -134,7 +164,7 @@ class Studio:
         self._pixels, self._height = width * height, height
         size = [_SUPERSAMPLING * width, _SUPERSAMPLING * height]
         self._plotter = pv.Plotter(off_screen=True, window_size=size, lighting="none")
-        self._plotter.set_background(PAGE)
+        self._plotter.background_color = pv.Color(PAGE)
         self._plotter.disable_anti_aliasing()
         # From the camera's upper left, so that every view is lit alike; the fill keeps the scale's colours true.
         for place, strength in (((-1.2, 1.5, 1.6), 0.7), ((0.6, -0.5, 2.0), 0.55)):
@@ -184,7 +214,7 @@ class Studio:
             **_MATERIAL,
             show_edges=len(p) * _MESH_LINES <= self._pixels,
             edge_color=INK,
-            edge_opacity=0.2,
+            edge_opacity=0.14,
             line_width=1.5,
             show_scalar_bar=False,
         )
@@ -204,20 +234,20 @@ class Studio:
             self._plotter.add_mesh(lines, line_width=1.5, **look)
             return
         radius = self._tube(replay, p)
-        self._plotter.add_mesh(lines.tube(radius=radius, n_sides=12), smooth_shading=True, **look)
-        joints = pv.PolyData(p).glyph(geom=_ball(1.5 * radius), orient=False, scale=False)
-        self._plotter.add_mesh(joints, color="#8a8d92", smooth_shading=True, **_MATERIAL)
+        tubes = cast(pv.PolyData, lines.tube(radius=radius, n_sides=12))
+        self._plotter.add_mesh(tubes, smooth_shading=True, **look)
+        self._plotter.add_mesh(_balls(p, 1.5 * radius), color=_JOINT, smooth_shading=True, **_MATERIAL)
 
     def _tube(self, replay: Replay, p: NDArray[np.float32]) -> float:
         """The radius of a spring [m]: thin against its length and the scene, but no less than about a pixel."""
-        thin = min(0.07 * float(replay.rest_lengths.mean()), 0.007 * _extent(p))
+        thin = min(0.07 * spacing(replay), 0.007 * _extent(p))
         return max(thin, 1.1 * _extent(p) / self._height)
 
     def _pins(self, replay: Replay, p: NDArray[np.float32]) -> None:
         if len(replay.pinned):
-            spaced = min(0.3 * float(replay.rest_lengths.mean()), 0.009 * _extent(p))
+            spaced = min(0.3 * spacing(replay), 0.009 * _extent(p))
             radius = max(spaced, 0.004 * _extent(p), 0.0 if len(replay.triangles) else 2.2 * self._tube(replay, p))
-            pins = pv.PolyData(p[replay.pinned]).glyph(geom=_ball(radius), orient=False, scale=False)
+            pins = _balls(p[replay.pinned], radius)
             self._plotter.add_mesh(pins, color=INK, smooth_shading=True, **_MATERIAL)
 
     def _shadow(self, replay: Replay, p: NDArray[np.float32], ground: float) -> None:

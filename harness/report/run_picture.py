@@ -24,7 +24,7 @@ from harness.report.page import (
     strain_scale,
     text,
 )
-from harness.report.render import Studio, drawable_frames, frame_all
+from harness.report.render import Studio, area_vectors, drawable_frames, frame_all, natural_angles
 from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, RULE, WIDTH
 
 _MAIN = (36, 114, 1244, 750)  # left, top, width, height of the final frame [pixels from the top left]
@@ -65,16 +65,17 @@ def _facts(replay: Replay) -> list[str]:
 def _frames(page: Figure, replay: Replay, shown: NDArray[np.int64], camera: tuple[float, float] | None) -> None:
     left, top, width, height = _MAIN
     points = replay.positions[shown].reshape(-1, 3)
-    view = frame_all(points, aspect=width / height, angles=camera)
     *earlier, final = (int(k) for k in shown)
+    angles = natural_angles(points, area_vectors(replay, final)) if camera is None else camera
+    view = frame_all(points, aspect=width / height, angles=angles)
     with Studio(width, height) as studio:
         paste(page, studio.draw(replay, final, view), left, top)
     text(page, left + 4, top + height - 4, clock(replay, final), size=11.5)
     if not earlier:
         return
     tile = (height - (_EARLIER - 1) * _GAP) // _EARLIER
-    rule = page.add_artist(Line2D([0, 0], [0, 0], color=RULE, linewidth=0.8))
-    rule.set_data([(_STRIP_LEFT - 20) / WIDTH] * 2, [1 - (top + 4) / HEIGHT, 1 - (top + height - 4) / HEIGHT])
+    x, ends = (_STRIP_LEFT - 20) / WIDTH, (top + 4, top + height - 4)
+    page.add_artist(Line2D([x, x], [1 - y / HEIGHT for y in ends], color=RULE, linewidth=0.8))
     with Studio(_STRIP_WIDTH, tile) as studio:
         for row, frame in enumerate(earlier):
             at = top + row * (tile + _GAP)

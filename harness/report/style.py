@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from matplotlib.colors import LinearSegmentedColormap
 
+from harness.record.shading import STRAIN_COLOURS
 from solvers.registry import SOLVERS
 
 WIDTH, HEIGHT, DPI = 1600, 900, 100
@@ -15,13 +16,10 @@ WIDTH, HEIGHT, DPI = 1600, 900, 100
 PAGE, INK, MUTED, RULE = "#fcfbf9", "#23262b", "#6c7078", "#dcdad5"
 """Background, text, secondary text, hairlines."""
 
-STRAIN_COLORS = ("#0b4a86", "#5b9bd0", "#d9d7d2", "#ee8f45", "#a33b05")
-"""Strain at -range, -range/2, 0, range/2, range: blue to orange, so that colour-blind readers see the sign,
-with the same lightness at equal distances from rest."""
+STRAIN_MAP = LinearSegmentedColormap.from_list("strain", STRAIN_COLOURS, N=512)
+"""The scale of the recordings, from -strain_range to strain_range."""
 
-STRAIN_MAP = LinearSegmentedColormap.from_list("strain", STRAIN_COLORS, N=512)
-
-RC = {
+RC: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 10,
     "text.color": INK,

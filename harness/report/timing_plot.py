@@ -190,7 +190,7 @@ def _direct_labels(ax: Axes, ends: list) -> None:
     for column in sorted({x for x, *_ in ends}):
         here = sorted((end for end in ends if end[0] == column), key=lambda end: end[1])
         wanted = ax.transData.transform([(x, y) for x, y, *_ in here])
-        at = _spread(wanted[:, 1], ax.bbox.y0 + 6, ax.bbox.y1 - 6)
+        at = _spread(wanted[:, 1].tolist(), ax.bbox.y0 + 6, ax.bbox.y1 - 6)
         for (x, y, words, color), height in zip(here, at, strict=True):
             line = {"arrowstyle": "-", "color": color, "alpha": 0.45, "linewidth": 0.8, "shrinkA": 1, "shrinkB": 5}
             ax.annotate(

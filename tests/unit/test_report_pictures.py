@@ -1,0 +1,248 @@
+"""Pictures of runs and comparisons: their size, what is in them, and what happens where nothing can be drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from harness.errors import RunFailed
+from harness.record.base import Replay
+from harness.record.shading import STRAIN_COLOURS
+from harness.report import comparison, opengl, page, run_picture
+from harness.report.comparison import draw_comparison
+from harness.report.render import (
+    Studio,
+    area_vectors,
+    drawable_frames,
+    frame_all,
+    natural_angles,
+    spring_strain,
+    vertex_strain,
+)
+from harness.report.run_picture import draw_run
+from harness.report.style import HEIGHT, PAGE, WIDTH
+
+needs_opengl = pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
+
+STRETCHED = 0.1  # strain at the ends of the scale in these tests
+
+
+def cloth(n: int = 6, frames: int = 8, *, stretch: float = 1.05, triangles: bool = True) -> Replay:
+    """A square cloth in the plane z = 0 that sinks, all its springs at the strain `stretch` - 1."""
+    u, v = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
+    rest = np.stack([u, -v, 0 * u], axis=-1).reshape(-1, 3)
+    k = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (x.ravel() for x in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    springs = np.concatenate(
+        [np.stack([k[:-1].ravel(), k[1:].ravel()], 1), np.stack([k[:, :-1].ravel(), k[:, 1:].ravel()], 1)]
+    )
+    sinking = np.linspace(0, 0.3, frames)[:, None] * np.array([0.0, -1.0, 0.0])
+    return Replay(
+        title="cloth 6 - sparse",
+        run_id="0123",
+        frames=2 * np.arange(frames),
+        times=np.linspace(0.0, 0.28, frames),
+        positions=(stretch * rest + sinking[:, None]).astype(np.float32),
+        triangles=faces if triangles else np.empty((0, 3), np.int64),
+        springs=springs,
+        rest_lengths=np.full(len(springs), 1 / (n - 1)),
+        pinned=k[[0, -1], 0],
+        strain_range=STRETCHED,
+        scalars={"/residual": (2 * np.arange(1, frames), np.geomspace(1e-2, 1e-6, frames - 1))},
+        properties={"scene": "cloth", "size": n, "solver": "sparse", "milliseconds_per_step": 1.25},
+    )
+
+
+def chain(n: int = 10) -> Replay:
+    whole = cloth(n, triangles=False)
+    links = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)
+    lengths = np.full(n - 1, 1 / (n - 1))
+    return replace(whole, positions=whole.positions[:, :n], springs=links, rest_lengths=lengths, pinned=np.array([0]))
+
+
+def broken(replay: Replay, frame: int, value: float = np.nan) -> Replay:
+    positions = replay.positions.copy()
+    positions[frame:, 3] = value
+    return replace(replay, positions=positions)
+
+
+def pixels(path: Path) -> NDArray[np.float64]:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB")).astype(float)
+
+
+def drawn(image: NDArray[np.float64], left: int, top: int, width: int, height: int) -> float:
+    """The share of pixels in a region that are far from the colour of the page."""
+    region = image[top : top + height, left : left + width]
+    return float((np.abs(region - 255 * np.array(to_rgb(PAGE))).max(axis=-1) > 60).mean())
+
+
+@pytest.fixture
+def words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """All that is written on the pages that a test draws."""
+    written: list[str] = []
+
+    def save(sheet: Figure, path: Path) -> None:
+        written.extend(text.get_text() for text in sheet.texts)
+        page.save(sheet, path)
+
+    for module in (run_picture, comparison):
+        monkeypatch.setattr(module, "save", save)
+    return written
+
+
+@needs_opengl
+@pytest.mark.parametrize("make", [cloth, lambda: cloth(triangles=False), chain], ids=["cloth", "net", "chain"])
+def test_a_run_is_drawn_large_and_in_a_strip_of_five(make: Callable[[], Replay], tmp_path: Path) -> None:
+    draw_run(make(), tmp_path / "run.png")
+    image = pixels(tmp_path / "run.png")
+    assert image.shape == (HEIGHT, WIDTH, 3)
+    # A chain covers the fewest pixels: a rod of about 10 x 400 of 1244 x 750.
+    assert drawn(image, *run_picture._MAIN) > 0.002
+    tile = run_picture._MAIN[3] // 5
+    for row in range(5):
+        assert drawn(image, run_picture._STRIP_LEFT, run_picture._MAIN[1] + row * tile, 244, tile - 30) > 0.0005
+    assert [file.name for file in tmp_path.iterdir()] == ["run.png"], "no partial file is left"
+
+
+@needs_opengl
+def test_the_title_names_scene_size_solver_counts_and_cost(words: list[str], tmp_path: Path) -> None:
+    draw_run(cloth(), tmp_path / "run.png")
+    text = "\n".join(words)
+    for said in ("cloth, size 6", "sparse", "36 vertices, 60 springs", "1.25 ms a step", "+10 %", "−10 %", "pinned"):
+        assert said in text
+
+
+@needs_opengl
+@pytest.mark.parametrize(("strain", "colour"), list(zip((-0.1, -0.05, 0.0, 0.05, 0.1), STRAIN_COLOURS, strict=True)))
+def test_a_uniform_strain_has_the_documented_colour(strain: float, colour: str) -> None:
+    replay = cloth(stretch=1 + strain)
+    view = frame_all(replay.positions[0], aspect=1.0, angles=(0.0, 0.0))
+    with Studio(160, 160) as studio:
+        image = studio.draw(replay, 0, view)
+    seen = np.median(image[60:100, 60:100].reshape(-1, 3), axis=0) / 255
+    # Light and mesh lines change a facing surface's brightness by up to a tenth; the colours differ by more.
+    assert np.abs(seen - to_rgb(colour)).max() < 0.1
+
+
+def test_a_vertex_shows_its_most_strained_spring_with_its_sign() -> None:
+    replay = chain(4)
+    positions = np.array([[[0, 0, 0], [0, -0.3, 0], [0, -0.7, 0], [0, -1.0, 0]]], np.float32)
+    replay = replace(replay, positions=positions, rest_lengths=np.array([1, 1, 0]) / 3)
+    expected = np.array([-0.1, 0.2, 0.0])
+    # Positions are recorded in float32.
+    assert spring_strain(replay, 0) == pytest.approx(expected, abs=1e-6)
+    assert vertex_strain(replay, 0) == pytest.approx([-0.1, 0.2, 0.2, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.0, 1.7])
+@pytest.mark.parametrize("angles", [(0.0, 0.0), (32.0, 20.0), (-148.0, 15.0)])
+def test_the_camera_sees_every_point_from_near_by(aspect: float, angles: tuple[float, float]) -> None:
+    points = np.random.default_rng(7).normal(size=(50, 3)) * [3.0, 1.0, 2.0]
+    view = frame_all(points, aspect=aspect, angles=angles)
+    forward = view.target - view.position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    offset = points - view.position
+    depth = offset @ forward
+    edge = np.tan(np.radians(12.0))
+    across, up = offset @ right / depth / (aspect * edge), offset @ np.cross(right, forward) / depth / edge
+    assert (depth > 0).all()
+    # The edge is at 1; the shadow, which must be seen too, takes up some of the view.
+    assert 0.5 < max(np.abs(across).max(), np.abs(up).max()) < 1.0
+
+
+def test_the_view_is_from_the_side_where_most_surface_shows() -> None:
+    tilt = np.array([[1.0, 0.0, 0.0], [0.0, 0.7, 0.7], [0.0, -0.7, 0.7]], np.float32)
+    chosen = []
+    for side in (1, -1):
+        replay = cloth()
+        replay = replace(replay, positions=replay.positions @ tilt * np.array([1, 1, side], np.float32))
+        areas = area_vectors(replay, -1)
+        azimuth, elevation = natural_angles(replay.positions[-1], areas)
+        shown = {}
+        for corner in (32.0, -32.0, 148.0, -148.0):
+            a, e = np.radians([corner, elevation])
+            towards = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
+            shown[corner] = np.abs(areas @ towards).sum()
+        # The usual corner is kept unless another shows more than a twentieth more.
+        assert shown[azimuth] >= max(shown.values()) / 1.05
+        chosen.append(abs(azimuth) < 90)
+    assert sorted(chosen) == [False, True], "mirrored scenes are seen from opposite sides"
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
+def test_frames_are_drawn_up_to_the_first_that_is_not_finite(value: float) -> None:
+    assert drawable_frames(cloth()).tolist() == list(range(8))
+    assert drawable_frames(broken(cloth(), 5, value)).tolist() == [0, 1, 2, 3, 4]
+
+
+@needs_opengl
+def test_positions_that_are_not_finite_are_told_in_words(words: list[str], tmp_path: Path) -> None:
+    draw_run(broken(cloth(), 5), tmp_path / "run.png")
+    assert "not finite from frame 10 on" in "\n".join(words)
+    assert drawn(pixels(tmp_path / "run.png"), *run_picture._MAIN) > 0.01, "the last finite frame is drawn"
+
+
+@needs_opengl
+def test_a_run_without_a_finite_frame_is_a_picture_that_says_so(words: list[str], tmp_path: Path) -> None:
+    draw_run(broken(cloth(), 0), tmp_path / "run.png")
+    assert "not finite from frame 0 on" in "\n".join(words)
+    assert pixels(tmp_path / "run.png").shape == (HEIGHT, WIDTH, 3)
+
+
+@needs_opengl
+def test_a_comparison_shows_solvers_side_by_side_with_their_distance(words: list[str], tmp_path: Path) -> None:
+    first = cloth()
+    moved = first.positions + np.array([0.0, 0.0, 0.1], np.float32)
+    second = replace(first, positions=moved, properties={**first.properties, "solver": "dense"})
+    third = replace(broken(first, 4), properties={**first.properties, "solver": "xpbd"})
+    draw_comparison({"a": first, "b": second, "c": third}, tmp_path / "side.png")
+    for said in ("cloth, size 6", "sparse", "dense", "xpbd", "first", "1.0e-06", "not finite\nfrom frame 8 on"):
+        assert said in words
+    assert "0.5" in words, "0.1 m are half a rest length of 0.2 m"
+    image = pixels(tmp_path / "side.png")
+    assert image.shape == (HEIGHT, WIDTH, 3)
+    assert drawn(image, 40, 118, 480, 600) > 0.01
+    assert drawn(image, 540, 118, 480, 600) > 0.01
+
+
+@needs_opengl
+def test_a_comparison_has_a_panel_for_each_scene_and_size(words: list[str], tmp_path: Path) -> None:
+    runs = {}
+    for scene in ("cloth", "net"):
+        for size in (5, 6):
+            for label, threads in (("1 thread", 1), ("2 threads", 2)):
+                replay = cloth(size, triangles=scene == "cloth")
+                known = {"scene": scene, "size": size, "solver": "sparse", "threads": threads}
+                runs[f"{label}, {scene} {size}"] = replace(replay, properties=known)
+    draw_comparison(runs, tmp_path / "side.png")
+    assert [word for word in words if "size" in word] == [
+        "cloth, size 5",
+        "cloth, size 6",
+        "net, size 5",
+        "net, size 6",
+    ]
+    assert "1 thread, net 6" in words, "runs of one solver go by their labels"
+
+
+def test_without_opengl_the_message_names_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(opengl, "_TRY", "import os; os.kill(os.getpid(), 11)")  # as VTK ends without the libraries
+    opengl.problem.cache_clear()
+    try:
+        for draw in (lambda at: draw_run(cloth(), at), lambda at: draw_comparison({"a": cloth()}, at)):
+            with pytest.raises(RunFailed, match="apt-get install libegl1 libgl1-mesa-dri"):
+                draw(tmp_path / "run.png")
+    finally:
+        opengl.problem.cache_clear()
+    assert not list(tmp_path.iterdir())
