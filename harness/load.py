@@ -59,14 +59,14 @@ def load_any(path: Path, *, solvers: Sequence[str] = (), sizes: Sequence[int] = 
     what to run; a sweep says so itself. Raises InputError.
     """
     given = {key: value for key, value in options.items() if value is not None}
-    document = Document(path, {}) if path.suffix == ".json" else read_yaml(path)
+    document = Document(path, {}) if _is_assignment(path) else read_yaml(path)
     if "scenes" in document.data:
         if solvers or sizes or given:
             raise InputError(Mistake("is a sweep, which says itself what to run; change the file instead", path))
         return _sweep(document)
-    if path.suffix != ".json" and "mesh" not in document.data:
+    if not _is_assignment(path) and "mesh" not in document.data:
         raise InputError(Mistake("is neither a scene (it has no `mesh`) nor a sweep (it has no `scenes`)", path))
-    scene = scene_from_assignment(path) if path.suffix == ".json" else _scene(document)
+    scene = scene_from_assignment(path) if _is_assignment(path) else _scene(document)
     keys = {"scenes": [path.name], "sizes": list(sizes), "solvers": list(solvers) or [DEFAULT_SOLVER]}
     asked = Document(path, {**keys, "options": given})
     return _expanded(asked, {path.stem: scene})
@@ -79,7 +79,7 @@ def load_sweep(path: Path) -> Sweep:
 
 def load_scene(path: Path) -> SceneSpec:
     """The scene in a YAML file, or in an assignment's JSON file. Raises InputError."""
-    return scene_from_assignment(path) if path.suffix == ".json" else _scene(read_yaml(path))
+    return scene_from_assignment(path) if _is_assignment(path) else _scene(read_yaml(path))
 
 
 def scene_from_assignment(path: Path) -> SceneSpec:
@@ -233,6 +233,10 @@ def parameters_model(name: str, solver: type) -> type[Model]:
         f.name: (hints[f.name], ... if f.default is MISSING else f.default) for f in fields(solver)
     }
     return create_model(name, __base__=Model, __doc__=solver.__doc__, **given)
+
+
+def _is_assignment(path: Path) -> bool:
+    return path.suffix.lower() == ".json"
 
 
 def _check_name(document: Document) -> None:

@@ -1,0 +1,197 @@
+"""Hostile configs: what each file holds, what the answer must name, and the line where there is one."""
+
+from __future__ import annotations
+
+SCENE = {
+    "mesh": "{kind: grid}",
+    "default_size": "4",
+    "mass": "1",
+    "time_step": "1/30",
+    "frames": "2",
+    "effects": "[{kind: springs, stretch: 100}, {kind: pins, at: [corners]}]",
+}
+SWEEP = {"scenes": "[good.yaml]", "sizes": "[4, 6]", "solvers": "[numba]"}
+
+
+def text(base: dict[str, str], **changes: str | None) -> str:
+    """A config whose lines are the keys of `base`, some of them changed, added or (None) left out."""
+    return "".join(f"{key}: {value}\n" for key, value in {**base, **changes}.items() if value is not None)
+
+
+def scene(**changes: str | None) -> str:
+    return text(SCENE, **changes)
+
+
+def sweep(**changes: str | None) -> str:
+    return text(SWEEP, **changes)
+
+
+BOMB = "a: &a [0,0,0,0,0,0,0,0,0,0]\n" + "".join(
+    f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n" for a, b in zip("abcdef", "bcdefg", strict=True)
+)
+NESTED_SCENE = "{kind: springs, stretch: " + "[" * 40 + "]" * 40 + "}"
+LONG_LIST = "[" + ", ".join(map(str, range(2, 60))) + "]"
+
+SCENES: dict[str, tuple[str | bytes, str, int | None]] = {
+    "empty file": ("", "is empty", None),
+    "comments alone": ("# nothing\n", "is empty", None),
+    "a list": ("- mesh\n- mass\n", "should hold a mapping", 1),
+    "a word": ("mesh\n", "should hold a mapping", 1),
+    "no keys of ours": ("colour: red\n", "neither a scene", None),
+    "unfinished list": ("mesh: {kind: grid}\nframes: [1,\n", "is not YAML", 3),
+    "tab as indent": ("mesh:\n\tkind: grid\n", "is not YAML", 2),
+    "binary junk": (bytes(range(128, 256)), "UTF-8", 1),
+    "latin-1": (b"mesh: {kind: grid}\ndescription: caf\xe9\n", "UTF-8", 2),
+    "UTF-16": ("mesh: {kind: grid}\n".encode("utf-16"), "UTF-8", 1),
+    "NUL": (b"mesh: {kind: grid}\nframes: \x00\n", "not allowed", 2),
+    "escaped NUL in a file name": (scene(mesh=r'{kind: file, path: "a\0b.obj"}'), "mesh.path", 1),
+    "lone surrogate": (scene(description=r'"\ud800"'), "description", 7),
+    "two documents": (scene() + "---\n" + scene(), "single document", 7),
+    "YAML 1.1 directive": ("%YAML 1.1\n---\n" + scene(), "directives", 1),
+    "Python tag": (scene(mass="!!python/object/apply:os.system [touch pwned]"), "mass", 3),
+    "own tag": (scene(mass="!mass 1"), "!mass", 3),
+    "tag that does not fit": (scene(mass="!!int heavy"), "heavy", 3),
+    "binary tag": (scene(mass="!!binary aGk="), "binary", 3),
+    "alias bomb": (BOMB + scene(), "too large", None),
+    "alias of itself": ("mesh: &m {kind: grid, inner: *m}\n", "too large", 1),
+    "undefined alias": (scene(mass="*total"), "undefined alias", 3),
+    "merge key": (scene(extra="{<<: {kind: grid}}"), "extra", 7),
+    "deep nesting": ("mesh: " + "[" * 5000, "depth", 1),
+    "nesting within the parser's reach": (scene(effects="[" * 31 + "]" * 31), "effects[0]", 6),
+    "nested parameter": (scene(effects=f"[{NESTED_SCENE}]"), "depth", 6),
+    "large file": ("# " + "x" * 2**18 + "\n" + scene(), "larger than", None),
+    "duplicate key": (scene() + "mass: 2\n", "mass: duplicate key", 7),
+    "duplicate key in a mesh": (scene(mesh="{kind: grid, width: 1, width: 2}"), "mesh.width: duplicate", 1),
+    "list as key": (scene() + "? [a, b]\n: 1\n", "plain words", None),
+    "unknown key": (scene(masss="1"), "did you mean 'mass'", 7),
+    "unknown key in an effect": (scene(effects="[{kind: springs, stretch: 1, bnd: 1}]"), "'bend'", 6),
+    "unknown key in the camera": (scene(camera="{azimut: 3}"), "camera.azimut", 7),
+    "unknown mesh": (scene(mesh="{kind: gird}"), "did you mean 'grid'", 1),
+    "unknown effect": (scene(effects="[{kind: springs, stretch: 1}, {kind: pin}]"), "effects[1].kind", 6),
+    "mesh of no kind": (scene(mesh="{width: 1}"), "mesh", 1),
+    "mesh as a word": (scene(mesh="grid"), "mesh", 1),
+    "mesh of null": (scene(mesh="null"), "mesh", 1),
+    "kind of a number": (scene(mesh="{kind: 3}"), "mesh.kind", 1),
+    "effects as a mapping": (scene(effects="{kind: springs, stretch: 1}"), "effects", 6),
+    "effect of null": (scene(effects="[null]"), "effects[0]", 6),
+    "no frames": (scene(frames=None), "frames: is missing", None),
+    "no time step": (scene(time_step=None), "time_step: is missing", None),
+    "no mass": (scene(mass=None), "mass: is missing", None),
+    "no size": (scene(default_size=None), "sizes: is missing", None),
+    "mass of zero": (scene(mass="0"), "mass", 3),
+    "negative mass": (scene(mass="-1"), "mass", 3),
+    "mass of NaN": (scene(mass=".nan"), "mass", 3),
+    "infinite mass": (scene(mass="-.inf"), "mass", 3),
+    "overflowing mass": (scene(mass="1e999"), "mass", 3),
+    "mass as a boolean": (scene(mass="true"), "mass", 3),
+    "mass as text": (scene(mass="'1'"), "mass", 3),
+    "mass with a unit": (scene(mass="1 kg"), "mass", 3),
+    "mass as a list": (scene(mass="[1]"), "mass", 3),
+    "time step of zero": (scene(time_step="0"), "time_step", 4),
+    "time step by zero": (scene(time_step="1/0"), "time_step", 4),
+    "time step of code": (scene(time_step="__import__('os').getcwd()"), "time_step", 4),
+    "time step of a vast power": (scene(time_step="1e9999999999"), "time_step", 4),
+    "time step that underflows": (scene(time_step="1e-300"), "time_step", 4),
+    "frames of zero": (scene(frames="0"), "frames", 5),
+    "frames of a fraction": (scene(frames="1.5"), "frames", 5),
+    "frames as a boolean": (scene(frames="true"), "frames", 5),
+    "frames beyond 64 bits": (scene(frames="9" * 30), "frames", 5),
+    "frames of 5000 digits": (scene(frames="9" * 5000), "frames", 5),
+    "frames of 5000 hexadecimal digits": (scene(frames="0x" + "f" * 5000), "frames", 5),
+    "too many frames": (scene(frames="1e7"), "frames", 5),
+    "velocity of two numbers": (scene(velocity="[0, 1]"), "velocity", 7),
+    "velocity of four numbers": (scene(velocity="[0, 0, 0, 0]"), "velocity", 7),
+    "velocity as a number": (scene(velocity="1"), "velocity", 7),
+    "velocity of NaN": (scene(velocity="[0, .nan, 0]"), "velocity[1]", 7),
+    "size of zero": (scene(default_size="0"), "default_size", 2),
+    "size of 1e9": (scene(default_size="1e9"), "default_size", 2),
+    "more vertices than memory": (scene(mesh="{kind: block}", default_size="5000"), "vertices", None),
+    "negative stiffness": (scene(effects="[{kind: springs, stretch: -1}]"), "effects[0].stretch", 6),
+    "stiffness as a boolean": (scene(effects="[{kind: springs, stretch: yes}]"), "effects[0].stretch", 6),
+    "unknown rule": (scene(effects="[{kind: springs, stretch: 1, rule: magic}]"), "effects[0].rule", 6),
+    "pins at no part": (scene(effects="[{kind: pins, at: [cornrs]}]"), "effects[0]", 6),
+    "pins that pin nothing": (scene(effects="[{kind: pins}]"), "effects[0]", 6),
+    "pins beyond the mesh": (scene(effects="[{kind: pins, indices: [16]}]"), "effects[0]", 6),
+    "negative pin": (scene(effects="[{kind: pins, indices: [-1]}]"), "effects[0].indices[0]", 6),
+    "pin weight of a word": (scene(effects="[{kind: pins, at: [top], weight: hard}]"), "'exact'", 6),
+    "missing mesh file": (scene(mesh="{kind: file, path: none.obj}"), "mesh.path", 1),
+    "folder as mesh file": (scene(mesh="{kind: file, path: folder}"), "mesh.path", 1),
+    "mesh file beyond names": (scene(mesh="{kind: file, path: " + "x" * 5000 + "}"), "mesh.path", 1),
+    "OBJ with a face beyond its vertices": (scene(mesh="{kind: file, path: beyond.obj}"), "beyond.obj", 4),
+    "OBJ with a face of words": (scene(mesh="{kind: file, path: words.obj}"), "words.obj", 4),
+    "OBJ with NaN": (scene(mesh="{kind: file, path: nan.obj}"), "nan.obj", 1),
+    "empty OBJ": (scene(mesh="{kind: file, path: empty.obj}"), "empty.obj", None),
+    "binary OBJ": (scene(mesh="{kind: file, path: junk.obj}"), "junk.obj", None),
+}
+SWEEPS: dict[str, tuple[str, str, int | None]] = {
+    "no scenes": (sweep(scenes="[]"), "scenes", 1),
+    "scenes as a word": (sweep(scenes="good.yaml"), "scenes", 1),
+    "scene of null": (sweep(scenes="[null]"), "scenes[0]", 1),
+    "scene inline": (sweep(scenes="[{mesh: {kind: grid}}]"), "scenes[0]", 1),
+    "missing scene": (sweep(scenes="[none.yaml]"), "scenes[0]", 1),
+    "sweep as scene": (sweep(scenes="[sweep.yaml]"), "is a sweep", None),
+    "folder as scene": (sweep(scenes="[folder]"), "scenes[0]", 1),
+    "loop of links as scene": (sweep(scenes="[loop.yaml]"), "scenes[0]", 1),
+    "scene of an odd name": (sweep(scenes="['-rf .yaml']"), "-rf .yaml", None),
+    "scene of dots": (sweep(scenes="['..']"), "scenes[0]", 1),
+    "two scenes of one name": (sweep(scenes="[good.yaml, folder/good.yaml]"), "scenes[1]", 1),
+    "size of 1": (sweep(sizes="[4, 1]"), "sizes[1]", 2),
+    "negative size": (sweep(sizes="[-4]"), "sizes[0]", 2),
+    "size of 1e9 in a sweep": (sweep(sizes="[4, 1e9]"), "sizes[1]", 2),
+    "size as a boolean": (sweep(sizes="[true]"), "sizes[0]", 2),
+    "sizes as a number": (sweep(sizes="8"), "sizes", 2),
+    "no solvers": (sweep(solvers=None), "solvers: is missing", None),
+    "empty solvers": (sweep(solvers="[]"), "solvers", 3),
+    "unknown solver": (sweep(solvers="[numbat]"), "did you mean 'numba'", 3),
+    "solver of a path": (sweep(solvers="['../../numba']"), "solvers[0]", 3),
+    "solver that names code": (sweep(solvers="['os:system']"), "solvers[0]", 3),
+    "unknown parameter": (sweep(solvers="[{name: numba, magic: 1}]"), "solvers[0].magic", 3),
+    "unnamed solver": (sweep(solvers="[{precision: 1}]"), "solvers[0]", 3),
+    "option outside options": (sweep(iterations="5"), "iterations", 4),
+    "unknown option": (sweep(options="{iteration: 5}"), "did you mean 'iterations'", 4),
+    "options as a list": (sweep(options="[5]"), "options", 4),
+    "no iterations": (sweep(options="{iterations: 0}"), "options.iterations", 4),
+    "empty list of iterations": (sweep(options="{iterations: []}"), "options.iterations", 4),
+    "iterations as a boolean": (sweep(options="{iterations: [5, true]}"), "options.iterations[1]", 4),
+    "tolerance of zero": (sweep(options="{tolerance: 0}"), "options.tolerance", 4),
+    "tolerance of NaN": (sweep(options="{tolerance: [null, .nan]}"), "options.tolerance[1]", 4),
+    "unknown first guess": (sweep(options="{first_guess: best}"), "options.first_guess", 4),
+    "threads of a million": (sweep(options="{threads: 1e6}"), "options.threads", 4),
+    "strain range of zero": (sweep(options="{strain_range: 0}"), "options.strain_range", 4),
+    "record as text": (sweep(options="{record: 'no'}"), "options.record", 4),
+    "convergence of frame zero": (sweep(options="{convergence_frames: [0]}"), "convergence_frames[0]", 4),
+    "convergence beyond the end": (sweep(options="{convergence_frames: [1, 9]}"), "convergence_frames[1]", 4),
+    "vast grid": (
+        sweep(options=f"{{iterations: {LONG_LIST}, threads: {LONG_LIST}, rounds: {LONG_LIST}}}"),
+        "at most 10000",
+        4,
+    ),
+    "exclude of nothing": (sweep(exclude="[{size: 8}]"), "exclude[0]", 4),
+    "exclude of all": (sweep(exclude="[{}]"), "leaves no run", 4),
+    "exclude of an unknown solver": (sweep(exclude="[{solver: dense}]"), "exclude[0].solver", 4),
+    "exclude as a mapping": (sweep(exclude="{size: 4}"), "exclude", 4),
+    "include of no size": (sweep(include="[{iterations: 3}]"), "include[0].size", 4),
+    "include of an unknown scene": (sweep(include="[{scene: goood, size: 4}]"), "did you mean 'good'", 4),
+    "include of a vast size": (sweep(include="[{size: 10000}]"), "include[0].size[0]", 4),
+}
+QUAD = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+OTHER_FILES = {
+    "good.yaml": scene(),
+    "-rf .yaml": scene(),
+    "folder/good.yaml": scene(frames="3"),
+    "sweep.yaml": sweep(),
+    "beyond.obj": QUAD + "f 1 2 9\n",
+    "words.obj": QUAD + "f one two three\n",
+    "nan.obj": QUAD.replace("0 0 0", "nan 0 0") + "f 1 2 3\n",
+    "empty.obj": "",
+}
+JSONS = {
+    "empty JSON": ("", None),
+    "JSON of a list": ("[]", None),
+    "JSON of deep lists": ("[" * 100_000, None),
+    "JSON without a mesh": ('{"k": 1, "b": []}', "obj"),
+    "JSON of no such mesh": ('{"obj": "none.obj", "k": 1, "b": []}', "none.obj"),
+    "JSON of NaN": ('{"obj": "quad.obj", "k": NaN, "b": []}', "k"),
+    "JSON pinned beyond": ('{"obj": "quad.obj", "k": 1, "b": [4]}', "b"),
+    "JSON pinned at zero": ('{"obj": "quad.obj", "k": 1, "b": [0]}', "b"),
+}
