@@ -152,7 +152,7 @@ class DenseLocalGlobal:
         def project(p: Positions, y: Positions, out: Positions) -> None:
             v = A @ p
             length = np.sqrt(np.einsum("ij,ij->i", v, v))[:, None]
-            d = r * np.where(length > TINY, v / np.maximum(length, TINY), rest_direction)
+            d = r * np.where(length <= TINY, rest_direction, v / np.maximum(length, TINY))
             np.matmul(AtK, d, out=out)
             out += y
 
