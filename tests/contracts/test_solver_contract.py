@@ -1,0 +1,120 @@
+"""What every solver promises: the contract of `solvers.problem`, for each name in the registry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from harness.trace import EnergyNorm, trace
+from solvers.problem import Positions, StepProblem, StopRule
+from solvers.registry import SOLVERS, load
+from tests.scenes import cloth, first_problem, frozen, random_problem
+
+solvers = pytest.mark.parametrize("solver", [load(target)() for target in SOLVERS.values()], ids=list(SOLVERS))
+
+PROBLEMS = {
+    "cloth": lambda: first_problem(cloth(10)),
+    "cloth, exact pins, inertial guess": lambda: first_problem(cloth(10, "exact"), "inertial"),
+    "random": lambda: random_problem(0),
+    "random, not pinned": lambda: random_problem(1, weights=()),
+}
+problems = pytest.mark.parametrize("problem", [frozen(make()) for make in PROBLEMS.values()], ids=list(PROBLEMS))
+
+
+def iterates(prepared, problem: StepProblem, count: int) -> list[Positions]:
+    return [p.copy() for p in islice(prepared.iterates(problem), count)]
+
+
+@solvers
+@problems
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_a_solve_ends_at_exactly_the_iterate_of_its_number(solver, problem, count):
+    prepared = solver.prepare(problem.system)
+    solution = prepared.solve(problem, StopRule(count))
+    assert solution.iterations == count
+    np.testing.assert_array_equal(solution.positions, iterates(prepared, problem, count)[-1])
+
+
+@solvers
+@problems
+def test_a_solve_that_a_tolerance_ends_does_so_at_exactly_an_iterate(solver, problem):
+    prepared = solver.prepare(problem.system)
+    solution = prepared.solve(problem, StopRule(200, 1e-2))
+    assert 0 < solution.iterations <= 200
+    np.testing.assert_array_equal(solution.positions, iterates(prepared, problem, solution.iterations)[-1])
+
+
+@solvers
+@problems
+def test_solves_that_interleave_do_not_disturb_each_other(solver, problem):
+    prepared = solver.prepare(problem.system)
+    other = replace(problem, first_guess=problem.first_guess + 1.0, force=2.0 * problem.force)
+    alone = iterates(prepared, problem, 6), iterates(prepared, other, 6)
+    together = zip(prepared.iterates(problem), prepared.iterates(other), strict=False)
+    for (p, q), a, b in zip(islice(together, 6), *alone, strict=True):
+        np.testing.assert_array_equal(p, a)
+        np.testing.assert_array_equal(q, b)
+        prepared.solve(other, StopRule(3, 1e-3))
+
+
+@solvers
+@problems
+def test_two_preparations_of_a_system_give_the_same_bits(solver, problem):
+    one, two = (iterates(solver.prepare(problem.system), problem, 5)[-1] for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+
+
+@solvers
+@problems
+def test_a_solution_belongs_to_its_caller(solver, problem):
+    prepared = solver.prepare(problem.system)
+    positions = prepared.solve(problem, StopRule(3)).positions
+    kept = positions.copy()
+    prepared.solve(replace(problem, first_guess=problem.first_guess + 1.0), StopRule(4))
+    np.testing.assert_array_equal(positions, kept)
+    assert positions.flags.c_contiguous
+    assert positions.dtype == np.float64
+    given = (problem.target, problem.force, problem.pin_targets, problem.current, problem.first_guess)
+    assert not any(np.shares_memory(positions, array) for array in given)
+
+
+@solvers
+@problems
+def test_phases_may_run_at_any_time_and_leave_the_solver_as_it_was(solver, problem):
+    prepared = solver.prepare(problem.system)
+    before = iterates(prepared, problem, 3)
+    phases = prepared.phases(problem)
+    assert set(phases) == {"local", "global"}
+    for phase in (*phases.values(), *reversed(phases.values())):
+        phase()
+    for p, wanted in zip(iterates(prepared, problem, 3), before, strict=True):
+        np.testing.assert_array_equal(p, wanted)
+
+
+@solvers
+@problems
+def test_exactly_pinned_vertices_are_on_their_targets_in_every_iterate(solver, problem):
+    pins = problem.system.pins
+    for p in iterates(solver.prepare(problem.system), problem, 4):
+        np.testing.assert_array_equal(p[pins.vertices[pins.exact]], problem.pin_targets[pins.exact])
+
+
+@solvers
+@problems
+def test_the_reported_residual_is_the_length_of_the_last_step_in_the_norm_of_the_matrix(solver, problem):
+    prepared = solver.prepare(problem.system)
+    solution = prepared.solve(problem, StopRule(9, 1e-14))
+    curve = trace(prepared, problem, EnergyNorm(problem.system), 9)
+    # Two ways to add the same terms; what is left of the sum after cancellation is good to half the digits.
+    assert solution.residual == pytest.approx(curve.residuals[-1], rel=1e-7)
+    assert curve.objective[-1] == problem.value(solution.positions)
+
+
+@solvers
+def test_the_facts_are_whole_numbers_by_name(solver):
+    facts = solver.prepare(random_problem(0).system).facts
+    assert facts["nnz_system"] > 0
+    assert all(float(value).is_integer() for value in facts.values())

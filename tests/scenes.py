@@ -1,0 +1,130 @@
+"""Scenes, networks and step problems for the tests, bound by the harness as a run binds them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from harness.effects.base import Effect
+from harness.effects.gravity import Gravity
+from harness.effects.pins import Pins as PinsEffect
+from harness.effects.springs import Springs as SpringsEffect
+from harness.mesh.chain import Chain
+from harness.mesh.grid import Grid, Net
+from harness.mesh.solids import Block, Tower
+from harness.mesh.surfaces import Skirt
+from harness.scene import Scene, build
+from harness.simulate import problem, simulate, start
+from harness.spec import MeshSource, SceneSpec
+from solvers.energies.springs import Springs
+from solvers.local_global import CompiledLocalGlobal, DenseLocalGlobal, SparseLocalGlobal
+from solvers.problem import Pins, Positions, Solver, StepProblem, StopRule, System
+
+BACKENDS: tuple[Solver, ...] = (DenseLocalGlobal(), SparseLocalGlobal(), CompiledLocalGlobal())
+"""The three ways to do one and the same local-global iteration."""
+
+
+def scene(
+    mesh: MeshSource,
+    *effects: Effect,
+    size: int,
+    mass: float = 1.0,
+    time_step: float = 1 / 30,
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Scene:
+    """A scene of models, as a scene file declares them."""
+    spec = SceneSpec(
+        mesh=mesh,
+        mass=mass,
+        time_step=time_step,
+        frames=1,
+        velocity=velocity,
+        effects=effects,
+        path=Path("scene.yaml"),
+    )
+    return build(spec, size)
+
+
+def cloth(size: int, weight: float | str = 1e10, stretch: float = 300.0) -> Scene:
+    """A level cloth that falls, held at two corners."""
+    pins = PinsEffect.model_validate({"at": ["top_corners"], "weight": weight})
+    return scene(Grid(), SpringsEffect(stretch=stretch, shear=stretch / 5), Gravity(), pins, size=size)
+
+
+SCENES: dict[str, Callable[[float | str], Scene]] = {
+    "single-spring": lambda weight: scene(
+        Chain(), SpringsEffect(stretch=500.0), Gravity(), _pins("first", weight), size=2
+    ),
+    "chain": lambda weight: scene(
+        Chain(length=2.0), SpringsEffect(stretch=500.0), Gravity(), _pins("ends", weight), size=10
+    ),
+    "net": lambda weight: scene(Net(), SpringsEffect(stretch=300.0), Gravity(), _pins("corners", weight), size=5),
+    "cloth": lambda weight: cloth(8, weight),
+    "stiff-cloth": lambda weight: cloth(40, weight, stretch=1e5),
+    "tower": lambda weight: scene(
+        Tower(), SpringsEffect(stretch=2e6), Gravity(), _pins("base", weight), size=12, mass=1000.0
+    ),
+    "block": lambda weight: scene(
+        Block(), SpringsEffect(stretch=2e5), Gravity(), _pins("left", weight), size=9, mass=100.0
+    ),
+    "skirt": lambda weight: scene(
+        Skirt(), SpringsEffect(stretch=200.0, shear=20.0), Gravity(), _pins("top", weight), size=30
+    ),
+}
+"""Scenes by name, made with a pin weight [N/m] or "exact"."""
+
+
+def _pins(part: str, weight: float | str) -> PinsEffect:
+    return PinsEffect.model_validate({"at": [part], "weight": weight})
+
+
+def first_problem(made: Scene, first_guess: str = "current") -> StepProblem:
+    """The problem of a scene's first step."""
+    return problem(made, start(made), first_guess)
+
+
+def trajectory(made: Scene, solver: Solver, frames: int, *, first_guess: str = "current", iterations: int = 50):
+    """The positions (frames, n, 3) [m] after each step."""
+    steps = simulate(
+        made, solver.prepare(made.system), StopRule(iterations), first_guess=first_guess, frames=frames
+    )
+    return np.array([step.solution.positions.copy() for step in steps])
+
+
+def static_shape(made: Scene, *, iterations: int = 20_000, tolerance: float = 1e-10) -> Positions:
+    """Where a scene comes to rest, (n, 3) [m]: one step so long that inertia (M/dt^2) weighs nothing."""
+    system = replace(made.system, time_step=1e6)
+    stated = first_problem(replace(made, system=system))
+    solution = CompiledLocalGlobal().prepare(system).solve(stated, StopRule(iterations, tolerance))
+    assert solution.stopped != "iterations", "the static solve has not converged"
+    return solution.positions
+
+
+def random_network(rng: np.random.Generator, n: int, m: int) -> tuple[Positions, Springs]:
+    """Rest positions (n, 3) [m] and m springs of random stiffness between random vertices, loops and twins included."""
+    rest = rng.normal(size=(n, 3))
+    return rest, Springs.at_rest(rest, rng.integers(0, n, (m, 2)), rng.uniform(1.0, 1e3, m))
+
+
+def random_problem(seed: int, *, n: int = 12, m: int = 30, weights: tuple[float, ...] = (1e4, np.inf)) -> StepProblem:
+    """A step of a random network under random forces; vertices 0, 1, ... are pinned with the weights."""
+    rng = np.random.default_rng(seed)
+    rest, springs = random_network(rng, n, m)
+    q = len(weights)
+    system = System(rng.uniform(0.1, 2.0, n), 1 / 30, (springs,), Pins(np.arange(q), np.array(weights)))
+    targets = rest[:q] + 0.1 * rng.normal(size=(q, 3))
+    target, force, guess = (rng.normal(size=(n, 3)) for _ in range(3))
+    current = rest.copy()
+    current[:q] = targets
+    return StepProblem(system, target, force, targets, current, guess)
+
+
+def frozen(problem: StepProblem) -> StepProblem:
+    """The same problem; whoever writes to one of its arrays raises."""
+    arrays = [problem.target, problem.force, problem.pin_targets, problem.current, problem.first_guess]
+    for array in [*arrays, problem.system.mass, problem.system.pins.vertices, problem.system.pins.weight]:
+        array.flags.writeable = False
+    return problem

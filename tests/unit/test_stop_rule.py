@@ -1,0 +1,122 @@
+"""When a solve ends, and what it reports."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from harness.trace import EnergyNorm, trace
+from solvers.problem import StepProblem, StopRule
+from tests.scenes import BACKENDS, cloth, first_problem, random_problem
+
+HALF_THE_DIGITS = 1e-7
+"""A residual is the root of a sum that cancels, added up in another order by each backend."""
+
+backends = pytest.mark.parametrize("backend", BACKENDS, ids=lambda b: type(b).__name__)
+
+
+def at_rest(problem: StepProblem) -> StepProblem:
+    """The same system with nothing that moves it."""
+    p = problem.current
+    return replace(problem, target=p, force=np.zeros_like(p), first_guess=p)
+
+
+@backends
+def test_without_a_tolerance_all_iterations_are_done(backend):
+    problem = at_rest(first_problem(cloth(6)))
+    solution = backend.prepare(problem.system).solve(problem, StopRule(17))
+    assert (solution.iterations, solution.stopped) == (17, "iterations")
+    assert np.isnan(solution.yardstick)
+    assert np.isfinite(solution.residual)
+
+
+@backends
+def test_a_tolerance_ends_a_solve_at_the_first_residual_below_it(backend):
+    problem = first_problem(cloth(8))
+    prepared = backend.prepare(problem.system)
+    curve = trace(prepared, problem, EnergyNorm(problem.system), 100).residuals
+    solution = prepared.solve(problem, StopRule(100, 0.05))
+    below = [k for k, residual in enumerate(curve, 1) if residual <= 0.05 * curve[0]]
+    assert (solution.iterations, solution.stopped) == (below[0], "tolerance")
+    assert solution.yardstick == pytest.approx(curve[0], rel=HALF_THE_DIGITS)  # the guess is the current positions
+    assert solution.residual == pytest.approx(curve[below[0] - 1], rel=HALF_THE_DIGITS)
+    assert solution.residual <= 0.05 * solution.yardstick
+
+
+@backends
+def test_the_limit_ends_a_solve_that_the_tolerance_does_not(backend):
+    problem = first_problem(cloth(8))
+    solution = backend.prepare(problem.system).solve(problem, StopRule(5, 1e-12))
+    assert (solution.iterations, solution.stopped) == (5, "iterations")
+    assert solution.residual > 1e-12 * solution.yardstick
+
+
+@backends
+@pytest.mark.parametrize("offset", [0.0, 1e3], ids="{:g} m from the origin".format)
+def test_a_scene_at_rest_stops_after_one_iteration(backend, offset):
+    """Its residual is round-off, of which no fraction would ever be reached; the floor knows its size."""
+    problem = at_rest(first_problem(cloth(12)))
+    away = {name: getattr(problem, name) + offset for name in ("target", "pin_targets", "current", "first_guess")}
+    solution = backend.prepare(problem.system).solve(replace(problem, **away), StopRule(50, 1e-6))
+    assert solution.iterations == 1
+    assert solution.stopped in ("floor", "tolerance")  # "tolerance" where the residual is exactly zero
+
+
+@backends
+def test_the_floor_does_not_stop_a_scene_that_moves(backend):
+    """Free fall from rest, the slowest start there is."""
+    problem = first_problem(cloth(12))
+    solution = backend.prepare(problem.system).solve(problem, StopRule(50, 1e-6))
+    assert solution.stopped != "floor"
+    assert solution.iterations > 1
+
+
+@backends
+def test_the_floor_can_be_taken_away(backend):
+    problem = at_rest(first_problem(cloth(12)))
+    solution = backend.prepare(problem.system).solve(problem, StopRule(3, 1e-9, floor=0.0))
+    assert solution.stopped != "floor"
+
+
+@backends
+def test_the_yardstick_is_taken_at_the_current_positions_whatever_the_first_guess(backend):
+    """A guess nearer to the solution makes a solve shorter, never stricter."""
+    made = replace(cloth(8), velocity=(1.0, 0.0, 0.0))
+    current, inertial = (first_problem(made, guess) for guess in ("current", "inertial"))
+    prepared = backend.prepare(made.system)
+    found = [prepared.solve(problem, StopRule(100, 0.05)) for problem in (current, inertial)]
+    first = next(iter(prepared.iterates(current)))
+    residual = EnergyNorm(made.system)(first - current.current)
+    for solution in found:
+        assert solution.yardstick == pytest.approx(residual, rel=HALF_THE_DIGITS)
+    assert found[0].iterations != found[1].iterations  # the guesses do differ
+
+
+@backends
+def test_the_residual_leaves_pinned_vertices_out(backend):
+    """The assignment's guess leaves pins off their targets; with a weight of 1e10 that would be all one sees."""
+    problem = random_problem(0, weights=(1e10, 1e10))
+    prepared = backend.prepare(problem.system)
+    moved = problem.first_guess.copy()
+    moved[:2] += 1e-3
+    solution = prepared.solve(replace(problem, first_guess=moved), StopRule(1))
+    (p,) = islice(prepared.iterates(replace(problem, first_guess=moved)), 1)
+    e = moved - p
+    e[:2] = 0.0
+    (springs,) = problem.system.energies
+    A = e[springs.edges[:, 0]] - e[springs.edges[:, 1]]  # pyright: ignore[reportAttributeAccessIssue]
+    inertia = problem.system.mass / problem.system.time_step**2 @ np.sum(e**2, axis=1)
+    wanted = np.sqrt(inertia + springs.stiffness @ np.sum(A**2, axis=1))  # pyright: ignore[reportAttributeAccessIssue]
+    assert solution.residual == pytest.approx(wanted, rel=HALF_THE_DIGITS)
+
+
+@backends
+def test_a_solve_that_diverged_says_so_and_does_not_pass_for_converged(backend):
+    problem = random_problem(0, weights=())
+    lost = np.full_like(problem.first_guess, np.nan)
+    solution = backend.prepare(problem.system).solve(replace(problem, first_guess=lost), StopRule(4, 1e-3))
+    assert (solution.iterations, solution.stopped) == (4, "iterations")
+    assert np.isnan(solution.residual)
