@@ -1,0 +1,34 @@
+"""`pytest tests/bench --benchmark-only` runs the gates and stores their times under results/bench."""
+
+import os
+from typing import Any
+
+import pytest
+from threadpoolctl import threadpool_info
+
+from harness import machine
+from tests.bench.gates import THREADS
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # This runs before pytest-benchmark reads its options.
+    if config.option.benchmark_only:
+        config.option.benchmark_enable = True
+        config.option.benchmark_storage = f"file://{config.rootpath / 'results' / 'bench'}"
+        config.option.benchmark_save = config.option.benchmark_save or "gates"
+        config.option.benchmark_save_data = True
+
+
+def pytest_benchmark_update_machine_info(machine_info: dict[str, Any]) -> None:
+    # What is stored may be published: it tells of the machine's kind and not whose it is, and holds
+    # nothing that changes from one run to the next, so that two files compare.
+    del machine_info["node"]
+    machine_info["cpu"] = {key: machine_info["cpu"].get(key) for key in ("brand_raw", "arch", "count")}
+    machine_info["affinity"] = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    machine_info["versions"] = machine.versions()
+    machine_info["threads"] = THREADS
+    machine_info["blas"] = [
+        {key: library[key] for key in ("internal_api", "version")}
+        for library in threadpool_info()
+        if library["user_api"] == "blas"
+    ]

@@ -1,0 +1,175 @@
+"""The gates: what must stay how fast against what. A new gate is one entry of `GATES`.
+
+All work runs with one thread of Numba and one of BLAS, and all times are CPU times of the process: another program on
+the machine hardly moves them, and what a library does in a thread of its own (the recordings' writer) is counted
+even where it hides on another core. A program that uses several threads on purpose would need wall times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from harness.effects.gravity import Gravity
+from harness.effects.pins import Pins
+from harness.effects.springs import Springs
+from harness.mesh.grid import Grid
+from harness.record.base import Frame, RecordingInfo
+from harness.record.rerun import RerunRecorder
+from harness.scene import Scene, build
+from harness.simulate import Step, simulate
+from harness.spec import SceneSpec
+from solvers.local_global import PreparedLocalGlobal
+from solvers.problem import Positions, Prepared, StopRule
+from solvers.registry import SOLVERS, load
+
+THREADS = 1
+STOP = StopRule(iterations=50)
+Work = Callable[[], Positions]
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """Two makers of work that must come to the same positions, and how their times may compare.
+
+    limit: of time of the candidate / time of the yardstick; why: where the limit comes from;
+    tolerance: the largest difference of the two answers, in their unit; turns: A B A, how often.
+    """
+
+    name: str
+    candidate: Callable[[], Work]
+    yardstick: Callable[[], Work]
+    limit: float
+    why: str
+    tolerance: float = 0.0
+    turns: int = 15
+
+
+def sheet(size: int) -> Scene:
+    """A cloth with sides and both diagonals, lying flat, that falls about two pinned corners."""
+    effects = (Springs(stretch=1000.0), Gravity(), Pins(at=("top_corners",)))
+    spec = SceneSpec(mesh=Grid(), mass=1.0, time_step=1 / 30, frames=1, effects=effects, path=Path("sheet.yaml"))
+    return build(spec, size)
+
+
+def prepare(solver: str, scene: Scene) -> PreparedLocalGlobal:
+    """A solver by name, prepared for the scene."""
+    return load(SOLVERS[solver])().prepare(scene.system)
+
+
+def steps(scene: Scene, prepared: Prepared, frames: int) -> list[Step]:
+    """The scene's first steps."""
+    return list(simulate(scene, prepared, STOP, first_guess="current", frames=frames))
+
+
+def simulated(solver: str, size: int, frames: int) -> Work:
+    """Whole steps through the harness; the last positions [m]."""
+    scene = sheet(size)
+    prepared = prepare(solver, scene)
+    return lambda: steps(scene, prepared, frames)[-1].solution.positions
+
+
+def solved(solver: str, size: int, frames: int) -> Work:
+    """The solver alone, on the problems that the harness states in the same steps; the last positions [m]."""
+    scene = sheet(size)
+    prepared = prepare(solver, scene)
+    problems = [step.problem for step in steps(scene, prepared, frames)]
+    return lambda: [prepared.solve(problem, STOP) for problem in problems][-1].positions
+
+
+def projected(solver: str, size: int, repeats: int) -> Work:
+    """The local step alone, at stretched positions; A'K d [N]."""
+    scene = sheet(size)
+    prepared = prepare(solver, scene)
+    p = 1.1 * scene.mesh.rest
+    nothing, out = np.zeros_like(p), np.empty_like(p)
+
+    def work() -> Positions:
+        for _ in range(repeats):
+            prepared.project(p, nothing, out)
+        return out
+
+    return work
+
+
+def recorded(solver: str, size: int, frames: int) -> Work:
+    """Whole steps, each recorded, to a finished recording; the last positions [m]."""
+    scene = sheet(size)
+    prepared = prepare(solver, scene)
+
+    def work() -> Positions:
+        with TemporaryDirectory() as folder:
+            return record(scene, prepared, frames, Path(folder) / "sheet.rrd")
+
+    return work
+
+
+def record(scene: Scene, prepared: Prepared, frames: int, path: Path) -> Positions:
+    """Record the scene's first steps, with its start as frame 0; the last positions [m]."""
+    info = RecordingInfo(
+        title="sheet",
+        run_id="sheet",
+        mesh=scene.mesh,
+        springs=scene.springs.edges,
+        rest_lengths=scene.springs.rest_length,
+        pinned=scene.system.pins.vertices,
+        time_step=scene.system.time_step,
+        strain_range=0.1,
+        properties={"scene": "sheet"},
+    )
+    recorder = RerunRecorder(path, info)
+    p = scene.mesh.rest
+    recorder.frame(Frame(0, 0.0, p, {}, float("nan"), 0))
+    for step in simulate(scene, prepared, STOP, first_guess="current", frames=frames):
+        p, s = step.solution.positions, step.solution
+        recorder.frame(Frame(step.index, step.index * scene.system.time_step, p, {}, s.residual, s.iterations))
+    recorder.close({})
+    return p
+
+
+# Tolerances [m], [N]: the backends add the same numbers in another order.
+GATES = (
+    Gate(
+        name="numba-against-sparse-64",
+        candidate=lambda: simulated("numba", 64, frames=4),
+        yardstick=lambda: simulated("sparse", 64, frames=4),
+        tolerance=1e-9,
+        limit=0.45,
+        why="measured 0.34; its parts (local 0.45, CHOLMOD against SuperLU 0.40) bound it on other processors",
+    ),
+    Gate(
+        name="sparse-against-dense-24",
+        candidate=lambda: simulated("sparse", 24, frames=1),
+        yardstick=lambda: simulated("dense", 24, frames=1),
+        tolerance=1e-9,
+        limit=0.065,
+        why="measured 0.043; half as much again for processors whose BLAS is faster",
+    ),
+    Gate(
+        name="compiled-local-step-against-numpy-64",
+        candidate=lambda: projected("numba", 64, repeats=50),
+        yardstick=lambda: projected("sparse", 64, repeats=50),
+        tolerance=1e-9,
+        limit=0.6,
+        why="measured 0.45; a third more for processors with another vector unit",
+    ),
+    Gate(
+        name="harness-against-bare-solver-64",
+        candidate=lambda: simulated("numba", 64, frames=20),
+        yardstick=lambda: solved("numba", 64, frames=20),
+        limit=1.02,
+        why="a promise: stating the problem of a step costs at most 2 % of solving it; measured 1.009",
+    ),
+    Gate(
+        name="recording-against-simulating-alone-64",
+        candidate=lambda: recorded("numba", 64, frames=60),
+        yardstick=lambda: simulated("numba", 64, frames=60),
+        limit=1.10,
+        why="a promise: a pass that records takes at most 10 % more than one that simulates; measured 1.08",
+        turns=9,
+    ),
+)

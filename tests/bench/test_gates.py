@@ -1,0 +1,26 @@
+"""Gates on ratios of times. Without `--benchmark-only` nothing is timed: candidate and yardstick must agree."""
+
+from dataclasses import asdict
+from functools import partial
+from time import process_time
+
+import numpy as np
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from harness.machine import pinned_threads
+from tests.bench.gates import GATES, THREADS, Gate
+from tests.bench.ratio import measure_ratio
+
+
+@pytest.mark.benchmark(timer=process_time)
+@pytest.mark.parametrize("gate", GATES, ids=lambda gate: gate.name)
+def test_the_gate_holds(gate: Gate, benchmark: BenchmarkFixture):
+    with pinned_threads(THREADS):
+        candidate, yardstick = gate.candidate(), gate.yardstick()
+        answer = candidate if benchmark.enabled else partial(benchmark.pedantic, candidate)
+        np.testing.assert_allclose(answer(), yardstick(), rtol=0, atol=gate.tolerance)
+        if benchmark.enabled:
+            ratio = measure_ratio(benchmark, candidate, yardstick, turns=gate.turns, clock=process_time)
+            benchmark.extra_info |= {"ratio": asdict(ratio), "limit": gate.limit, "why": gate.why}
+            assert not ratio.exceeds(gate.limit), f"{ratio} lies above {gate.limit}: {gate.why}"
