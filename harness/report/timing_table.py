@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import duckdb
@@ -12,7 +12,6 @@ import numpy as np
 import pyarrow as pa
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
@@ -113,7 +112,7 @@ _NUMBERS = (
 
 def summary_table(table: pa.Table) -> Table:
     """One line for each run: what it was, whether it succeeded, and its times [ms]."""
-    out = Table(box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False, caption_justify="left")
+    out = Table(box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     for name in ("scene", "size", "solver"):
         out.add_column(name, overflow="fold", justify="right" if name == "size" else "left", min_width=len(name))
     for name in _NUMBERS:
@@ -135,16 +134,9 @@ def summary_table(table: pa.Table) -> Table:
             _number(run.residual, "{:.1e}".format),
             _number(run.largest_strain, lambda strain: f"{100 * strain:.3g} %"),
         )
-    failed = [run for run in found if run.status != "ok"]
-    out.caption = escape("\n".join(f"{_name(run, names)}: {run.reason or run.status}" for run in failed)) or None
     # Lines longer than a narrow terminal keep their numbers; Rich would cut them to ellipses.
     out.width = Measurement.get(wide := Console(width=1000), wide.options, out).maximum
     return out
-
-
-def _name(run: Run, names: Mapping[str, str]) -> str:
-    """A run's solver, scene and size in words."""
-    return f"{names[run.run_id]} on {run.scene}" + (f", size {run.size}" if run.size else "")
 
 
 def _number(value, words) -> str:
