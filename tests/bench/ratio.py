@@ -38,7 +38,7 @@ class Ratio:
 
         The resampling is seeded, so the same times give the same interval.
         """
-        ratios = np.mean(candidate, axis=1) / np.asarray(yardstick)
+        ratios = np.asarray(candidate, float).mean(axis=1) / np.asarray(yardstick, float)
         resampled = np.random.default_rng(0).choice(ratios, (RESAMPLES, len(ratios)))
         low, high = np.quantile(np.median(resampled, axis=1), [0.025, 0.975])
         return cls(float(np.median(ratios)), float(low), float(high), len(ratios))

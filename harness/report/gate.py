@@ -1,0 +1,140 @@
+"""Compares two stored pytest-benchmark files: what became slower?
+
+A benchmark that was measured against a yardstick stores `extra_info["ratio"]` (median, low, high): it is slower
+where the new interval lies wholly above the old one, by more than a margin. Of others the minima are compared, with a
+wide margin, and a difference between two machines is a remark only. A benchmark that vanished counts as a
+regression: deleting a gate must not open it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, Field, ValidationError
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from harness.errors import InputError, Mistake
+
+RATIO_MARGIN = 0.05
+"""Beyond both intervals: ratios of two runs of the same code lie up to 3 % apart on a loaded machine."""
+OTHER_MACHINE_MARGIN = 0.25
+"""The same for ratios from different machines: two programs do not gain alike from another processor."""
+MINIMUM_MARGIN = 0.5
+"""Minima of two runs lie 4 % apart on an idle machine; another program on the same core doubles them."""
+
+REGRESSIONS = ("slower", "vanished")
+
+
+class Ratio(BaseModel):
+    """A median ratio of times and its 95 % interval."""
+
+    median: float = Field(gt=0)
+    low: float = Field(gt=0)
+    high: float = Field(gt=0)
+
+
+class Extra(BaseModel):
+    """What a benchmark tells beside its times."""
+
+    ratio: Ratio | None = None
+
+
+class Stats(BaseModel):
+    """The times of a benchmark [s]."""
+
+    min: float = Field(gt=0)
+
+
+class Benchmark(BaseModel):
+    """One benchmark of a file."""
+
+    fullname: str
+    extra_info: Extra
+    stats: Stats
+
+
+class Stored(BaseModel):
+    """A file that pytest-benchmark stored, as far as it is compared; unknown keys are passed over."""
+
+    machine_info: Mapping[str, Any]
+    benchmarks: list[Benchmark] = Field(min_length=1)
+
+    @property
+    def by_name(self) -> dict[str, Benchmark]:
+        """The benchmarks by the names of their tests."""
+        return {benchmark.fullname: benchmark for benchmark in self.benchmarks}
+
+    @property
+    def machine(self) -> tuple[Any, ...]:
+        """What decides about speed: the processor and how many of its cores may be used."""
+        cpu = self.machine_info.get("cpu") or {}
+        return (cpu.get("brand_raw"), cpu.get("count"), self.machine_info.get("affinity"))
+
+
+def compare(base: Path, new: Path, console: Console) -> int:
+    """Print a table of what changed from `base` to `new`; 1 if anything became slower or vanished, else 0.
+
+    Raises InputError for a file that pytest-benchmark did not store.
+    """
+    old, now = _read(base), _read(new)
+    same = old.machine == now.machine
+    table = Table("benchmark", "old", "new", "change", "verdict", box=SIMPLE_HEAD)
+    verdicts = []
+    for name in old.by_name | now.by_name:
+        before, after = old.by_name.get(name), now.by_name.get(name)
+        change, verdict = _judged(before, after, same)
+        verdicts.append(verdict)
+        table.add_row(*map(escape, (name.rpartition("::")[2], _figure(before), _figure(after), change, verdict)))
+    console.print(table)
+    if not same:
+        console.print("The files come from different machines: minima are not judged, ratios with a wider margin.")
+    bad = sum(verdict in REGRESSIONS for verdict in verdicts)
+    console.print(f"{bad} of {len(verdicts)} became slower or vanished" if bad else "nothing became slower")
+    return 1 if bad else 0
+
+
+def _judged(old: Benchmark | None, new: Benchmark | None, same_machine: bool) -> tuple[str, str]:
+    """The change in words, and a verdict: slower, vanished, faster, unchanged, new, or not judged."""
+    if old is None or new is None:
+        return "", "new" if old is None else "vanished"
+    was, now = old.extra_info.ratio, new.extra_info.ratio
+    if was and not now:
+        return "", "vanished"
+    if was and now:
+        margin = RATIO_MARGIN if same_machine else OTHER_MACHINE_MARGIN
+        change = now.median / was.median
+        slower, faster = now.low > was.high * (1 + margin), now.high * (1 + margin) < was.low
+    else:
+        change = new.stats.min / old.stats.min
+        slower, faster = change > 1 + MINIMUM_MARGIN, change * (1 + MINIMUM_MARGIN) < 1
+        if not same_machine and (slower or faster):
+            return f"{change - 1:+.1%}", "not judged: other machine"
+    return f"{change - 1:+.1%}", "slower" if slower else "faster" if faster else "unchanged"
+
+
+def _figure(benchmark: Benchmark | None) -> str:
+    """The ratio with its interval, else the minimum."""
+    if benchmark is None:
+        return ""
+    ratio = benchmark.extra_info.ratio
+    if ratio is None:
+        return f"{1e3 * benchmark.stats.min:.3g} ms at best"
+    return f"{ratio.median:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]"
+
+
+def _read(path: Path) -> Stored:
+    """The stored benchmarks of a file; raises InputError."""
+    wanted = "wanted a file that pytest-benchmark stored; `pytest tests/bench --benchmark-only` makes one"
+    try:
+        return Stored.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(Mistake(f"cannot be read ({error.strerror}); {wanted}", path)) from error
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(map(str, first["loc"]))
+        raise InputError(Mistake(f"{first['msg']}; {wanted}", path, key=key)) from error

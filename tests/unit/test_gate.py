@@ -1,0 +1,170 @@
+"""`springbench gate`: what counts as a regression between two stored benchmark files."""
+
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from harness.cli import app
+from harness.errors import InputError
+from harness.report.gate import compare
+
+ROOT = Path(__file__).resolve().parents[2]
+HERE = {"cpu": {"brand_raw": "Fast 9000", "count": 2}, "affinity": 2}
+ELSEWHERE = {"cpu": {"brand_raw": "Slow 100", "count": 2}, "affinity": 2}
+
+MINIMUM = 0.010
+
+
+def ratio(median: float, spread: float = 0.01) -> dict[str, float]:
+    return {"median": median, "low": median - spread, "high": median + spread}
+
+
+def benchmark(name: str = "numba", minimum: float = MINIMUM, **extra: Any) -> dict[str, Any]:
+    return {"fullname": f"tests/bench/test_gates.py::test_gate[{name}]", "stats": {"min": minimum}, "extra_info": extra}
+
+
+def stored(path: Path, *benchmarks: dict[str, Any], machine: dict[str, Any] = HERE) -> Path:
+    path.write_text(json.dumps({"machine_info": machine, "benchmarks": benchmarks, "version": "5.3.1"}))
+    return path
+
+
+def judged(base: Path, new: Path) -> tuple[int, str]:
+    console = Console(file=io.StringIO(), width=200)
+    code = compare(base, new, console)
+    assert isinstance(console.file, io.StringIO)
+    return code, console.file.getvalue()
+
+
+WIDE = ratio(1.2, spread=0.15)  # from 1.05 to 1.35: above 1.00 +- 0.01, but not by the margin of 5 %
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "machine", "code", "verdict"),
+    [
+        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(1.0)}, HERE, 0, "unchanged", id="the same ratio"),
+        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(1.2)}, HERE, 1, "slower", id="a higher ratio"),
+        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(0.8)}, HERE, 0, "faster", id="a lower ratio"),
+        pytest.param({"ratio": ratio(1.0)}, {"ratio": WIDE}, HERE, 0, "unchanged", id="an uncertain ratio"),
+        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(1.2)}, ELSEWHERE, 0, "unchanged", id="ratio elsewhere"),
+        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(1.5)}, ELSEWHERE, 1, "slower", id="far ratio elsewhere"),
+        pytest.param({"ratio": ratio(1.0)}, {}, HERE, 1, "vanished", id="a ratio that vanished"),
+        pytest.param({}, {"minimum": 1.4 * MINIMUM}, HERE, 0, "unchanged", id="a minimum within the margin"),
+        pytest.param({}, {"minimum": 1.6 * MINIMUM}, HERE, 1, "slower", id="a minimum beyond the margin"),
+        pytest.param({}, {"minimum": 0.5 * MINIMUM}, HERE, 0, "faster", id="a lower minimum"),
+        pytest.param({}, {"minimum": 9 * MINIMUM}, ELSEWHERE, 0, "not judged", id="a minimum elsewhere"),
+    ],
+)
+def test_a_benchmark_is_judged(old: dict, new: dict, machine: dict, code: int, verdict: str, tmp_path: Path):
+    base = stored(tmp_path / "base.json", benchmark(**old))
+    found, text = judged(base, stored(tmp_path / "new.json", benchmark(**new), machine=machine))
+    assert found == code
+    assert verdict in text
+    assert ("different machines" in text) == (machine is ELSEWHERE)
+
+
+def test_a_ratio_is_judged_whatever_the_times_were(tmp_path: Path):
+    base = stored(tmp_path / "base.json", benchmark(ratio=ratio(1.0)))
+    code, text = judged(base, stored(tmp_path / "new.json", benchmark(minimum=5 * MINIMUM, ratio=ratio(1.0))))
+    assert code == 0
+    assert "unchanged" in text
+
+
+def test_a_gate_that_vanished_is_a_regression_and_a_new_one_is_not(tmp_path: Path):
+    one, both = stored(tmp_path / "one.json", benchmark("a")), tmp_path / "both.json"
+    stored(both, benchmark("a"), benchmark("b"))
+    code, text = judged(both, one)
+    assert code == 1
+    assert [line.split()[-1] for line in text.splitlines() if "[b]" in line] == ["vanished"]
+    code, text = judged(one, both)
+    assert code == 0
+    assert [line.split()[-1] for line in text.splitlines() if "[b]" in line] == ["new"]
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        pytest.param(None, "No such file", id="missing"),
+        pytest.param("no JSON", "Invalid JSON", id="no JSON"),
+        pytest.param("[1, 2]", "object", id="another shape"),
+        pytest.param('{"runs": []}', "machine_info: Field required", id="another program's JSON"),
+        pytest.param('{"machine_info": {}, "benchmarks": []}', "benchmarks", id="no benchmarks"),
+        pytest.param(
+            json.dumps({"machine_info": {}, "benchmarks": [benchmark(minimum=-1.0)]}),
+            "benchmarks.0.stats.min",
+            id="a negative time",
+        ),
+        pytest.param(
+            json.dumps({"machine_info": {}, "benchmarks": [benchmark(ratio={"median": 1.0})]}),
+            "benchmarks.0.extra_info.ratio.low",
+            id="a ratio without its interval",
+        ),
+    ],
+)
+def test_a_foreign_file_is_the_users_mistake(content: str | None, told: str, tmp_path: Path):
+    good, bad = stored(tmp_path / "good.json", benchmark()), tmp_path / "bad.json"
+    if content is not None:
+        bad.write_text(content)
+    for pair in ((good, bad), (bad, good)):
+        with pytest.raises(InputError) as caught:
+            judged(*pair)
+        message = str(caught.value)
+        assert message.startswith(f"{bad}: ")
+        assert told in message
+        assert "wanted a file that pytest-benchmark stored" in message
+
+
+@pytest.mark.parametrize(("new", "code"), [(1.0, 0), (1.5, 1), (None, 2)])
+def test_the_command_line_answers_with_the_exit_code(new: float | None, code: int, tmp_path: Path):
+    base = stored(tmp_path / "base.json", benchmark(ratio=ratio(1.0)))
+    other = stored(tmp_path / "new.json", benchmark(ratio=ratio(new))) if new else tmp_path / "missing.json"
+    assert CliRunner().invoke(app, ["gate", str(base), str(other)]).exit_code == code
+
+
+BENCHMARK = """
+from dataclasses import asdict
+from time import process_time
+
+import pytest
+from tests.bench.ratio import measure_ratio
+
+def count():
+    return sum(range(1000))
+
+@pytest.mark.benchmark(timer=process_time)
+def test_counts(benchmark):
+    benchmark.extra_info["ratio"] = asdict(measure_ratio(benchmark, count, count, turns=5, clock=process_time))
+"""
+
+
+def test_what_the_gates_store_can_be_compared_and_names_no_host(tmp_path: Path):
+    (tmp_path / "pytest.ini").write_text("[pytest]\naddopts = --benchmark-disable\n")
+    (tmp_path / "test_counts.py").write_text(BENCHMARK)
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-p",
+        "tests.bench.conftest",
+        "--benchmark-only",
+        "-p",
+        "no:cacheprovider",
+    ]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    told = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert told.returncode == 0, told.stdout + told.stderr
+    (file,) = (tmp_path / "results" / "bench").glob("*/0001_gates.json")
+    content = json.loads(file.read_text())
+    assert "node" not in content["machine_info"]
+    assert len(content["benchmarks"][0]["stats"]["data"]) == 10
+    code, text = judged(file, file)
+    assert code == 0
+    assert "test_counts" in text
+    assert "unchanged" in text
