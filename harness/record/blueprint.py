@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -15,6 +16,12 @@ from harness.record.shading import palette
 BACKGROUND = (38, 40, 46)
 _DIRECTION = np.array([0.62, 0.38, 0.78])
 """From where the camera looks: a little from above and from the side, y is up."""
+
+_HALF_VIEW = math.tan(math.radians(55 / 2))
+"""The viewer's angle of view is 55 degrees, from bottom to top."""
+
+COLOURS = (0xE69F00FF, 0x56B4E9FF, 0x009E73FF, 0xCC79A7FF, 0xF0E442FF, 0xD55E00FF, 0x0072B2FF, 0x999999FF)
+"""Of the lines of a plot: the palette of Okabe and Ito, told apart by the colour-blind; clear on black first."""
 
 
 def spring_cadence(info: RecordingInfo) -> int:
@@ -52,15 +59,19 @@ class Box:
         if np.linalg.norm(high - low) <= self._limit:
             self._low, self._high = low, high
 
-    def eye(self) -> rrb.EyeControls3D:
-        """An orbiting eye that sees the box as a whole."""
-        centre, size = (self._low + self._high) / 2, float(np.linalg.norm(self._high - self._low)) or 1.0
-        eye = centre + 0.8 * size * _DIRECTION / np.linalg.norm(_DIRECTION)
-        kind = rrb.Eye3DKind.Orbital
+    def eye(self, aspect: float = 1.0) -> rrb.EyeControls3D:
+        """An orbiting eye that just sees the whole box in a view of this width / height."""
+        centre, half = (self._low + self._high) / 2, (self._high - self._low) / 2
+        corners = half * np.array(list(itertools.product((-1, 1), repeat=3)))
+        towards = _DIRECTION / np.linalg.norm(_DIRECTION)
+        right = np.cross((0, 1, 0), towards) / np.linalg.norm(np.cross((0, 1, 0), towards))
+        x, y, z = np.stack([right, np.cross(towards, right), towards]) @ corners.T
+        distance = 1.05 * np.max(z + np.maximum(np.abs(x) / aspect, np.abs(y)) / _HALF_VIEW) or 1.0
+        kind, eye = rrb.Eye3DKind.Orbital, centre + distance * towards
         return rrb.EyeControls3D(kind=kind, position=eye, look_target=centre, eye_up=(0, 1, 0))
 
 
-def scene_view(root: str, name: str, box: Box, *, springs_visible: bool) -> rrb.Spatial3DView:
+def scene_view(root: str, name: str, box: Box, *, springs_visible: bool, aspect: float = 1.0) -> rrb.Spatial3DView:
     """The mesh under `root`/scene; its springs are there to be switched on."""
     springs = f"{root}/scene/springs"
     return rrb.Spatial3DView(
@@ -68,7 +79,7 @@ def scene_view(root: str, name: str, box: Box, *, springs_visible: bool) -> rrb.
         name=name,
         background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=box.eye(),
+        eye_controls=box.eye(aspect),
         overrides={springs: rrb.EntityBehavior(visible=springs_visible)},
     )
 
@@ -131,7 +142,8 @@ def run_document(info: RecordingInfo) -> str:
     hint = (
         "A vertex shows the strain of largest magnitude among its springs. The springs themselves "
         f"(`/scene/springs`, in each frame that {spring_cadence(info)} divides) "
-        "are switched on by the eye in the blueprint panel.\n"
+        "are switched on by the eye in the blueprint panel. On the timeline `iteration` the scene "
+        "stands at its last frame.\n"
     )
     return f"# {info.title}\n\n| | |\n|-|-|\n{rows}\n\n{colours}{hint}"
 

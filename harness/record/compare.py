@@ -13,12 +13,9 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from harness.record.blueprint import Box, panels, plot, scale_view, scene_view
+from harness.record.blueprint import COLOURS, Box, panels, plot, scale_view, scene_view
 from harness.record.partial import PartialFile
-from harness.record.reader import Source, network, open_recording, positions, properties
-
-COLOURS = (0xE69F00FF, 0x56B4E9FF, 0x009E73FF, 0xCC79A7FF, 0xF0E442FF, 0xD55E00FF, 0x0072B2FF, 0x999999FF)
-"""The palette of Okabe and Ito, told apart by the colour-blind; clear on black first."""
+from harness.record.reader import Source, network, open_recording, positions, properties, triangles
 
 _QUANTITIES = {
     "/residual/log10": "log10 of the residual [J^(1/2)]",
@@ -57,6 +54,7 @@ class _Run:
         self.name, self.root = name, f"/{k + 1}-{re.sub(r'[^A-Za-z0-9_.]+', '-', name)}"
         self.strain_range, self.time_step = float(fixed["strain_range"][0]), float(fixed["time_step"][0])
         self.properties: dict[str, Any] = properties(source)[1]
+        self.triangles = len(triangles(source))
         self.entities: set[str] = set()
         self.box: Box | None = None
         for _, _, p in positions(source):
@@ -70,18 +68,22 @@ def _copy(file: PartialFile, path: Path, name: str, k: int) -> _Run:
         for chunk in source.chunks(content="/**"):
             run.entities.add(chunk.entity_path)
             file.stream.send_chunks(chunk.with_entity_path(run.root + chunk.entity_path))
-    style = rr.SeriesLines(names=name, colors=COLOURS[k % len(COLOURS)], widths=1.5)
+    colour = COLOURS[k % len(COLOURS)]
     for entity in run.entities:
         if entity in _QUANTITIES or entity.startswith(_CURVE):
-            file.stream.log(run.root + entity, style, static=True)
+            file.stream.log(run.root + entity, rr.SeriesLines(names=name, colors=colour, widths=1.5), static=True)
+        if entity.startswith(_CURVE):
+            points = rr.SeriesPoints(names=name, colors=colour, marker_sizes=3)
+            file.stream.log(run.root + entity, points, static=True)
     file.flush()
     return run
 
 
 def _layout(runs: list[_Run]) -> rrb.Blueprint:
     entities = set.union(*(run.entities for run in runs))
+    columns = min(len(runs), 4)
     scenes = [
-        scene_view(run.root, run.name, run.box, springs_visible="/scene/mesh" not in run.entities)
+        scene_view(run.root, run.name, run.box, springs_visible=not run.triangles, aspect=min(1.0, 3.2 / columns))
         for run in runs
         if run.box
     ]
@@ -101,7 +103,7 @@ def _layout(runs: list[_Run]) -> rrb.Blueprint:
     first = runs[0]
     return rrb.Blueprint(
         rrb.Vertical(
-            rrb.Grid(*scenes, grid_columns=min(len(scenes), 4)),
+            rrb.Grid(*scenes, grid_columns=columns),
             scale_view(first.strain_range, f"{first.root}/legend"),
             rrb.Horizontal(*plots[:_SHOWN], rrb.Tabs(*plots[_SHOWN:], *curves, table, active_tab=0)),
             row_shares=[10, 1.3, 5],

@@ -103,7 +103,7 @@ def read_replay(path: Path, frames: Collection[int] | None = None) -> Replay:
             frames=np.array(order, np.int64),
             times=times,
             positions=stacked,
-            triangles=_triangles(source),
+            triangles=triangles(source),
             springs=springs["springs"].reshape(-1, 2).astype(np.int64),
             rest_lengths=springs["rest_lengths"].astype(np.float64),
             pinned=springs["pinned"].astype(np.int64),
@@ -213,7 +213,8 @@ def positions(
                 yield int(index), float(_times(batch, "time")[k]), _row(batch, name, k).reshape(-1, 3)
 
 
-def _triangles(source: Source) -> NDArray[np.int64]:
+def triangles(source: Source) -> NDArray[np.int64]:
+    """The mesh's triangles, shape (f, 3)."""
     for chunk in source.chunks(content="/scene/mesh", components=["Mesh3D:triangle_indices"]):
         return _row(chunk.to_record_batch(), "Mesh3D:triangle_indices").reshape(-1, 3).astype(np.int64)
     return np.empty((0, 3), np.int64)

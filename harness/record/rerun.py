@@ -46,7 +46,7 @@ class RerunRecorder:
         self._shading = Shading(info)
         self._box = blueprint.Box(info.mesh.rest)
         self._scalars: dict[str, list[tuple[int, float]]] = {}
-        self._styled: set[str] = set()
+        self._styled: dict[str, list[str]] = {}
         self._frames = 0
         self._pins: NDArray[np.float32] | None = None
         self._springs_shown = False
@@ -64,6 +64,7 @@ class RerunRecorder:
         strain, of_vertex = self._shading.strains(frame.positions)
         self._stream.set_time("frame", sequence=frame.index)
         self._stream.set_time("time", duration=frame.time)
+        self._stream.set_time("iteration", sequence=0)  # else that timeline would show no scene at all
         self._log_mesh(p, self._shading.colours(of_vertex))
         self._log_pins(p)
         self._log_springs(p, strain)
@@ -169,10 +170,15 @@ class RerunRecorder:
             rr.TimeColumn("time", duration=frames * self._info.time_step),
         )
 
-    def _style(self, entity: str, name: str) -> None:
-        if entity not in self._styled:
-            self._styled.add(entity)
-            self._stream.log(entity, rr.SeriesLines(names=name, widths=1.5), static=True)
+    def _style(self, entity: str, label: str) -> None:
+        group, name = entity.rsplit("/", 1)
+        names = self._styled.setdefault(group, [])
+        if name not in names:
+            colour = blueprint.COLOURS[len(names) % len(blueprint.COLOURS)]
+            names.append(name)
+            self._stream.log(entity, rr.SeriesLines(names=label, colors=colour, widths=1.5), static=True)
+            if group.startswith("/convergence"):  # a frame has but one place on the timeline `frame`
+                self._stream.log(entity, rr.SeriesPoints(names=label, colors=colour, marker_sizes=3), static=True)
 
 
 def _segments(ends: NDArray[np.float32]) -> pa.Array:
