@@ -101,9 +101,9 @@ def _layout(panels: int, tiles: int) -> _Grid:
 
 
 def _title(page: Figure, panels: Mapping[str, Sequence[tuple[str, Replay]]]) -> None:
-    meaning = "distance: the farthest vertex from the first solver's, in mean rest lengths"
+    meaning = "final frames; distance: the farthest vertex from the first solver's, in mean rest lengths"
     if len(panels) > 1:
-        header(page, "Final frames, solver by solver", [meaning])
+        header(page, "Solvers side by side", [meaning])
         return
     ((heading, panel),) = panels.items()
     replay = panel[0][1]
