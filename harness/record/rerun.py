@@ -108,7 +108,7 @@ class RerunRecorder:
 
     def _log_once(self) -> None:
         info, mesh = self._info, self._info.mesh
-        facts: dict[str, Any] = dict(info.properties)
+        facts: dict[str, Any] = {key: [value] for key, value in info.properties.items()}
         self._stream.send_property("run", rr.AnyValues(**facts))
         network: dict[str, Any] = {
             "time_step": info.time_step,

@@ -1,0 +1,313 @@
+"""What every recording promises: exact positions, small files, whole files or none, and answers for damaged ones."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from harness.errors import InputError, RunFailed
+from harness.mesh.grid import Grid
+from harness.record.base import Frame
+from harness.record.compare import side_by_side
+from harness.record.reader import open_recording, read_replay, summary
+from harness.record.rerun import FLUSH, SCALARS, RerunRecorder
+from tests.recordings import MESHES, info, record, waving
+
+
+def columns(path: Path) -> dict[tuple[str, str], str]:
+    """A digest of each column of a recording, decoded: row ids and the cut into chunks do not count."""
+    rows: dict[tuple[str, str], list[tuple[str, bytes]]] = {}
+    for chunk in RrdReader(path).store().stream():
+        batch = chunk.to_record_batch()
+        times = [batch[name].cast(pa.int64()).to_pylist() for name in sorted(chunk.timeline_names)]
+        for name in set(batch.schema.names) - set(chunk.timeline_names) - {"rerun.controls.RowId"}:
+            for k in range(batch.num_rows):
+                digest = hashlib.sha256(repr(batch[name][k].as_py()).encode()).digest()
+                rows.setdefault((chunk.entity_path, name), []).append((repr([t[k] for t in times]), digest))
+    return {key: hashlib.sha256(repr(sorted(found)).encode()).hexdigest() for key, found in rows.items()}
+
+
+@pytest.mark.parametrize("mesh", MESHES)
+def test_positions_come_back_exactly_to_float32(mesh: str, tmp_path: Path):
+    of = info(mesh)
+    replay = read_replay(record(tmp_path / "a.rrd", of, count=12))
+    expected = np.array([frame.positions.astype(np.float32) for frame in waving(of, 12)])
+    np.testing.assert_array_equal(replay.positions, expected)
+    np.testing.assert_array_equal(replay.frames, np.arange(12))
+    np.testing.assert_allclose(replay.times, 0.01 * np.arange(12), atol=1e-9)  # the file counts nanoseconds
+
+
+@pytest.mark.parametrize("mesh", MESHES)
+def test_what_does_not_change_comes_back(mesh: str, tmp_path: Path):
+    of = info(mesh)
+    replay = read_replay(record(tmp_path / "a.rrd", of))
+    assert (replay.title, replay.run_id, replay.strain_range) == (of.title, of.run_id, of.strain_range)
+    assert replay.properties == of.properties
+    np.testing.assert_array_equal(replay.triangles, of.mesh.triangles)
+    np.testing.assert_array_equal(replay.springs, of.springs)
+    np.testing.assert_array_equal(replay.rest_lengths, of.rest_lengths)
+    np.testing.assert_array_equal(replay.pinned, of.pinned)
+
+
+def test_a_mesh_without_springs_or_pins_is_recorded(tmp_path: Path):
+    none = {"springs": np.empty((0, 2), np.int64), "rest_lengths": np.empty(0), "pinned": np.empty(0, np.int64)}
+    replay = read_replay(record(tmp_path / "a.rrd", info(**none)))
+    assert (replay.springs.shape, replay.rest_lengths.shape, replay.pinned.shape) == ((0, 2), (0,), (0,))
+    assert len(replay.frames) == 12
+
+
+def test_topology_is_written_once(tmp_path: Path):
+    with open_recording(record(tmp_path / "a.rrd", count=30)) as source:
+        found = list(source.chunks(content="/scene/mesh", components=["Mesh3D:triangle_indices"]))
+    assert [(chunk.num_rows, chunk.is_static) for chunk in found] == [(1, True)]
+
+
+def test_scalars_come_in_bulk(tmp_path: Path):
+    frames = 3 * SCALARS + 1
+    with open_recording(record(tmp_path / "a.rrd", count=frames)) as source:
+        chunks = list(source.chunks(content="/strain/largest", components=["Scalars:scalars"]))
+    assert [chunk.num_rows for chunk in chunks] == [SCALARS] * 3 + [1]
+
+
+def test_a_frame_of_a_large_cloth_takes_at_most_20_bytes_a_vertex(tmp_path: Path):
+    mesh = Grid().build(64)
+    of = replace(info(), mesh=mesh, springs=mesh.springs, rest_lengths=mesh.rest_lengths)
+    sizes = [record(tmp_path / f"{count}.rrd", of, count, 0.01).stat().st_size for count in (60, 180)]
+    assert (sizes[1] - sizes[0]) / 120 / len(mesh.rest) < 20
+
+
+def test_recording_leaves_its_input_untouched(tmp_path: Path):
+    of = info()
+    recorder = RerunRecorder(tmp_path / "a.rrd", of)
+    for frame in waving(of, 3):
+        before = frame.positions.copy()
+        frame.positions.flags.writeable = False  # writing would raise
+        recorder.frame(frame)
+        np.testing.assert_array_equal(frame.positions, before)
+    recorder.close({})
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e300])
+def test_positions_that_are_not_finite_are_recorded(value: float, tmp_path: Path):
+    of = info()
+    recorder = RerunRecorder(tmp_path / "a.rrd", of)
+    for frame in waving(of, 3):
+        p = frame.positions.copy()
+        if frame.index == 1:
+            p[7] = value
+        recorder.frame(replace(frame, positions=p))
+    replay = read_replay(recorder.close({}))
+    with np.errstate(over="ignore"):
+        np.testing.assert_array_equal(replay.positions[1, 7], np.full(3, np.float32(value)))
+    assert np.isfinite(replay.positions[[0, 2]]).all()
+
+
+def test_two_recordings_of_one_run_are_equal(tmp_path: Path):
+    first, second = (columns(record(tmp_path / f"{name}.rrd")) for name in "ab")
+    assert first == second
+    other = columns(record(tmp_path / "c.rrd", amplitude=0.1 + 1e-6))
+    assert first.keys() == other.keys()
+    changed = {entity for entity, name in first if first[entity, name] != other[entity, name]}
+    assert changed >= {"/scene/mesh", "/strain/largest"}
+
+
+def test_the_scalars_of_a_replay_have_one_value_a_frame(tmp_path: Path):
+    scalars = read_replay(record(tmp_path / "a.rrd", count=12)).scalars
+    steps = np.arange(1, 12)
+    np.testing.assert_array_equal(scalars["/energy/springs"], (steps, 2.0 * steps))
+    np.testing.assert_array_equal(scalars["/milliseconds/local"], (steps, steps / 2))
+    np.testing.assert_array_equal(scalars["/residual"][1], [np.nan, *(10.0**-k for k in range(1, 12))])
+    np.testing.assert_allclose(scalars["/residual/log10"][1][1:], -steps)
+    np.testing.assert_array_equal(scalars["/iterations"][1], np.arange(12))
+    assert not any("convergence" in entity for entity in scalars)
+
+
+def test_convergence_is_on_the_timelines_of_frames_and_of_iterations(tmp_path: Path):
+    table = summary(record(tmp_path / "a.rrd")).scalars
+    rows = [row for row in table.to_pylist() if row["entity"] == "/convergence/residual/frame_0003"]
+    found = [(row["frame"], row["iteration"], row["value"]) for row in rows]
+    assert found == [(3, 1, 1.0), (3, 2, 0.1), (3, 3, 0.0)]
+
+
+def test_springs_of_a_large_mesh_do_not_stay_over_a_mesh_that_moves_on(tmp_path: Path):
+    mesh = Grid().build(20)
+    of = replace(info(), mesh=mesh, springs=mesh.springs, rest_lengths=mesh.rest_lengths)
+    drawn, cleared = [], []
+    with open_recording(record(tmp_path / "a.rrd", of, count=100)) as source:
+        for chunk in source.chunks(content="/scene/springs"):
+            batch = chunk.to_record_batch()
+            names = set(batch.schema.names)
+            for k, frame in enumerate(batch["frame"].to_pylist()):
+                if "LineStrips3D:strips" in names and batch["LineStrips3D:strips"][k].is_valid:
+                    drawn.append(frame)
+                if "Clear:is_recursive" in names and batch["Clear:is_recursive"][k].is_valid:
+                    cleared.append(frame)
+    assert 1 < len(drawn) < 10
+    assert cleared == [frame + 1 for frame in drawn]
+
+
+def test_the_file_has_its_name_only_when_it_is_complete(tmp_path: Path):
+    of = info()
+    recorder = RerunRecorder(tmp_path / "a.rrd", of)
+    for frame in waving(of, 7):
+        recorder.frame(frame)
+    assert not (tmp_path / "a.rrd").exists()
+    assert recorder.close({}) == tmp_path / "a.rrd"
+    recorder.abandon()  # as a clean-up does: nothing more happens
+    assert [file.name for file in tmp_path.iterdir()] == ["a.rrd"]
+    assert summary(tmp_path / "a.rrd").complete
+    assert RrdReader(tmp_path / "a.rrd").blueprints(), "it opens with its own layout"
+
+
+def test_nothing_is_left_of_an_abandoned_recording(tmp_path: Path):
+    recorder = RerunRecorder(tmp_path / "a.rrd", info())
+    for frame in waving(info(), 7):
+        recorder.frame(frame)
+    recorder.abandon()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_that_cannot_be_written_fails(tmp_path: Path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(RunFailed, match="cannot be written"):
+        RerunRecorder(tmp_path / "file" / "a.rrd", info())
+
+
+RECORD = """
+import os, resource, signal, sys
+from pathlib import Path
+from harness.record.rerun import RerunRecorder
+from tests.recordings import info, waving
+recorder = RerunRecorder(Path(sys.argv[1]), info())
+{before}
+for frame in waving(info(), 33):
+    recorder.frame(frame)
+{after}
+"""
+KILLED = RECORD.format(before="", after="os.kill(os.getpid(), signal.SIGKILL)")
+FULL = RECORD.format(
+    before="signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))",
+    after="recorder.close({})",
+)
+
+
+def run(code: str, path: Path) -> subprocess.CompletedProcess[str]:
+    """Run Python code in a process of its own, in the repository."""
+    root = Path(__file__).resolve().parents[2]
+    return subprocess.run([sys.executable, "-c", code, path], cwd=root, capture_output=True, text=True)
+
+
+def test_a_full_disk_is_a_failure_and_not_a_damaged_file(tmp_path: Path):
+    told = run(FULL, tmp_path / "a.rrd")
+    assert "RunFailed" in told.stderr
+    assert "cannot be written" in told.stderr
+    assert not (tmp_path / "a.rrd").exists()
+
+
+def test_a_killed_run_leaves_all_frames_up_to_the_last_flush(tmp_path: Path):
+    told = run(KILLED, tmp_path / "a.rrd")
+    assert told.returncode == -signal.SIGKILL, told.stderr
+    (left,) = tmp_path.iterdir()
+    assert left.name != "a.rrd"
+    found, replay = summary(left), read_replay(left)
+    assert not found.complete
+    assert len(replay.frames) > 33 - FLUSH
+    expected = [frame.positions.astype(np.float32) for frame in waving(info(), len(replay.frames))]
+    np.testing.assert_array_equal(replay.positions, expected)
+    assert len(replay.scalars["/strain/largest"][0]) == SCALARS
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8, 0.99])
+def test_a_file_that_was_cut_is_read_up_to_the_cut(share: float, tmp_path: Path):
+    path = record(tmp_path / "a.rrd", count=60)
+    whole = read_replay(path)
+    os.truncate(path, int(share * path.stat().st_size))
+    replay, found = read_replay(path), summary(path)
+    assert not found.complete
+    assert 0 < len(replay.frames) <= 60
+    np.testing.assert_array_equal(replay.positions, whole.positions[: len(replay.frames)])
+    assert [file.name for file in tmp_path.iterdir()] == ["a.rrd"]
+
+
+def foreign(path: Path) -> None:
+    """A recording of Rerun that is none of ours."""
+    stream = rr.RecordingStream("other", recording_id="other")
+    stream.save(path)
+    stream.log("/points", rr.Points3D([[0, 0, 0]]))
+    stream.flush()
+    stream.disconnect()
+
+
+STRANGERS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "missing": (lambda path: None, "no such file"),
+    "folder": (lambda path: path.mkdir(), "no such file"),
+    "empty": (lambda path: path.write_bytes(b""), "is empty"),
+    "text": (lambda path: path.write_text("frame,x,y\\n0,1,2\\n"), "is not a Rerun recording"),
+    "noise": (lambda path: path.write_bytes(bytes(range(256)) * 9), "is not a Rerun recording"),
+    "head": (lambda path: path.write_bytes(b"RRF2"), "Rerun recording"),
+    "garbage": (lambda path: path.write_bytes(b"RRF2" + bytes(range(256)) * 9), "Rerun recording|can be read"),
+    "foreign": (foreign, "not of one run"),
+}
+
+
+@pytest.mark.parametrize("name", STRANGERS)
+def test_what_is_no_recording_is_refused_by_name(name: str, tmp_path: Path):
+    make, message = STRANGERS[name]
+    path = tmp_path / "a.rrd"
+    make(path)
+    with pytest.raises(InputError, match=message) as refused:
+        read_replay(path)
+    assert refused.value.mistakes[0].file == path
+
+
+def test_chosen_frames_are_read_alone(tmp_path: Path):
+    path = record(tmp_path / "a.rrd", count=12)
+    whole, chosen = read_replay(path), read_replay(path, [7, 2, -1])
+    np.testing.assert_array_equal(chosen.frames, [2, 7, 11])
+    np.testing.assert_array_equal(chosen.positions, whole.positions[[2, 7, 11]])
+    with pytest.raises(InputError, match="no frame 12; frames 0 to 11"):
+        read_replay(path, [12])
+
+
+def test_solvers_stand_side_by_side_in_one_file(tmp_path: Path):
+    paths = {"dense, 5 x": tmp_path / "a.rrd", "dense 5 x": tmp_path / "b.rrd"}
+    for k, path in enumerate(paths.values()):
+        record(path, amplitude=0.1 * (k + 1))
+    side_by_side(tmp_path / "both.rrd", paths, "cloth 6")
+    found = summary(tmp_path / "both.rrd")
+    assert found.complete
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.rrd", "b.rrd", "both.rrd"]
+    for k, path in enumerate(paths.values()):
+        root = f"/{k + 1}-dense-5-x"
+        assert {root + entity for entity in summary(path).entities} <= set(found.entities)
+        ours = {key: value for key, value in columns(path).items() if key[0] == "/scene/mesh"}
+        copied = columns(tmp_path / "both.rrd")
+        assert {name: copied[root + entity, name] for entity, name in ours} == {key[1]: v for key, v in ours.items()}
+
+
+def test_nothing_is_left_of_a_comparison_with_a_stranger(tmp_path: Path):
+    record(tmp_path / "a.rrd")
+    foreign(tmp_path / "b.rrd")
+    with pytest.raises(InputError, match="not of one run"):
+        side_by_side(tmp_path / "both.rrd", {"a": tmp_path / "a.rrd", "b": tmp_path / "b.rrd"}, "both")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.rrd", "b.rrd"]
+
+
+def test_frames_may_be_left_out(tmp_path: Path):
+    of = info()
+    recorder = RerunRecorder(tmp_path / "a.rrd", of)
+    for index in (0, 10, 20):
+        recorder.frame(Frame(index, index * 0.01, of.mesh.rest, {}, 1.0, 1))
+    np.testing.assert_array_equal(read_replay(recorder.close({})).frames, [0, 10, 20])

@@ -1,0 +1,184 @@
+"""`springbench inspect` and `springbench view`: what they print, write, open and refuse."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.csv
+import pytest
+import pyvista as pv
+from rich.console import Console
+
+from harness.errors import InputError, RunFailed
+from harness.record.compare import side_by_side
+from harness.record.reader import read_replay
+from harness.report import inspect as module
+from harness.report.inspect import inspect, view
+from tests.recordings import info, record
+
+
+@pytest.fixture
+def cloth(tmp_path: Path) -> Path:
+    return record(tmp_path / "cloth.rrd")
+
+
+@pytest.fixture
+def chain(tmp_path: Path) -> Path:
+    return record(tmp_path / "chain.rrd", info("chain"))
+
+
+def printed(*paths: Path, **options: Any) -> str:
+    """What an inspection prints, white space made one blank."""
+    out = io.StringIO()
+    asked = {"frame": None, "export": None, "csv": None, **options}
+    inspect(list(paths), **asked, console=Console(file=out, width=200))
+    return " ".join(out.getvalue().split())
+
+
+def test_an_inspection_says_what_is_in_a_recording(cloth: Path):
+    text = printed(cloth)
+    for words in (
+        "cloth - test",
+        "cpu a, b [c]",
+        "frame 0 11",
+        "iteration 0 3",
+        "frames 12 recorded",
+        "/milliseconds/step 1 6 10.5",
+        "/energy/springs 2 22 22",
+        "/residual 0.1 1e-11 0.1",
+        "/strain/largest",
+        "/scene/mesh",
+    ):
+        assert words in text, words
+    assert "Not complete" not in text
+
+
+def test_an_inspection_says_that_a_run_was_stopped(cloth: Path):
+    os.truncate(cloth, int(0.7 * cloth.stat().st_size))
+    assert "Not complete" in printed(cloth)
+
+
+@pytest.mark.parametrize("suffix", [".vtp", ".vtk", ".ply", ".stl", ".obj"])
+def test_a_frame_is_exported_as_a_surface(suffix: str, cloth: Path, tmp_path: Path):
+    target = tmp_path / f"mesh{suffix}"
+    printed(cloth, frame=5, export=target)
+    replay = read_replay(cloth, [5])
+    mesh = pv.read(target)
+    assert mesh.n_cells == len(replay.triangles)
+    low, high = replay.positions[0].min(axis=0), replay.positions[0].max(axis=0)
+    np.testing.assert_allclose(np.reshape(mesh.bounds, (3, 2)).T, [low, high], atol=1e-5)  # text formats: 6 digits
+    if suffix in (".vtp", ".vtk"):
+        np.testing.assert_array_equal(mesh.points, replay.positions[0])
+        assert np.abs(mesh.point_data["strain"]).max() == pytest.approx(
+            replay.scalars["/strain/largest"][1][5], rel=1e-4
+        )
+
+
+def test_the_last_frame_of_a_chain_is_exported_as_lines(chain: Path, tmp_path: Path):
+    printed(chain, export=tmp_path / "chain.vtp")
+    mesh, replay = pv.read(tmp_path / "chain.vtp"), read_replay(chain, [-1])
+    np.testing.assert_array_equal(mesh.points, replay.positions[0])
+    np.testing.assert_array_equal(mesh.lines.reshape(-1, 3)[:, 1:], replay.springs)
+    assert mesh.cell_data["strain"].shape == (len(replay.springs),)
+
+
+def test_scalars_are_written_in_long_form(cloth: Path, tmp_path: Path):
+    printed(cloth, csv=tmp_path / "scalars.csv")
+    rows = pyarrow.csv.read_csv(tmp_path / "scalars.csv").to_pylist()
+    at = {(row["entity"], row["frame"], row["iteration"]): (row["time"], row["value"]) for row in rows}
+    assert at["/energy/springs", 4, None] == (0.04, 8.0)
+    assert at["/convergence/objective/frame_0003", 3, 2] == (0.03, 4.0)
+
+
+def test_two_recordings_are_compared_in_metres_and_rest_lengths(cloth: Path, tmp_path: Path):
+    of = info()
+    moved = replace(of.mesh, rest=of.mesh.rest + np.array([0.0, 0.25, 0.0]))
+    other = record(tmp_path / "other.rrd", replace(of, mesh=moved), count=9)
+    text = printed(cloth, other)
+    assert "positions in frame 8" in text  # the last that both have
+    shift = np.linalg.norm(
+        read_replay(cloth, [8]).positions[0].astype(float) - read_replay(other, [8]).positions[0], axis=1
+    )
+    spacing = of.rest_lengths.mean()
+    assert f"max {shift.max():.6g} {shift.max() / spacing:.6g}" in text
+    assert f"rms {np.sqrt(np.mean(shift**2)):.6g}" in text
+    assert "/milliseconds/step 6 4.5 0.75" in text
+
+
+def test_two_equal_recordings_do_not_differ(cloth: Path, tmp_path: Path):
+    assert "max 0 0 rms 0 0" in printed(cloth, record(tmp_path / "same.rrd"))
+
+
+def test_recordings_side_by_side_can_be_inspected(cloth: Path, tmp_path: Path):
+    both = tmp_path / "both.rrd"
+    side_by_side(both, {"dense": cloth, "sparse": cloth}, "cloth 6")
+    assert "/1-dense/milliseconds/step 1 6 10.5" in printed(both)
+    with pytest.raises(InputError, match="not of one run"):
+        printed(both, cloth)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frame": 12, "export": Path("a.vtp")}, "no frame 12; frames 0 to 11"),
+        ({"frame": 3}, "--frame: .* --export"),
+        ({"export": Path("a.png")}, r"unknown suffix '.png'; .* one of .obj, .ply, .stl, .vtk, .vtp"),
+        ({"export": Path("no/folder/a.vtp")}, "cannot be written"),
+        ({"csv": Path("no/folder/a.csv")}, "cannot be written"),
+    ],
+    ids=["frame", "frame-without-export", "suffix", "export-folder", "csv-folder"],
+)
+def test_a_mistake_is_answered_with_what_is_wanted(options: dict, message: str, cloth: Path, tmp_path: Path):
+    placed = {key: tmp_path / value if isinstance(value, Path) else value for key, value in options.items()}
+    with pytest.raises(InputError, match=message):
+        printed(cloth, **placed)
+
+
+def test_a_chain_is_not_exported_as_a_surface(chain: Path, tmp_path: Path):
+    with pytest.raises(InputError, match=r"springs without a surface: one of .vtk, .vtp"):
+        printed(chain, export=tmp_path / "a.stl")
+
+
+def test_one_file_takes_one_recording(cloth: Path, chain: Path, tmp_path: Path):
+    with pytest.raises(InputError, match="take one recording; 2 came"):
+        printed(cloth, chain, csv=tmp_path / "a.csv")
+
+
+def test_meshes_of_different_sizes_are_not_compared(cloth: Path, chain: Path):
+    with pytest.raises(InputError, match="36 and 9 vertices"):
+        printed(cloth, chain)
+
+
+def test_the_viewer_opens_the_recordings(cloth: Path, monkeypatch: pytest.MonkeyPatch):
+    opened: list[list[str]] = []
+
+    def run(command: list[str], check: bool) -> subprocess.CompletedProcess:
+        opened.append(command)
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(module.subprocess, "run", run)
+    view([cloth])
+    ((binary, *files),) = opened
+    assert Path(binary).is_file()
+    assert files == [str(cloth)]
+
+
+def test_the_viewer_says_that_it_needs_a_display(cloth: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(module.sys, "platform", "linux")
+    with pytest.raises(RunFailed, match="no display"):
+        view([cloth])
+
+
+def test_the_viewer_refuses_what_is_no_recording(tmp_path: Path):
+    (tmp_path / "a.rrd").write_text("no")
+    with pytest.raises(InputError, match="is not a Rerun recording"):
+        view([tmp_path / "a.rrd"])

@@ -1,0 +1,68 @@
+"""The layout of a recording: a camera that sees the run, and words that say what is shown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.mesh.grid import Grid
+from harness.record.blueprint import Box, run_document, scale_name, spring_cadence
+from tests.recordings import info
+
+CORNER = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 2.0]])
+
+
+def numbers(component: Any) -> np.ndarray:
+    """The three numbers of a position in a blueprint."""
+    return np.array(component.as_arrow_array().to_pylist()[0])
+
+
+def seen(box: Box, points: np.ndarray, aspect: float) -> np.ndarray:
+    """How far points are from the middle of the picture, 1 at its edge, (n, 2): across, up."""
+    controls = box.eye(aspect)
+    eye, target = numbers(controls.position), numbers(controls.look_target)
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, numbers(controls.eye_up))
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    depth = (points - eye) @ forward
+    tangent = np.tan(np.radians(55 / 2))
+    return np.abs(np.stack([(points - eye) @ right / aspect, (points - eye) @ up], axis=1) / depth[:, None] / tangent)
+
+
+@pytest.mark.parametrize("aspect", [0.6, 1.0])
+@pytest.mark.parametrize("fall", [0.0, -1.0, -5.0])
+def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: float):
+    box = Box(CORNER)
+    box.add(CORNER + np.array([0.0, fall, 0.0]))
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, fall) for z in (0, 2)])
+    places = seen(box, corners, aspect)
+    assert places.max() <= 1.0
+    assert places.max() > 0.9  # the margin is 5 %
+
+
+@pytest.mark.parametrize("bad", [1e6, np.nan, np.inf])
+def test_the_camera_ignores_positions_that_have_blown_up(bad: float):
+    box, same = Box(CORNER), Box(CORNER)
+    box.add(np.array([[bad, 0.0, 0.0]]))
+    assert numbers(box.eye().position) == pytest.approx(numbers(same.eye().position))
+
+
+def test_a_single_point_can_be_looked_at():
+    assert np.isfinite(numbers(Box(np.zeros((1, 3))).eye().position)).all()
+
+
+def test_springs_of_small_meshes_are_drawn_in_every_frame():
+    assert spring_cadence(info()) == 1
+    mesh = Grid().build(40)
+    assert spring_cadence(replace(info(), mesh=mesh, springs=mesh.springs)) > 10
+
+
+def test_the_words_name_colours_run_and_machine():
+    text = run_document(info())
+    for words in ("cloth - test", "| cpu | `a, b [c]` |", "time step", "blue = compressed 10 %", "/scene/springs"):
+        assert words in text
+    assert scale_name(0.025).count("2.5 %") == 2
