@@ -53,7 +53,10 @@ def minimum_degree(pointers, neighbours, piece, local):
     vertices = piece.copy()
     gone = members + 1
     for place in range(size):
-        best = np.argmin(degree)
+        best = 0
+        for i in range(size):
+            if degree[i] < degree[best]:
+                best = i
         piece[place] = vertices[best]
         degree[best] = gone
         rows[best, best >> 6] &= ~(np.uint64(1) << np.uint64(best & 63))

@@ -47,7 +47,8 @@ def _dissect(pointers, neighbours, order, leaf):
         first, end, connected = stack.pop()
         piece = order[first:end]
         pieces += 1
-        owner[piece] = pieces
+        for v in piece:
+            owner[v] = pieces
         if end - first <= leaf:
             minimum_degree(pointers, neighbours, piece, local)
             continue
@@ -62,16 +63,17 @@ def _dissect(pointers, neighbours, order, leaf):
         refine(pointers, neighbours, piece, side, local)
         at = first
         for part in range(3):
+            begun = at
             for i in range(end - first):
                 if side[i] == part:
                     scratch[at] = piece[i]
                     at += 1
             if part < 2:
-                stack.append((at - np.sum(side == part), at, False))
+                stack.append((begun, at, False))
+        for i in range(begun, end):
+            owner[scratch[i]] = -1
         for i in range(first, end):
             order[i] = scratch[i]
-        for i in range(end - np.sum(side == 2), end):
-            owner[order[i]] = -1
 
 
 @njit(cache=True)

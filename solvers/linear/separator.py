@@ -147,7 +147,7 @@ def refine(pointers, neighbours, piece, side, local):
     moved = np.zeros(size, np.bool_)
     separator = np.empty(size, np.int64)
     pull = np.zeros((size, 2), np.int64)  # how many neighbours on the other side a move to this side pulls in
-    trail = np.empty((size, 2), np.int64)  # vertex, side it had
+    trail = np.empty((2 * size, 2), np.int64)  # vertex, side it had
     for _ in range(_PASSES):
         moved[:] = False
         listed = 0
@@ -171,9 +171,11 @@ def refine(pointers, neighbours, piece, side, local):
             if choice < 0:
                 break
             i = separator[choice]
+            v = piece[i]
+            if at + 1 + pointers[v + 1] - pointers[v] > len(trail):
+                break
             listed -= 1
             separator[choice] = separator[listed]
-            v = piece[i]
             moved[i] = True
             trail[at, 0], trail[at, 1] = i, 2
             at += 1
@@ -199,15 +201,13 @@ def refine(pointers, neighbours, piece, side, local):
                     w = piece[j]
                     for f in range(pointers[w], pointers[w + 1]):
                         k = local[neighbours[f]]
-                        if k >= 0 and side[k] == 2 and k != j:
+                        if k >= 0 and side[k] == 2:
                             pull[k, to] -= 1
             gap = abs(counts[0] - counts[1])
             if counts[2] < best or (counts[2] == best and gap < best_gap):
                 best, best_gap, best_at, since = counts[2], gap, at, 0
             else:
                 since += 1
-            if at + 64 > size:
-                break
         improved = best_at > 0
         while at > best_at:
             at -= 1

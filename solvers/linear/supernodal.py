@@ -1,0 +1,100 @@
+"""A sparse Cholesky factorisation made to be solved with thousands of times, three right-hand sides at a time.
+
+    Q = L L';  supernode J with rows B below:  S = L_JJ^-T L_JJ^-1,  W = -L_BJ L_JJ^-1
+    Q x = b:   forwards b_B += W b_J;  backwards x_J = S b_J + W' x_B
+
+A solve is then multiply-adds alone, over panels [S; W] that lie in the order in which they are read.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from solvers.linear.ordering import nested_dissection
+from solvers.linear.supernodal_factor import factorise
+from solvers.linear.supernodal_solve import solve
+from solvers.linear.symbolic import LANES, WIDTH, Symbolic, analyse
+from solvers.problem import NotPositiveDefinite, Positions
+
+Precision = Literal["float64", "float32"]
+
+
+class Layout(NamedTuple):
+    """Where the panels of a factor lie. A supernode is cut into chunks of at most WIDTH columns, a panel each.
+
+    chunks (c, 6): of each its offset in the panels, its offset in `index`, its rows, its columns without
+    padding, its padded columns in LANES, its first slot; chunk_of (s + 1,): the first chunk of each supernode;
+    index: of each supernode the slots of its columns and of the rows below; size: entries in all panels.
+    """
+
+    chunks: NDArray[np.int64]
+    chunk_of: NDArray[np.int64]
+    index: NDArray[np.int32]
+    size: int
+
+    @classmethod
+    def of(cls, s: Symbolic) -> Layout:
+        """The layout of a factor of this structure."""
+        width, below = s.width.astype(np.int64), np.diff(s.row_start)
+        many = -(-width // WIDTH)
+        chunk_of = np.concatenate([[0], np.cumsum(many)])
+        node = np.repeat(np.arange(len(width)), many)
+        done = (np.arange(len(node)) - chunk_of[node]) * WIDTH
+        own = np.minimum(WIDTH, width[node] - done)
+        rows = width[node] - done + below[node]
+        quads = -(-own // LANES)
+        cells = rows * quads * LANES
+        base = np.concatenate([[0], np.cumsum(width + below)])
+        columns = np.stack(
+            [np.cumsum(cells) - cells, base[node] + done, rows, own, quads, s.first[node] + done], axis=1
+        )
+        is_row = np.repeat(np.tile([False, True], len(width)), np.stack([width, below], axis=1).ravel())
+        index = np.empty(base[-1], np.int32)
+        index[is_row] = s.rows
+        index[~is_row] = np.flatnonzero(s.vertex >= 0)
+        return cls(np.ascontiguousarray(columns), chunk_of, index, int(cells.sum()))
+
+
+class Supernodal:
+    """A supernodal Cholesky factorisation of a sparse symmetric positive definite Q.
+
+    nonzeros: entries of L, diagonal included, before supernodes are padded; panel_bytes: what is read of the
+    panels, once forwards and once backwards without each other's part; flops: additions and multiplications a solve,
+    padding included. `precision` is that of the panels and the solve; the factorisation is in float64.
+    """
+
+    def __init__(self, Q: csr_array, *, precision: Precision = "float64") -> None:
+        """Raises NotPositiveDefinite, with a vertex at fault."""
+        if not np.isfinite(Q.data).all():
+            rows = np.repeat(np.arange(len(Q.indptr) - 1), np.diff(Q.indptr))
+            v = rows[~np.isfinite(Q.data)][0]
+            raise NotPositiveDefinite(f"Q is not finite in row {v}: a stiffness, a mass or a pin weight there is not")
+        pointers, neighbours = Q.indptr.astype(np.int64), Q.indices.astype(np.int32)
+        s = analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
+        layout = Layout.of(s)
+        panels = np.empty(layout.size)
+        v = factorise(
+            pointers, neighbours, Q.data, s.slot, s.vertex, s.parent, s.first, s.row_start, s.rows,
+            np.arange(len(s.parent)), layout.chunk_of, layout.chunks, panels,
+        )  # fmt: skip
+        if v >= 0:
+            raise NotPositiveDefinite(
+                f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point at vertex {v}: nothing "
+                "determines its position, or stiffnesses, masses and pin weights lie too far apart or are negative"
+            )
+        self._symbolic, self._layout = s, layout
+        self._panels = panels.astype(precision, copy=False)
+        self._work = np.zeros(4 * len(s.vertex), precision)
+        self.nonzeros: int | None = s.nonzeros
+        self.panel_bytes = self._panels.nbytes
+        whole, below = layout.chunks[:, 2], layout.chunks[:, 2] - layout.chunks[:, 3]
+        self.flops = int(2 * 3 * LANES * layout.chunks[:, 4] @ (whole + below))
+
+    def solve(self, b: Positions, out: Positions) -> None:
+        """Write Q^-1 b, shape (n, 3), to `out`; b is left as it is and must not be `out`."""
+        s, layout = self._symbolic, self._layout
+        solve(self._panels, layout.index, layout.chunks, s.vertex, s.slot, self._work, b, out)
