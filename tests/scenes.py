@@ -88,9 +88,7 @@ def first_problem(made: Scene, first_guess: str = "current") -> StepProblem:
 
 def trajectory(made: Scene, solver: Solver, frames: int, *, first_guess: str = "current", iterations: int = 50):
     """The positions (frames, n, 3) [m] after each step."""
-    steps = simulate(
-        made, solver.prepare(made.system), StopRule(iterations), first_guess=first_guess, frames=frames
-    )
+    steps = simulate(made, solver.prepare(made.system), StopRule(iterations), first_guess=first_guess, frames=frames)
     return np.array([step.solution.positions.copy() for step in steps])
 
 

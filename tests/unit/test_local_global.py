@@ -10,7 +10,7 @@ import pytest
 from scipy.sparse import csr_array
 
 from solvers.energies.springs import TINY, Springs
-from solvers.local_global import CompiledLocalGlobal, DenseLocalGlobal, SparseLocalGlobal
+from solvers.local_global import CompiledLocalGlobal, DenseLocalGlobal, SparseLocalGlobal, only_springs
 from solvers.matrices import assemble
 from solvers.problem import NotPositiveDefinite, Pins, Positions, StepProblem, StopRule, System, Unsupported
 from tests.scenes import BACKENDS, SCENES, cloth, first_problem, random_network, random_problem
@@ -70,7 +70,7 @@ def test_an_iteration_is_a_preconditioned_gradient_step_of_length_one(backend, w
     guess[s.pins.vertices[exact]] = problem.pin_targets[exact]
     problem = replace(problem, first_guess=guess)
     (after,) = iterates(backend, problem, 1)
-    Q = assemble(s, [s.energies[0]]).toarray()  # pyright: ignore[reportArgumentType]  (springs are projective)
+    Q = assemble(s, [only_springs(s, "the test")]).toarray()
     step = np.linalg.solve(Q[np.ix_(s.free, s.free)], problem.gradient(guess)[s.free])
     np.testing.assert_allclose((guess - after)[s.free], step, rtol=0, atol=SOLVE * np.abs(step).max())
 
@@ -125,8 +125,7 @@ def test_loops_twins_and_springs_of_no_rest_length_are_harmless(backend):
 @backends
 def test_springs_in_two_energies_are_as_good_as_in_one(backend):
     problem = random_problem(6)
-    (one,) = problem.system.energies
-    assert isinstance(one, Springs)
+    one = only_springs(problem.system, "the test")
     parts = tuple(
         Springs(one.edges[k], one.stiffness[k], one.rest_length[k], one.rest_direction[k])
         for k in (slice(0, 11), slice(11, None))
@@ -217,8 +216,7 @@ INDEFINITE = {
 
 
 def _stiffness(system: System, k: float) -> Springs:
-    (springs,) = system.energies
-    assert isinstance(springs, Springs)
+    springs = only_springs(system, "the test")
     return replace(springs, stiffness=np.full(len(springs.edges), k))
 
 

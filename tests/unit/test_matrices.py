@@ -109,7 +109,10 @@ def test_no_explicit_zeros_are_stored_for_zero_mass_zero_stiffness_twins_and_loo
 
 
 def test_a_loop_has_an_empty_row_in_the_incidence():
-    assert matrices.signed_incidence_matrix_sparse(np.array([[1, 1], [0, 1]]), 2).toarray().tolist() == [[0, 0], [1, -1]]
+    assert matrices.signed_incidence_matrix_sparse(np.array([[1, 1], [0, 1]]), 2).toarray().tolist() == [
+        [0, 0],
+        [1, -1],
+    ]
 
 
 def test_one_number_stands_for_the_stiffness_of_every_spring_and_the_weight_of_every_pin():
@@ -163,8 +166,8 @@ def bare_system(springs, stiffness, mass, pinned, weight=1.0):
 
 @pytest.mark.parametrize("case", LOOSE)
 def test_vertices_that_nothing_determines_are_named(case):
-    *network, named = LOOSE[case]
-    system, energy = bare_system(*network)
+    springs, stiffness, mass, pinned, named = LOOSE[case]
+    system, energy = bare_system(springs, stiffness, mass, pinned)
     with pytest.raises(NotPositiveDefinite) as raised:
         matrices.assemble(system, [energy])
     assert named in str(raised.value)
@@ -173,5 +176,6 @@ def test_vertices_that_nothing_determines_are_named(case):
 @pytest.mark.parametrize("weight", [1.0, np.inf])
 @pytest.mark.parametrize("case", HELD)
 def test_a_mass_or_a_pin_determines_all_that_springs_tie_to_it(case, weight):
-    system, energy = bare_system(*HELD[case], weight)
+    springs, stiffness, mass, pinned = HELD[case]
+    system, energy = bare_system(springs, stiffness, mass, pinned, weight)
     assert matrices.assemble(system, [energy]).shape == (system.vertices, system.vertices)

@@ -115,9 +115,7 @@ def test_targets_follow_the_order_of_the_pins_where_exact_ones_and_penalties_alt
     problem = random_problem(5)
     weights = np.array([np.inf, 1e8, np.inf, 1e8])
     vertices, targets = np.array([1, 2, 5, 8]), np.arange(12.0).reshape(4, 3)
-    problem = replace(
-        problem, system=replace(problem.system, pins=Pins(vertices, weights)), pin_targets=targets
-    )
+    problem = replace(problem, system=replace(problem.system, pins=Pins(vertices, weights)), pin_targets=targets)
     p = SparseLocalGlobal().prepare(problem.system).solve(problem, StopRule(20)).positions
     # Some 1e4 N over 1e8 N/m.
     np.testing.assert_allclose(p[vertices], targets, rtol=0, atol=1e-3)

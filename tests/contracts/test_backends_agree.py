@@ -1,0 +1,138 @@
+"""Dense, sparse and compiled do the same iterations: to the last few digits, whatever the scene and the threads."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+
+from harness.load import scene_from_assignment
+from harness.scene import Scene, build
+from harness.simulate import FIRST_GUESSES
+from solvers.local_global import CompiledLocalGlobal, DenseLocalGlobal, SparseLocalGlobal, only_springs
+from solvers.problem import Positions, Solver
+from tests.scenes import BACKENDS, SCENES, first_problem, random_problem, trajectory
+
+AGREEMENT = 1e-9
+"""Of the scene's size. One solve leaves 1e-16 times the condition number, at most 1e6 where stiffness meets
+inertia; a swinging net multiplies that by a few in a hundred steps, a squeezed or stiff one by much more."""
+
+SMALL = ("single-spring", "chain", "net", "cloth")
+LARGE = ("stiff-cloth", "tower", "block", "skirt")
+WEIGHTS = {"penalty": 1e10, "exact": "exact"}
+
+ASSIGNMENT = Path(__file__).resolve().parents[3] / "shared" / "scenes"
+
+small = pytest.mark.parametrize("name", SMALL)
+pins = pytest.mark.parametrize("weight", WEIGHTS.values(), ids=list(WEIGHTS))
+first_guesses = pytest.mark.parametrize("first_guess", FIRST_GUESSES)
+
+
+def apart(found: list[Positions]) -> float:
+    """The largest difference of a coordinate between any two."""
+    return float(np.ptp(found, axis=0).max())
+
+
+def after_iterations(backend: Solver, problem, count: int) -> Positions:
+    *_, p = islice(backend.prepare(problem.system).iterates(problem), count)
+    return p
+
+
+@small
+@pins
+def test_backends_agree_after_a_hundred_steps(name, weight):
+    made = SCENES[name](weight)
+    assert apart([trajectory(made, backend, 100) for backend in BACKENDS]) <= AGREEMENT * made.mesh.size
+
+
+@pins
+@first_guesses
+def test_backends_agree_from_every_first_guess(weight, first_guess):
+    made = SCENES["cloth"](weight)
+    found = [trajectory(made, backend, 20, first_guess=first_guess) for backend in BACKENDS]
+    assert apart(found) <= AGREEMENT * made.mesh.size
+
+
+@pytest.mark.parametrize("name", LARGE)
+@pins
+def test_backends_agree_on_a_step_of_a_large_scene(name, weight):
+    made = SCENES[name](weight)
+    problem = first_problem(made)
+    assert apart([after_iterations(backend, problem, 15) for backend in BACKENDS]) <= AGREEMENT * made.mesh.size
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_backends_agree_from_random_positions(name):
+    made = SCENES[name](1e10)
+    problem = first_problem(made)
+    rng = np.random.default_rng(0)
+    guess = problem.current + 0.3 * made.mesh.size * rng.normal(size=problem.current.shape)
+    problem = replace(problem, first_guess=guess)
+    assert apart([after_iterations(backend, problem, 10) for backend in BACKENDS]) <= AGREEMENT * made.mesh.size
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_backends_agree_on_random_networks(seed):
+    problem = random_problem(seed)
+    assert apart([after_iterations(backend, problem, 30) for backend in BACKENDS]) <= AGREEMENT
+
+
+@pytest.mark.skipif(not ASSIGNMENT.is_dir(), reason="the assignment's scenes are not beside the repository")
+@pytest.mark.parametrize("name", ["single-spring-horizontal", "horizontal-chain", "net"])
+def test_backends_agree_on_the_assignments_small_scenes(name):
+    made = assignment_scene(name)
+    found = [trajectory(made, backend, 100, first_guess="assignment") for backend in BACKENDS]
+    assert apart(found) <= AGREEMENT * made.mesh.size
+
+
+@pytest.mark.skipif(not ASSIGNMENT.is_dir(), reason="the assignment's scenes are not beside the repository")
+def test_sparse_and_compiled_agree_on_the_assignments_flag():
+    made = assignment_scene("flag")
+    found = [
+        trajectory(made, backend, 15, first_guess="assignment")
+        for backend in (SparseLocalGlobal(), CompiledLocalGlobal())
+    ]
+    assert apart(found) <= AGREEMENT * made.mesh.size
+
+
+def assignment_scene(name: str) -> Scene:
+    return build(scene_from_assignment(ASSIGNMENT / f"{name}.json"), 0)
+
+
+@pytest.mark.skipif(numba.get_num_threads() < 2, reason="Numba was started with one thread")
+@pytest.mark.parametrize("name", ["chain", "stiff-cloth", "block", "skirt"])
+def test_the_compiled_backend_gives_the_same_bits_with_any_number_of_threads(name):
+    problem = first_problem(SCENES[name](1e10))
+    before, found = numba.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            numba.set_num_threads(threads)
+            found.append(after_iterations(CompiledLocalGlobal(), problem, 10).copy())
+    finally:
+        numba.set_num_threads(before)
+    np.testing.assert_array_equal(found[0], found[1])
+
+
+def test_the_dense_backend_is_the_formulas_of_the_paper():
+    """One iteration, written out with the matrices' names."""
+    problem = random_problem(3, weights=(1e4,))
+    s = problem.system
+    springs = only_springs(s, "the test")
+    n, m = s.vertices, len(springs.edges)
+    A, C, K = np.zeros((m, n)), np.zeros((1, n)), np.diag(springs.stiffness)
+    for e, (i, j) in enumerate(springs.edges):
+        A[e, i] += 1.0
+        A[e, j] -= 1.0
+    C[0, 0] = 1.0
+    M, dt, w, r = np.diag(s.mass), s.time_step, 1e4, springs.rest_length
+    v = A @ problem.first_guess
+    length = np.linalg.norm(v, axis=1)
+    d = (r / np.where(length, length, 1.0))[:, None] * v
+    Q = A.T @ K @ A + M / dt**2 + w * C.T @ C
+    y = M @ problem.target / dt**2 + problem.force + w * C.T @ problem.pin_targets
+    wanted = np.linalg.solve(Q, A.T @ K @ d + y)
+    np.testing.assert_allclose(after_iterations(DenseLocalGlobal(), problem, 1), wanted, rtol=0, atol=AGREEMENT)

@@ -1,0 +1,153 @@
+"""Motion and rest against closed forms, and what implicit Euler conserves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from harness.effects.ether_drag import EtherDrag
+from harness.effects.gravity import Gravity
+from harness.effects.pins import Pins
+from harness.effects.springs import Springs
+from harness.mesh.chain import Chain
+from harness.mesh.grid import Grid
+from harness.scene import Scene
+from harness.simulate import State, problem
+from solvers.local_global import CompiledLocalGlobal
+from solvers.problem import Positions, StopRule
+from tests.scenes import BACKENDS, scene, static_shape, trajectory
+
+G = 9.81
+DT = 1 / 30
+CONVERGED = StopRule(20_000, 1e-13)
+
+backends = pytest.mark.parametrize("backend", BACKENDS, ids=lambda b: type(b).__name__)
+
+FREE = scene(Grid(), Springs(stretch=300.0), size=6)
+"""A cloth that nothing holds and nothing pulls at."""
+
+
+def moving(
+    made: Scene, velocity: Positions, steps: int, stop: StopRule = CONVERGED
+) -> list[tuple[Positions, Positions]]:
+    """Positions and velocities at the start and after each step."""
+    dt, prepared = made.system.time_step, CompiledLocalGlobal().prepare(made.system)
+    state = State(made.mesh.rest, made.mesh.rest - dt * velocity, 0)
+    found = [(state.positions, velocity)]
+    for index in range(1, steps + 1):
+        solution = prepared.solve(problem(made, state, "current"), stop)
+        state = State(solution.positions, state.positions, index)
+        found.append((state.positions, (state.positions - state.previous) / dt))
+    return found
+
+
+def spinning(made: Scene, rate: float) -> Positions:
+    """The velocity of a rotation about the vertical through the middle [m/s]."""
+    arm = made.mesh.rest - made.mesh.rest.mean(axis=0)
+    return np.cross([0.0, rate, 0.0], arm)
+
+
+def angular_momentum(made: Scene, p: Positions, v: Positions) -> np.ndarray:
+    return np.cross(p, made.system.mass[:, None] * v).sum(axis=0)
+
+
+@backends
+@pytest.mark.parametrize("stretch", [5.0, 500.0, 5e6])
+def test_a_mass_on_a_spring_follows_the_recurrence_of_implicit_euler(backend, stretch):
+    """(m/dt^2 + k) u' = m/dt^2 (2 u - u_before) + m g, along the spring's own axis, where it is linear."""
+    pins = Pins(at=("first",), weight="exact")
+    made = scene(
+        Chain(direction=(0.0, -1.0, 0.0)), Springs(stretch=stretch), Gravity(), pins, size=2, mass=2.0, time_step=DT
+    )
+    made = replace(made, velocity=(0.0, -0.5, 0.0))
+    extension = -trajectory(made, backend, 50)[:, 1, 1] - 1.0
+    u, before, inertia = 0.0, -0.5 * DT, 1.0 / DT**2
+    for found in extension:
+        u, before = (inertia * (2 * u - before) + G) / (inertia + stretch), u
+        assert abs(found - u) <= 1e-13  # fifty steps of round-off in positions of order one
+
+
+@pytest.mark.parametrize("stretch", [10.0, 500.0, 5e4])
+def test_a_mass_on_a_spring_hangs_at_the_extension_of_its_weight(stretch):
+    made = scene(
+        Chain(direction=(0.0, -1.0, 0.0)), Springs(stretch=stretch), Gravity(), Pins(at=("first",)), size=2, mass=2.0
+    )
+    # The pin of 1e10 N/m gives way by 2e-9 m under 2 kg; inertia pulls with 1e-12 N/m.
+    assert static_shape(made)[1, 1] == pytest.approx(-1.0 - G / stretch, abs=1e-8)
+
+
+@backends
+def test_a_free_cloth_falls_as_a_stone_does(backend):
+    """y_n = -g dt^2 n (n + 1) / 2, by implicit Euler."""
+    made = scene(Grid(), Springs(stretch=300.0), Gravity(), size=6, time_step=DT)
+    p = trajectory(made, backend, 40)
+    n = np.arange(1, 41)[:, None]
+    wanted = made.mesh.rest[:, 1] - G * DT**2 * n * (n + 1) / 2
+    # A thousand roundings of a fall of 9 m, which the cloth's own vibration carries on: 1e-12 to 1e-11.
+    np.testing.assert_allclose(p[:, :, 1], wanted, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(p[:, :, [0, 2]], made.mesh.rest[:, [0, 2]][None].repeat(40, 0), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("iterations", [1, 20])
+def test_linear_momentum_is_conserved_converged_or_not(iterations):
+    velocity = np.random.default_rng(0).normal(size=FREE.mesh.rest.shape)
+    momenta = [FREE.system.mass @ v for _, v in moving(FREE, velocity, 20, StopRule(iterations))]
+    # Round-off of positions, 1e-16, times stiffness over inertia, some tens, divided by dt.
+    np.testing.assert_allclose(momenta, np.tile(momenta[0], (21, 1)), rtol=0, atol=1e-12)
+
+
+def test_the_centre_of_mass_moves_as_a_particle_under_drag_and_gravity():
+    made = scene(Grid(), Springs(stretch=300.0), Gravity(), EtherDrag(rate=2.0), size=6, time_step=DT)
+    velocity = np.random.default_rng(1).normal(size=made.mesh.rest.shape)
+    share = made.system.mass / made.system.mass.sum()
+    centre, v = share @ made.mesh.rest, share @ velocity
+    for p, _ in moving(made, velocity, 20, StopRule(5))[1:]:
+        v = np.exp(-2.0 * DT) * v + DT * np.array([0.0, -G, 0.0])
+        centre = centre + DT * v
+        np.testing.assert_allclose(share @ p, centre, rtol=0, atol=1e-12)  # as above
+
+
+def test_angular_momentum_changes_by_exactly_what_implicit_euler_takes():
+    """L' = L + dt sum m v' x v.
+
+    Springs are central, sum p' x F(p') = 0, so sum p' x M v' = sum p' x M v, and p' = p + dt v'.
+    """
+    velocity = spinning(FREE, 3.0) + 0.3 * np.random.default_rng(2).normal(size=FREE.mesh.rest.shape)
+    steps = moving(FREE, velocity, 10)
+    for (p, v), (after, faster) in pairwise(steps):
+        taken = DT * np.cross(FREE.system.mass[:, None] * faster, v).sum(axis=0)
+        change = angular_momentum(FREE, after, faster) - angular_momentum(FREE, p, v)
+        # Forces that are left after convergence: 1e-13 of the first, some tens of newtons, times dt.
+        np.testing.assert_allclose(change, taken, rtol=0, atol=1e-10)
+
+
+def test_implicit_euler_slows_a_spin_in_proportion_to_the_time_step():
+    """v' x v has the size |v|^2 w dt for a turn by w dt: L falls by the fraction w^2 dt^2 a step, w^2 dt a second."""
+    lost = []
+    for steps in (10, 20, 40):
+        made = replace(FREE, system=replace(FREE.system, time_step=0.1 / steps))
+        path = moving(made, spinning(made, 3.0), steps)
+        L = [angular_momentum(made, p, v)[1] for p, v in path]
+        assert all(after < before for before, after in pairwise(L))
+        lost.append(1.0 - L[-1] / L[0])
+    # The next term is smaller by w dt, at most 0.03, and by the cloth's stretch.
+    np.testing.assert_allclose([lost[0] / lost[1], lost[1] / lost[2]], 2.0, rtol=0.1)
+
+
+@backends
+@pytest.mark.parametrize("iterations", [1, 3, 50])
+def test_a_step_never_ends_with_more_than_it_had(backend, iterations):
+    """E(p') + |v' - v|^2_M / 2 <= E(p) + |v|^2_M / 2 after any number of iterations, since each of them descends."""
+    dt, mass, (springs,) = FREE.system.time_step, FREE.system.mass, FREE.system.energies
+    velocity = 2.0 * np.random.default_rng(3).normal(size=FREE.mesh.rest.shape)
+    state, prepared = State(FREE.mesh.rest, FREE.mesh.rest - dt * velocity, 0), backend.prepare(FREE.system)
+    for index in range(1, 30):
+        p = prepared.solve(problem(FREE, state, "current"), StopRule(iterations)).positions
+        v, after = (state.positions - state.previous) / dt, (p - state.positions) / dt
+        had = springs.value(state.positions) + 0.5 * mass @ np.sum(v**2, axis=1)
+        has = springs.value(p) + 0.5 * mass @ np.sum((after - v) ** 2, axis=1)
+        assert has <= had * (1 + 1e-13)  # sums of some hundred terms
+        state = State(p, state.positions, index)

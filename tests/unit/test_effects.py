@@ -1,0 +1,209 @@
+"""Effects: each against its formula, and nothing at all where a scene asks for nothing."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from harness.effects.base import Contribution
+from harness.effects.constant_force import ConstantForce
+from harness.effects.ether_drag import EtherDrag
+from harness.effects.gravity import Gravity
+from harness.effects.pins import Pins
+from harness.effects.springs import Springs
+from harness.effects.table import EFFECTS
+from harness.effects.wind import Wind
+from harness.errors import InputError
+from harness.material import spring_stiffness
+from harness.mesh.chain import Chain
+from harness.mesh.grid import Grid
+from solvers.energies.springs import Springs as SpringsEnergy
+from solvers.registry import load
+from tests.scenes import scene
+
+MESH = Grid(width=2.0, height=1.0, skip_one=True).build(5)
+N = len(MESH.rest)
+MASS = np.linspace(1.0, 2.0, N)
+DT = 0.1
+
+RNG = np.random.default_rng(0)
+P, V, T = RNG.normal(size=(N, 3)), RNG.normal(size=(N, 3)), 1.7
+
+ABSENT = [
+    Gravity(acceleration=(0.0, 0.0, 0.0)),
+    ConstantForce(force=(0.0, 0.0, 0.0)),
+    Wind(strength=0.0),
+    Wind(field="assignment", strength=0.0),
+    Wind(force=(0.0, 0.0, 0.0)),
+    EtherDrag(rate=0.0),
+    Springs(stretch=0.0),
+]
+
+
+def force_of(effect) -> np.ndarray:
+    (force,) = bound(effect).forces
+    return force(P, V, T)
+
+
+def bound(effect) -> Contribution:
+    return effect.bind(MESH, MASS, DT)
+
+
+def chosen(**selectors) -> list[int]:
+    (pin,) = bound(Pins(**selectors)).pins
+    np.testing.assert_array_equal(pin.targets, MESH.rest[pin.vertices])
+    return pin.vertices.tolist()
+
+
+@pytest.mark.parametrize("effect", ABSENT, ids=repr)
+def test_an_effect_of_nothing_leaves_nothing(effect):
+    contribution = bound(effect)
+    assert all(getattr(contribution, field.name) == () for field in fields(contribution))
+
+
+def test_a_scene_without_effects_has_nothing_in_any_place():
+    made = scene(Chain(), size=3)
+    assert (made.system.energies, made.forces, made.filters) == ((), (), ())
+    assert len(made.system.pins.vertices) == len(made.pin_targets) == 0
+
+
+@pytest.mark.parametrize("kind", EFFECTS)
+def test_the_name_of_an_effect_is_its_kind(kind):
+    assert load(EFFECTS[kind]).model_fields["kind"].default == kind
+
+
+def test_gravity_is_mass_times_acceleration():
+    wanted = np.outer(MASS, [1.0, -9.81, 0.5])
+    np.testing.assert_array_equal(force_of(Gravity(acceleration=(1.0, -9.81, 0.5))), wanted)
+
+
+def test_a_constant_force_is_the_same_on_every_vertex_whatever_its_mass():
+    np.testing.assert_array_equal(force_of(ConstantForce(force=(1, -2, 3))), np.tile([1.0, -2.0, 3.0], (N, 1)))
+
+
+def test_a_force_that_never_changes_cannot_be_written_to():
+    with pytest.raises(ValueError, match="read-only"):
+        force_of(Gravity())[:] = 0.0
+
+
+def test_a_constant_wind_is_spread_as_the_mass_is():
+    force = force_of(Wind(force=(2.0, 0.0, 4.0), strength=3.0))
+    np.testing.assert_allclose(force, 3.0 * np.outer(MESH.shares, [2.0, 0.0, 4.0]), rtol=1e-15)
+    np.testing.assert_allclose(force.sum(axis=0), [6.0, 0.0, 12.0], rtol=1e-14)  # a sum of N terms
+
+
+def test_wind_per_vertex_is_the_same_on_every_vertex():
+    force = force_of(Wind(force=(2.0, 0.0, 4.0), per="vertex", strength=0.5))
+    np.testing.assert_array_equal(force, np.tile([1.0, 0.0, 2.0], (N, 1)))
+
+
+def test_the_assignments_wind_is_its_formula():
+    diagonal = np.sqrt(2.0**2 + 1.0**2)
+    for i, force in enumerate(force_of(Wind(field="assignment", per="vertex"))):
+        phi = P[i, 0] / diagonal + T
+        wanted = [3 + 1.5 * (1 + np.cos(5 * phi)), 1 + np.cos(0.3 + phi), np.sin(phi)]
+        np.testing.assert_allclose(force, wanted, rtol=1e-14)  # the phase of a cosine has 1e-15
+
+
+def test_the_assignments_wind_and_force_make_its_external_force():
+    total = force_of(Wind(field="assignment", per="vertex")) + force_of(ConstantForce(force=(0.0, -9.8, 0.0)))
+    phi = P[:, 0] / MESH.size + T
+    np.testing.assert_allclose(total[:, 1], -9.8 + 1 + np.cos(0.3 + phi), rtol=1e-14)
+
+
+def test_the_assignments_wind_per_share_is_the_mean_over_the_mass():
+    each, shared = (force_of(Wind(field="assignment", per=per)) for per in ("vertex", "share"))
+    np.testing.assert_allclose(shared, MESH.shares[:, None] * each, rtol=1e-15)
+
+
+def test_ether_drag_scales_the_velocity_once_a_step():
+    (decay,) = bound(EtherDrag(rate=3.0)).filters
+    np.testing.assert_allclose(decay(V), np.exp(-3.0 * DT) * V, rtol=1e-15)
+
+
+SELECTED = {
+    "a part": ({"at": ("top",)}, MESH.parts["top"]),
+    "two parts that overlap": (
+        {"at": ("top", "left")},
+        np.union1d(MESH.parts["top"], MESH.parts["left"]),
+    ),
+    "vertices, in any order and twice": ({"indices": (3, 0, 3)}, [0, 3]),
+    "a box, faces included": (
+        {"box": {"low": (-1.0, -1.0, -0.5), "high": (0.0, 0.0, -0.5)}},
+        [0, 1, 2],
+    ),
+    "a part and vertices": ({"at": ("top_corners",), "indices": (7,)}, [0, 4, 7]),
+    "every third of all": ({"every": 3}, np.arange(N)[::3]),
+    "every second of a part": ({"at": ("top",), "every": 2}, [0, 2, 4]),
+}
+
+
+@pytest.mark.parametrize("case", SELECTED)
+def test_pins_hold_what_their_selectors_name(case):
+    selectors, wanted = SELECTED[case]
+    assert chosen(**selectors) == list(wanted)
+
+
+@pytest.mark.parametrize(("weight", "wanted"), [(5.0, 5.0), ("exact", np.inf)])
+def test_pins_have_their_weight(weight, wanted):
+    (pin,) = bound(Pins(at=("top",), weight=weight)).pins
+    assert pin.weight == wanted
+
+
+def test_pins_weigh_what_the_assignments_do_unless_told():
+    (pin,) = bound(Pins(at=("top",))).pins
+    assert pin.weight == 1e10
+
+
+REFUSED = {
+    "an unknown part": ({"at": ("topp",)}, "did you mean 'top'"),
+    "a vertex beyond the last": ({"indices": (0, N)}, f"came {N}; the mesh has the vertices 0 to {N - 1}"),
+    "an empty box": ({"box": {"low": (5.0, 5.0, 5.0), "high": (6.0, 6.0, 6.0)}}, "no vertex of the mesh lies in"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_pins_that_do_not_fit_the_mesh_are_refused(case):
+    selectors, told = REFUSED[case]
+    with pytest.raises(InputError, match=told):
+        bound(Pins(**selectors))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [{}, {"every": 1}, {"indices": [-1]}, {"at": ["top"], "weight": 0}, {"at": ["top"], "weight": "hard"}],
+    ids=str,
+)
+def test_pins_that_mean_nothing_are_refused(data):
+    with pytest.raises(ValidationError):
+        Pins.model_validate(data)
+
+
+def test_springs_take_the_stiffness_of_their_rule():
+    (energy,) = bound(Springs(stretch=100.0, shear=20.0, bend=0.5)).energies
+    assert isinstance(energy, SpringsEnergy)
+    wanted = spring_stiffness(MESH, rule="continuum", stretch=100.0, shear=20.0, bend=0.5)
+    np.testing.assert_array_equal(energy.stiffness, wanted)
+    np.testing.assert_array_equal(energy.edges, MESH.springs)
+    np.testing.assert_allclose(energy.rest_length, MESH.rest_lengths, rtol=1e-15)
+
+
+def test_springs_shear_as_they_stretch_unless_told():
+    (energy,) = bound(Springs(stretch=100.0, rule="fixed")).energies
+    assert isinstance(energy, SpringsEnergy)
+    assert set(energy.stiffness) == {100.0}
+
+
+def test_springs_of_no_stiffness_are_left_out():
+    (energy,) = bound(Springs(stretch=100.0, shear=0.0)).energies
+    assert isinstance(energy, SpringsEnergy)
+    np.testing.assert_array_equal(energy.edges, MESH.springs[MESH.families["stretch"]])
+
+
+def test_the_reference_size_sets_the_stiffness_of_liu2013():
+    (energy,) = bound(Springs(stretch=100.0, rule="liu2013", reference=9)).energies
+    assert isinstance(energy, SpringsEnergy)
+    assert energy.stiffness[0] == 100.0 * (5 - 1) / (9 - 1)

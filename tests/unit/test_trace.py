@@ -1,0 +1,56 @@
+"""The trace of a solve: residuals and objectives by the oracle, over the solver's own iterates."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice, pairwise
+
+import numpy as np
+import pytest
+
+from harness.trace import EnergyNorm, trace
+from solvers.local_global import CompiledLocalGlobal, SparseLocalGlobal, only_springs
+from solvers.matrices import assemble
+from tests.scenes import cloth, first_problem, frozen, random_problem
+
+
+def test_the_norm_is_the_square_root_of_the_quadratic_form_without_pins():
+    problem = random_problem(0)
+    rng = np.random.default_rng(1)
+    e = rng.normal(size=problem.target.shape)
+    kept = e.copy()
+    Q = assemble(problem.system, [only_springs(problem.system, "the test")]).toarray()
+    inner = np.where(problem.system.unpinned[:, None], e, 0.0)
+    assert EnergyNorm(problem.system)(e) == pytest.approx(np.sqrt(np.trace(inner.T @ Q @ inner)), rel=1e-13)
+    np.testing.assert_array_equal(e, kept)
+
+
+def test_a_trace_has_the_objective_and_the_step_of_each_iterate():
+    problem = frozen(first_problem(cloth(8)))
+    prepared, norm = SparseLocalGlobal().prepare(problem.system), EnergyNorm(problem.system)
+    curve = trace(prepared, problem, norm, 12)
+    iterates = [problem.first_guess, *(p.copy() for p in islice(prepared.iterates(problem), 12))]
+    assert curve.objective == [problem.value(p) for p in iterates[1:]]
+    assert curve.residuals == [norm(b - a) for a, b in pairwise(iterates)]
+
+
+def test_a_cloth_that_falls_converges():
+    problem = first_problem(cloth(8))
+    curve = trace(CompiledLocalGlobal().prepare(problem.system), problem, EnergyNorm(problem.system), 60)
+    assert curve.residuals[-1] < 0.1 * curve.residuals[0]
+    assert curve.objective[-1] < curve.objective[0]
+
+
+def test_a_first_guess_off_the_pins_does_not_show_in_the_residual():
+    problem = first_problem(cloth(8))
+    guess = problem.first_guess.copy()
+    guess[problem.system.pins.vertices] += 5.0
+    prepared, norm = CompiledLocalGlobal().prepare(problem.system), EnergyNorm(problem.system)
+    far = trace(prepared, replace(problem, first_guess=guess), norm, 1).residuals[0]
+    # With the pins in it the residual would be sqrt(1e10) * 5: half a million.
+    assert far < 1e3
+
+
+def test_what_is_not_a_number_stays_so():
+    problem = random_problem(0)
+    assert np.isnan(EnergyNorm(problem.system)(np.full_like(problem.target, np.nan)))
