@@ -67,19 +67,20 @@ def _frames(page: Figure, replay: Replay, shown: NDArray[np.int64], camera: tupl
     points = replay.positions[shown].reshape(-1, 3)
     *earlier, final = (int(k) for k in shown)
     angles = natural_angles(points, area_vectors(replay, final)) if camera is None else camera
-    view = frame_all(points, aspect=width / height, angles=angles)
+    close = frame_all(replay.positions[final], aspect=width / height, angles=angles)
     with Studio(width, height) as studio:
-        paste(page, studio.draw(replay, final, view), left, top)
+        paste(page, studio.draw(replay, final, close), left, top)
     text(page, left + 4, top + height - 4, clock(replay, final), size=11.5)
     if not earlier:
         return
     tile = (height - (_EARLIER - 1) * _GAP) // _EARLIER
+    whole = frame_all(points, aspect=_STRIP_WIDTH / tile, angles=angles)
     x, ends = (_STRIP_LEFT - 20) / WIDTH, (top + 4, top + height - 4)
     page.add_artist(Line2D([x, x], [1 - y / HEIGHT for y in ends], color=RULE, linewidth=0.8))
     with Studio(_STRIP_WIDTH, tile) as studio:
         for row, frame in enumerate(earlier):
             at = top + row * (tile + _GAP)
-            paste(page, studio.draw(replay, frame, view), _STRIP_LEFT, at)
+            paste(page, studio.draw(replay, frame, whole), _STRIP_LEFT, at)
             text(page, _STRIP_LEFT + 4, at + tile - 4, clock(replay, frame), size=9, color=MUTED)
 
 
