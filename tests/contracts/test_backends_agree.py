@@ -17,9 +17,9 @@ from solvers.local_global import CompiledLocalGlobal, DenseLocalGlobal, SparseLo
 from solvers.problem import Positions, Solver
 from tests.scenes import BACKENDS, SCENES, first_problem, random_problem, trajectory
 
-AGREEMENT = 1e-9
-"""Of the scene's size. One solve leaves 1e-16 times the condition number, at most 1e6 where stiffness meets
-inertia; a swinging net multiplies that by a few in a hundred steps, a squeezed or stiff one by much more."""
+AGREEMENT = 1e-10
+"""Of the scene's size. One step leaves 1e-15 to 2e-14, by the condition of Q; motion amplifies it, a hundred steps of
+the cloth and of the net to 1e-12, the assignment's flag, whose springs are stiff, to 1e-10 in thirty."""
 
 SMALL = ("single-spring", "chain", "net", "cloth")
 LARGE = ("stiff-cloth", "tower", "block", "skirt")
@@ -93,7 +93,7 @@ def test_backends_agree_on_the_assignments_small_scenes(name):
 def test_sparse_and_compiled_agree_on_the_assignments_flag():
     made = assignment_scene("flag")
     found = [
-        trajectory(made, backend, 15, first_guess="assignment")
+        trajectory(made, backend, 12, first_guess="assignment")
         for backend in (SparseLocalGlobal(), CompiledLocalGlobal())
     ]
     assert apart(found) <= AGREEMENT * made.mesh.size
