@@ -9,12 +9,11 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from cholespy import CholeskySolverD, MatrixType  # pyright: ignore[reportAttributeAccessIssue]  (no stubs)
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
-from solvers.problem import NotPositiveDefinite, Positions
+from solvers.problem import NotPositiveDefinite, Positions, Unsupported
 
 _REASON = (
     "Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point: its stiffnesses, masses and "
@@ -73,12 +72,16 @@ class SparseLU:
 
 
 class SimplicialCholesky:
-    """CHOLMOD's simplicial Cholesky factorisation, through cholespy."""
+    """CHOLMOD's simplicial Cholesky factorisation, through cholespy, which has wheels for x86-64 alone."""
 
     nonzeros: int | None = None
 
     def __init__(self, Q: csr_array) -> None:
-        """Raises NotPositiveDefinite."""
+        """Raises Unsupported where cholespy is not installed, NotPositiveDefinite."""
+        try:
+            from cholespy import CholeskySolverD, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
+        except ImportError as error:
+            raise Unsupported("numba: needs cholespy, which has no wheel for this machine; use sparse") from error
         if not np.isfinite(Q.data).all():
             raise NotPositiveDefinite(_REASON)
         pointers, columns = Q.indptr.astype(np.int32), Q.indices.astype(np.int32)
