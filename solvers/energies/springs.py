@@ -108,8 +108,6 @@ class Springs:
         nn = unit[:, :, None] * unit[:, None, :]
         H = self.stiffness[:, None, None] * (nn + lateral[:, None, None] * (np.eye(3) - nn))
         n, (i, j) = len(p), self.edges.T
-        loop = (i == j)[:, None, None]
-        H = np.where(loop, 0.0, H)
         rows, columns = np.concatenate([i, j, i, j]), np.concatenate([i, j, j, i])
         blocks = np.concatenate([H, H, -H, -H])
         order = np.lexsort((columns, rows))
