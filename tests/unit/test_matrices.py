@@ -142,6 +142,17 @@ def test_the_matrix_of_a_system_is_the_assignments_without_exact_pins(network):
     assert made.nnz == len(mass) + 2 * len(springs)
 
 
+def test_the_energy_norm_is_a_number_where_round_off_makes_its_square_negative():
+    rng = np.random.default_rng(0)
+    springs, k = rng.integers(0, 9, (30, 2)), rng.uniform(size=30)
+    network = springs, k, np.zeros(9), 1.0, np.empty(0, np.int64), np.empty(0)
+    shifts = [np.tile(shift, (9, 1)) for shift in rng.normal(size=(50, 3))]
+    for Q in (dense_matrices(*network)["Q"], sparse_matrices(*network)["Q"]):
+        assert min(np.einsum("ij,ij->", e, Q @ e) for e in shifts) < 0.0
+        # Springs do not feel a shift: the square is zero but for round-off of some 1e-15.
+        assert all(0.0 <= matrices.energy_norm(Q, e) < 1e-6 for e in shifts)
+
+
 LOOSE = {
     "a vertex alone": ([[0, 1]], [1.0], [1, 1, 0], [], "1 in all (2)"),
     "springs that lead nowhere": ([[1, 2]], [1.0], [1, 0, 0], [], "2 in all (1, 2)"),

@@ -34,6 +34,22 @@ def test_a_trace_has_the_objective_and_the_step_of_each_iterate():
     assert curve.residuals == [norm(b - a) for a, b in pairwise(iterates)]
 
 
+def test_a_solver_may_yield_the_same_array_every_time():
+    problem = random_problem(0)
+    prepared, norm = SparseLocalGlobal().prepare(problem.system), EnergyNorm(problem.system)
+
+    class Reusing:
+        facts, solve, phases = prepared.facts, prepared.solve, prepared.phases
+
+        def iterates(self, problem):
+            out = np.empty_like(problem.target)
+            for p in prepared.iterates(problem):
+                out[:] = p
+                yield out
+
+    assert trace(Reusing(), problem, norm, 5).residuals == trace(prepared, problem, norm, 5).residuals
+
+
 def test_a_cloth_that_falls_converges():
     problem = first_problem(cloth(8))
     curve = trace(CompiledLocalGlobal().prepare(problem.system), problem, EnergyNorm(problem.system), 60)
