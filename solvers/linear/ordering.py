@@ -21,7 +21,7 @@ _LEAF = 96
 """Pieces up to this size are not cut further: below it a separator saves less than minimum degree does."""
 
 
-def nested_dissection(pointers: NDArray[np.int32], neighbours: NDArray[np.int32]) -> NDArray[np.int32]:
+def nested_dissection(pointers: NDArray[np.int64], neighbours: NDArray[np.int32]) -> NDArray[np.int32]:
     """The order of elimination of a graph's vertices, shape (n,): entry i is the vertex that goes i-th.
 
     pointers (n + 1,), neighbours: the graph in CSR form, symmetric, loops allowed.
@@ -61,7 +61,7 @@ def _dissect(pointers, neighbours, order, leaf):
             minimum_degree(pointers, neighbours, piece, local)
             continue
         refine(pointers, neighbours, piece, side, local)
-        at = first
+        at = begun = first
         for part in range(3):
             begun = at
             for i in range(end - first):

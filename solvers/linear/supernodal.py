@@ -8,16 +8,19 @@ A solve is then multiply-adds alone, over panels [S; W] that lie in the order in
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers.linear.ordering import nested_dissection
 from solvers.linear.supernodal_factor import factorise
-from solvers.linear.supernodal_solve import solve
-from solvers.linear.symbolic import LANES, WIDTH, Symbolic, analyse
+from solvers.linear.supernodal_solve import solve, solve_in_parallel
+from solvers.linear.supernodes import LANES, WIDTH
+from solvers.linear.symbolic import Symbolic, analyse
 from solvers.problem import NotPositiveDefinite, Positions
 
 Precision = Literal["float64", "float32"]
@@ -26,15 +29,18 @@ Precision = Literal["float64", "float32"]
 class Layout(NamedTuple):
     """Where the panels of a factor lie. A supernode is cut into chunks of at most WIDTH columns, a panel each.
 
-    chunks (c, 6): of each its offset in the panels, its offset in `index`, its rows, its columns without
+    chunks (c, 6): of each its offset in the panels, its offset in `places`, its rows, its columns without
     padding, its padded columns in LANES, its first slot; chunk_of (s + 1,): the first chunk of each supernode;
-    index: of each supernode the slots of its columns and of the rows below; size: entries in all panels.
+    places: of each supernode the slots of its columns and of the rows below, in a group's own copy where they are in
+    the top; spans: see `supernodal_solve`; size: entries in all panels; rows: of four numbers, of the work vector.
     """
 
     chunks: NDArray[np.int64]
     chunk_of: NDArray[np.int64]
-    index: NDArray[np.int32]
+    places: NDArray[np.int32]
+    spans: NDArray[np.int64]
     size: int
+    rows: int
 
     @classmethod
     def of(cls, s: Symbolic) -> Layout:
@@ -53,10 +59,28 @@ class Layout(NamedTuple):
             [np.cumsum(cells) - cells, base[node] + done, rows, own, quads, s.first[node] + done], axis=1
         )
         is_row = np.repeat(np.tile([False, True], len(width)), np.stack([width, below], axis=1).ravel())
-        index = np.empty(base[-1], np.int32)
-        index[is_row] = s.rows
-        index[~is_row] = np.flatnonzero(s.vertex >= 0)
-        return cls(np.ascontiguousarray(columns), chunk_of, index, int(cells.sum()))
+        places = np.empty(base[-1], np.int32)
+        places[is_row] = s.rows
+        places[~is_row] = np.flatnonzero(s.vertex >= 0)
+
+        bounds = s.group_start
+        spans = np.stack(
+            [chunk_of[bounds[:-1]], chunk_of[bounds[1:]], s.first[bounds[:-1]], s.first[bounds[1:]]], axis=1
+        )
+        top, end = spans[-1, 2:]
+        for g, (begin, stop) in enumerate(pairwise(base[bounds[:-1]])):
+            part = places[begin:stop]
+            part[part >= top] += (g + 1) * (end - top)
+        spans = spans[(spans[:, 0] < spans[:, 1]) | (np.arange(len(spans)) == len(spans) - 1)]
+        rows_of_work = int(end + (len(spans) - 1) * (end - top))
+        return cls(
+            np.ascontiguousarray(columns),
+            chunk_of,
+            places,
+            np.ascontiguousarray(spans, np.int64),
+            int(cells.sum()),
+            rows_of_work,
+        )
 
 
 class Supernodal:
@@ -64,7 +88,8 @@ class Supernodal:
 
     nonzeros: entries of L, diagonal included, before supernodes are padded; panel_bytes: what is read of the
     panels, once forwards and once backwards without each other's part; flops: additions and multiplications a solve,
-    padding included. `precision` is that of the panels and the solve; the factorisation is in float64.
+    padding included; shares: the part of the panels in each group of subtrees that a thread may do, and in the top
+    that one does alone. `precision` is that of the panels and the solve; the factorisation is in float64.
     """
 
     def __init__(self, Q: csr_array, *, precision: Precision = "float64") -> None:
@@ -73,28 +98,37 @@ class Supernodal:
             rows = np.repeat(np.arange(len(Q.indptr) - 1), np.diff(Q.indptr))
             v = rows[~np.isfinite(Q.data)][0]
             raise NotPositiveDefinite(f"Q is not finite in row {v}: a stiffness, a mass or a pin weight there is not")
-        pointers, neighbours = Q.indptr.astype(np.int64), Q.indices.astype(np.int32)
+        pointers = np.asarray(Q.indptr, np.int64)
+        neighbours = np.asarray(Q.indices, np.int32)
         s = analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
         layout = Layout.of(s)
         panels = np.empty(layout.size)
         v = factorise(
             pointers, neighbours, Q.data, s.slot, s.vertex, s.parent, s.first, s.row_start, s.rows,
-            np.arange(len(s.parent)), layout.chunk_of, layout.chunks, panels,
+            s.sequence, layout.chunk_of, layout.chunks, panels,
         )  # fmt: skip
         if v >= 0:
             raise NotPositiveDefinite(
                 f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point at vertex {v}: nothing "
                 "determines its position, or stiffnesses, masses and pin weights lie too far apart or are negative"
             )
-        self._symbolic, self._layout = s, layout
-        self._panels = panels.astype(precision, copy=False)
-        self._work = np.zeros(4 * len(s.vertex), precision)
         self.nonzeros: int | None = s.nonzeros
-        self.panel_bytes = self._panels.nbytes
+        self.panel_bytes = layout.size * np.dtype(precision).itemsize
         whole, below = layout.chunks[:, 2], layout.chunks[:, 2] - layout.chunks[:, 3]
         self.flops = int(2 * 3 * LANES * layout.chunks[:, 4] @ (whole + below))
+        entries = layout.chunks[:, 2] * layout.chunks[:, 4]
+        self.shares = [float(entries[a:e].sum() / max(1, entries.sum())) for a, e in layout.spans[:, :2]]
+        self._arguments = (
+            panels.astype(precision, copy=False),
+            layout.places,
+            layout.chunks,
+            layout.spans,
+            s.vertex,
+            np.zeros(4 * layout.rows, precision),
+        )
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b, shape (n, 3), to `out`; b is left as it is and must not be `out`."""
-        s, layout = self._symbolic, self._layout
-        solve(self._panels, layout.index, layout.chunks, s.vertex, s.slot, self._work, b, out)
+        groups = len(self._arguments[3]) - 1
+        kernel = solve_in_parallel if groups > 1 and numba.get_num_threads() > 1 else solve
+        kernel(*self._arguments, b, out)

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from solvers.linear.supernodal_vectors import add_forward
-from solvers.linear.symbolic import WIDTH
+from solvers.linear.supernodes import WIDTH
 
 _NO_DIGITS = 4.0 * np.finfo(np.float64).eps
 """A pivot this small beside its entry of the matrix is round-off."""

@@ -1,20 +1,27 @@
 """The two passes of a solve over the panels of a factor.
 
-forwards, children first:   y_below += W y_own
-backwards, parents first:   y_own = S y_own + W' y_below
+    forwards, children first:   y_below += W y_own
+    backwards, parents first:   y_own = S y_own + W' y_below
+
+The supernodes come in groups of subtrees and a top above them. Each group has a copy of the top's rows of its own:
+forwards it adds to that, and backwards it reads from it, so that groups may be done side by side; copies are added up
+in the order of the groups. The bits of the result are therefore the same whatever the number of threads.
+
+`spans` (groups + 1, 4) holds the first and last chunk and the first and last slot of each group, and in its last row
+those of the top; `work` has 4 numbers a slot, and behind them the groups' copies.
 """
 
 from __future__ import annotations
 
-from numba import njit
+from numba import njit, prange
 
 from solvers.linear.supernodal_vectors import add_forward, set_backward
 
 
 @njit(cache=True)
-def load(b, vertex, work):
-    """The right-hand sides b (n, 3) to the rows of `work`; padding gets zeros."""
-    for i in range(len(vertex)):
+def _load(b, vertex, begin, end, work):
+    """The right-hand sides b (n, 3) to rows of `work`; padding gets zeros."""
+    for i in range(begin, end):
         v = vertex[i]
         if v >= 0:
             for c in range(3):
@@ -22,20 +29,20 @@ def load(b, vertex, work):
         else:
             for c in range(3):
                 work[4 * i + c] = 0.0
-        work[4 * i + 3] = 0.0
 
 
 @njit(cache=True)
-def store(work, slot, out):
-    """The solution in `work` to out (n, 3)."""
-    for v in range(len(slot)):
-        i = slot[v]
-        for c in range(3):
-            out[v, c] = work[4 * i + c]
+def _store(work, vertex, begin, end, out):
+    """The solution in rows of `work` to out (n, 3)."""
+    for i in range(begin, end):
+        v = vertex[i]
+        if v >= 0:
+            for c in range(3):
+                out[v, c] = work[4 * i + c]
 
 
 @njit(cache=True)
-def forwards(panels, index, chunks, begin, end, work):
+def _forwards(panels, index, chunks, begin, end, work):
     """The pass forwards over the chunks from `begin` to `end`."""
     for k in range(begin, end):
         offset, at, count, own, quads, first = chunks[k]
@@ -53,7 +60,7 @@ def forwards(panels, index, chunks, begin, end, work):
 
 
 @njit(cache=True)
-def backwards(panels, index, chunks, begin, end, work):
+def _backwards(panels, index, chunks, begin, end, work):
     """The pass backwards over the chunks from `end` down to `begin`."""
     for k in range(end - 1, begin - 1, -1):
         offset, at, count, _own, quads, first = chunks[k]
@@ -68,9 +75,60 @@ def backwards(panels, index, chunks, begin, end, work):
 
 
 @njit(cache=True)
-def solve(panels, index, chunks, vertex, slot, work, b, out):
+def _ascend(panels, index, chunks, spans, vertex, work, b, group):
+    """The pass forwards over a group."""
+    chunk, chunk_end, slot, slot_end = spans[group]
+    top, top_end = spans[-1, 2], spans[-1, 3]
+    _load(b, vertex, slot, slot_end, work)
+    copy = 4 * (top_end + group * (top_end - top))
+    for k in range(4 * (top_end - top)):
+        work[copy + k] = 0.0
+    _forwards(panels, index, chunks, chunk, chunk_end, work)
+
+
+@njit(cache=True)
+def _turn(panels, index, chunks, spans, vertex, work, b, out):
+    """Both passes over the top."""
+    chunk, chunk_end, top, top_end = spans[-1]
+    _load(b, vertex, top, top_end, work)
+    size = 4 * (top_end - top)
+    for group in range(len(spans) - 1):
+        copy = 4 * top_end + group * size
+        for k in range(size):
+            work[4 * top + k] += work[copy + k]
+    _forwards(panels, index, chunks, chunk, chunk_end, work)
+    _backwards(panels, index, chunks, chunk, chunk_end, work)
+    _store(work, vertex, top, top_end, out)
+
+
+@njit(cache=True)
+def _descend(panels, index, chunks, spans, vertex, work, out, group):
+    """The pass backwards over a group."""
+    chunk, chunk_end, slot, slot_end = spans[group]
+    top, top_end = spans[-1, 2], spans[-1, 3]
+    size = 4 * (top_end - top)
+    copy = 4 * top_end + group * size
+    for k in range(size):
+        work[copy + k] = work[4 * top + k]
+    _backwards(panels, index, chunks, chunk, chunk_end, work)
+    _store(work, vertex, slot, slot_end, out)
+
+
+@njit(cache=True)
+def solve(panels, index, chunks, spans, vertex, work, b, out):
     """Q out = b on one thread."""
-    load(b, vertex, work)
-    forwards(panels, index, chunks, 0, len(chunks), work)
-    backwards(panels, index, chunks, 0, len(chunks), work)
-    store(work, slot, out)
+    for group in range(len(spans) - 1):
+        _ascend(panels, index, chunks, spans, vertex, work, b, group)
+    _turn(panels, index, chunks, spans, vertex, work, b, out)
+    for group in range(len(spans) - 2, -1, -1):
+        _descend(panels, index, chunks, spans, vertex, work, out, group)
+
+
+@njit(cache=True, parallel=True)
+def solve_in_parallel(panels, index, chunks, spans, vertex, work, b, out):
+    """Q out = b on Numba's threads."""
+    for group in prange(len(spans) - 1):
+        _ascend(panels, index, chunks, spans, vertex, work, b, group)
+    _turn(panels, index, chunks, spans, vertex, work, b, out)
+    for group in prange(len(spans) - 1):
+        _descend(panels, index, chunks, spans, vertex, work, out, group)

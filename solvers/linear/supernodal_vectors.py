@@ -8,6 +8,8 @@ of which are a vector, and the sums are transposed at the end: no padding is mul
 
 from __future__ import annotations
 
+from typing import Any
+
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
@@ -16,6 +18,9 @@ from numba.extending import intrinsic
 
 _I32 = ir.IntType(32)
 _I64 = ir.IntType(64)
+_I8P = ir.IntType(8).as_pointer()
+_AHEAD = 2048
+"""How many bytes ahead a panel is asked for: rows are short, and the hardware's own guess comes too late."""
 
 
 class _Vectors:
@@ -33,7 +38,16 @@ class _Vectors:
         wide = self.builder.bitcast(pointer, ir.VectorType(self.element, lanes).as_pointer())
         return self.builder.load(wide, align=self.size)
 
-    def store(self, value: ir.Value, pointer: ir.Value) -> None:
+    def prefetch(self, row: ir.Value, quads: int, distance: int) -> None:
+        """Ask for the cache lines `distance` bytes on from a row of a panel."""
+        call = self.builder.module.declare_intrinsic(
+            "llvm.prefetch.p0", fnty=ir.FunctionType(ir.VoidType(), [_I8P, _I32, _I32, _I32])
+        )
+        byte = self.builder.bitcast(row, _I8P)
+        for line in range(0, 4 * quads * self.size, 64):
+            self.builder.call(call, [self.builder.gep(byte, [_I64(distance + line)]), _I32(0), _I32(3), _I32(1)])
+
+    def store(self, value: Any, pointer: ir.Value) -> None:
         wide = self.builder.bitcast(pointer, value.type.as_pointer())
         self.builder.store(value, wide, align=self.size)
 
@@ -42,8 +56,7 @@ class _Vectors:
         return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(lanes)), lanes))
 
     def broadcast(self, pointer: ir.Value, lanes: int) -> ir.Value:
-        single = self.zero(lanes)
-        single = self.builder.insert_element(single, self.builder.load(pointer, align=self.size), _I32(0))
+        single = self.builder.insert_element(self.zero(lanes), self.builder.load(pointer, align=self.size), _I32(0))
         return self.shuffle(single, single, [0] * lanes)
 
     def multiply_add(self, a: ir.Value, b: ir.Value, c: ir.Value | None) -> ir.Value:
@@ -77,8 +90,7 @@ def _signature(*kinds):
     return types.void(*(types.unliteral(kind) for kind in kinds[:-1]), kinds[-1])
 
 
-@intrinsic
-def add_forward(typingctx, panel, offset, index, at, count, x, x_row, y, y_row, quads):
+def _add_forward(typingctx, panel, offset, index, at, count, x, x_row, y, y_row, quads):
     """y[y_row + index[at + r]] += sum_j panel[offset + 4 quads r + j] x[x_row + j], for r < count."""
     signature = _signature(panel, offset, index, at, count, x, x_row, y, y_row, quads)
 
@@ -95,6 +107,7 @@ def add_forward(typingctx, panel, offset, index, at, count, x, x_row, y, y_row, 
         xs = [vectors.load(builder.gep(x, [_I64(4 * j)]), 4 * together) for j in range(0, 4 * quads, together)]
         with cgutils.for_range(builder, count) as loop:
             row = builder.gep(panel, [builder.mul(loop.index, _I64(4 * quads))])
+            vectors.prefetch(row, quads, _AHEAD)
             place = builder.zext(builder.load(builder.gep(index, [loop.index])), _I64)
             target = builder.gep(y, [builder.mul(place, _I64(4))])
             sums = []
@@ -122,8 +135,7 @@ def add_forward(typingctx, panel, offset, index, at, count, x, x_row, y, y_row, 
     return signature, generate
 
 
-@intrinsic
-def set_backward(typingctx, panel, offset, index, at, count, y, x_row, quads):
+def _set_backward(typingctx, panel, offset, index, at, count, y, x_row, quads):
     """y[x_row + j] = sum over r < count of panel[offset + 4 quads r + j] y[index[at + r]]; count is at least 1."""
     signature = _signature(panel, offset, index, at, count, y, x_row, quads)
 
@@ -147,6 +159,7 @@ def set_backward(typingctx, panel, offset, index, at, count, y, x_row, quads):
 
         def add(r, accumulators):
             row = builder.gep(panel, [builder.mul(r, _I64(4 * quads))])
+            vectors.prefetch(row, quads, -_AHEAD)
             place = builder.zext(builder.load(builder.gep(index, [r])), _I64)
             source = builder.gep(y, [builder.mul(place, _I64(4))])
             for (j, lanes), triple in zip(groups, accumulators, strict=True):
@@ -155,15 +168,17 @@ def set_backward(typingctx, panel, offset, index, at, count, y, x_row, quads):
                     factor = vectors.broadcast(builder.gep(source, [_I64(c)]), lanes)
                     builder.store(vectors.multiply_add(w, factor, builder.load(accumulator)), accumulator)
 
+        # From the last row to the first: the panels are then read strictly downwards, as they were read upwards before,
+        # so that what is still in the cache is read first.
+        last = builder.sub(count, _I64(1))
         whole = builder.udiv(count, _I64(unroll))
         with cgutils.for_range(builder, whole) as loop:
-            first = builder.mul(loop.index, _I64(unroll))
+            first = builder.sub(last, builder.mul(loop.index, _I64(unroll)))
             for k in range(unroll):
-                add(builder.add(first, _I64(k)), sums[k])
+                add(builder.sub(first, _I64(k)), sums[k])
         if unroll > 1:
-            done = builder.mul(whole, _I64(unroll))
-            with cgutils.for_range(builder, builder.sub(count, done)) as loop:
-                add(builder.add(done, loop.index), sums[0])
+            with cgutils.for_range(builder, builder.urem(count, _I64(unroll))) as loop:
+                add(loop.index, sums[0])
 
         out = builder.gep(y, [builder.mul(x_row, _I64(4))])
         for g, (j, lanes) in enumerate(groups):
@@ -176,3 +191,8 @@ def set_backward(typingctx, panel, offset, index, at, count, y, x_row, quads):
         return context.get_dummy_value()
 
     return signature, generate
+
+
+# Numba passes the first argument itself, which type checkers do not know.
+add_forward: Any = intrinsic(_add_forward)
+set_backward: Any = intrinsic(_set_backward)

@@ -1,8 +1,6 @@
 """What the factor of a sparse symmetric matrix will look like, found from its graph alone.
 
-Elimination tree and column counts (Liu 1990; Davis 2006, chapter 4), supernodes (columns of one structure) and their
-relaxed amalgamation (Ashcraft and Grimes 1989): a supernode joins its parent where the solve gets cheaper, by a
-model of its cost, although zeros are stored then.
+Elimination tree and column counts (Liu 1990; Davis 2006, chapter 4), and the rows of each supernode.
 """
 
 from __future__ import annotations
@@ -13,23 +11,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-WIDTH = 16
-"""The most columns that a panel has."""
-
-LANES = 4
-"""Columns of a supernode are padded to a multiple of this."""
-
-_PER_PANEL, _PER_ROW = 60.0, 3.0
-"""The cost of a panel and of a row of it, in that of one entry: both measured, neither critical."""
+from solvers.linear.supernodes import GROUPS, LANES, amalgamate, groups
 
 
 class Symbolic(NamedTuple):
     """The structure of L, over slots: the places of the work vector, padded so that each supernode begins at a lane.
 
+    Supernodes are numbered group by group, and then those above all groups, the top; children before parents.
+
     slot: the slot of each vertex (n,); vertex: the vertex of each slot, -1 for padding (slots,);
     parent: each supernode's in the tree, -1 for a root (s,); first: its first slot (s + 1,);
     width: its columns that are not padding (s,); row_start (s + 1,), rows: the slots of its rows below, sorted;
-    nonzeros: those of L before amalgamation, diagonal included. Supernodes are in postorder.
+    sequence: the supernodes in a postorder of their tree (s,); group_start: the first supernode of each group and of
+    the top (GROUPS + 2,); nonzeros: those of L before amalgamation, diagonal included.
     """
 
     slot: NDArray[np.int32]
@@ -39,39 +33,52 @@ class Symbolic(NamedTuple):
     width: NDArray[np.int32]
     row_start: NDArray[np.int64]
     rows: NDArray[np.int32]
+    sequence: NDArray[np.int32]
+    group_start: NDArray[np.int64]
     nonzeros: int
 
 
-def analyse(pointers: NDArray[np.int32], neighbours: NDArray[np.int32], order: NDArray[np.int32]) -> Symbolic:
+def analyse(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], order: NDArray[np.int32]) -> Symbolic:
     """The structure of the factor when vertices are eliminated in `order` (n,), up to a postorder of its tree."""
-    place = np.empty(len(order), np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
-    parent = _elimination_tree(pointers, neighbours, order, place)
-    post = _postorder(parent)
+    place = _inverse(order)
+    post = _postorder(_elimination_tree(pointers, neighbours, order, place))
     order = order[post]
-    place[order] = np.arange(len(order), dtype=np.int32)
+    place = _inverse(order)
     parent = _elimination_tree(pointers, neighbours, order, place)
     count = _column_counts(pointers, neighbours, order, place, parent)
-    tree, of_column = _amalgamate(parent, count)
+    tree, of_column, cost = amalgamate(parent, count)
+
     post = _postorder(tree)
-    place_of_node = np.empty(len(post), np.int32)
-    place_of_node[post] = np.arange(len(post), dtype=np.int32)
-    node = place_of_node[of_column]
-    upper = tree[post]
-    node_parent = np.where(upper < 0, np.int32(-1), place_of_node[upper])
+    group = groups(tree, cost)
+    by_number = post[np.argsort(group[post], kind="stable")]
+    number = _inverse(by_number)
+    upper = tree[by_number]
+    node_parent = np.where(upper < 0, np.int32(-1), number[upper])
+    group_start = np.searchsorted(group[by_number], np.arange(GROUPS + 2))
+
+    node = number[of_column]
     column = np.argsort(node, kind="stable")  # within a node the columns keep their order
-    width = np.bincount(node, minlength=len(post)).astype(np.int32)
-    first = np.zeros(len(post) + 1, np.int32)
+    width = np.bincount(node, minlength=len(tree)).astype(np.int32)
+    first = np.zeros(len(tree) + 1, np.int32)
     np.cumsum((width + LANES - 1) // LANES * LANES, out=first[1:])
-    vertex = np.full(first[-1], -1, np.int32)
-    slot = np.empty(len(order), np.int32)
     start = np.cumsum(width) - width
     slots = (np.arange(len(order)) + np.repeat(first[:-1] - start, width)).astype(np.int32)
+    vertex = np.full(first[-1], -1, np.int32)
+    slot = np.empty(len(order), np.int32)
     vertex[slots] = order[column]
     slot[order[column]] = slots
-    node_of_slot = np.repeat(np.arange(len(post), dtype=np.int32), np.diff(first))
-    row_start, rows = _structure(pointers, neighbours, slot, vertex, node_parent, node_of_slot, len(post))
-    return Symbolic(slot, vertex, node_parent, first, width, row_start, rows, int(count.sum()))
+    node_of_slot = np.repeat(np.arange(len(tree), dtype=np.int32), np.diff(first))
+    row_start, rows = _structure(pointers, neighbours, slot, vertex, node_parent, node_of_slot, len(tree))
+    return Symbolic(
+        slot, vertex, node_parent, first, width, row_start, rows, number[post], group_start, int(count.sum())
+    )  # fmt: skip
+
+
+def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The place of each entry of a permutation."""
+    place = np.empty(len(order), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    return place
 
 
 @njit(cache=True)
@@ -138,88 +145,6 @@ def _column_counts(pointers, neighbours, order, place, parent):
                 mark[j] = i
                 j = parent[j]
     return count
-
-
-@njit(cache=True)
-def _cost(width, rows):
-    """What a supernode costs a solve, in the cost of an entry."""
-    total = 0.0
-    while width > 0:
-        chunk = min(width, WIDTH)
-        width -= chunk
-        padded = (chunk + LANES - 1) // LANES * LANES
-        total += _PER_PANEL + (rows + width) * (padded + _PER_ROW) + chunk * (0.5 * padded + _PER_ROW)
-    return total
-
-
-@njit(cache=True)
-def _amalgamate(parent, count):
-    """The tree of supernodes after amalgamation, and the supernode of each column."""
-    n = len(parent)
-    of_column = np.empty(n, np.int32)
-    nodes = 0
-    for j in range(n):  # columns with one structure
-        if j > 0 and parent[j - 1] == j and count[j - 1] == count[j] + 1:
-            of_column[j] = nodes - 1
-        else:
-            of_column[j] = nodes
-            nodes += 1
-    width = np.zeros(nodes, np.int64)
-    rows = np.zeros(nodes, np.int64)
-    tree = np.full(nodes, -1, np.int32)
-    for j in range(n):
-        s = of_column[j]
-        width[s] += 1
-        rows[s] = count[j] - 1
-        tree[s] = of_column[parent[j]] if parent[j] >= 0 else -1
-
-    child = np.full(nodes, -1, np.int32)
-    sibling = np.full(nodes, -1, np.int32)
-    for s in range(nodes - 1, -1, -1):
-        if tree[s] >= 0:
-            sibling[s] = child[tree[s]]
-            child[tree[s]] = s
-    into = np.arange(nodes)
-    for s in range(nodes):  # children come first, so theirs are settled
-        while True:
-            best, best_gain, before_best, before = -1, 0.0, -1, -1
-            c = child[s]
-            while c >= 0:
-                apart = _cost(width[c], rows[c]) + _cost(width[s], rows[s])
-                gain = apart - _cost(width[c] + width[s], rows[s])
-                if gain >= best_gain:
-                    best, best_gain, before_best = c, gain, before
-                before = c
-                c = sibling[c]
-            if best < 0:
-                break
-            into[best] = s
-            width[s] += width[best]
-            if before_best >= 0:  # out of the list of children,
-                sibling[before_best] = sibling[best]
-            else:
-                child[s] = sibling[best]
-            c = child[best]
-            while c >= 0:  # and its children into it
-                following = sibling[c]
-                sibling[c] = child[s]
-                child[s] = c
-                c = following
-    name = np.full(nodes, -1, np.int32)
-    kept = 0
-    for s in range(nodes):
-        if into[s] == s:
-            name[s] = kept
-            kept += 1
-    for s in range(nodes - 1, -1, -1):  # a node's name is that of the one it went into
-        name[s] = name[into[s]]
-    merged = np.full(kept, -1, np.int32)
-    for s in range(nodes):
-        if into[s] == s and tree[s] >= 0:
-            merged[name[s]] = name[tree[s]]
-    for j in range(n):
-        of_column[j] = name[of_column[j]]
-    return merged, of_column
 
 
 @njit(cache=True)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.sparse import csr_array, eye_array
+from scipy.sparse import block_diag, csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
@@ -44,6 +45,10 @@ def solution(Q, b, **options):
     return out
 
 
+def vertices(Q):
+    return len(Q.indptr) - 1
+
+
 def right_hand_sides(n, seed=0):
     return np.random.default_rng(seed).normal(size=(n, 3))
 
@@ -71,7 +76,7 @@ def networks(draw, decades=2.0):
 @settings(max_examples=60, deadline=None)
 @given(networks())
 def test_solves_random_networks_as_superlu_does(Q):
-    b = right_hand_sides(Q.shape[0])
+    b = right_hand_sides(vertices(Q))
     expected = splu(Q.tocsc()).solve(b)
     # Entries of Q span 4 decades at most, so that its condition times the round-off stays below this.
     assert np.abs(solution(Q, b) - expected).max() <= 1e-12 * np.abs(expected).max()
@@ -80,7 +85,7 @@ def test_solves_random_networks_as_superlu_does(Q):
 @settings(max_examples=60, deadline=None)
 @given(networks(decades=12.0))
 def test_is_backward_stable_over_twelve_decades_of_stiffness(Q):
-    b = right_hand_sides(Q.shape[0])
+    b = right_hand_sides(vertices(Q))
     # The solutions themselves have no digits in common with anything at a condition of 1e16 and more; the equations
     # must hold to round-off all the same. n eps is 7e-14 at 300 vertices.
     assert backward_error(Q, solution(Q, b), b) <= 1e-12
@@ -89,7 +94,7 @@ def test_is_backward_stable_over_twelve_decades_of_stiffness(Q):
 @settings(max_examples=30, deadline=None)
 @given(networks())
 def test_a_float32_factor_is_accurate_to_float32(Q):
-    b = right_hand_sides(Q.shape[0])
+    b = right_hand_sides(vertices(Q))
     expected = splu(Q.tocsc()).solve(b)
     # 6e-8 times a condition of up to 1e3 of these networks
     assert np.abs(solution(Q, b, precision="float32") - expected).max() <= 1e-4 * np.abs(expected).max()
@@ -124,7 +129,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_solves_networks_of_every_shape(name):
     Q = CASES[name]
-    b = right_hand_sides(Q.shape[0])
+    b = right_hand_sides(vertices(Q))
     expected = splu(Q.tocsc()).solve(b)
     # The sheet has a condition of 1e10 in its norm, of 1e4 without the rows of its pins: 1e4 eps and a margin.
     assert np.abs(solution(Q, b) - expected).max() <= 1e-11 * np.abs(expected).max()
@@ -137,7 +142,7 @@ def test_solves_no_equations_at_all():
 
 def test_columns_in_any_order_and_entries_in_parts_mean_the_same_matrix():
     Q = sheet(12)
-    rows = np.repeat(np.arange(144), np.diff(Q.indptr))
+    rows = Q.tocoo().row
     shuffled = np.lexsort((np.random.default_rng(0).random(Q.nnz), rows))
     parts = csr_array((np.repeat(Q.data[shuffled] / 2, 2), np.repeat(Q.indices[shuffled], 2), 2 * Q.indptr), Q.shape)
     b = right_hand_sides(144)
@@ -161,6 +166,47 @@ def test_gives_the_same_bits_each_time(precision):
         (first, second)[k % 2].solve(b, out)
     for out in results[1:]:
         np.testing.assert_array_equal(out, results[0])
+
+
+@pytest.fixture
+def threads():
+    """Numba's setting of threads, put back afterwards."""
+    before = numba.get_num_threads()
+    yield numba.set_num_threads
+    numba.set_num_threads(before)
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_gives_the_same_bits_whatever_the_number_of_threads(precision, threads):
+    Q, b = sheet(64), right_hand_sides(4096)
+    factor = Supernodal(Q, precision=precision)
+    results = []
+    for count in range(1, numba.get_num_threads() + 1):
+        threads(count)
+        results.append(np.empty_like(b))
+        factor.solve(b, results[-1])
+    assert len(factor.shares) > 1  # large enough to be shared out
+    for out in results[1:]:
+        np.testing.assert_array_equal(out, results[0])
+
+
+def test_shares_work_out_evenly_with_little_at_the_top():
+    shares = Supernodal(sheet(64)).shares
+    assert len(shares) == 5
+    assert max(shares[:-1]) <= 1.1 / 4 + 1e-9
+    assert shares[-1] <= 0.06  # the separators of two levels of dissection, of eight
+    assert len(Supernodal(sheet(16)).shares) == 2
+    assert Supernodal(sheet(16)).shares[-1] == 0.0
+
+
+def test_separate_components_are_shared_out_too():
+    parts = block_diag([sheet(30)] * 8, format="csr")
+    b = right_hand_sides(vertices(parts))
+    factor = Supernodal(csr_array(parts))
+    assert max(factor.shares) <= 0.26
+    out = np.empty_like(b)
+    factor.solve(b, out)
+    assert backward_error(parts, out, b) <= 1e-12
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
