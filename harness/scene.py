@@ -32,7 +32,7 @@ class Scene:
 
     @property
     def springs(self) -> Springs:
-        """All springs that have stiffness, in the mesh's order."""
+        """All springs that have stiffness: effect by effect, each in the mesh's order."""
         return Springs.joined([energy for energy in self.system.energies if isinstance(energy, Springs)])
 
 

@@ -28,7 +28,7 @@ class Unsupported(Exception):
 
 
 class NotPositiveDefinite(Exception):
-    """The system matrix has no Cholesky factor: a vertex has neither mass nor a spring nor a pin."""
+    """The system matrix has no Cholesky factor: some vertex is loose, or round-off or the input spoils it."""
 
 
 class Energy(Protocol):
