@@ -144,8 +144,10 @@ def _draw(
     missing = opengl.problem() if any(p.run.pictures for p in drawn) else None
     if missing:
         say(missing)
-    for p in drawn:
-        if p.run.pictures and not missing and (p.files.rows in fresh or not p.files.picture.exists()):
+    wanting = [p for p in drawn if p.run.pictures and (p.files.rows in fresh or not p.files.picture.exists())]
+    if wanting and not missing:
+        say(f"drawing the pictures of {len(wanting)} runs")
+        for p in wanting:
             camera = p.run.scene.camera
             angles = (camera.azimuth, camera.elevation) if camera else None
             draw_run(read_replay(p.files.recording), p.files.picture, camera=angles)
@@ -171,12 +173,14 @@ def _groups(drawn: list[Planned]) -> dict[str, list[Planned]]:
 
 
 def _distinct(p: Planned, group: list[Planned]) -> str:
-    """The solver's name, with the options in which the group's runs differ."""
-    varied = [
-        f"{option.replace('_', ' ')} {getattr(p.run, option)}"
-        for option in ("solver", "iterations", "tolerance", "first_guess", "threads", "frames", "rounds")
-        if len({str(getattr(other.run, option)) for other in group if other.run.solver.name == p.run.solver.name}) > 1
-    ]
+    """The solver's name, with the parameters and options in which the group's runs of this solver differ."""
+    options = ("iterations", "tolerance", "first_guess", "threads", "frames", "rounds")
+
+    def settings(run: RunSpec) -> dict[str, Any]:
+        return {**run.solver.parameters, **{option: getattr(run, option) for option in options}}
+
+    own = [settings(other.run) for other in group if other.run.solver.name == p.run.solver.name]
+    varied = [f"{k.replace('_', ' ')} {v}" for k, v in settings(p.run).items() if any(o[k] != v for o in own)]
     return ", ".join([p.run.solver.name, *varied])
 
 
