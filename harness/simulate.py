@@ -53,9 +53,7 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
     return FIRST_GUESSES[first_guess](stated, scene, state)
 
 
-def simulate(
-    scene: Scene, prepared: Prepared, stop: StopRule, *, first_guess: str, frames: int
-) -> Iterator[Step]:
+def simulate(scene: Scene, prepared: Prepared, stop: StopRule, *, first_guess: str, frames: int) -> Iterator[Step]:
     """The scene's first steps, one more each time it is asked; the clock stands still in between."""
     state = start(scene)
     for index in range(1, frames + 1):

@@ -174,14 +174,24 @@ def _groups(drawn: list[Planned]) -> dict[str, list[Planned]]:
 
 def _distinct(p: Planned, group: list[Planned]) -> str:
     """The solver's name, with the parameters and options in which the group's runs of this solver differ."""
-    options = ("iterations", "tolerance", "first_guess", "threads", "frames", "rounds")
 
     def settings(run: RunSpec) -> dict[str, Any]:
-        return {**run.solver.parameters, **{option: getattr(run, option) for option in options}}
+        return {**run.solver.parameters, **{option: getattr(run, option) for option in _SHORT}}
 
     own = [settings(other.run) for other in group if other.run.solver.name == p.run.solver.name]
-    varied = [f"{k.replace('_', ' ')} {v}" for k, v in settings(p.run).items() if any(o[k] != v for o in own)]
-    return ", ".join([p.run.solver.name, *varied])
+    varied = [(k, v) for k, v in settings(p.run).items() if any(other[k] != v for other in own)]
+    return ", ".join([p.run.solver.name, *(_SHORT.get(k, f"{k} {{}}").format(v) for k, v in varied)])
+
+
+_SHORT = {
+    "iterations": "{} it.",
+    "tolerance": "tol. {}",
+    "first_guess": "{}",
+    "threads": "{} thr.",
+    "frames": "{} frames",
+    "rounds": "{} rounds",
+}
+"""How an option's value is named where space is short."""
 
 
 def failures(table: pa.Table) -> list[str]:
