@@ -1,0 +1,92 @@
+"""The inverse of a small Q, kept whole: a solve is then one dense product, without a chain of dependent steps.
+
+    x = Q^-1 b,   Q^-1 = L^-T L^-1
+
+For springs Q is an M-matrix, so that its inverse has no negative entry and the product of two roundings is all that
+is lost.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.sparse import csr_array
+
+from solvers.problem import NotPositiveDefinite, Positions
+
+_ROWS = 4
+"""Rows of the inverse that are done together: 12 sums side by side hide the latency of an addition."""
+
+
+class Inverse:
+    """The dense inverse of a symmetric positive definite Q; n^2 entries, so for small n.
+
+    nonzeros: entries of one triangle; panel_bytes: what a solve reads of the inverse; flops: a solve's additions and
+    multiplications, padding included. `precision` is that of the stored inverse and of the product.
+    """
+
+    def __init__(self, Q: csr_array, *, precision: Literal["float64", "float32"] = "float64") -> None:
+        """Raises NotPositiveDefinite, with the vertex at fault."""
+        n = len(Q.indptr) - 1
+        dense = np.asfortranarray(Q.toarray())
+        if not np.isfinite(dense).all():
+            v = int(np.flatnonzero(~np.isfinite(dense).all(axis=1))[0])
+            raise NotPositiveDefinite(f"Q is not finite in row {v}: a stiffness, a mass or a pin weight there is not")
+        inverse = dense
+        if n:
+            factor, info = dpotrf(dense, lower=1)
+            lost = np.flatnonzero(factor.diagonal() ** 2 <= 4.0 * np.finfo(float).eps * dense.diagonal())
+            if info or len(lost):
+                v = info - 1 if info else int(lost[0])
+                raise NotPositiveDefinite(
+                    f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point at vertex {v}: nothing "
+                    "determines its position, or stiffnesses, masses and pin weights lie too far apart or are negative"
+                )
+            inverse, _ = dpotri(factor, lower=1)
+        padded = -(-n // _ROWS) * _ROWS
+        stored = np.zeros((padded, padded), precision)
+        stored[:n, :n] = np.tril(inverse) + np.tril(inverse, -1).T
+        self.nonzeros: int | None = n * (n + 1) // 2
+        self.panel_bytes = stored.nbytes
+        self.flops = 2 * 3 * stored.size
+        self._inverse, self._columns = stored, np.zeros((3, padded), precision)
+
+    def solve(self, b: Positions, out: Positions) -> None:
+        """Write Q^-1 b, shape (n, 3), to `out`; b is left as it is and must not be `out`."""
+        multiply(self._inverse, self._columns, b, out)
+
+
+# Sums may be reordered, which vectors need; NaN and infinity keep their meaning.
+@njit(cache=True, fastmath={"contract", "reassoc", "nsz"})
+def multiply(inverse, columns, b, out):
+    """out = inverse b; `columns` (3, padded n) is scratch whose padding is zero."""
+    n = len(b)
+    for i in range(n):
+        columns[0, i], columns[1, i], columns[2, i] = b[i, 0], b[i, 1], b[i, 2]
+    x, y, z = columns[0], columns[1], columns[2]
+    zero = inverse.dtype.type(0.0)
+    for i in range(0, len(inverse), 4):
+        r0, r1, r2, r3 = inverse[i], inverse[i + 1], inverse[i + 2], inverse[i + 3]
+        x0, x1, x2, x3 = zero, zero, zero, zero
+        y0, y1, y2, y3 = zero, zero, zero, zero
+        z0, z1, z2, z3 = zero, zero, zero, zero
+        for j in range(len(inverse)):
+            a, b_, c = x[j], y[j], z[j]
+            x0 += r0[j] * a
+            x1 += r1[j] * a
+            x2 += r2[j] * a
+            x3 += r3[j] * a
+            y0 += r0[j] * b_
+            y1 += r1[j] * b_
+            y2 += r2[j] * b_
+            y3 += r3[j] * b_
+            z0 += r0[j] * c
+            z1 += r1[j] * c
+            z2 += r2[j] * c
+            z3 += r3[j] * c
+        for k, s in enumerate(((x0, y0, z0), (x1, y1, z1), (x2, y2, z2), (x3, y3, z3))):
+            if i + k < n:
+                out[i + k, 0], out[i + k, 1], out[i + k, 2] = s
