@@ -12,16 +12,19 @@ continuum    The material stays the same when the mesh is refined. With h the sp
                   C11 = E + 10/3 S, C12 = C66 = 7/3 S [Pa].
     These are the limits. Springs on the boundary have cells on one side only and yet full stiffness, so that
     a cloth of width W is stiffer by up to h / W, a block by up to that for each side of its cross-section.
-    bending       k_e = 16 B / h^2, constant B [N m] (BEND springs, rest length 2h, in dimension 2).
+    bending       k_e = 16 B / h^2, constant B [N m] (BEND springs, rest length 2h, in dimension 2), and
+                  4 k_e less for the springs along the lines (STRETCH), 2 k_e less at the ends of lines.
 
     Skip-one springs have no quadratic bending energy about a flat sheet: a fold by the angle t shortens one
     by 2h (1 - cos(t/2)), h t^2/4 to leading order, and a metre of fold has 1/h of them, which store
     k h t^4/32. A sheet of bending stiffness B that takes the same fold over one spacing stores
-    B (t/h)^2 h/2 = B t^2/(2h). The two agree at t = 1 rad for k = 16 B / h^2. The price: gentler bends are
-    underestimated by the factor t^2 (a fixed curvature c makes t = c h, so that smooth bends get softer as
-    the mesh is refined), and the springs resist stretch too: they add 4 k_e = 64 B / h^2 to the membrane
-    stiffness along the lines of the mesh, without bound as h falls. So bending does not converge under
-    refinement, unlike the other constants. This rule is our own.
+    B (t/h)^2 h/2 = B t^2/(2h). The two agree at t = 1 rad for k = 16 B / h^2: the sharpest bends of the mesh
+    resist as the sheet does. Gentler ones are underestimated by the factor t^2; a fixed curvature c makes
+    t = c h, so smooth bends get softer as the mesh is refined, and the limit is the membrane without B.
+    Skip-one springs resist stretch too. Along a line each spring lies under two of them (under one at the
+    ends), each of which pulls with 2h k at a unit of strain, as much as 2 k more in the spring below would. That
+    has so much less, so that the sheet's membrane stiffness is `stretch` at every size. A mesh so fine that
+    nothing would be left, h < 8 sqrt(B / stretch), is refused. This rule is our own.
 
 liu2013      k_e = constant * (resolution - 1) / (reference - 1), constants [N/m] as they are at the size
     `reference`: Liu et al. 2013 give their curtain 150, 300, 600, 1200 at 11, 21, 41, 81 vertices a side.
@@ -35,6 +38,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 from harness.errors import InputError, Mistake, did_you_mean
 from harness.mesh.base import BEND, SHEAR, STRETCH, Mesh
@@ -60,7 +64,36 @@ def spring_stiffness(
         if not 0 <= constant < np.inf:
             raise InputError(Mistake(f"{constant} is no stiffness; wanted a finite number >= 0", key=family))
         k[mesh.families[family]] = constant * RULES[rule](mesh, family, reference)
+    return _relieved(mesh, k) if rule == "continuum" else k
+
+
+def _relieved(mesh: Mesh, k: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The stiffnesses, those along the lines less what skip-one springs add to them."""
+    if not k[mesh.families[BEND]].any():
+        return k
+    along = mesh.families[STRETCH]
+    added = 2 * _overlaps(mesh) * k[mesh.families[BEND]].max()
+    if (added > k[along]).any():
+        worst = int(np.argmax(added - k[along]))
+        had, more = k[along][worst], added[worst]
+        least = mesh.spacing * (more / had) ** 0.5 if had else np.inf
+        problem = (
+            f"its springs alone would resist stretch by {more:.4g} N/m at a spacing of {mesh.spacing:.4g} m, and "
+            f"`stretch` is {had:.4g} N/m; wanted a spacing of at least {least:.4g} m, less `bend` or more `stretch`"
+        )
+        raise InputError(Mistake(problem, key="bend"))
+    k[along] -= added
     return k
+
+
+def _overlaps(mesh: Mesh) -> NDArray[np.int64]:
+    """Under how many BEND springs each STRETCH spring lies: one or two. A BEND spring spans two of them."""
+    (i, j), (a, b) = (mesh.springs[mesh.families[family]].T for family in (STRETCH, BEND))
+    n, name = len(mesh.rest), np.arange(1, len(i) + 1)
+    spring = coo_array((np.tile(name, 2), (np.r_[i, j], np.r_[j, i])), shape=(n, n)).tocsr()
+    bend, middle = (spring[a] * spring[b]).nonzero()
+    under = [np.asarray(spring[end[bend], middle]) for end in (a, b)]
+    return np.bincount(np.concatenate(under) - 1, minlength=len(i))
 
 
 def _fixed(mesh: Mesh, family: str, reference: int | None) -> float:

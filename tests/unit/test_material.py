@@ -109,7 +109,7 @@ def test_a_fold_stores_the_bending_energy_that_the_rule_promises(t):
     # t = 1 rad is 1 % off: 2 (1 - cos(1/2)) = 0.2448 against 1/4, hence 4 % in energy; edge rows count fully
     size, bending = 21, 3e-4
     mesh = Grid(diagonals="none", skip_one=True).build(size)
-    k = spring_stiffness(mesh, rule="continuum", stretch=0.0, shear=0.0, bend=bending)
+    k = spring_stiffness(mesh, rule="continuum", stretch=10.0, shear=0.0, bend=bending)
     folded = mesh.rest.copy()
     right = mesh.rest[:, 0] > 1e-9
     folded[right] = mesh.rest[right] * [np.cos(t), 1, 1] + np.outer(mesh.rest[right, 0], [0, np.sin(t), 0])
@@ -120,21 +120,29 @@ def test_a_fold_stores_the_bending_energy_that_the_rule_promises(t):
     assert energy == pytest.approx(continuum * t**2, rel=0.045)
 
 
-def test_skip_one_springs_add_four_times_their_stiffness_to_the_membrane():
+@pytest.mark.parametrize("bend", [0.0, 1e-4, 5e-4])
+def test_bending_leaves_the_membrane_stiffness_as_it_is(bend):
     mesh = Grid(diagonals="none", skip_one=True).build(41)
-    k = spring_stiffness(mesh, rule="continuum", stretch=0.0, shear=0.0, bend=1.0)
+    k = spring_stiffness(mesh, rule="continuum", stretch=100.0, shear=0.0, bend=bend)
+    assert np.all(k[mesh.families[BEND]] == 16 * bend / mesh.spacing**2)
     strain = mesh.rest * [0.01, 0, 0]
     i, j = mesh.springs.T
     longer = np.abs(strain[i] - strain[j])[:, 0]
     stiffness = 2 * (0.5 * k @ longer**2) / 0.01**2  # energy of a square metre = 1/2 stiffness strain^2
-    assert stiffness == pytest.approx(4 * k.max(), rel=0.01)  # rows lack one spring (2.5 %), edges add one (2.5 %)
+    assert stiffness == pytest.approx(100.0 * 41 / 40, rel=ROUND_OFF)  # a row too many
+
+
+def test_a_mesh_too_fine_for_its_bending_stiffness_is_refused_with_the_figures():
+    # 64 B / h^2 = 64 0.01 20^2 = 256 N/m against 100; 8 sqrt(0.01 / 100) = 0.08 m
+    with pytest.raises(InputError, match=r"256 N/m.*0\.05 m.*100 N/m.*at least 0\.08 m"):
+        spring_stiffness(Grid(skip_one=True).build(21), rule="continuum", stretch=100.0, shear=0.0, bend=0.01)
 
 
 @pytest.mark.parametrize(
     ("generator", "stretch", "shear", "bend"),
     [
         (Chain(length=3.0), lambda h: 1 / h, None, None),
-        (Grid(skip_one=True), lambda h: 1.0, lambda h: 1.0, lambda h: 16 / h**2),
+        (Grid(), lambda h: 1.0, lambda h: 1.0, None),
         (Net(), lambda h: 1.0, None, None),
         (Skirt(), lambda h: 1.0, lambda h: 1.0, None),
         (Balloon(), lambda h: 1.0, None, None),
@@ -144,8 +152,8 @@ def test_skip_one_springs_add_four_times_their_stiffness_to_the_membrane():
 )
 def test_continuum_stiffness_follows_the_dimension(generator, stretch, shear, bend):
     mesh = generator.build(7)
-    k = spring_stiffness(mesh, rule="continuum", stretch=2.0, shear=3.0, bend=5.0)
-    for family, constant, scale in ((STRETCH, 2.0, stretch), (SHEAR, 3.0, shear), (BEND, 5.0, bend)):
+    k = spring_stiffness(mesh, rule="continuum", stretch=2.0, shear=3.0, bend=2e-4)
+    for family, constant, scale in ((STRETCH, 2.0, stretch), (SHEAR, 3.0, shear), (BEND, 2e-4, bend)):
         springs = mesh.families[family]
         assert (scale is None) == (not len(springs))
         if scale:
