@@ -1,8 +1,8 @@
 """A fill-reducing order by nested dissection (George 1973) of the graph of a sparse symmetric matrix.
 
-A separator is found from graph distances alone: breadth-first distances from four far-apart vertices a, b, c, d
+A separator is found from graph distances alone: breadth-first distances from far-apart vertices a, b, c, ...
 (a farthest-point choice, as in Harel and Koren's high-dimensional embedding 2002) stand for coordinates. The fields
-a - b, c - d, (a + c) - (b + d), ... are cut where their vertex boundary is smallest for the balance it gives,
+a - b, (a + c) - (b + d), ... are cut where their vertex boundary is smallest for the balance it gives,
 and the separator is then refined by moves of single vertices (Fiduccia and Mattheyses 1982; for separators: Ashcraft
 and Liu 1996). Small pieces are ordered by minimum degree, the separators around them counted (Pellegrini,
 Roman and Amestoy 2000: halo minimum degree).
@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from solvers.linear.minimum_degree import minimum_degree
-from solvers.linear.separator import distances, refine, smallest_cut
+from solvers.linear.separator import LANDMARKS, TOGETHER, refine, separate
 
 _LEAF = 96
 """Pieces up to this size are not cut further: below it a separator saves less than minimum degree does."""
@@ -38,7 +38,8 @@ def _dissect(pointers, neighbours, order, leaf):
     """Sort `order` into the order of elimination: of every piece, its parts first and its separator last."""
     n = len(order)
     owner = np.zeros(n, np.int32)  # the piece that a vertex is in; -1 once it is in a separator
-    dist = np.full((4, n), -1, np.int32)
+    dist = np.zeros((n, LANDMARKS), np.int32)
+    field = np.empty((n, TOGETHER), np.int32)
     local = np.full(n, -1, np.int32)
     scratch = np.empty(n, np.int32)
     stack = [(0, n, False)]  # first, end, known to be connected
@@ -55,8 +56,7 @@ def _dissect(pointers, neighbours, order, leaf):
         if not connected:
             _split_components(pointers, neighbours, owner, pieces, order, first, end, leaf, scratch, stack)
             continue
-        distances(pointers, neighbours, owner, pieces, piece, dist, scratch)
-        side = smallest_cut(pointers, neighbours, owner, pieces, piece, dist, local)
+        side = separate(pointers, neighbours, owner, pieces, piece, dist, field, scratch)
         if len(side) == 0:  # nearly complete: nothing separates it
             minimum_degree(pointers, neighbours, piece, local)
             continue

@@ -5,21 +5,38 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-_FIELDS = np.array(
-    [
-        [1, -1, 0, 0],
-        [0, 0, 1, -1],
-        [1, -1, 1, -1],
-        [1, -1, -1, 1],
-        [1, 0, 0, 0],
-        [0, 0, 1, 0],
-    ],
-    np.int32,
-)
-"""The sums of distances from the four far vertices that are tried as coordinates, one a row."""
+LANDMARKS = 8
+_FEW = 4
+"""A sheet shows its directions in the distances from its corners, four of the landmarks; a solid needs all eight."""
+
+TOGETHER = 8
+"""Fields are swept so many at a time, as a vector."""
+
+
+def _fields() -> NDArray[np.int32]:
+    """The sums of distances from the landmarks that are tried as coordinates, (blocks, landmarks, TOGETHER).
+
+    The eight corners of a box are its landmarks: of the 35 ways to set four of them against four, three are its
+    directions. The first block, for pieces that are flat or long, is content with the first four landmarks.
+    """
+    few = [[1, -1, 1, -1], [1, -1, -1, 1], [1, 1, -1, -1], [1, -1, 0, 0], [0, 0, 1, -1]]
+    few += [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+    halves = [[1 if i in (0, *three) else -1 for i in range(8)] for three in combinations(range(1, 8), 3)]
+    pairs = [[(i == 2 * k) - (i == 2 * k + 1) for i in range(8)] for k in range(4)] + [[1, -1, 1, -1, 1, -1, 0, 0]]
+    fields = np.array([[*row, 0, 0, 0, 0] for row in few] + pairs + halves, np.int32)
+    return np.ascontiguousarray(fields.reshape(-1, TOGETHER, LANDMARKS).transpose(0, 2, 1))
+
+
+_FIELDS = _fields()
+
+_SHEET = 1.5
+"""A square sheet is cut by the square root of its vertices; more fields are tried where it takes this much more."""
 
 _SMALLEST_SIDE = 0.25
 """The least share of the vertices that a side may have."""
@@ -48,87 +65,105 @@ def _breadth_first(pointers, neighbours, owner, number, root, dist, queue):
 
 
 @njit(cache=True)
-def distances(pointers, neighbours, owner, number, piece, dist, queue):
-    """Distances of the piece's vertices from four of them that lie far apart, into `dist` (4, n)."""
-    for v in piece:
-        dist[0, v] = -1
-    tail = _breadth_first(pointers, neighbours, owner, number, piece[0], dist[0], queue)
-    far = queue[tail - 1]
-    for k in range(4):
+def _distances(pointers, neighbours, owner, number, piece, begin, end, dist, queue):
+    """Distances of the piece's vertices from landmarks `begin` to `end`, as far apart as may be, into `dist`."""
+    far = piece[0]
+    if begin == 0:  # the first is where a search from anywhere ends
         for v in piece:
-            dist[k, v] = -1
-        _breadth_first(pointers, neighbours, owner, number, far, dist[k], queue)
+            dist[v, 0] = -1
+        far = queue[_breadth_first(pointers, neighbours, owner, number, far, dist[:, 0], queue) - 1]
+    for k in range(begin, end):
         farthest = -1
+        if k > 0:
+            for v in piece:
+                nearest = dist[v, 0]
+                for i in range(1, k):
+                    nearest = min(nearest, dist[v, i])
+                if nearest > farthest:
+                    farthest, far = nearest, v
         for v in piece:
-            nearest = dist[0, v]
-            for i in range(1, k + 1):
-                nearest = min(nearest, dist[i, v])
-            if nearest > farthest:
-                farthest, far = nearest, v
+            dist[v, k] = -1
+        _breadth_first(pointers, neighbours, owner, number, far, dist[:, k], queue)
 
 
 @njit(cache=True)
-def smallest_cut(pointers, neighbours, owner, number, piece, dist, field):
+def separate(pointers, neighbours, owner, number, piece, dist, field, queue):
     """The sides (len(piece),) of the best cut of any field, or an empty array where there is none.
 
-    A cut at t parts {field <= t} from the rest; its separator is the boundary of the lower side. `field` is scratch.
+    A cut at t parts {field <= t} from the rest; its separator is the boundary of the lower side. Scratch: `dist`
+    (n, LANDMARKS), `field` (n, TOGETHER), `queue` (n,).
     """
     size = len(piece)
     best = np.inf
-    best_row, best_cut = -1, 0
-    for row in range(len(_FIELDS)):
-        low, high = _combine(dist, _FIELDS[row], piece, field)
-        count = np.zeros(high - low + 2, np.int64)  # how many have this value
-        enter = np.zeros(high - low + 2, np.int64)  # differences of the size of the boundary
+    best_block, best_field, best_cut = -1, 0, 0
+    top = np.empty(TOGETHER, np.int32)
+    low = np.empty(TOGETHER, np.int32)
+    high = np.empty(TOGETHER, np.int32)
+    for block in range(len(_FIELDS)):
+        if best < _SHEET * np.sqrt(size):
+            break
+        if block < 2:
+            begin, end = (0, _FEW) if block == 0 else (_FEW, LANDMARKS)
+            _distances(pointers, neighbours, owner, number, piece, begin, end, dist, queue)
+        _combine(dist, _FIELDS[block], piece, field, low, high)
+        reach = 0
+        for k in range(TOGETHER):
+            reach = max(reach, high[k] - low[k])
+        count = np.zeros((reach + 2, TOGETHER), np.int32)  # how many have this value
+        enter = np.zeros((reach + 2, TOGETHER), np.int32)  # differences of the size of the boundary
         for v in piece:
-            value = field[v] - low
-            top = value
+            for k in range(TOGETHER):
+                top[k] = field[v, k]
             for e in range(pointers[v], pointers[v + 1]):
                 u = neighbours[e]
                 if owner[u] == number:
-                    top = max(top, field[u] - low)
-            count[value] += 1
-            enter[value] += 1
-            enter[top] -= 1
-        below, boundary = 0, 0
-        for cut in range(high - low):
-            below += count[cut]
-            boundary += enter[cut]
-            left, right = below - boundary, size - below
-            if min(left, right) >= _SMALLEST_SIDE * (size - boundary):
-                cost = boundary * (1.0 + 2.0 * ((left - right) / size) ** 2)
-                if cost < best:
-                    best, best_row, best_cut = cost, row, cut + low
-    if best_row < 0 or best > 0.4 * size:
-        for v in piece:
-            field[v] = -1
+                    for k in range(TOGETHER):
+                        top[k] = max(top[k], field[u, k])
+            for k in range(TOGETHER):
+                count[field[v, k] - low[k], k] += 1
+                enter[field[v, k] - low[k], k] += 1
+                enter[top[k] - low[k], k] -= 1
+        for k in range(TOGETHER):
+            below, boundary = 0, 0
+            for cut in range(high[k] - low[k]):
+                below += count[cut, k]
+                boundary += enter[cut, k]
+                left, right = below - boundary, size - below
+                if min(left, right) >= _SMALLEST_SIDE * (size - boundary):
+                    cost = boundary * (1.0 + 2.0 * ((left - right) / size) ** 2)
+                    if cost < best:
+                        best, best_block, best_field, best_cut = cost, block, k, cut + low[k]
+    if best_block < 0 or best > 0.4 * size:
         return np.empty(0, np.int8)
     side = np.empty(size, np.int8)
-    _combine(dist, _FIELDS[best_row], piece, field)
+    _combine(dist, _FIELDS[best_block], piece, field, low, high)
     for i in range(size):
         v = piece[i]
-        side[i] = 1 if field[v] > best_cut else 0
+        side[i] = 1 if field[v, best_field] > best_cut else 0
         if side[i] == 0:
             for e in range(pointers[v], pointers[v + 1]):
                 u = neighbours[e]
-                if owner[u] == number and field[u] > best_cut:
+                if owner[u] == number and field[u, best_field] > best_cut:
                     side[i] = 2
-    for v in piece:
-        field[v] = -1
     return side
 
 
 @njit(cache=True)
-def _combine(dist, weights, piece, field):
-    """Write the weighted sum of distances to `field`; returns its least and greatest values."""
-    low, high = np.int32(2**31 - 1), np.int32(-(2**31) + 1)
+def _combine(dist, weights, piece, field, low, high):
+    """Write weighted sums of distances to `field`, and their least and greatest values to `low` and `high`."""
+    low[:] = 2**31 - 1
+    high[:] = -(2**31)
+    total = np.empty(TOGETHER, np.int32)
     for v in piece:
-        value = np.int32(0)
-        for k in range(4):
-            value += weights[k] * dist[k, v]
-        field[v] = value
-        low, high = min(low, value), max(high, value)
-    return low, high
+        total[:] = 0
+        for i in range(LANDMARKS):
+            d = dist[v, i]
+            for k in range(TOGETHER):
+                total[k] += weights[i, k] * d
+        for k in range(TOGETHER):
+            field[v, k] = total[k]
+            low[k] = min(low[k], total[k])
+            high[k] = max(high[k], total[k])
 
 
 @njit(cache=True)

@@ -87,10 +87,9 @@ def test_the_structure_is_that_of_dense_elimination(matrix):
         assert s.parent[node] == -1 or node < s.parent[node]
 
 
-# What dissection may fill in beside minimum degree: less on sheets, a little more where it has few levels to gain on,
-# and more on a cube, whose flat separators distances along diagonals do not show well.
+# Dissection gains with the number of its levels: nothing yet on the small and narrow ones, a tenth on a cube.
 @pytest.mark.parametrize(
-    ("shape", "limit"), [((40, 40), 1.0), ((90, 30), 1.03), ((30, 6, 6), 1.03), ((10, 10, 10), 1.2)], ids=str
+    ("shape", "limit"), [((40, 40), 1.0), ((90, 30), 1.03), ((30, 6, 6), 1.03), ((12, 12, 12), 0.9)], ids=str
 )
 def test_fills_in_about_as_little_as_minimum_degree(shape, limit):
     matrix = box(*shape)
