@@ -49,6 +49,7 @@ class RerunRecorder:
         self._styled: dict[str, list[str]] = {}
         self._frames = 0
         self._pins: NDArray[np.float32] | None = None
+        self._unseen = 1e-6 * info.mesh.size
         self._springs_shown = False
         application = blueprint.application(info)
         self._file = PartialFile(path, application, info.run_id, info.title)
@@ -136,7 +137,9 @@ class RerunRecorder:
 
     def _log_pins(self, p: NDArray[np.float32]) -> None:
         pins = p[self._info.pinned]
-        if self._pins is None or not np.array_equal(pins, self._pins):
+        with np.errstate(invalid="ignore"):
+            moved = np.inf if self._pins is None else np.abs(pins - self._pins).max(initial=0.0)
+        if not moved <= self._unseen:  # a penalty lets its vertices move by less; what is not a number is recorded
             points = rr.Points3D(pins, radii=rr.Radius.ui_points(5), colors=(255, 200, 40))
             self._stream.log("/scene/pins", points)
             self._pins = pins
