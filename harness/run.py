@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import traceback
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from harness import machine, rows
-from harness.errors import RunFailed
+from harness.errors import InputError, RunFailed
 from harness.measure import Diverged, Measured, Settings, digest, measure, steps
 from harness.record.base import Frame, Recorder, RecordingInfo
 from harness.record.rerun import RerunRecorder
@@ -60,15 +61,24 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
     try:
         with machine.pinned_threads(run.threads):
             found = _passes(run, files, tick, positions)
-    except (Unsupported, NotPositiveDefinite, Diverged, RunFailed, MemoryError) as error:
-        found = [{"phase": "run", "status": _status(error), "reason": str(error) or type(error).__name__}]
+    except InputError:
+        raise
+    except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
+        found = [{"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error)}]
     result = [common | row for row in found]
     rows.write(files.rows, result)
     return result
 
 
-def _status(error: Exception) -> str:
-    return {Unsupported: "unsupported", Diverged: "diverged"}.get(type(error), "failed")
+_STATUS: dict[type[Exception], str] = {Unsupported: "unsupported", Diverged: "diverged"}
+
+
+def _reason(error: Exception) -> str:
+    """An error of ours speaks for itself; of any other the row also says what it was and where it came from."""
+    if isinstance(error, (Unsupported, NotPositiveDefinite, Diverged, RunFailed)):
+        return str(error)
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
 
 
 def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
