@@ -57,7 +57,7 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
     tick: told the name of the pass after each step; positions: where to store the positions after every step
     (frames, n, 3) [m], float64. Returns the rows. Raises InputError for what the user can mend.
     """
-    common = _common(run)
+    shared = common(run)
     try:
         with machine.pinned_threads(run.threads):
             found = _passes(run, files, tick, positions)
@@ -65,7 +65,7 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
         raise
     except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
         found = [{"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error)}]
-    result = [common | row for row in found]
+    result = [shared | row for row in found]
     rows.write(files.rows, result)
     return result
 
@@ -217,7 +217,7 @@ def save_positions(path: Path, positions: np.ndarray) -> None:
     os.replace(partial, path)
 
 
-def _common(run: RunSpec) -> dict[str, Any]:
+def common(run: RunSpec) -> dict[str, Any]:
     """The columns that are the same in all rows of a run."""
     here = machine.describe()
     return {
