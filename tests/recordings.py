@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rerun as rr
 
 from harness.mesh.chain import Chain
 from harness.mesh.grid import Grid
@@ -55,3 +56,12 @@ def record(path: Path, of: RecordingInfo | None = None, count: int = 12, amplitu
             recorder.convergence(3, [1.0, 0.1, 0.0], [5.0, 4.0, 4.0])
     steps = np.arange(1.0, count)
     return recorder.close({"step": list(steps), "local": list(steps / 2)})
+
+
+def foreign(path: Path) -> None:
+    """A recording of Rerun that is none of ours."""
+    stream = rr.RecordingStream("other", recording_id="other")
+    stream.save(path)
+    stream.log("/points", rr.Points3D([[0, 0, 0]]))
+    stream.flush()
+    stream.disconnect()

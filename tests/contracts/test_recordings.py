@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import signal
-import subprocess
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pytest
-import rerun as rr
 from rerun.chunk import RrdReader
 
 from harness.errors import InputError, RunFailed
@@ -22,8 +16,8 @@ from harness.mesh.grid import Grid
 from harness.record.base import Frame
 from harness.record.compare import side_by_side
 from harness.record.reader import open_recording, read_replay, summary
-from harness.record.rerun import FLUSH, SCALARS, RerunRecorder
-from tests.recordings import MESHES, info, record, waving
+from harness.record.rerun import SCALARS, RerunRecorder
+from tests.recordings import MESHES, foreign, info, record, waving
 
 
 def columns(path: Path) -> dict[tuple[str, str], str]:
@@ -183,93 +177,6 @@ def test_a_recording_that_cannot_be_written_fails(tmp_path: Path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(RunFailed, match="cannot be written"):
         RerunRecorder(tmp_path / "file" / "a.rrd", info())
-
-
-RECORD = """
-import os, resource, signal, sys
-from pathlib import Path
-from harness.record.rerun import RerunRecorder
-from tests.recordings import info, waving
-recorder = RerunRecorder(Path(sys.argv[1]), info())
-{before}
-for frame in waving(info(), 33):
-    recorder.frame(frame)
-{after}
-"""
-KILLED = RECORD.format(before="", after="os.kill(os.getpid(), signal.SIGKILL)")
-FULL = RECORD.format(
-    before="signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))",
-    after="recorder.close({})",
-)
-
-
-def run(code: str, path: Path) -> subprocess.CompletedProcess[str]:
-    """Run Python code in a process of its own, in the repository."""
-    root = Path(__file__).resolve().parents[2]
-    return subprocess.run([sys.executable, "-c", code, path], cwd=root, capture_output=True, text=True)
-
-
-def test_a_full_disk_is_a_failure_and_not_a_damaged_file(tmp_path: Path):
-    told = run(FULL, tmp_path / "a.rrd")
-    assert "RunFailed" in told.stderr
-    assert "cannot be written" in told.stderr
-    assert not (tmp_path / "a.rrd").exists()
-
-
-def test_a_killed_run_leaves_all_frames_up_to_the_last_flush(tmp_path: Path):
-    told = run(KILLED, tmp_path / "a.rrd")
-    assert told.returncode == -signal.SIGKILL, told.stderr
-    (left,) = tmp_path.iterdir()
-    assert left.name != "a.rrd"
-    found, replay = summary(left), read_replay(left)
-    assert not found.complete
-    assert len(replay.frames) > 33 - FLUSH
-    expected = [frame.positions.astype(np.float32) for frame in waving(info(), len(replay.frames))]
-    np.testing.assert_array_equal(replay.positions, expected)
-    assert len(replay.scalars["/strain/largest"][0]) == SCALARS
-
-
-@pytest.mark.parametrize("share", [0.5, 0.8, 0.99])
-def test_a_file_that_was_cut_is_read_up_to_the_cut(share: float, tmp_path: Path):
-    path = record(tmp_path / "a.rrd", count=60)
-    whole = read_replay(path)
-    os.truncate(path, int(share * path.stat().st_size))
-    replay, found = read_replay(path), summary(path)
-    assert not found.complete
-    assert 0 < len(replay.frames) <= 60
-    np.testing.assert_array_equal(replay.positions, whole.positions[: len(replay.frames)])
-    assert [file.name for file in tmp_path.iterdir()] == ["a.rrd"]
-
-
-def foreign(path: Path) -> None:
-    """A recording of Rerun that is none of ours."""
-    stream = rr.RecordingStream("other", recording_id="other")
-    stream.save(path)
-    stream.log("/points", rr.Points3D([[0, 0, 0]]))
-    stream.flush()
-    stream.disconnect()
-
-
-STRANGERS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "missing": (lambda path: None, "no such file"),
-    "folder": (lambda path: path.mkdir(), "no such file"),
-    "empty": (lambda path: path.write_bytes(b""), "is empty"),
-    "text": (lambda path: path.write_text("frame,x,y\\n0,1,2\\n"), "is not a Rerun recording"),
-    "noise": (lambda path: path.write_bytes(bytes(range(256)) * 9), "is not a Rerun recording"),
-    "head": (lambda path: path.write_bytes(b"RRF2"), "Rerun recording"),
-    "garbage": (lambda path: path.write_bytes(b"RRF2" + bytes(range(256)) * 9), "Rerun recording|can be read"),
-    "foreign": (foreign, "not of one run"),
-}
-
-
-@pytest.mark.parametrize("name", STRANGERS)
-def test_what_is_no_recording_is_refused_by_name(name: str, tmp_path: Path):
-    make, message = STRANGERS[name]
-    path = tmp_path / "a.rrd"
-    make(path)
-    with pytest.raises(InputError, match=message) as refused:
-        read_replay(path)
-    assert refused.value.mistakes[0].file == path
 
 
 def test_chosen_frames_are_read_alone(tmp_path: Path):
