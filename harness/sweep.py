@@ -102,7 +102,7 @@ def run_sweep(
         finally:
             display.end()
         table = rows.read(p.files.rows for p in planned)
-        _draw(name, planned, {p.files.rows for p in todo}, folder, table, say)
+        _draw(name, planned, folder, table, say)
     return table
 
 
@@ -134,17 +134,16 @@ def _alone(folder: Path) -> Iterator[None]:
 def _draw(
     name: str,
     planned: list[Planned],
-    fresh: set[Path],
     folder: Path,
     table: pa.Table,
     say: Callable[[str], None],
 ) -> None:
-    """Pictures of runs, and what compares runs, where it is missing or one of its runs is fresh."""
+    """Pictures of runs, and what compares runs, where it is missing or older than a recording that it shows."""
     drawn = [p for p in planned if p.run.record and p.files.recording.exists()]
     missing = opengl.problem() if any(p.run.pictures for p in drawn) else None
     if missing:
         say(missing)
-    wanting = [p for p in drawn if p.run.pictures and (p.files.rows in fresh or not p.files.picture.exists())]
+    wanting = [p for p in drawn if p.run.pictures and _stale(p.files.picture, [p.files.recording])]
     if wanting and not missing:
         say(f"drawing the pictures of {len(wanting)} runs")
         for p in wanting:
@@ -155,13 +154,17 @@ def _draw(
         recordings = {_distinct(p, group): p.files.recording for p in group}
         recording = folder / "recordings" / f"{label}-solvers.rrd"
         picture = folder / "pictures" / f"{label}-solvers.png"
-        changed = any(p.files.rows in fresh for p in group)
-        if changed or not recording.exists():
+        if _stale(recording, recordings.values()):
             side_by_side(recording, recordings, label.replace("-", " "))
-        if group[0].run.pictures and not missing and (changed or not picture.exists()):
+        if group[0].run.pictures and not missing and _stale(picture, recordings.values()):
             draw_comparison({key: read_replay(path) for key, path in recordings.items()}, picture)
     if any(p.run.pictures for p in planned):
         draw_timing(table, folder / "pictures" / "timing.png", name)
+
+
+def _stale(made: Path, sources: Iterable[Path]) -> bool:
+    """Whether a file is missing, or older than one of those it was made from."""
+    return not made.exists() or any(made.stat().st_mtime_ns < source.stat().st_mtime_ns for source in sources)
 
 
 def _groups(drawn: list[Planned]) -> dict[str, list[Planned]]:
