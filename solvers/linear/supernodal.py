@@ -3,7 +3,9 @@
     Q = L L';  supernode J with rows B below:  S = L_JJ^-T L_JJ^-1,  W = -L_BJ L_JJ^-1
     Q x = b:   forwards b_B += W b_J;  backwards x_J = S b_J + W' x_B
 
-A solve is then multiply-adds alone, over panels [S; W] that lie in the order in which they are read.
+A solve is then multiply-adds alone, over panels W that lie in the order in which they are read, upwards and then
+downwards. Whatever W is rounded to, a solve applies (I + W)' S (I + W), which is symmetric and positive definite as
+long as S is: so W may be float16, and S is not less than float32.
 """
 
 from __future__ import annotations
@@ -23,23 +25,25 @@ from solvers.linear.supernodes import LANES, WIDTH
 from solvers.linear.symbolic import Symbolic, analyse
 from solvers.problem import NotPositiveDefinite, Positions
 
-Precision = Literal["float64", "float32"]
+Precision = Literal["float64", "float32", "float16"]
 
 
 class Layout(NamedTuple):
     """Where the panels of a factor lie. A supernode is cut into chunks of at most WIDTH columns, a panel each.
 
-    chunks (c, 6): of each its offset in the panels, its offset in `places`, its rows, its columns without
-    padding, its padded columns in LANES, its first slot; chunk_of (s + 1,): the first chunk of each supernode;
-    places: of each supernode the slots of its columns and of the rows below, in a group's own copy where they are in
-    the top; spans: see `supernodal_solve`; size: entries in all panels; rows: of four numbers, of the work vector.
+    chunks (c, 7): of each the offsets of its S, of its W and of the slots of its rows in `places`, its columns
+    without padding, its rows below, its padded columns in LANES, its first slot; chunk_of (s + 1,): the first chunk
+    of each supernode; places: of each supernode the slots of its columns and of the rows below, in a group's own
+    copy where they are in the top; spans: see `supernodal_solve`; squares, panels: entries in all S and in all W;
+    rows: of four numbers, of the work vector.
     """
 
     chunks: NDArray[np.int64]
     chunk_of: NDArray[np.int64]
     places: NDArray[np.int32]
     spans: NDArray[np.int64]
-    size: int
+    squares: int
+    panels: int
     rows: int
 
     @classmethod
@@ -51,13 +55,19 @@ class Layout(NamedTuple):
         node = np.repeat(np.arange(len(width)), many)
         done = (np.arange(len(node)) - chunk_of[node]) * WIDTH
         own = np.minimum(WIDTH, width[node] - done)
-        rows = width[node] - done + below[node]
+        rows = width[node] - done - own + below[node]
         quads = -(-own // LANES)
-        cells = rows * quads * LANES
+        squares, panels = own * quads * LANES, rows * quads * LANES
         base = np.concatenate([[0], np.cumsum(width + below)])
-        columns = np.stack(
-            [np.cumsum(cells) - cells, base[node] + done, rows, own, quads, s.first[node] + done], axis=1
-        )
+        columns = [
+            np.cumsum(squares) - squares,
+            np.cumsum(panels) - panels,
+            base[node] + done + own,
+            own,
+            rows,
+            quads,
+            s.first[node] + done,
+        ]
         is_row = np.repeat(np.tile([False, True], len(width)), np.stack([width, below], axis=1).ravel())
         places = np.empty(base[-1], np.int32)
         places[is_row] = s.rows
@@ -74,11 +84,12 @@ class Layout(NamedTuple):
         spans = spans[(spans[:, 0] < spans[:, 1]) | (np.arange(len(spans)) == len(spans) - 1)]
         rows_of_work = int(end + (len(spans) - 1) * (end - top))
         return cls(
-            np.ascontiguousarray(columns),
+            np.stack(columns, axis=1),
             chunk_of,
             places,
             np.ascontiguousarray(spans, np.int64),
-            int(cells.sum()),
+            int(squares.sum()),
+            int(panels.sum()),
             rows_of_work,
         )
 
@@ -86,10 +97,11 @@ class Layout(NamedTuple):
 class Supernodal:
     """A supernodal Cholesky factorisation of a sparse symmetric positive definite Q.
 
-    nonzeros: entries of L, diagonal included, before supernodes are padded; panel_bytes: what is read of the
-    panels, once forwards and once backwards without each other's part; flops: additions and multiplications a solve,
-    padding included; shares: the part of the panels in each group of subtrees that a thread may do, and in the top
-    that one does alone. `precision` is that of the panels and the solve; the factorisation is in float64.
+    nonzeros: entries of L, diagonal included, before supernodes are padded; panel_bytes: of all S and W; flops:
+    additions and multiplications a solve, padding included; shares: the part of the entries in each group of
+    subtrees that a thread may do, and last in the top that one does alone. `precision` is that of the panels; the
+    factorisation is in float64, the solve in float64 for panels in that and in float32 for others. Solves of one
+    factor share its work vector: they are done one at a time.
     """
 
     def __init__(self, Q: csr_array, *, precision: Precision = "float64") -> None:
@@ -102,10 +114,10 @@ class Supernodal:
         neighbours = np.asarray(Q.indices, np.int32)
         s = analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
         layout = Layout.of(s)
-        panels = np.empty(layout.size)
+        squares, panels = np.empty(layout.squares), np.empty(layout.panels)
         v = factorise(
             pointers, neighbours, Q.data, s.slot, s.vertex, s.parent, s.first, s.row_start, s.rows,
-            s.sequence, layout.chunk_of, layout.chunks, panels,
+            s.sequence, layout.chunk_of, layout.chunks, squares, panels,
         )  # fmt: skip
         if v >= 0:
             raise NotPositiveDefinite(
@@ -113,22 +125,19 @@ class Supernodal:
                 "determines its position, or stiffnesses, masses and pin weights lie too far apart or are negative"
             )
         self.nonzeros: int | None = s.nonzeros
-        self.panel_bytes = layout.size * np.dtype(precision).itemsize
-        whole, below = layout.chunks[:, 2], layout.chunks[:, 2] - layout.chunks[:, 3]
-        self.flops = int(2 * 3 * LANES * layout.chunks[:, 4] @ (whole + below))
-        entries = layout.chunks[:, 2] * layout.chunks[:, 4]
+        work = np.zeros(4 * layout.rows, np.float64 if precision == "float64" else np.float32)
+        squares, panels = squares.astype(work.dtype, copy=False), panels.astype(work.dtype, copy=False)
+        if precision == "float16":
+            panels = panels.astype(np.float16).view(np.uint16)  # which Numba has arrays of
+        self.panel_bytes = squares.nbytes + panels.nbytes
+        own, below, quads = layout.chunks[:, 3:6].T
+        self.flops = int(2 * 3 * LANES * quads @ (own + 2 * below))
+        entries = (own + 2 * below) * quads
         self.shares = [float(entries[a:e].sum() / max(1, entries.sum())) for a, e in layout.spans[:, :2]]
-        self._arguments = (
-            panels.astype(precision, copy=False),
-            layout.places,
-            layout.chunks,
-            layout.spans,
-            s.vertex,
-            np.zeros(4 * layout.rows, precision),
-        )
+        self._arguments = squares, panels, layout.places, layout.chunks, layout.spans, s.vertex, work
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b, shape (n, 3), to `out`; b is left as it is and must not be `out`."""
-        groups = len(self._arguments[3]) - 1
+        groups = len(self.shares) - 1
         kernel = solve_in_parallel if groups > 1 and numba.get_num_threads() > 1 else solve
         kernel(*self._arguments, b, out)

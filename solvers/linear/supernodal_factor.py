@@ -24,11 +24,24 @@ _NO_DIGITS = 4.0 * np.finfo(np.float64).eps
 
 @njit(cache=True)
 def factorise(
-    pointers, neighbours, values, slot, vertex, parent, first, row_start, rows, sequence, chunk_of, chunks, panels
+    pointers,
+    neighbours,
+    values,
+    slot,
+    vertex,
+    parent,
+    first,
+    row_start,
+    rows,
+    sequence,
+    chunk_of,
+    chunks,
+    squares,
+    panels,
 ):
-    """Fill `panels` from a matrix (CSR) in the supernodes' `sequence`, a postorder of their tree.
+    """Fill `squares` (S) and `panels` (W) from a matrix (CSR) in the supernodes' `sequence`, a postorder of their tree.
 
-    chunk_of (s + 1,): the first chunk of each supernode; chunks (c, 6): see `solvers.linear.supernodal.Layout`.
+    chunk_of (s + 1,): the first chunk of each supernode; chunks (c, 7): see `solvers.linear.supernodal.Layout`.
     Returns the vertex whose pivot is not positive, or -1.
     """
     nodes = len(parent)
@@ -99,6 +112,7 @@ def factorise(
                 block,
                 inverse,
                 index,
+                squares,
                 panels,
             )
             if bad >= 0:
@@ -156,10 +170,11 @@ def _eliminate(
     block,
     inverse,
     index,
+    squares,
     panels,
 ):
     """Take the chunk of columns that begins at `start` out of the front, and write its panel."""
-    offset, real, quads = chunk[0], chunk[3], chunk[4]
+    square, at, real, quads = chunk[0], chunk[1], chunk[3], chunk[5]
     width = 4 * quads
     for q in range(quads):
         strip = 4 * ((start // 4 + q) * size + start)
@@ -192,14 +207,13 @@ def _eliminate(
             for k in range(j, i):
                 total -= panel[i, k] * inverse[k, j]
             inverse[i, j] = total / panel[i, i]
-    at = offset
     for i in range(real):  # S
         for j in range(width):
             total = 0.0
             for k in range(max(i, j), real):
                 total += inverse[k, i] * inverse[k, j]
-            panels[at + j] = total if j < real else 0.0
-        at += width
+            squares[square + j] = total if j < real else 0.0
+        square += width
     row = np.empty(WIDTH)
     for r in range(width, size - start):
         for j in range(width):  # L21 = A21 L11^-T

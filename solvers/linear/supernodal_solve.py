@@ -45,33 +45,30 @@ def _store(work, vertex, begin, end, out):
 def _forwards(panels, index, chunks, begin, end, work):
     """The pass forwards over the chunks from `begin` to `end`."""
     for k in range(begin, end):
-        offset, at, count, own, quads, first = chunks[k]
-        offset += 4 * quads * own
-        at += own
-        count -= own
+        _, offset, at, _, below, quads, first = chunks[k]
         if quads == 4:
-            add_forward(panels, offset, index, at, count, work, first, work, 0, 4)
+            add_forward(panels, offset, index, at, below, work, first, work, 0, 4)
         elif quads == 1:
-            add_forward(panels, offset, index, at, count, work, first, work, 0, 1)
+            add_forward(panels, offset, index, at, below, work, first, work, 0, 1)
         elif quads == 2:
-            add_forward(panels, offset, index, at, count, work, first, work, 0, 2)
+            add_forward(panels, offset, index, at, below, work, first, work, 0, 2)
         else:
-            add_forward(panels, offset, index, at, count, work, first, work, 0, 3)
+            add_forward(panels, offset, index, at, below, work, first, work, 0, 3)
 
 
 @njit(cache=True)
-def _backwards(panels, index, chunks, begin, end, work):
+def _backwards(squares, panels, index, chunks, begin, end, work):
     """The pass backwards over the chunks from `end` down to `begin`."""
     for k in range(end - 1, begin - 1, -1):
-        offset, at, count, _own, quads, first = chunks[k]
+        start, offset, at, own, below, quads, first = chunks[k]
         if quads == 4:
-            set_backward(panels, offset, index, at, count, work, first, 4)
+            set_backward(squares, start, own, panels, offset, index, at, below, work, first, 4)
         elif quads == 1:
-            set_backward(panels, offset, index, at, count, work, first, 1)
+            set_backward(squares, start, own, panels, offset, index, at, below, work, first, 1)
         elif quads == 2:
-            set_backward(panels, offset, index, at, count, work, first, 2)
+            set_backward(squares, start, own, panels, offset, index, at, below, work, first, 2)
         else:
-            set_backward(panels, offset, index, at, count, work, first, 3)
+            set_backward(squares, start, own, panels, offset, index, at, below, work, first, 3)
 
 
 @njit(cache=True)
@@ -87,7 +84,7 @@ def _ascend(panels, index, chunks, spans, vertex, work, b, group):
 
 
 @njit(cache=True)
-def _turn(panels, index, chunks, spans, vertex, work, b, out):
+def _turn(squares, panels, index, chunks, spans, vertex, work, b, out):
     """Both passes over the top."""
     chunk, chunk_end, top, top_end = spans[-1]
     _load(b, vertex, top, top_end, work)
@@ -97,12 +94,12 @@ def _turn(panels, index, chunks, spans, vertex, work, b, out):
         for k in range(size):
             work[4 * top + k] += work[copy + k]
     _forwards(panels, index, chunks, chunk, chunk_end, work)
-    _backwards(panels, index, chunks, chunk, chunk_end, work)
+    _backwards(squares, panels, index, chunks, chunk, chunk_end, work)
     _store(work, vertex, top, top_end, out)
 
 
 @njit(cache=True)
-def _descend(panels, index, chunks, spans, vertex, work, out, group):
+def _descend(squares, panels, index, chunks, spans, vertex, work, out, group):
     """The pass backwards over a group."""
     chunk, chunk_end, slot, slot_end = spans[group]
     top, top_end = spans[-1, 2], spans[-1, 3]
@@ -110,25 +107,25 @@ def _descend(panels, index, chunks, spans, vertex, work, out, group):
     copy = 4 * top_end + group * size
     for k in range(size):
         work[copy + k] = work[4 * top + k]
-    _backwards(panels, index, chunks, chunk, chunk_end, work)
+    _backwards(squares, panels, index, chunks, chunk, chunk_end, work)
     _store(work, vertex, slot, slot_end, out)
 
 
 @njit(cache=True)
-def solve(panels, index, chunks, spans, vertex, work, b, out):
+def solve(squares, panels, index, chunks, spans, vertex, work, b, out):
     """Q out = b on one thread."""
     for group in range(len(spans) - 1):
         _ascend(panels, index, chunks, spans, vertex, work, b, group)
-    _turn(panels, index, chunks, spans, vertex, work, b, out)
+    _turn(squares, panels, index, chunks, spans, vertex, work, b, out)
     for group in range(len(spans) - 2, -1, -1):
-        _descend(panels, index, chunks, spans, vertex, work, out, group)
+        _descend(squares, panels, index, chunks, spans, vertex, work, out, group)
 
 
 @njit(cache=True, parallel=True)
-def solve_in_parallel(panels, index, chunks, spans, vertex, work, b, out):
+def solve_in_parallel(squares, panels, index, chunks, spans, vertex, work, b, out):
     """Q out = b on Numba's threads."""
     for group in prange(len(spans) - 1):
         _ascend(panels, index, chunks, spans, vertex, work, b, group)
-    _turn(panels, index, chunks, spans, vertex, work, b, out)
+    _turn(squares, panels, index, chunks, spans, vertex, work, b, out)
     for group in prange(len(spans) - 1):
-        _descend(panels, index, chunks, spans, vertex, work, out, group)
+        _descend(squares, panels, index, chunks, spans, vertex, work, out, group)

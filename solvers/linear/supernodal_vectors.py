@@ -3,7 +3,8 @@
 A panel W has rows of 4 m entries (m = 1 to 4), one after the other; a work vector has rows of 4: x, y, z and padding.
 In a pass forwards, row r of W meets the panel's 4 m rows of x, which stay in registers, and its result is added to the
 row of y that `index` names. In a pass backwards each row of y that `index` names meets its row of W, four columns
-of which are a vector, and the sums are transposed at the end: no padding is multiplied.
+of which are a vector, and the sums are transposed at the end: no padding is multiplied. Panels have the work vector's
+type, or are float16, seen as uint16, beside float32.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ _AHEAD = 2048
 
 
 class _Vectors:
-    """Vectors of one element type, written with a builder."""
+    """Vectors of the element type of the work vector, written with a builder."""
 
     def __init__(self, context, builder, element: types.Float) -> None:
         self.builder = builder
         self.element = context.get_value_type(element)
         self.size = element.bitwidth // 8
+        self.narrow = element.bitwidth == 32
 
     def zero(self, lanes: int) -> ir.Constant:
         return ir.Constant(ir.VectorType(self.element, lanes), [0.0] * lanes)
@@ -38,13 +40,21 @@ class _Vectors:
         wide = self.builder.bitcast(pointer, ir.VectorType(self.element, lanes).as_pointer())
         return self.builder.load(wide, align=self.size)
 
-    def prefetch(self, row: ir.Value, quads: int, distance: int) -> None:
-        """Ask for the cache lines `distance` bytes on from a row of a panel."""
+    def entries(self, pointer: Any, kind: types.Array, lanes: int) -> ir.Value:
+        """Entries of a panel of this kind; float16 is widened."""
+        if kind.dtype != types.uint16:
+            return self.load(pointer, lanes)
+        half = ir.VectorType(ir.HalfType(), lanes)
+        short = self.builder.load(self.builder.bitcast(pointer, half.as_pointer()), align=2)
+        return self.builder.fpext(short, ir.VectorType(self.element, lanes))
+
+    def prefetch(self, row: ir.Value, kind: types.Array, quads: int, distance: int) -> None:
+        """Ask for the cache lines `distance` bytes on from a row of a panel of this kind."""
         call = self.builder.module.declare_intrinsic(
             "llvm.prefetch.p0", fnty=ir.FunctionType(ir.VoidType(), [_I8P, _I32, _I32, _I32])
         )
         byte = self.builder.bitcast(row, _I8P)
-        for line in range(0, 4 * quads * self.size, 64):
+        for line in range(0, quads * kind.dtype.bitwidth // 2, 64):
             self.builder.call(call, [self.builder.gep(byte, [_I64(distance + line)]), _I32(0), _I32(3), _I32(1)])
 
     def store(self, value: Any, pointer: ir.Value) -> None:
@@ -96,24 +106,24 @@ def _add_forward(typingctx, panel, offset, index, at, count, x, x_row, y, y_row,
 
     def generate(context, builder, signature, args):
         panel, offset, index, at, count, x, x_row, y, y_row, quads = _arguments(context, builder, signature, args)
-        vectors = _Vectors(context, builder, signature.args[0].dtype)
-        narrow = signature.args[0].dtype.bitwidth == 32
+        kind = signature.args[0]
+        vectors = _Vectors(context, builder, signature.args[7].dtype)
         panel = builder.gep(panel, [offset])
         index = builder.gep(index, [at])
         x = builder.gep(x, [builder.mul(x_row, _I64(4))])
         y = builder.gep(y, [builder.mul(y_row, _I64(4))])
         # As many rows of x in a vector as make 512 bits of float32; one of float64.
-        together = 4 if narrow else 1
+        together = 4 if vectors.narrow else 1
         xs = [vectors.load(builder.gep(x, [_I64(4 * j)]), 4 * together) for j in range(0, 4 * quads, together)]
         with cgutils.for_range(builder, count) as loop:
             row = builder.gep(panel, [builder.mul(loop.index, _I64(4 * quads))])
-            vectors.prefetch(row, quads, _AHEAD)
+            vectors.prefetch(row, kind, quads, _AHEAD)
             place = builder.zext(builder.load(builder.gep(index, [loop.index])), _I64)
             target = builder.gep(y, [builder.mul(place, _I64(4))])
             sums = []
-            if narrow:
+            if vectors.narrow:
                 for q in range(quads):
-                    w = vectors.load(builder.gep(row, [_I64(4 * q)]), 4)
+                    w = vectors.entries(builder.gep(row, [_I64(4 * q)]), kind, 4)
                     spread = vectors.shuffle(w, w, [j // 4 for j in range(16)])
                     sums.append(vectors.multiply_add(spread, xs[q], sums.pop() if q >= 2 else None))
                 total = vectors.total(sums)
@@ -135,16 +145,22 @@ def _add_forward(typingctx, panel, offset, index, at, count, x, x_row, y, y_row,
     return signature, generate
 
 
-def _set_backward(typingctx, panel, offset, index, at, count, y, x_row, quads):
-    """y[x_row + j] = sum over r < count of panel[offset + 4 quads r + j] y[index[at + r]]; count is at least 1."""
-    signature = _signature(panel, offset, index, at, count, y, x_row, quads)
+def _set_backward(typingctx, square, start, own, panel, offset, index, at, below, y, x_row, quads):
+    """y[x_row + j] = sum over r < own of square[start + 4 quads r + j] y[x_row + r]
+    + sum over r < below of panel[offset + 4 quads r + j] y[index[at + r]]."""
+    signature = _signature(square, start, own, panel, offset, index, at, below, y, x_row, quads)
 
     def generate(context, builder, signature, args):
-        panel, offset, index, at, count, y, x_row, quads = _arguments(context, builder, signature, args)
-        vectors = _Vectors(context, builder, signature.args[0].dtype)
+        square, start, own, panel, offset, index, at, below, y, x_row, quads = _arguments(
+            context, builder, signature, args
+        )
+        square_kind, panel_kind = signature.args[0], signature.args[3]
+        vectors = _Vectors(context, builder, signature.args[8].dtype)
+        square = builder.gep(square, [start])
         panel = builder.gep(panel, [offset])
         index = builder.gep(index, [at])
-        group = 8 if signature.args[0].dtype.bitwidth == 32 else 4  # entries in 256 bits
+        out = builder.gep(y, [builder.mul(x_row, _I64(4))])
+        group = 8 if vectors.narrow else 4  # entries in 256 bits
         groups = [(j, min(group, 4 * quads - j)) for j in range(0, 4 * quads, group)]
         # Enough sums side by side to hide the latency of an addition.
         unroll = max(1, 4 // len(groups))
@@ -157,30 +173,37 @@ def _set_backward(typingctx, panel, offset, index, at, count, y, x_row, quads):
                 for accumulator in triple:
                     builder.store(vectors.zero(lanes), accumulator)
 
-        def add(r, accumulators):
-            row = builder.gep(panel, [builder.mul(r, _I64(4 * quads))])
-            vectors.prefetch(row, quads, -_AHEAD)
-            place = builder.zext(builder.load(builder.gep(index, [r])), _I64)
-            source = builder.gep(y, [builder.mul(place, _I64(4))])
+        def add(row, kind, source, accumulators):
             for (j, lanes), triple in zip(groups, accumulators, strict=True):
-                w = vectors.load(builder.gep(row, [_I64(j)]), lanes)
+                w = vectors.entries(builder.gep(row, [_I64(j)]), kind, lanes)
                 for c, accumulator in enumerate(triple):
                     factor = vectors.broadcast(builder.gep(source, [_I64(c)]), lanes)
                     builder.store(vectors.multiply_add(w, factor, builder.load(accumulator)), accumulator)
 
+        def add_below(r, accumulators):
+            row = builder.gep(panel, [builder.mul(r, _I64(4 * quads))])
+            vectors.prefetch(row, panel_kind, quads, -_AHEAD)
+            place = builder.zext(builder.load(builder.gep(index, [r])), _I64)
+            add(row, panel_kind, builder.gep(y, [builder.mul(place, _I64(4))]), accumulators)
+
         # From the last row to the first: the panels are then read strictly downwards, as they were read upwards before,
         # so that what is still in the cache is read first.
-        last = builder.sub(count, _I64(1))
-        whole = builder.udiv(count, _I64(unroll))
+        last = builder.sub(below, _I64(1))
+        whole = builder.udiv(below, _I64(unroll))
         with cgutils.for_range(builder, whole) as loop:
             first = builder.sub(last, builder.mul(loop.index, _I64(unroll)))
             for k in range(unroll):
-                add(builder.sub(first, _I64(k)), sums[k])
+                add_below(builder.sub(first, _I64(k)), sums[k])
         if unroll > 1:
-            with cgutils.for_range(builder, builder.urem(count, _I64(unroll))) as loop:
-                add(loop.index, sums[0])
+            with cgutils.for_range(builder, builder.urem(below, _I64(unroll))) as loop:
+                add_below(loop.index, sums[0])
+        bottom = builder.sub(own, _I64(1))
+        with cgutils.for_range(builder, own) as loop:
+            r = builder.sub(bottom, loop.index)
+            row = builder.gep(square, [builder.mul(r, _I64(4 * quads))])
+            vectors.prefetch(row, square_kind, quads, -_AHEAD)
+            add(row, square_kind, builder.gep(out, [builder.mul(r, _I64(4))]), sums[-1])
 
-        out = builder.gep(y, [builder.mul(x_row, _I64(4))])
         for g, (j, lanes) in enumerate(groups):
             a, b, c = (vectors.total([builder.load(s[g][k]) for s in sums]) for k in range(3))
             ab = vectors.shuffle(a, b, range(2 * lanes))

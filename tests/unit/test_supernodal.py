@@ -100,17 +100,34 @@ def test_a_float32_factor_is_accurate_to_float32(Q):
     assert np.abs(solution(Q, b, precision="float32") - expected).max() <= 1e-4 * np.abs(expected).max()
 
 
-def test_a_float32_factor_in_correction_form_reaches_the_solution_of_float64():
-    Q = sheet(20)
-    b = right_hand_sides(400)
-    factor = Supernodal(Q, precision="float32")
+@pytest.mark.parametrize(("precision", "corrections"), [("float32", 4), ("float16", 20)])
+def test_a_rounded_factor_in_correction_form_reaches_the_solution_of_float64(precision, corrections):
+    Q = sheet(40)
+    b = right_hand_sides(1600)
+    factor = Supernodal(Q, precision=precision)
     x, step = np.zeros_like(b), np.empty_like(b)
-    for _ in range(12):
+    for _ in range(corrections):
         factor.solve(b - Q @ x, step)
         x += step
     expected = solution(Q, b)
-    # The condition of Q is about 1e10 / 2; its rows of pins are exact, what is left has one of 1e5: 1e5 eps.
-    assert np.abs(x - expected).max() <= 1e-10 * np.abs(expected).max()
+    # Without the rows of its pins Q has a condition of 1e4: what float64 itself leaves, with a margin.
+    assert np.abs(x - expected).max() <= 1e-11 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32", "float16"])
+def test_what_a_factor_applies_is_symmetric_and_positive_definite(precision):
+    Q = sheet(12)
+    factor = Supernodal(Q, precision=precision)
+    inverse = np.empty((144, 144))
+    for k in range(0, 144, 3):
+        out = np.empty((144, 3))
+        factor.solve(np.eye(144)[:, k : k + 3], out)
+        inverse[:, k : k + 3] = out
+    scale = np.sqrt(np.outer(np.diag(inverse), np.diag(inverse)))
+    # Sums of a few hundred terms in the precision of the work vector.
+    tolerance = 1e-13 if precision == "float64" else 1e-5
+    assert np.max(np.abs(inverse - inverse.T) / scale) <= tolerance
+    assert np.linalg.eigvalsh((inverse + inverse.T) / 2 / scale).min() > 0.0
 
 
 CASES = {
@@ -157,7 +174,7 @@ def test_leaves_the_right_hand_sides_as_they_are():
     np.testing.assert_array_equal(b, kept)
 
 
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", ["float64", "float32", "float16"])
 def test_gives_the_same_bits_each_time(precision):
     Q, b = sheet(40), right_hand_sides(1600)
     first, second = Supernodal(Q, precision=precision), Supernodal(Q, precision=precision)
@@ -176,7 +193,7 @@ def threads():
     numba.set_num_threads(before)
 
 
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", ["float64", "float32", "float16"])
 def test_gives_the_same_bits_whatever_the_number_of_threads(precision, threads):
     Q, b = sheet(64), right_hand_sides(4096)
     factor = Supernodal(Q, precision=precision)
@@ -249,4 +266,7 @@ def test_counts_bytes_and_flops_of_a_matrix_known_by_hand():
     assert factor.nonzeros == 20 * 21 // 2
     assert factor.panel_bytes == (20 * 16 + 4 * 4) * 8
     assert factor.flops == 2 * 3 * (20 * 16 + 4 * 4 + 4 * 16)
+    assert factor.shares == [1.0, 0.0]
     assert Supernodal(Q, precision="float32").panel_bytes == factor.panel_bytes // 2
+    # The inverses of the chunks, 16 x 16 and 4 x 4, stay in float32.
+    assert Supernodal(Q, precision="float16").panel_bytes == (16 * 16 + 4 * 4) * 4 + 4 * 16 * 2
