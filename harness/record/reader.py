@@ -195,7 +195,9 @@ def network(source: Source) -> dict[str, NDArray[Any]]:
     for chunk in source.chunks(content="/network"):
         batch = chunk.to_record_batch()
         names = [name for name in batch.schema.names if name != _ROW_ID]
-        return {name: _row(batch, name) for name in names}
+        # Rerun writes no column for an empty array: a mesh without springs, or without pins.
+        none = dict.fromkeys(("springs", "rest_lengths", "pinned"), np.empty(0))
+        return none | {name: _row(batch, name) for name in names}
     names = f"application {source.application!r}"
     problem = f"is a Rerun recording ({names}) but not of one run: it has no /network and /scene/mesh"
     raise InputError(Mistake(problem, file=source.path))
