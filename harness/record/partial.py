@@ -6,6 +6,7 @@ batch in a kill: what is logged reaches the disk with `flush`.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 from pathlib import Path
@@ -16,6 +17,9 @@ from rerun.chunk import RrdReader
 
 from harness.errors import RunFailed
 
+_PATIENCE = 30
+"""Seconds that a flush may take."""
+
 
 class PartialFile:
     """An open recording stream into a partial file beside `path`.
@@ -24,7 +28,7 @@ class PartialFile:
     """
 
     def __init__(self, path: Path, application: str, recording_id: str, title: str) -> None:
-        self._path = path
+        self._path, self._broken = path, False
         self._partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.rrd")
         rr.set_strict_mode(True)  # without it a wrong shape is swallowed and logged as nothing
         self.stream = rr.RecordingStream(
@@ -44,7 +48,7 @@ class PartialFile:
     def flush(self) -> None:
         """Wait until all that was logged is in the file."""
         try:
-            self.stream.flush(timeout_sec=60)
+            self.stream.flush(timeout_sec=_PATIENCE)
         except Exception as error:
             raise self._failure(error) from error
 
@@ -64,8 +68,15 @@ class PartialFile:
 
     def abandon(self) -> None:
         """Stop and remove the partial file, where there still is one."""
-        self.stream.disconnect()
+        if not self._broken:
+            self.stream.disconnect()
         self._partial.unlink(missing_ok=True)
 
     def _failure(self, error: Exception) -> RunFailed:
+        if not self._broken:
+            # The library's writing thread has died (the disk is full), and whatever waits for it may wait for
+            # ever: disconnecting, the clean-up at exit, the stream's end. So none of them is to come.
+            self._broken = True
+            rr.unregister_shutdown()
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(self.stream))
         return RunFailed(f"{self._path}: the recording cannot be written: {error}")
