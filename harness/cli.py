@@ -1,4 +1,4 @@
-"""The command line: `springbench run`, `list`, `query`, `schema`, `inspect`, `view`, `gate`.
+"""The command line: `springbench run`, `speed`, `list`, `query`, `schema`, `inspect`, `view`, `gate`.
 
 Exit codes: 0 all is well, 1 a run failed or a gate found a regression, 2 the user's mistake, 130 stopped by Ctrl-C.
 """
@@ -93,6 +93,31 @@ def run(
     for line in failed:
         _say(line)
     raise typer.Exit(1 if failed else 0)
+
+
+@app.command()
+def speed(
+    config: Config,
+    results: Results = Path("results"),
+    budget: Annotated[float, typer.Option(help="Seconds that a candidate may take at a size.")] = 120.0,
+    again: Annotated[bool, typer.Option("--again", help="Do all sizes, also those that are there.")] = False,
+) -> None:
+    """Time a sweep's solvers in turns, beside a yardstick in C++ and the machine's own limits."""
+    from harness.load import load_sweep
+    from harness.speed.figures import figures
+    from harness.speed.pictures import draw
+    from harness.speed.report import run_speed
+    from harness.speed.table import remarks, speed_table
+
+    sweep = load_sweep(config)
+    folder = results / sweep.name
+    found = figures(run_speed(sweep, folder, _say, again=again, budget=budget))
+    out.print(speed_table(found))
+    for line in remarks(found):
+        _say(line)
+    draw(found, folder / "pictures")
+    _say(f"rows and pictures are in {folder}")
+    raise typer.Exit(1 if any(f.status in ("failed", "diverged") for f in found) else 0)
 
 
 @app.command("list")

@@ -64,13 +64,18 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
     except InputError:
         raise
     except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
-        found = [{"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error)}]
+        found = [failure(error)]
     result = [shared | row for row in found]
     rows.write(files.rows, result)
     return result
 
 
 _STATUS: dict[type[Exception], str] = {Unsupported: "unsupported", Diverged: "diverged"}
+
+
+def failure(error: Exception) -> dict[str, Any]:
+    """The row of a run that ended with an error, less what all its rows share."""
+    return {"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error)}
 
 
 def _reason(error: Exception) -> str:

@@ -1,0 +1,94 @@
+"""One quantity against mesh size on a page of its own: a line for each candidate, named at the right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MultipleLocator, NullLocator
+
+from harness.report.page import axes, count, header, new_page, quantity, save, shorten
+from harness.report.style import HEIGHT, PAGE, RC, WIDTH, marks
+
+_LEFT, _TOP, _NAMES, _BELOW = 110, 130, 400, 70
+_DASHES = ("-", (0, (5, 2)), (0, (1, 1.6)), (0, (6, 2, 1, 2)), (0, (3, 1, 1, 1, 1, 1)))
+
+
+class Series(NamedTuple):
+    """The line of a candidate: its name, its solver (which has a colour), vertices and values (k,) each."""
+
+    name: str
+    solver: str
+    vertices: Sequence[int]
+    values: Sequence[float]
+
+
+def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[Series], *, share: bool) -> None:
+    """Draw to `path`, WIDTH x HEIGHT pixels, PNG; `share`: values are parts of a whole, drawn in percent.
+
+    Of one solver the candidates differ in their dashes and, beyond those, in the shade of its colour.
+    """
+    drawn = [line for line in series if line.values]
+    looks = marks(line.solver for line in drawn)
+    with matplotlib.rc_context(RC):
+        page = new_page()
+        header(page, title, facts, letters=84)
+        ax = axes(page, _LEFT, _TOP, WIDTH - _LEFT - _NAMES, HEIGHT - _TOP - _BELOW)
+        handles: list[tuple[float, Line2D]] = []
+        for k, line in enumerate(drawn):
+            place = sum(other.solver == line.solver for other in drawn[:k])
+            alike = sum(other.solver == line.solver for other in drawn)
+            look = looks[line.solver]
+            color = matplotlib.colormaps["viridis"](0.8 * place / max(1, alike - 1)) if alike > 3 else look.color
+            (handle,) = ax.plot(
+                line.vertices,
+                line.values,
+                color=color,
+                linestyle=_DASHES[place % len(_DASHES)],
+                linewidth=1.8,
+                marker=look.marker,
+                markersize=6,
+                markeredgecolor=PAGE,
+                label=shorten(line.name, 44),
+            )
+            handles.append((line.values[-1], handle))
+        _scales(ax, drawn, share)
+        ordered = [handle for _, handle in sorted(handles, key=lambda pair: -pair[0])]
+        if ordered:
+            ax.legend(
+                handles=ordered,
+                loc="center left",
+                bbox_to_anchor=(1.02, 0.5),
+                frameon=False,
+                fontsize=10,
+                handlelength=4,
+                labelspacing=0.8,
+            )
+        save(page, path)
+
+
+def _scales(ax, drawn: Sequence[Series], share: bool) -> None:
+    """Vertices by logarithms; times by logarithms too, shares from nothing up."""
+    sizes = sorted({n for line in drawn for n in line.vertices})
+    ax.set_xscale("log")
+    ax.set_xlabel("vertices", fontsize=10, loc="left")
+    ax.xaxis.set_major_locator(FixedLocator(sizes))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: count(round(value))))
+    if share:
+        highest = max((max(line.values) for line in drawn), default=1.0)
+        ax.set_ylim(0.0, max(1.0, 1.05 * highest))
+        ax.yaxis.set_major_locator(MultipleLocator(0.1 * np.ceil(max(1.0, highest) / 1.5)))
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:.0f} %"))
+    else:
+        ax.set_yscale("log")
+        ax.yaxis.set_major_locator(LogLocator(numticks=12))
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: quantity(value)))
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_minor_locator(NullLocator())
+    ax.tick_params(length=3, labelsize=9.5)
+    ax.grid(axis="y")
+    ax.set_axisbelow(True)

@@ -1,0 +1,209 @@
+"""What the rows of a speed report say: milliseconds, bytes a second, which limit binds and how near it is, ratios."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from harness.speed import work
+from harness.speed.report import MACHINE, YARDSTICK
+
+STEP = 50
+"""Iterations of the step that all steps are stated as, however many were done."""
+
+RESAMPLES = 4000
+
+Row = dict[str, Any]
+
+
+class Interval(NamedTuple):
+    """A median ratio of times and its 95 % interval."""
+
+    median: float
+    low: float
+    high: float
+
+
+class Limit(NamedTuple):
+    """What binds, `bandwidth` or `arithmetic`, and the seconds that it allows for some work."""
+
+    binds: str
+    seconds: float
+
+
+class Figures(NamedTuple):
+    """One candidate at one size. Times [ms]: the least of all rounds; None: not measured or not known.
+
+    step: of STEP iterations; touched: bytes a second of an iteration, by what the factor's panels hold; binds: the
+    limit that binds; reached: the part of it that an iteration reaches by those bytes and flops; least: the part by
+    the entries of L alone, without the panels' padding; faster: than the yardstick a step; solves_faster: than
+    cholespy a global step.
+    """
+
+    scene: str
+    size: int
+    vertices: int
+    label: str
+    solver: str
+    status: str
+    reason: str | None
+    choice: str | None
+    iterations: int | None = None
+    cold: float | None = None
+    warm: float | None = None
+    local: float | None = None
+    global_: float | None = None
+    step: float | None = None
+    bytes: float | None = None
+    touched: float | None = None
+    binds: str | None = None
+    reached: float | None = None
+    least: float | None = None
+    faster: Interval | None = None
+    cheap_faster: Interval | None = None
+    solves_faster: Interval | None = None
+    load: float | None = None
+
+
+class Machine:
+    """The measured limits of one size's turns: bandwidth by working set, and flops, by number of threads."""
+
+    def __init__(self, rows: Sequence[Row]) -> None:
+        best: dict[tuple[int, str], dict[float, float]] = defaultdict(dict)
+        for row in rows:
+            rate = (row["bytes"] or row["flops"]) / row["seconds"]
+            at = best[row["threads"], row["phase"]]
+            at[row["working_set"]] = max(rate, at.get(row["working_set"], 0.0))
+        self._best = best
+
+    def bandwidth(self, threads: int, working_set: float, kernel: str = "read") -> float:
+        """Bytes a second from a working set [bytes], between the measured ones by logarithms."""
+        at = sorted(self._best[threads, kernel].items())
+        return float(np.exp(np.interp(np.log(working_set), *np.log(np.array(at)).T)))
+
+    def flops(self, threads: int, precision: str) -> float:
+        """Flops a second; below float32 there is no arithmetic."""
+        kind = "float64" if precision == "float64" else "float32"
+        return self._best[threads, f"fma {kind}"][0.0]
+
+    def limit(self, counted: work.Work, threads: int, precision: str) -> Limit:
+        """The seconds that the machine needs at least, and for what."""
+        seconds = {
+            "bandwidth": counted.bytes / self.bandwidth(threads, counted.working_set),
+            "arithmetic": counted.flops / self.flops(threads, precision),
+        }
+        binds = max(seconds, key=seconds.__getitem__)
+        return Limit(binds, seconds[binds])
+
+
+def figures(table: pa.Table) -> list[Figures]:
+    """The figures of all candidates in the rows, in their order; the machine's own rows are what they refer to."""
+    runs: dict[str, list[Row]] = defaultdict(list)
+    for row in table.to_pylist():
+        runs[row["run_id"]].append(row)
+    labels = _labels([found[0] for found in runs.values()])
+    groups: dict[tuple[str, int], dict[str, list[Row]]] = defaultdict(dict)
+    for found in runs.values():
+        groups[found[0]["scene"], found[0]["size"]][labels[found[0]["run_id"]]] = found
+    out = []
+    for group in groups.values():
+        machine = Machine([row for found in group.values() for row in found if row["solver"] == MACHINE])
+        for label, found in group.items():
+            if found[0]["solver"] != MACHINE:
+                out.append(_figures(label, found, group, machine))
+    return out
+
+
+def _labels(firsts: Sequence[Row]) -> dict[str, str]:
+    """By run id, the solver with those of its parameters that vary, and its threads where there are several."""
+    values: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for row in firsts:
+        for key, value in json.loads(row["parameters"]).items():
+            values[row["solver"], key].add(str(value))
+    return {
+        row["run_id"]: " ".join(
+            [row["solver"]]
+            + [str(v) for key, v in json.loads(row["parameters"]).items() if len(values[row["solver"], key]) > 1]
+            + ([f"x{row['threads']}"] if row["threads"] > 1 else [])
+        )
+        for row in firsts
+    }
+
+
+def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], machine: Machine) -> Figures:
+    first = found[0]
+    known = Figures(
+        *(first["scene"], first["size"], first["vertices"], label, first["solver"]),
+        *(first["status"], first["reason"], first["choice"]),
+    )
+    if first["status"] != "ok":
+        return known
+    times = {phase: _times(found, phase) for phase in ("prepare", "local", "global", "step")}
+    known = known._replace(
+        iterations=next(row["iterations"] for row in found if row["phase"] == "step"),
+        cold=1e3 * times["prepare"][0],
+        warm=1e3 * float(times["prepare"][1:].min()) if len(times["prepare"]) > 1 else None,
+        local=1e3 * float(times["local"].min()),
+        global_=1e3 * float(times["global"].min()),
+        step=1e3 * STEP * float(times["step"].min()),
+        faster=_against(group, f"{YARDSTICK} default", "step", times),
+        cheap_faster=_against(group, f"{YARDSTICK} cheap", "step", times),
+        solves_faster=_against(group, _cholespy(group), "global", times),
+        load=max(row["load"] for row in found),
+    )
+    facts = {name: first[name] for name in ("nnz_factor", "panel_bytes", "flops_per_solve") if first[name] is not None}
+    if "nnz_factor" not in facts:
+        return known
+    precision = json.loads(first["parameters"]).get("precision", "float64")
+    counts = first["vertices"], first["springs"], precision
+    touched = work.count(facts, *counts)["iteration"]
+    least = work.count({"nnz_factor": facts["nnz_factor"]}, *counts)["iteration"]
+    limit, seconds = machine.limit(touched, first["threads"], precision), float(times["step"].min())
+    return known._replace(
+        bytes=touched.bytes,
+        touched=touched.bytes / seconds,
+        binds=limit.binds,
+        reached=limit.seconds / seconds,
+        least=machine.limit(least, first["threads"], precision).seconds / seconds,
+    )
+
+
+def _times(found: Sequence[Row], phase: str) -> NDArray[np.float64]:
+    """The seconds of a phase by round; of a step, an iteration's."""
+    return np.array(
+        [row["seconds"] / (row["iterations"] if phase == "step" else 1) for row in found if row["phase"] == phase]
+    )
+
+
+def _cholespy(group: Mapping[str, list[Row]]) -> str:
+    """The label of the candidate that solves with cholespy on one thread."""
+    return next(
+        (
+            label
+            for label, found in group.items()
+            if found[0]["threads"] == 1 and json.loads(found[0]["parameters"]).get("linear") == "cholespy"
+        ),
+        "",
+    )
+
+
+def _against(
+    group: Mapping[str, list[Row]], yardstick: str, phase: str, times: Mapping[str, NDArray[np.float64]]
+) -> Interval | None:
+    """How many times faster than a yardstick in the same rounds; None where that has no times."""
+    theirs = _times(group.get(yardstick, ()), phase)
+    rounds = min(len(theirs), len(times[phase]))
+    return interval(theirs[:rounds] / times[phase][:rounds]) if rounds else None
+
+
+def interval(ratios: NDArray[np.float64]) -> Interval:
+    """The median of ratios, with a percentile bootstrap's 95 % interval (Efron 1979); seeded."""
+    resampled = np.random.default_rng(0).choice(ratios, (RESAMPLES, len(ratios)))
+    low, high = np.quantile(np.median(resampled, axis=1), [0.025, 0.975])
+    return Interval(float(np.median(ratios)), float(low), float(high))

@@ -1,0 +1,132 @@
+"""What the machine can do at best, measured: bytes a second by working set (after STREAM, McCalpin 1995), and flops.
+
+    read     s += a_i                    8 bytes an entry
+    triad    a_i = b_i + 3 c_i           24 bytes an entry, as STREAM counts them
+    fma      a = a x + y in registers    2 flops a lane
+
+The same kernels with one thread and with several: each thread has its own part of a working set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import njit, prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+WORKING_SETS = tuple(int(2.0**k) for k in np.arange(14, 29.5, 0.5))
+"""Bytes in all threads together: from 16 KiB, in the first cache, to 512 MiB, in memory."""
+
+_CHAINS, _VECTOR_BYTES = 12, 64
+_REPEATS = 1 << 18
+_FAST = {"contract", "reassoc", "nsz"}
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """One kernel, ready to be timed: its name, the bytes that it goes through again and again, what one call moves
+    [bytes] and computes [flops]."""
+
+    name: str
+    working_set: int
+    bytes: int
+    flops: int
+    call: Callable[[], object]
+
+
+def probes(sets: tuple[int, ...] = WORKING_SETS) -> Iterator[Probe]:
+    """All kernels, for the number of threads that Numba uses now."""
+    threads = numba.get_num_threads()
+    room = np.ones(max(sets) // 8)
+    for size in sets:
+        a = room[: size // 8]
+        # Short sets are gone through many times in a call, or its overhead would be what is measured.
+        repeats = max(1, 2**24 // size)
+        yield Probe("read", size, 8 * len(a) * repeats, len(a) * repeats, lambda a=a, r=repeats: _read(a, threads, r))
+        b, c, d = np.split(a[: len(a) // 3 * 3], 3)
+        moved, flops = 24 * len(b) * repeats, 2 * len(b) * repeats
+        yield Probe("triad", size, moved, flops, lambda b=b, c=c, d=d, r=repeats: _triad(b, c, d, threads, r))
+    for name, kind in (("fma float64", np.float64), ("fma float32", np.float32)):
+        start = np.ones(1, kind)
+        lanes = _VECTOR_BYTES // start.itemsize
+        flops = 2 * _CHAINS * lanes * _REPEATS * threads
+        yield Probe(name, 0, 0, flops, lambda start=start: _fused(start, threads))
+
+
+@njit(parallel=True, fastmath=_FAST)
+def _read(a, threads, repeats):
+    total = 0.0
+    for t in prange(threads):
+        first, last = len(a) * t // threads, len(a) * (t + 1) // threads
+        total += _sum(a[first:last], repeats)
+    return total
+
+
+@njit(fastmath=_FAST)
+def _sum(a, repeats):
+    total = 0.0
+    for k in range(repeats):
+        part = 0.0
+        for i in range(len(a)):
+            part += a[i]
+        a[k % len(a)] = 1.0  # or the compiler would go through the array once
+        total += part
+    return total
+
+
+@njit(parallel=True, fastmath=_FAST)
+def _triad(a, b, c, threads, repeats):
+    for t in prange(threads):
+        first, last = len(a) * t // threads, len(a) * (t + 1) // threads
+        for _ in range(repeats):
+            _add_scaled(a[first:last], b[first:last], c[first:last])
+
+
+@njit(fastmath=_FAST)
+def _add_scaled(a, b, c):
+    for i in range(len(a)):
+        a[i] = b[i] + 3.0 * c[i]
+
+
+@njit(parallel=True)
+def _fused(start, threads):
+    total = 0.0
+    for _ in prange(threads):
+        total += _chains(start, _REPEATS)
+    return total
+
+
+def _multiply_adds(typingctx, start, repeats):
+    """The sum of some vectors after `repeats` multiply-adds of each with start[0] and itself, all in registers."""
+
+    def generate(context, builder, signature, args):
+        array, count = signature.args[0], args[1]
+        element = context.get_value_type(array.dtype)
+        lanes = _VECTOR_BYTES * 8 // array.dtype.bitwidth
+        vector = ir.VectorType(element, lanes)
+        x = builder.load(context.make_array(array)(context, builder, args[0]).data)
+        spread = ir.Constant(vector, [0.0] * lanes)
+        for lane in range(lanes):
+            spread = builder.insert_element(spread, x, ir.Constant(ir.IntType(32), lane))
+        chains = [cgutils.alloca_once(builder, vector) for _ in range(_CHAINS)]
+        for k, chain in enumerate(chains):
+            builder.store(ir.Constant(vector, [float(k)] * lanes), chain)
+        with cgutils.for_range(builder, count):
+            for chain in chains:
+                product = builder.fmul(builder.load(chain), spread, flags=("contract",))
+                builder.store(builder.fadd(product, spread, flags=("contract",)), chain)
+        total = ir.Constant(element, 0.0)
+        for chain in chains:
+            total = builder.fadd(total, builder.extract_element(builder.load(chain), ir.Constant(ir.IntType(32), 0)))
+        return total
+
+    return start.dtype(start, types.intp), generate
+
+
+_chains: Any = intrinsic(_multiply_adds)  # Numba passes the first argument itself, which type checkers do not know

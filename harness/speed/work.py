@@ -1,0 +1,50 @@
+"""What a phase moves and computes, by count: the other side of the machine's limits.
+
+    global step   2 x 3 flops for each entry of a factor that a solve reads, once a pass, and the vectors
+    local step    two indices and a weight for each spring, and the vectors
+
+A factor that hides how much it reads counts as L twice; one that hides L has no count at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+_ENTRY = {"float64": 8, "float32": 4, "float16": 2}
+"""Bytes of an entry of the factor, by the solver's `precision`."""
+
+_SPRING_BYTES, _SPRING_FLOPS = 16, 19
+"""k r and two indices; a difference, its length, a division and a sum at each end."""
+
+_LOCAL_BYTES, _GLOBAL_BYTES = 72, 176
+"""Bytes of the vectors at each vertex. Local: p and y read, b written. Global: b read, p written, and a work vector
+of 4 numbers read and written in each pass."""
+
+
+class Work(NamedTuple):
+    """bytes moved, flops computed, and the bytes that are gone through again and again."""
+
+    bytes: float
+    flops: float
+    working_set: float
+
+
+def count(facts: Mapping[str, float], vertices: int, springs: int, precision: str = "float64") -> dict[str, Work]:
+    """The work of one local step, one global step and one iteration, which is both; what is not known is left out.
+
+    facts: of a prepared solver (`nnz_factor`, `panel_bytes`, `flops_per_solve`).
+    """
+    local = Work(
+        _SPRING_BYTES * springs + _LOCAL_BYTES * vertices,
+        _SPRING_FLOPS * springs,
+        _SPRING_BYTES * springs + _LOCAL_BYTES * vertices,
+    )
+    if "nnz_factor" not in facts:
+        return {"local": local}
+    entry = _ENTRY[precision]
+    flops = facts.get("flops_per_solve", 12 * facts["nnz_factor"])
+    stored = facts.get("panel_bytes", entry * facts["nnz_factor"])
+    vectors = _GLOBAL_BYTES * vertices
+    whole = Work(flops / 6 * entry + vectors, flops, stored + vectors)
+    return {"local": local, "global": whole, "iteration": Work(*(a + b for a, b in zip(local, whole, strict=True)))}
