@@ -37,7 +37,7 @@ class Probe:
     working_set: int
     bytes: int
     flops: int
-    call: Callable[[], object]
+    call: Callable[[], Any]
 
 
 def probes(sets: tuple[int, ...] = WORKING_SETS) -> Iterator[Probe]:
@@ -59,7 +59,7 @@ def probes(sets: tuple[int, ...] = WORKING_SETS) -> Iterator[Probe]:
         yield Probe(name, 0, 0, flops, lambda start=start: _fused(start, threads))
 
 
-@njit(parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST)
 def _read(a, threads, repeats):
     total = 0.0
     for t in prange(threads):
@@ -68,7 +68,7 @@ def _read(a, threads, repeats):
     return total
 
 
-@njit(fastmath=_FAST)
+@njit(cache=True, fastmath=_FAST)
 def _sum(a, repeats):
     total = 0.0
     for k in range(repeats):
@@ -80,7 +80,7 @@ def _sum(a, repeats):
     return total
 
 
-@njit(parallel=True, fastmath=_FAST)
+@njit(cache=True, parallel=True, fastmath=_FAST)
 def _triad(a, b, c, threads, repeats):
     for t in prange(threads):
         first, last = len(a) * t // threads, len(a) * (t + 1) // threads
@@ -88,13 +88,13 @@ def _triad(a, b, c, threads, repeats):
             _add_scaled(a[first:last], b[first:last], c[first:last])
 
 
-@njit(fastmath=_FAST)
+@njit(cache=True, fastmath=_FAST)
 def _add_scaled(a, b, c):
     for i in range(len(a)):
         a[i] = b[i] + 3.0 * c[i]
 
 
-@njit(parallel=True)
+@njit(cache=True, parallel=True)
 def _fused(start, threads):
     total = 0.0
     for _ in prange(threads):

@@ -14,7 +14,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from harness import rows
+from harness import machine, rows
 from harness.load import Sweep
 from harness.run import Files
 from harness.scene import build
@@ -36,7 +36,11 @@ def run_speed(
     """Do the sizes of a sweep that are missing (all with `again`) and return all rows.
 
     budget: seconds that a candidate may take at a size, as its smaller sizes predict; say: prints a remark.
+    Raises InputError.
     """
+    for threads in {run.threads for run in sweep.runs()}:
+        with machine.pinned_threads(threads):  # refuses what this machine cannot do before anything starts
+            pass
     (folder / "rows").mkdir(parents=True, exist_ok=True)
     files: list[Path] = []
     past: dict[str, list[Past]] = {}

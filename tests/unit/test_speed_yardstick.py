@@ -1,0 +1,112 @@
+"""The yardstick in C++: it takes the same steps as ours where it can be built, and says why where it cannot."""
+
+from __future__ import annotations
+
+import stat
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.errors import RunFailed
+from harness.report.size_plot import Series, draw_by_size
+from harness.report.style import HEIGHT, WIDTH
+from harness.speed import yardstick
+from harness.speed.yardstick import CHEAP_TEMPORARIES, Yardstick, build
+from solvers.local_global import SparseLocalGlobal
+from solvers.problem import StopRule, Unsupported
+from tests.scenes import cloth, first_problem
+
+ECHO = f"""#!{sys.executable}
+import sys
+print(0.125, flush=True)
+for line in sys.stdin:
+    if int(line) > 100:
+        sys.exit(3)
+    print(int(line), 1.5, 2.5, flush=True)
+with open(sys.argv[2], "wb") as file:
+    file.write(bytes(8 * 3 * 16))
+"""
+
+
+@pytest.fixture
+def echo(tmp_path: Path) -> Path:
+    """A program that speaks as the yardstick does, for a cloth of 16 vertices, and ends badly above 100 iterations."""
+    program = tmp_path / "echo"
+    program.write_text(ECHO)
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    return program
+
+
+def test_without_a_compiler_it_is_unsupported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(yardstick.shutil, "which", lambda _: None)
+    with pytest.raises(Unsupported, match=r"no C\+\+ compiler"):
+        build(tmp_path)
+
+
+def test_what_the_compiler_says_is_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    compiler = tmp_path / "compiler"
+    compiler.write_text("#!/bin/sh\necho 'yardstick.cpp:17: fatal error: Eigen/Sparse: No such file' >&2\nexit 1\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    with pytest.raises(Unsupported, match=r"Eigen/Sparse: No such file.*libeigen3-dev"):
+        build(tmp_path / "build")
+    assert list((tmp_path / "build").iterdir()) == []
+
+
+def test_it_is_asked_line_by_line(echo: Path, tmp_path: Path):
+    made = cloth(4)
+    running = Yardstick(echo, first_problem(made), made.springs, tmp_path, "")
+    assert running.prepare_seconds == 0.125
+    assert running.step(7) == [7.0, 1.5, 2.5]
+    assert running.close().shape == (16, 3)
+    assert [path.name for path in tmp_path.iterdir()] == ["echo"]
+
+
+def test_a_program_that_ends_early_is_a_failed_run(echo: Path, tmp_path: Path):
+    made = cloth(4)
+    running = Yardstick(echo, first_problem(made), made.springs, tmp_path, "")
+    with pytest.raises(RunFailed, match="too short"):
+        running.step(101)
+    with pytest.raises(RunFailed):
+        running.step(1)
+    running.kill()
+
+
+def test_exact_pins_are_not_its_kind(tmp_path: Path):
+    made = cloth(4, weight="exact")
+    with pytest.raises(Unsupported, match="penalty"):
+        Yardstick(tmp_path / "none", first_problem(made), made.springs, tmp_path, "")
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The real one; where it cannot be built the report says so in a row, and there is nothing to compare."""
+    try:
+        return build(tmp_path_factory.mktemp("build"))
+    except Unsupported as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("tunables", ["", CHEAP_TEMPORARIES], ids=["default", "cheap temporaries"])
+def test_it_takes_the_same_steps_as_ours(program: Path, tmp_path: Path, tunables: str):
+    made = cloth(12)
+    stated = first_problem(made)
+    ours = SparseLocalGlobal().prepare(made.system).solve(stated, StopRule(50)).positions
+    running = Yardstick(program, stated, made.springs, tmp_path, tunables)
+    for _ in range(2):  # each step starts from the first guess again
+        step, local, global_ = running.step(50)
+        assert step >= local + global_ > 0.0
+    # Two factorisations of a matrix with weights from 1e2 to 1e10: round-off in positions of a metre.
+    np.testing.assert_allclose(running.close(), ours, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_a_picture_has_its_size_whatever_is_in_it(tmp_path: Path, share: bool):
+    lines = [Series(f"numba {k}", "numba", (100, 1024, 4096), (0.1 * k, 0.2 * k, 0.5 * k)) for k in range(1, 7)]
+    for name, series in (("full", lines), ("one", [Series("sparse", "sparse", (100,), (0.3,))]), ("none", [])):
+        path = tmp_path / f"{name}.png"
+        draw_by_size(path, "Title", ["fact"], series, share=share)
+        header = path.read_bytes()[16:24]
+        assert (int.from_bytes(header[:4], "big"), int.from_bytes(header[4:], "big")) == (WIDTH, HEIGHT)
