@@ -20,13 +20,13 @@ import numpy as np
 
 from harness import machine, rows
 from harness.errors import InputError, RunFailed
-from harness.measure import Diverged, Measured, Settings, digest, measure, steps
-from harness.record.base import Frame, Recorder, RecordingInfo
+from harness.measure import Diverged, Measured, Settings, measure
+from harness.observe import observe
+from harness.record.base import Recorder, RecordingInfo
 from harness.record.rerun import RerunRecorder
 from harness.scene import Scene, build
 from harness.spec import RunSpec
-from harness.trace import EnergyNorm, trace
-from solvers.problem import NotPositiveDefinite, Positions, StopRule, Unsupported
+from solvers.problem import NotPositiveDefinite, StopRule, Unsupported
 from solvers.registry import SOLVERS, load
 
 Tick = Callable[[str], None]
@@ -115,37 +115,20 @@ def _second_pass(
     positions: Path | None,
 ) -> dict[int, dict[str, Any]]:
     """Simulate again with everything that is looked at: energies, convergence, recording, positions."""
-    chosen = run.convergence_frames or {1, (run.frames + 1) // 2, run.frames}
     stored = np.empty((run.frames, len(scene.mesh.rest), 3)) if positions else None
-    norm = EnergyNorm(scene.system)
-    found: dict[int, dict[str, Any]] = {}
     with ExitStack() as cleanup:
         recorder = _recorder(run, files, scene, measured)
         if recorder:
             cleanup.callback(recorder.abandon)
-            recorder.frame(Frame(0, 0.0, scene.mesh.rest, {}, float("nan"), 0))
-        for step in steps(scene, measured.prepared, settings):
-            p, terms = step.solution.positions, step.problem.terms(step.solution.positions)
-            s = step.solution
-            found[step.index] = {
-                **{f"energy_{name}": value for name, value in terms.items()},
-                "objective": sum(terms.values()),
-                "largest_strain": largest_strain(scene, p),
-                "iterations": s.iterations,
-                "stopped": s.stopped,
-                "residual": s.residual,
-                "yardstick": s.yardstick,
-                "digest": digest(p),
-            }
-            if stored is not None:
-                stored[step.index - 1] = p
-            if recorder:
-                time = step.index * scene.system.time_step
-                recorder.frame(Frame(step.index, time, p, terms, s.residual, s.iterations))
-                if step.index in chosen:
-                    curve = trace(measured.prepared, step.problem, norm, s.iterations)
-                    recorder.convergence(step.index, curve.residuals, curve.objective)
-            tick("second pass")
+        found = observe(
+            scene,
+            measured.prepared,
+            settings,
+            recorder=recorder,
+            convergence=run.convergence_frames or {1, (run.frames + 1) // 2, run.frames},
+            stored=stored,
+            tick=lambda: tick("second pass"),
+        )
         if recorder:
             recorder.close(_milliseconds(measured, run.frames))
     if positions and stored is not None:
@@ -205,14 +188,6 @@ def _milliseconds(measured: Measured, frames: int) -> dict[str, list[float]]:
         if t.frame is not None:
             by_phase.setdefault(t.phase, [[] for _ in range(frames)])[t.frame - 1].append(1e3 * t.seconds)
     return {phase: [float(np.median(times)) for times in series] for phase, series in by_phase.items()}
-
-
-def largest_strain(scene: Scene, p: Positions) -> float:
-    """The largest |length / rest length - 1| of a spring at p (n, 3) [m]; 0 without springs."""
-    springs = scene.springs
-    i, j = springs.edges[springs.rest_length > 0.0].T
-    rest = springs.rest_length[springs.rest_length > 0.0]
-    return float(np.abs(np.linalg.norm(p[i] - p[j], axis=1) / rest - 1.0).max(initial=0.0))
 
 
 def save_positions(path: Path, positions: np.ndarray) -> None:

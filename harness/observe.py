@@ -1,0 +1,83 @@
+"""The second pass of a run: the same steps again, with everything that is looked at.
+
+A thread beside the solver looks at each step while the solver does the next, one step behind at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.measure import Settings, digest, steps
+from harness.record.base import Frame, Recorder
+from harness.scene import Scene
+from harness.simulate import Step
+from harness.trace import EnergyNorm, trace
+from solvers.problem import Positions, Prepared
+
+
+def observe(
+    scene: Scene,
+    prepared: Prepared,
+    settings: Settings,
+    *,
+    recorder: Recorder | None,
+    convergence: Collection[int],
+    stored: NDArray[np.float64] | None,
+    tick: Callable[[], None],
+) -> dict[int, dict[str, Any]]:
+    """Simulate a run's frames and return, by frame, the columns of its rows that tell of the solution.
+
+    recorder: takes every frame, and how the solve converged in the frames `convergence`; stored: where to put the
+    positions after each step, (frames, n, 3) [m]; tick: called after each step.
+    """
+    found: dict[int, dict[str, Any]] = {}
+
+    def look(step: Step) -> None:
+        p, s = step.solution.positions, step.solution
+        terms = step.problem.terms(p)
+        found[step.index] = {
+            **{f"energy_{name}": value for name, value in terms.items()},
+            "objective": sum(terms.values()),
+            "largest_strain": largest_strain(scene, p),
+            "iterations": s.iterations,
+            "stopped": s.stopped,
+            "residual": s.residual,
+            "yardstick": s.yardstick,
+            "digest": digest(p),
+        }
+        if stored is not None:
+            stored[step.index - 1] = p
+        if recorder:
+            time = step.index * scene.system.time_step
+            recorder.frame(Frame(step.index, time, p, terms, s.residual, s.iterations))
+
+    norm = EnergyNorm(scene.system) if recorder and convergence else None
+    if recorder:
+        recorder.frame(Frame(0, 0.0, scene.mesh.rest, {}, float("nan"), 0))
+    with ThreadPoolExecutor(1) as beside:
+        looked: Future[None] | None = None
+        for step in steps(scene, prepared, settings):
+            if looked:
+                looked.result()  # raises here what went wrong there
+            looked = beside.submit(look, step)
+            if recorder and norm and step.index in convergence:
+                curve = trace(prepared, step.problem, norm, step.solution.iterations)
+                looked.result()
+                recorder.convergence(step.index, curve.residuals, curve.objective)
+            tick()
+        if looked:
+            looked.result()
+    return found
+
+
+def largest_strain(scene: Scene, p: Positions) -> float:
+    """The largest |length / rest length - 1| of a spring at p (n, 3) [m]; 0 without springs."""
+    stretchable = scene.springs.rest_length > 0.0
+    i, j = scene.springs.edges[stretchable].T
+    lengths = np.linalg.norm(p[i] - p[j], axis=1)
+    return float(np.abs(lengths / scene.springs.rest_length[stretchable] - 1.0).max(initial=0.0))
