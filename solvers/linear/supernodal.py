@@ -104,15 +104,15 @@ class Supernodal:
     factor share its work vector: they are done one at a time.
     """
 
-    def __init__(self, Q: csr_array, *, precision: Precision = "float64") -> None:
-        """Raises NotPositiveDefinite, with a vertex at fault."""
+    def __init__(self, Q: csr_array, *, precision: Precision = "float64", symbolic: Symbolic | None = None) -> None:
+        """symbolic: the structure of the factor, where it is known. Raises NotPositiveDefinite, with a vertex at fault."""
         if not np.isfinite(Q.data).all():
             rows = np.repeat(np.arange(len(Q.indptr) - 1), np.diff(Q.indptr))
             v = rows[~np.isfinite(Q.data)][0]
             raise NotPositiveDefinite(f"Q is not finite in row {v}: a stiffness, a mass or a pin weight there is not")
         pointers = np.asarray(Q.indptr, np.int64)
         neighbours = np.asarray(Q.indices, np.int32)
-        s = analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
+        s = symbolic or analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
         layout = Layout.of(s)
         squares, panels = np.empty(layout.squares), np.empty(layout.panels)
         v = factorise(
