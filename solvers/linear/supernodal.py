@@ -105,7 +105,7 @@ class Supernodal:
     """
 
     def __init__(self, Q: csr_array, *, precision: Precision = "float64", symbolic: Symbolic | None = None) -> None:
-        """symbolic: the structure of the factor, where it is known. Raises NotPositiveDefinite, with a vertex at fault."""
+        """symbolic: the factor's structure, where it is known. Raises NotPositiveDefinite, with a vertex at fault."""
         if not np.isfinite(Q.data).all():
             rows = np.repeat(np.arange(len(Q.indptr) - 1), np.diff(Q.indptr))
             v = rows[~np.isfinite(Q.data)][0]
