@@ -5,7 +5,8 @@
 
 A solve is then multiply-adds alone, over panels W that lie in the order in which they are read, upwards and then
 downwards. Whatever W is rounded to, a solve applies (I + W)' S (I + W), which is symmetric and positive definite as
-long as S is: so W may be float16, and S is not less than float32.
+long as S is: so W may be float16, and S is not less than float32. For springs W has no entry above 1: it says what
+part of a vertex's force each neighbour takes on.
 """
 
 from __future__ import annotations
@@ -34,13 +35,15 @@ class Layout(NamedTuple):
     chunks (c, 7): of each the offsets of its S, of its W and of the slots of its rows in `places`, its columns
     without padding, its rows below, its padded columns in LANES, its first slot; chunk_of (s + 1,): the first chunk
     of each supernode; places: of each supernode the slots of its columns and of the rows below, in a group's own
-    copy where they are in the top; spans: see `supernodal_solve`; squares, panels: entries in all S and in all W;
-    rows: of four numbers, of the work vector.
+    copy where they are in the top; by_slot, by_vertex, spans: see `supernodal_solve` (unsigned: no test of the sign
+    when indexing); squares, panels: entries in all S and in all W; rows: of four numbers, of the work vector.
     """
 
     chunks: NDArray[np.int64]
     chunk_of: NDArray[np.int64]
     places: NDArray[np.int32]
+    by_slot: NDArray[np.uint32]
+    by_vertex: NDArray[np.uint32]
     spans: NDArray[np.int64]
     squares: int
     panels: int
@@ -68,16 +71,18 @@ class Layout(NamedTuple):
             quads,
             s.first[node] + done,
         ]
+        used = np.flatnonzero(s.vertex >= 0)
         is_row = np.repeat(np.tile([False, True], len(width)), np.stack([width, below], axis=1).ravel())
         places = np.empty(base[-1], np.int32)
         places[is_row] = s.rows
-        places[~is_row] = np.flatnonzero(s.vertex >= 0)
+        places[~is_row] = used
 
         bounds = s.group_start
-        spans = np.stack(
-            [chunk_of[bounds[:-1]], chunk_of[bounds[1:]], s.first[bounds[:-1]], s.first[bounds[1:]]], axis=1
-        )
-        top, end = spans[-1, 2:]
+        slots = s.first[bounds]
+        ends = np.stack([chunk_of[bounds], np.searchsorted(used, slots), slots], axis=1)
+        spans = np.stack([ends[:-1], ends[1:]], axis=2).reshape(-1, 6)
+        vertex = np.concatenate([np.sort(s.vertex[used[i:j]]) for i, j in spans[:, 2:4]])
+        top, end = spans[-1, 4:]
         for g, (begin, stop) in enumerate(pairwise(base[bounds[:-1]])):
             part = places[begin:stop]
             part[part >= top] += (g + 1) * (end - top)
@@ -87,6 +92,8 @@ class Layout(NamedTuple):
             np.stack(columns, axis=1),
             chunk_of,
             places,
+            np.stack([s.vertex[used], used], axis=1).astype(np.uint32),
+            np.stack([vertex, s.slot[vertex]], axis=1).astype(np.uint32),
             np.ascontiguousarray(spans, np.int64),
             int(squares.sum()),
             int(panels.sum()),
@@ -134,7 +141,16 @@ class Supernodal:
         self.flops = int(2 * 3 * LANES * quads @ (own + 2 * below))
         entries = (own + 2 * below) * quads
         self.shares = [float(entries[a:e].sum() / max(1, entries.sum())) for a, e in layout.spans[:, :2]]
-        self._arguments = squares, panels, layout.places, layout.chunks, layout.spans, s.vertex, work
+        self._arguments = (
+            squares,
+            panels,
+            layout.places,
+            layout.chunks,
+            layout.spans,
+            layout.by_slot,
+            layout.by_vertex,
+            work,
+        )
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b, shape (n, 3), to `out`; b is left as it is and must not be `out`."""

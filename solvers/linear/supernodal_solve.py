@@ -7,8 +7,11 @@ The supernodes come in groups of subtrees and a top above them. Each group has a
 forwards it adds to that, and backwards it reads from it, so that groups may be done side by side; copies are added up
 in the order of the groups. The bits of the result are therefore the same whatever the number of threads.
 
-`spans` (groups + 1, 4) holds the first and last chunk and the first and last slot of each group, and in its last row
-those of the top; `work` has 4 numbers a slot, and behind them the groups' copies.
+`spans` (groups + 1, 6) holds of each group, and in its last row of the top, the first and last chunk, the first and
+last of its vertices in either order, and its first and last slot. `by_slot` and `by_vertex` (n, 2) list vertices and
+their slots group by group, so that writing is in one direction both on the way in and on the way out. `work` has 4
+numbers a slot, and behind them the groups' copies. Slots that no vertex has are zero and stay so. (Entries of a table
+are read one by one: unpacking a row makes an array of it first, which costs 20 ns.)
 """
 
 from __future__ import annotations
@@ -19,33 +22,30 @@ from solvers.linear.supernodal_vectors import add_forward, set_backward
 
 
 @njit(cache=True)
-def _load(b, vertex, begin, end, work):
-    """The right-hand sides b (n, 3) to rows of `work`; padding gets zeros."""
+def _load(b, order, begin, end, work):
+    """The right-hand sides b (n, 3) to rows of `work`."""
+    rows = work.reshape(-1, 4)
     for i in range(begin, end):
-        v = vertex[i]
-        if v >= 0:
-            for c in range(3):
-                work[4 * i + c] = b[v, c]
-        else:
-            for c in range(3):
-                work[4 * i + c] = 0.0
+        v, k = order[i, 0], order[i, 1]
+        for c in range(3):
+            rows[k, c] = b[v, c]
 
 
 @njit(cache=True)
-def _store(work, vertex, begin, end, out):
+def _store(work, order, begin, end, out):
     """The solution in rows of `work` to out (n, 3)."""
+    rows = work.reshape(-1, 4)
     for i in range(begin, end):
-        v = vertex[i]
-        if v >= 0:
-            for c in range(3):
-                out[v, c] = work[4 * i + c]
+        v, k = order[i, 0], order[i, 1]
+        for c in range(3):
+            out[v, c] = rows[k, c]
 
 
 @njit(cache=True)
 def _forwards(panels, index, chunks, begin, end, work):
     """The pass forwards over the chunks from `begin` to `end`."""
     for k in range(begin, end):
-        _, offset, at, _, below, quads, first = chunks[k]
+        offset, at, below, quads, first = chunks[k, 1], chunks[k, 2], chunks[k, 4], chunks[k, 5], chunks[k, 6]
         if quads == 4:
             add_forward(panels, offset, index, at, below, work, first, work, 0, 4)
         elif quads == 1:
@@ -60,7 +60,8 @@ def _forwards(panels, index, chunks, begin, end, work):
 def _backwards(squares, panels, index, chunks, begin, end, work):
     """The pass backwards over the chunks from `end` down to `begin`."""
     for k in range(end - 1, begin - 1, -1):
-        start, offset, at, own, below, quads, first = chunks[k]
+        start, offset, at, own = chunks[k, 0], chunks[k, 1], chunks[k, 2], chunks[k, 3]
+        below, quads, first = chunks[k, 4], chunks[k, 5], chunks[k, 6]
         if quads == 4:
             set_backward(squares, start, own, panels, offset, index, at, below, work, first, 4)
         elif quads == 1:
@@ -72,11 +73,11 @@ def _backwards(squares, panels, index, chunks, begin, end, work):
 
 
 @njit(cache=True)
-def _ascend(panels, index, chunks, spans, vertex, work, b, group):
+def _ascend(panels, index, chunks, spans, by_slot, by_vertex, work, b, group):
     """The pass forwards over a group."""
-    chunk, chunk_end, slot, slot_end = spans[group]
-    top, top_end = spans[-1, 2], spans[-1, 3]
-    _load(b, vertex, slot, slot_end, work)
+    chunk, chunk_end, begin, end = spans[group, :4]
+    top, top_end = spans[-1, 4:]
+    _load(b, by_slot, begin, end, work)
     copy = 4 * (top_end + group * (top_end - top))
     for k in range(4 * (top_end - top)):
         work[copy + k] = 0.0
@@ -84,10 +85,10 @@ def _ascend(panels, index, chunks, spans, vertex, work, b, group):
 
 
 @njit(cache=True)
-def _turn(squares, panels, index, chunks, spans, vertex, work, b, out):
+def _turn(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out):
     """Both passes over the top."""
-    chunk, chunk_end, top, top_end = spans[-1]
-    _load(b, vertex, top, top_end, work)
+    chunk, chunk_end, begin, end, top, top_end = spans[-1]
+    _load(b, by_slot, begin, end, work)
     size = 4 * (top_end - top)
     for group in range(len(spans) - 1):
         copy = 4 * top_end + group * size
@@ -95,37 +96,37 @@ def _turn(squares, panels, index, chunks, spans, vertex, work, b, out):
             work[4 * top + k] += work[copy + k]
     _forwards(panels, index, chunks, chunk, chunk_end, work)
     _backwards(squares, panels, index, chunks, chunk, chunk_end, work)
-    _store(work, vertex, top, top_end, out)
+    _store(work, by_vertex, begin, end, out)
 
 
 @njit(cache=True)
-def _descend(squares, panels, index, chunks, spans, vertex, work, out, group):
+def _descend(squares, panels, index, chunks, spans, by_slot, by_vertex, work, out, group):
     """The pass backwards over a group."""
-    chunk, chunk_end, slot, slot_end = spans[group]
-    top, top_end = spans[-1, 2], spans[-1, 3]
+    chunk, chunk_end, begin, end = spans[group, :4]
+    top, top_end = spans[-1, 4:]
     size = 4 * (top_end - top)
     copy = 4 * top_end + group * size
     for k in range(size):
         work[copy + k] = work[4 * top + k]
     _backwards(squares, panels, index, chunks, chunk, chunk_end, work)
-    _store(work, vertex, slot, slot_end, out)
+    _store(work, by_vertex, begin, end, out)
 
 
 @njit(cache=True)
-def solve(squares, panels, index, chunks, spans, vertex, work, b, out):
+def solve(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out):
     """Q out = b on one thread."""
     for group in range(len(spans) - 1):
-        _ascend(panels, index, chunks, spans, vertex, work, b, group)
-    _turn(squares, panels, index, chunks, spans, vertex, work, b, out)
+        _ascend(panels, index, chunks, spans, by_slot, by_vertex, work, b, group)
+    _turn(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out)
     for group in range(len(spans) - 2, -1, -1):
-        _descend(squares, panels, index, chunks, spans, vertex, work, out, group)
+        _descend(squares, panels, index, chunks, spans, by_slot, by_vertex, work, out, group)
 
 
 @njit(cache=True, parallel=True)
-def solve_in_parallel(squares, panels, index, chunks, spans, vertex, work, b, out):
+def solve_in_parallel(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out):
     """Q out = b on Numba's threads."""
     for group in prange(len(spans) - 1):
-        _ascend(panels, index, chunks, spans, vertex, work, b, group)
-    _turn(squares, panels, index, chunks, spans, vertex, work, b, out)
+        _ascend(panels, index, chunks, spans, by_slot, by_vertex, work, b, group)
+    _turn(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out)
     for group in prange(len(spans) - 1):
-        _descend(squares, panels, index, chunks, spans, vertex, work, out, group)
+        _descend(squares, panels, index, chunks, spans, by_slot, by_vertex, work, out, group)

@@ -48,7 +48,7 @@ class _Vectors:
         short = self.builder.load(self.builder.bitcast(pointer, half.as_pointer()), align=2)
         return self.builder.fpext(short, ir.VectorType(self.element, lanes))
 
-    def prefetch(self, row: ir.Value, kind: types.Array, quads: int, distance: int) -> None:
+    def prefetch(self, row: ir.Value, kind: Any, quads: int, distance: int) -> None:
         """Ask for the cache lines `distance` bytes on from a row of a panel of this kind."""
         call = self.builder.module.declare_intrinsic(
             "llvm.prefetch.p0", fnty=ir.FunctionType(ir.VoidType(), [_I8P, _I32, _I32, _I32])
@@ -122,9 +122,13 @@ def _add_forward(typingctx, panel, offset, index, at, count, x, x_row, y, y_row,
             target = builder.gep(y, [builder.mul(place, _I64(4))])
             sums = []
             if vectors.narrow:
+                pairs = [
+                    vectors.entries(builder.gep(row, [_I64(4 * q)]), kind, 4 * min(2, quads - q))
+                    for q in range(0, quads, 2)
+                ]
                 for q in range(quads):
-                    w = vectors.entries(builder.gep(row, [_I64(4 * q)]), kind, 4)
-                    spread = vectors.shuffle(w, w, [j // 4 for j in range(16)])
+                    w = pairs[q // 2]
+                    spread = vectors.shuffle(w, w, [4 * (q % 2) + j // 4 for j in range(16)])
                     sums.append(vectors.multiply_add(spread, xs[q], sums.pop() if q >= 2 else None))
                 total = vectors.total(sums)
                 for lanes in (8, 4):
