@@ -10,10 +10,12 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from harness.machine import pinned_threads
 from tests.bench.gates import GATES, THREADS, Gate
 from tests.bench.ratio import measure_ratio
+from tests.bench.solves import SOLVES
 
 
 @pytest.mark.parametrize(
-    "gate", [pytest.param(gate, id=gate.name, marks=pytest.mark.benchmark(timer=gate.clock)) for gate in GATES]
+    "gate",
+    [pytest.param(gate, id=gate.name, marks=pytest.mark.benchmark(timer=gate.clock)) for gate in (*GATES, *SOLVES)],
 )
 def test_the_gate_holds(gate: Gate, benchmark: BenchmarkFixture):
     with pinned_threads(THREADS):
