@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers.linear.ordering import nested_dissection
-from solvers.linear.supernodal_factor import factorise
+from solvers.linear.supernodal_factor import factorise, keep_sums
 from solvers.linear.supernodal_solve import solve, solve_in_parallel
 from solvers.linear.supernodes import LANES, WIDTH
 from solvers.linear.symbolic import Symbolic, analyse
@@ -133,6 +133,8 @@ class Supernodal:
             )
         self.nonzeros: int | None = s.nonzeros
         work = np.zeros(4 * layout.rows, np.float64 if precision == "float64" else np.float32)
+        if precision == "float16":
+            keep_sums(panels, panels - panels.astype(np.float16), layout.chunks)
         squares, panels = squares.astype(work.dtype, copy=False), panels.astype(work.dtype, copy=False)
         if precision == "float16":
             panels = panels.astype(np.float16).view(np.uint16)  # which Numba has arrays of

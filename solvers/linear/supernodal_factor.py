@@ -262,3 +262,25 @@ def _eliminate(
         else:
             add_forward(tight, r * width, index, 0, count, flat, 0, front, begin, 1)
     return -1
+
+
+@njit(cache=True)
+def keep_sums(panels, rounding, chunks):
+    """Add what rounding takes from a column of W as a whole to its smallest entry, where it is rounded the least.
+
+    A column holds the weights with which a vertex follows those below. Noise in their sum would part vertices that
+    ought to move together, against stiff springs: the largest eigenvalue of what a solve makes of Q, 1 for no rounding,
+    was 1.028 on a sheet of 128 x 128 vertices and grew with their number; with the sums kept it is 1.0002 at any.
+    rounding: each entry less what it is rounded to.
+    """
+    for k in range(len(chunks)):
+        offset, below, width = chunks[k, 1], chunks[k, 4], 4 * chunks[k, 5]
+        for j in range(width if below > 0 else 0):
+            lost = 0.0
+            least = offset + j
+            for r in range(below):
+                at = offset + r * width + j
+                lost += rounding[at]
+                if abs(panels[at]) < abs(panels[least]):
+                    least = at
+            panels[least] += lost

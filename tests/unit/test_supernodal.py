@@ -100,7 +100,7 @@ def test_a_float32_factor_is_accurate_to_float32(Q):
     assert np.abs(solution(Q, b, precision="float32") - expected).max() <= 1e-4 * np.abs(expected).max()
 
 
-@pytest.mark.parametrize(("precision", "corrections"), [("float32", 4), ("float16", 20)])
+@pytest.mark.parametrize(("precision", "corrections"), [("float32", 4), ("float16", 6)])
 def test_a_rounded_factor_in_correction_form_reaches_the_solution_of_float64(precision, corrections):
     Q = sheet(40)
     b = right_hand_sides(1600)
@@ -112,6 +112,19 @@ def test_a_rounded_factor_in_correction_form_reaches_the_solution_of_float64(pre
     expected = solution(Q, b)
     # Without the rows of its pins Q has a condition of 1e4: what float64 itself leaves, with a margin.
     assert np.abs(x - expected).max() <= 1e-11 * np.abs(expected).max()
+
+
+def test_a_correction_by_a_half_precision_factor_overshoots_by_next_to_nothing():
+    """Descent needs eigenvalues below 2 of what the factor makes of Q. Rounded entry by entry they grow with n."""
+    Q, v = sheet(64), right_hand_sides(4096)
+    factor, out = Supernodal(Q, precision="float16"), np.empty((4096, 3))
+    growth = 0.0
+    for _ in range(40):
+        factor.solve(Q @ v, out)
+        growth = np.linalg.norm(out) / np.linalg.norm(v)
+        v = out / np.linalg.norm(out)
+    # 1.0001 measured here and 1.0002 at 256 x 256; 1.007 where the sums of columns are not kept
+    assert growth <= 1.001
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32", "float16"])
