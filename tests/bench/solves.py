@@ -22,9 +22,10 @@ def system_matrix(scene: Scene) -> csr_array:
 
 def solves(factorise: Callable[[csr_array], Factor], size: int, repeats: int) -> Work:
     """The solve alone, of the sheet's Q and a known answer of size one; what was found."""
-    Q = system_matrix(sheet(size))
+    scene = sheet(size)
+    Q = system_matrix(scene)
     factor = factorise(Q)
-    b = np.ascontiguousarray(Q @ np.random.default_rng(size).uniform(-1.0, 1.0, (Q.shape[0], 3)))
+    b = np.ascontiguousarray(Q @ np.random.default_rng(size).uniform(-1.0, 1.0, (scene.system.vertices, 3)))
     out = np.empty_like(b)
 
     def work() -> Positions:
