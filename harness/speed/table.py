@@ -74,17 +74,18 @@ def _share(value: float | None) -> str:
 
 
 def _ratio(interval: Interval | None) -> str:
-    return "–" if interval is None else f"{interval.median:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
+    return "–" if interval is None else f"{interval.ratio:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
 
 
 def remarks(found: Sequence[Figures]) -> list[str]:
     """What was left out or failed and why, what the solvers chose, and how the cost of a solve grows."""
-    said = [f"{f.label} at {f.size}: {f.status}: {f.reason}" for f in found if f.status != "ok"]
-    chosen: dict[str, list[str]] = defaultdict(list)
-    for f in found:
-        if f.choice:
-            chosen[f"{f.label} chose {f.choice}"].append(str(f.size))
-    said += [f"{words} (at {', '.join(sizes)})" for words, sizes in chosen.items()]
+    told: dict[str, list[str]] = defaultdict(list)
+    for f in sorted(found, key=lambda f: f.status == "ok"):
+        if f.status != "ok":
+            told[f"{f.label}: {f.status}: {f.reason}"].append(str(f.size))
+        elif f.choice:
+            told[f"{f.label} chose {f.choice}"].append(str(f.size))
+    said = [f"{words} (at {', '.join(sizes)})" for words, sizes in told.items()]
     for label, exponent in exponents(found).items():
         said.append(f"{label}: from 10,000 vertices on a solve costs n^{exponent:.2f}")
     return said

@@ -1,0 +1,125 @@
+"""What the speed report says of times that are known: limits, ratios, growth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from harness.rows import SCHEMA
+from harness.speed.figures import Machine, figures, interval
+from harness.speed.table import exponents
+from harness.speed.work import count
+
+
+def machine_row(phase: str, seconds: float, *, bytes: float = 0.0, flops: float = 0.0, working_set: float = 0.0):
+    """A row of the machine's own limits, one thread."""
+    return {
+        "run_id": "m",
+        "scene": "cloth",
+        "size": 4,
+        "solver": "machine",
+        "parameters": "{}",
+        "threads": 1,
+        "phase": phase,
+        "seconds": seconds,
+        "bytes": bytes,
+        "flops": flops,
+        "working_set": working_set,
+        "status": "ok",
+    }
+
+
+LIMITS = [
+    machine_row("read", 1.0, bytes=100.0, working_set=1e2),
+    machine_row("read", 2.0, bytes=100.0, working_set=1e2),  # a disturbed round
+    machine_row("read", 1.0, bytes=1.0, working_set=1e8),
+    machine_row("fma float64", 1.0, flops=1000.0),
+    machine_row("fma float32", 1.0, flops=2000.0),
+]
+
+
+def test_bandwidth_is_read_off_between_the_measured_working_sets():
+    machine = Machine(LIMITS)
+    # 100 bytes a second at 1e2 and 1 at 1e8: on logarithmic scales a straight line, level beyond its ends.
+    assert machine.bandwidth(1, 1e5) == pytest.approx(10.0, rel=1e-12)
+    assert machine.bandwidth(1, 1.0) == pytest.approx(100.0, rel=1e-12)
+    assert machine.flops(1, "float16") == machine.flops(1, "float32") == 2000.0
+
+
+def timed(solver: str, parameters: str, seconds: list[float], **columns: Any) -> list[dict[str, Any]]:
+    """Rows of a candidate on the cloth, with these seconds in each of its phases."""
+    shared = {
+        "run_id": solver + parameters,
+        "scene": "cloth",
+        "size": 4,
+        "solver": solver,
+        "parameters": parameters,
+        "threads": 1,
+        "vertices": 16,
+        "springs": 42,
+        "status": "ok",
+        "load": 0.5,
+    }
+    done = {"step": 10, "local": 1, "global": 1}
+    return [
+        shared | columns | {"phase": phase, "seconds": s * done.get(phase, 1), "iterations": done.get(phase)}
+        for phase in ("prepare", "local", "global", "step")
+        for s in seconds
+    ]
+
+
+def test_figures_say_how_near_the_binding_limit_is():
+    rows = [
+        *LIMITS,
+        *timed("eigen", '{"temporaries": "default"}', [9.0, 8.0, 8.0]),
+        *timed("eigen", '{"temporaries": "cheap"}', [4.0, 4.0, 4.0]),
+        *timed("numba", '{"linear": "cholespy"}', [3.0, 3.0, 3.0]),
+        *timed("numba", '{"linear": "supernodal"}', [1.0, 2.0, 1.0], nnz_factor=100, flops_per_solve=2400),
+    ]
+    found = {f.label: f for f in figures(pa.Table.from_pylist(rows, schema=SCHEMA))}
+    assert list(found) == ["eigen default", "eigen cheap", "numba cholespy", "numba supernodal"]
+    ours = found["numba supernodal"]
+    assert ours.iterations == 10
+    # 1 s an iteration at best, so a step of 50 takes 50 s.
+    assert (ours.cold, ours.warm, ours.local, ours.step) == (1e3, 1e3, 1e3, 5e4)
+    assert ours.faster is not None
+    assert ours.faster.ratio == 8.0
+    assert ours.cheap_faster is not None
+    assert ours.cheap_faster.ratio == 4.0
+    assert ours.solves_faster is not None
+    assert ours.solves_faster.ratio == 3.0
+    work = count({"nnz_factor": 100, "flops_per_solve": 2400}, 16, 42)["iteration"]
+    bandwidth = Machine(LIMITS).bandwidth(1, work.working_set)
+    assert (ours.binds, ours.touched) == ("bandwidth", work.bytes)
+    assert ours.reached == pytest.approx(work.bytes / bandwidth, rel=1e-12)
+    assert ours.reached is not None
+    assert ours.least is not None
+    assert ours.least < ours.reached
+    assert found["numba cholespy"].reached is None
+
+
+def test_the_interval_holds_the_ratio_and_is_the_same_each_time():
+    theirs, ours = np.exp(0.1 * np.random.default_rng(1).standard_normal((2, 15)))
+    found = interval(3.0 * theirs, ours)
+    assert found.low < found.ratio < found.high
+    assert found.low < 3.0 < found.high
+    assert interval(3.0 * theirs, ours) == found
+    assert interval(np.full(5, 2.0), np.ones(5)) == (2.0, 2.0, 2.0)
+
+
+def test_rounds_that_were_disturbed_do_not_move_the_ratio():
+    ours = np.ones(15)
+    ours[[2, 3, 7, 8, 9, 11]] = 40.0
+    assert interval(np.full(15, 6.0), ours).ratio == 6.0
+
+
+def test_the_growth_of_a_solve_is_the_power_in_its_times():
+    rows = []
+    for size in (100, 200, 400):
+        for row in timed("sparse", "{}", [1e-9 * size ** (2 * 1.25)]):
+            rows.append(row | {"run_id": f"s{size}", "size": size, "vertices": size**2})
+    found = figures(pa.Table.from_pylist(rows, schema=SCHEMA))
+    assert exponents(found) == {"sparse": pytest.approx(1.25, rel=1e-9)}  # the fit's round-off
