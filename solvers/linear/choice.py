@@ -1,18 +1,30 @@
-"""Which linear solver for which Q: by its size and by what its factor would need, never by a clock.
+"""Which linear solver for which Q: from exact counts of what each would need, before anything is factorised.
 
-The same Q, options and budget give the same choice on every machine: the limits below were measured once, and are
-compared with exact counts.
+    inverse      n^2 entries, one product              up to SMALL vertices
+    supernodal   2 x panels read a solve, flops once   while that is less than what conjugate gradients read
+    cg           ITERATIONS x (matrix and vectors)     beyond, and where the factor does not fit
+
+The counts follow from the graph of Q, the limits were measured once: no clock is asked, so that the same Q gives the
+same choice wherever both fit. A system that fits nowhere is refused with the numbers.
 """
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
 
+import numpy as np
+from numba import njit
 from scipy.sparse import csr_array
 
+from solvers.linear.conjugate_gradients import ConjugateGradients
 from solvers.linear.factors import Factor, SimplicialCholesky
 from solvers.linear.inverse import Inverse
-from solvers.linear.supernodal import Supernodal
+from solvers.linear.ordering import nested_dissection
+from solvers.linear.supernodal import Layout, Supernodal
+from solvers.linear.symbolic import Symbolic, analyse
 from solvers.problem import Unsupported
 
 Linear = Literal["auto", "inverse", "cholespy", "supernodal", "cg"]
@@ -22,22 +34,152 @@ SMALL = 128
 """Up to so many vertices the inverse is the fastest: 1.4 times at 100 vertices of a sheet, the same at 144, and half
 as fast as the supernodal factor at 256 (n^2 entries against n log n)."""
 
+_SOLVES = 1000
+"""In how many solves a factor has to pay for itself: 20 steps of 50 iterations."""
 
-def factorise(Q: csr_array, linear: Linear = "auto", precision: Precision = "float64") -> tuple[Factor, str]:
+_BYTES_PER_FLOP = 0.4
+"""A flop of the factorisation in bytes read by a solve: 35 Gflop/s beside 13 GB/s, on a solid of 60 vertices a side."""
+
+_ITERATIONS = 10
+"""Of conjugate gradients to their tolerance: 9 to 11 on sheets and solids of 1e4 to 1e6 vertices."""
+
+_BYTES_READ, _BYTES_KEPT = 70, 60
+"""Of an entry of Q by an iteration (with the coarse levels), and in memory at most while they are made; a vertex
+counts as four entries, for its vectors. The first fits sheets and solids of 1e6 vertices to a tenth, the second is
+over what was allocated for sheets (38), solids (31), chains (50) and stiffnesses over six decades (50)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What a solver needs: `memory` [bytes] at most while it is made; `traffic` [bytes] read by a solve, or the equal
+    of its share in the factorisation's flops; `words`: the counts behind them."""
+
+    memory: float
+    traffic: float
+    words: str
+
+
+class Choice(NamedTuple):
+    """A solver's name, why it was taken, and the structure of its factor where that was found on the way."""
+
+    name: str
+    why: str
+    symbolic: Symbolic | None = None
+
+
+def factorise(
+    Q: csr_array, linear: Linear = "auto", precision: Precision = "float64", *, memory: float | None = None
+) -> tuple[Factor, str]:
     """A solver of Q out = b and, in words, which one it is and why.
 
-    With a precision below float64 a solve is only that accurate, and is meant for corrections p - Q^-1 grad.
-    Raises Unsupported, NotPositiveDefinite.
+    With a precision below float64 a solve is only that accurate, and is meant for corrections p - Q^-1 grad; cg is
+    accurate to float64 always. memory [bytes]: what the solver may take beside Q (`memory_of_machine`). Raises
+    Unsupported where nothing fits, NotPositiveDefinite.
     """
-    n = len(Q.indptr) - 1
+    name, why, symbolic = choose(Q, linear, precision, memory=memory)
+    return _MAKERS[name](Q, precision, symbolic), f"{name}: {why}"
+
+
+def choose(
+    Q: csr_array, linear: Linear = "auto", precision: Precision = "float64", *, memory: float | None = None
+) -> Choice:
+    """The solver for Q; `linear` forces one. Raises Unsupported where it does not fit in `memory` [bytes]."""
     if linear not in get_args(Linear):
-        raise Unsupported(f"linear: {linear!r} is not known; one of {', '.join(get_args(Linear))}")
-    name = ("inverse" if n <= SMALL else "supernodal") if linear == "auto" else linear
-    why = "as asked" if linear != "auto" else f"{n} vertices, {'at most' if n <= SMALL else 'more than'} {SMALL}"
-    if name == "inverse":
-        return Inverse(Q, precision="float64" if precision == "float64" else "float32"), f"inverse: {why}"
-    if name == "cholespy":
-        if precision != "float64":
-            raise Unsupported(f"cholespy: is used in float64 alone, not in {precision}; use supernodal")
-        return SimplicialCholesky(Q), f"cholespy: {why}"
-    return Supernodal(Q, precision=precision), f"supernodal: {why}"  # pyright: ignore[reportArgumentType]
+        raise Unsupported(f"linear: {linear!r} is not known; it is one of {', '.join(get_args(Linear))}")
+    if linear == "cholespy" and precision != "float64":
+        raise Unsupported(f"cholespy: is used in float64 alone, not in {precision}; use supernodal")
+    n = len(Q.indptr) - 1
+    room = memory_of_machine() if memory is None else memory
+    if linear == "cholespy":
+        return Choice(linear, "as asked; its factor is not estimated beforehand")
+    if linear == "inverse" or (linear == "auto" and n <= SMALL):
+        why = "as asked" if linear == "inverse" else f"{n} vertices, at most {SMALL}"
+        return Choice("inverse", why) if _fits(_inverse(n), room) else _refuse(room, {"inverse": _inverse(n)})
+    iterative = _iterative(Q)
+    if linear == "cg":
+        found = Choice("cg", f"as asked; {iterative.words}")
+        return found if _fits(iterative, room) else _refuse(room, {"cg": iterative})
+    pointers, neighbours = np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32)
+    symbolic = analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
+    direct = estimate(symbolic, precision)
+    if linear == "supernodal":
+        found = Choice("supernodal", f"as asked; {direct.words}", symbolic)
+        return found if _fits(direct, room) else _refuse(room, {"supernodal": direct, "cg": iterative})
+    if _fits(direct, room) and direct.traffic <= iterative.traffic:
+        return Choice("supernodal", direct.words, symbolic)
+    if _fits(iterative, room):
+        reason = "a factor would cost more" if _fits(direct, room) else f"a factor would not fit in {_size(room)}"
+        return Choice("cg", f"{iterative.words}; {reason} ({direct.words})")
+    if _fits(direct, room):
+        return Choice("supernodal", direct.words, symbolic)
+    return _refuse(room, {"supernodal": direct, "cg": iterative})
+
+
+def memory_of_machine() -> float:
+    """Three quarters of the machine's memory [bytes]: the rest is for Q, the scene and its recording."""
+    return 0.75 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def estimate(s: Symbolic, precision: Precision = "float64") -> Estimate:
+    """What a supernodal factor of this structure needs: its panels, and fronts and updates while it is made."""
+    layout = Layout.of(s)
+    half = 2 if precision == "float16" else 4
+    panels = 8 * (layout.squares + layout.panels)
+    kept = panels if precision == "float64" else 4 * layout.squares + half * layout.panels
+    fronts, flops = _factorisation(s.parent, s.first, s.row_start, s.sequence)
+    memory = panels + (kept if precision != "float64" else 0) + 8 * fronts + 100 * len(s.slot)
+    words = f"its factor has {s.nonzeros:,} entries, {_size(kept)} in {precision}, after {flops:.1e} flops"
+    return Estimate(memory, 2 * kept + _BYTES_PER_FLOP * flops / _SOLVES, words)
+
+
+def _inverse(n: int) -> Estimate:
+    size = 8.0 * n**2
+    return Estimate(5 * size, size, f"{n**2:,} entries, {_size(size)}")
+
+
+def _iterative(Q: csr_array) -> Estimate:
+    entries = Q.nnz + 4 * (len(Q.indptr) - 1)
+    words = f"{_size(_BYTES_KEPT * entries)} for multigrid on {Q.nnz:,} entries, about {_ITERATIONS} iterations a solve"
+    return Estimate(_BYTES_KEPT * entries, _ITERATIONS * _BYTES_READ * entries, words)
+
+
+def _fits(need: Estimate, room: float) -> bool:
+    return need.memory <= room
+
+
+def _refuse(room: float, needs: dict[str, Estimate]) -> Choice:
+    listed = "; ".join(f"{name} needs {_size(need.memory)} ({need.words})" for name, need in needs.items())
+    raise Unsupported(f"the system does not fit in {_size(room)} of memory: {listed}; use a coarser mesh")
+
+
+def _size(count: float) -> str:
+    """Bytes in words."""
+    for unit in ("bytes", "KiB", "MiB", "GiB"):
+        if count < 1024 or unit == "GiB":
+            break
+        count /= 1024
+    return f"{count:,.3g} {unit}"
+
+
+@njit(cache=True)
+def _factorisation(parent, first, row_start, sequence):
+    """The most numbers in fronts and waiting updates at a time, and the flops of a multifrontal factorisation."""
+    nodes = len(parent)
+    waiting = np.zeros(nodes + 1, np.int64)  # of each supernode's children; the last is the roots'
+    most, now, largest, flops = 0, 0, 0, 0.0
+    for s in sequence:
+        own, below = first[s + 1] - first[s], (row_start[s + 1] - row_start[s] + 3) // 4 * 4
+        largest = max(largest, own + below)
+        now += below**2 - waiting[s]
+        most = max(most, now + waiting[s])
+        waiting[parent[s]] += below**2
+        flops += own * (own**2 / 3.0 + own * below + 1.0 * below**2)
+    return largest**2 + most, flops
+
+
+_MAKERS: dict[str, Callable[[csr_array, Precision, Symbolic | None], Factor]] = {
+    "inverse": lambda Q, precision, _: Inverse(Q, precision="float64" if precision == "float64" else "float32"),
+    "cholespy": lambda Q, precision, _: SimplicialCholesky(Q),
+    "supernodal": lambda Q, precision, symbolic: Supernodal(Q, precision=precision, symbolic=symbolic),
+    "cg": lambda Q, precision, _: ConjugateGradients(Q),
+}

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 from numba import njit
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg import get_lapack_funcs
 from scipy.sparse import csr_array
 
 from solvers.problem import NotPositiveDefinite, Positions
@@ -37,7 +37,8 @@ class Inverse:
             raise NotPositiveDefinite(f"Q is not finite in row {v}: a stiffness, a mass or a pin weight there is not")
         inverse = dense
         if n:
-            factor, info = dpotrf(dense, lower=1)
+            potrf, potri = get_lapack_funcs(("potrf", "potri"), (dense,))
+            factor, info = potrf(dense, lower=1)
             lost = np.flatnonzero(factor.diagonal() ** 2 <= 4.0 * np.finfo(float).eps * dense.diagonal())
             if info or len(lost):
                 v = info - 1 if info else int(lost[0])
@@ -45,7 +46,7 @@ class Inverse:
                     f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point at vertex {v}: nothing "
                     "determines its position, or stiffnesses, masses and pin weights lie too far apart or are negative"
                 )
-            inverse, _ = dpotri(factor, lower=1)
+            inverse, _ = potri(factor, lower=1)
         padded = -(-n // _ROWS) * _ROWS
         stored = np.zeros((padded, padded), precision)
         stored[:n, :n] = np.tril(inverse) + np.tril(inverse, -1).T
@@ -68,7 +69,7 @@ def multiply(inverse, columns, b, out):
         columns[0, i], columns[1, i], columns[2, i] = b[i, 0], b[i, 1], b[i, 2]
     x, y, z = columns[0], columns[1], columns[2]
     zero = inverse.dtype.type(0.0)
-    for i in range(0, len(inverse), 4):
+    for i in range(0, len(inverse), _ROWS):
         r0, r1, r2, r3 = inverse[i], inverse[i + 1], inverse[i + 2], inverse[i + 3]
         x0, x1, x2, x3 = zero, zero, zero, zero
         y0, y1, y2, y3 = zero, zero, zero, zero

@@ -1,0 +1,170 @@
+"""Multigrid by smoothed aggregation (Vanek, Mandel and Brezina 1996), as a preconditioner for scalar networks.
+
+    T  vertices to their aggregates, constant in each      P = (I - 4/(3 l) D^-1 A) T,  l the largest of D^-1 A
+    A_coarse = P'AP                                        z = V-cycle(r), a fixed symmetric operator near Q^-1
+
+Smoothing is a Chebyshev polynomial in D^-1 A (Adams et al. 2003), the same before and after the coarse correction:
+matrix products alone, so that the order of summation never depends on threads. The cycle is kept and done in float32,
+which its bytes pay for; accuracy is the business of the iteration around it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, dia_array
+
+from solvers import matrices
+from solvers.linear import multigrid_kernels as kernels
+from solvers.linear.supernodal import Supernodal
+from solvers.problem import NotPositiveDefinite
+
+_COARSEST = 1500
+"""A level of so few vertices is factorised: its solve then costs less than 2 % of a cycle."""
+
+_STRENGTH, _DOMINANCE = 0.25, 10.0
+_DEGREE = 2
+_LOWEST = 0.25
+"""Smoothing damps the part of the spectrum of D^-1 A above this share of its largest eigenvalue."""
+
+
+class Rows(NamedTuple):
+    """A sparse matrix in compressed rows, entries in float32."""
+
+    pointers: NDArray[np.int64]
+    columns: NDArray[np.int32]
+    values: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, matrix: csr_array) -> Rows:
+        """The same matrix, rounded."""
+        return cls(
+            np.asarray(matrix.indptr, np.int64), np.asarray(matrix.indices, np.int32), matrix.data.astype(np.float32)
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """A level above the coarsest: its matrix, how it is smoothed, how it leads to the next, and its vectors (n, 4)."""
+
+    A: Rows
+    P: Rows
+    R: Rows
+    inverse_diagonal: NDArray[np.float32]
+    weights: list[tuple[np.float32, np.float32]]
+    b: NDArray[np.float32]
+    x: NDArray[np.float32]
+    other: NDArray[np.float32]
+    step: NDArray[np.float32]
+
+
+class Multigrid:
+    """A V-cycle for Q; `apply(r)` is linear, symmetric and positive definite in r up to rounding.
+
+    nonzeros: entries of all levels' matrices, the coarsest's factor included; sizes: vertices of each level.
+    """
+
+    def __init__(self, Q: csr_array) -> None:
+        """Raises NotPositiveDefinite where the coarsest level is not."""
+        self._levels: list[Level] = []
+        self.sizes = [len(Q.indptr) - 1]
+        self.nonzeros = 0
+        A = Q
+        while self.sizes[-1] > _COARSEST:
+            level, coarse = _coarsen(A)
+            if len(coarse.indptr) - 1 > 0.7 * self.sizes[-1]:
+                break
+            self._levels.append(level)
+            self.nonzeros += A.nnz + 2 * len(level.P.values)
+            self.sizes.append(len(coarse.indptr) - 1)
+            A = coarse
+        try:
+            self._factor = Supernodal(A)
+        except NotPositiveDefinite as error:
+            raise NotPositiveDefinite(
+                f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point: level {len(self._levels)} of "
+                f"multigrid, of {self.sizes[-1]} vertices, is not; stiffnesses, masses and pin weights lie too far "
+                "apart or are negative"
+            ) from error
+        self.nonzeros += self._factor.nonzeros or 0
+        self._coarsest = np.zeros((self.sizes[-1], 4), np.float32), np.zeros((self.sizes[-1], 4), np.float32)
+        self._exact = np.zeros((self.sizes[-1], 3)), np.zeros((self.sizes[-1], 3))
+
+    @property
+    def right_hand_side(self) -> NDArray[np.float32]:
+        """Where `apply` reads r from, (n, 4), the last column zero."""
+        return self._levels[0].b if self._levels else self._coarsest[0]
+
+    def apply(self) -> NDArray[np.float32]:
+        """z near Q^-1 r, (n, 4); it is overwritten by the next."""
+        return self._cycle(0)
+
+    def _cycle(self, depth: int) -> NDArray[np.float32]:
+        if depth == len(self._levels):
+            (b, x), (b64, x64) = self._coarsest, self._exact
+            b64[:] = b[:, :3]
+            self._factor.solve(b64, x64)
+            x[:, :3] = x64
+            return x
+        level = self._levels[depth]
+        b, x, other, step = level.b, level.x, level.other, level.step
+        (_, scale), *more = level.weights
+        kernels.smooth_first(level.inverse_diagonal, scale, b, step, x)
+        for keep, scale in more:
+            kernels.smooth(*level.A, level.inverse_diagonal, keep, scale, b, step, x, other)
+            x, other = other, x
+        kernels.residual(*level.A, b, x, other)
+        below = self._levels[depth + 1].b if depth + 1 < len(self._levels) else self._coarsest[0]
+        kernels.multiply(*level.R, other, below)
+        kernels.add_product(*level.P, self._cycle(depth + 1), x)
+        for keep, scale in level.weights:
+            kernels.smooth(*level.A, level.inverse_diagonal, keep, scale, b, step, x, other)
+            x, other = other, x
+        return x
+
+
+def _coarsen(A: csr_array) -> tuple[Level, csr_array]:
+    """A level and the matrix of the next."""
+    n = len(A.indptr) - 1
+    of, count = kernels.aggregate(A.indptr, A.indices, A.data, _STRENGTH, _DOMINANCE)
+    diagonal = np.asarray(A.diagonal(), np.float64)
+    largest = _largest(A, diagonal)
+    inside = np.flatnonzero(of >= 0)
+    start = np.concatenate([[0], np.cumsum(of >= 0)])
+    T = csr_array((np.ones(len(inside)), of[inside], start.astype(A.indptr.dtype)), shape=(n, count))
+    F = csr_array((kernels.filtered(A.indptr, A.indices, A.data, _STRENGTH), A.indices, A.indptr), shape=A.shape)
+    # Lumping leaves a positive diagonal to springs; to other matrices, this does.
+    D = dia_array((1.0 / np.maximum(F.diagonal(), 0.05 * diagonal)[None, :], [0]), shape=(n, n))
+    P = matrices.without_zeros(csr_array(T - (4.0 / 3.0 / largest) * (D @ (F @ T))))
+    R = csr_array(P.T)
+    coarse = csr_array(R @ csr_array(A @ P))
+    vectors = [np.zeros((n, 4), np.float32) for _ in range(4)]
+    level = Level(
+        Rows.of(A), Rows.of(P), Rows.of(R), (1.0 / diagonal).astype(np.float32), _chebyshev(largest), *vectors
+    )
+    return level, coarse
+
+
+def _largest(A: csr_array, diagonal: NDArray[np.float64]) -> float:
+    """The largest eigenvalue of D^-1 A: the power method's, and no more than Gershgorin's bound."""
+    bound = float(((abs(A) @ np.ones(len(diagonal))) / diagonal).max())
+    v = np.random.default_rng(0).normal(size=len(diagonal))  # a bit of everything, and always the same
+    for _ in range(20):
+        v = (A @ v) / diagonal
+        v /= np.linalg.norm(v)
+    return min(bound, 1.1 * float(v @ (A @ v) / (v @ (diagonal * v))))
+
+
+def _chebyshev(largest: float) -> list[tuple[np.float32, np.float32]]:
+    """(keep, scale) of each step of the Chebyshev iteration for eigenvalues of _LOWEST to 1 times `largest`."""
+    centre, half = 0.5 * (1.0 + _LOWEST) * largest, 0.5 * (1.0 - _LOWEST) * largest
+    rho = half / centre
+    weights = [(0.0, 1.0 / centre)]
+    for _ in range(_DEGREE - 1):
+        following = 1.0 / (2.0 * centre / half - rho)
+        weights.append((following * rho, 2.0 * following / half))
+        rho = following
+    return [(np.float32(keep), np.float32(scale)) for keep, scale in weights]

@@ -1,0 +1,246 @@
+"""The passes of multigrid and of conjugate gradients over sparse rows and vectors of four numbers a vertex.
+
+Each row is summed by itself, and sums over all rows go by blocks of a fixed size whose parts are added in order: the
+bits do not depend on the number of threads. Vectors are (n, 4), three coordinates and a zero, so that what a matrix
+entry multiplies is one load.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+BLOCK = 512
+"""Rows that a thread does at a time."""
+
+_I64 = ir.IntType(64)
+
+
+def _gather(typingctx, values, columns, begin, end, x):
+    """sum over begin <= e < end of values[e] x[columns[e]], as four numbers of x's type."""
+    number = x.dtype
+    signature = types.UniTuple(number, 4)(values, columns, types.int64, types.int64, x)
+
+    def generate(context, builder, signature, args):
+        values, columns, x = (
+            context.make_array(kind)(context, builder, args[k]).data
+            for k, kind in ((0, signature.args[0]), (1, signature.args[1]), (4, signature.args[4]))
+        )
+        scalar = context.get_data_type(number)
+        vector = ir.VectorType(scalar, 4)
+        zero, lanes = ir.Constant(vector, None), ir.Constant(ir.VectorType(ir.IntType(32), 4), None)
+        total = cgutils.alloca_once_value(builder, zero)
+        builder.store(zero, total)
+        with cgutils.for_range_slice(builder, args[2], args[3], _I64(1), intp=_I64) as (e, _):
+            place = builder.mul(builder.sext(builder.load(builder.gep(columns, [e])), _I64), _I64(4))
+            source = builder.bitcast(builder.gep(x, [place]), vector.as_pointer())
+            value = builder.insert_element(zero, builder.load(builder.gep(values, [e])), ir.IntType(32)(0))
+            value = builder.shuffle_vector(value, zero, lanes)
+            load = builder.load(source)
+            load.align = 8  # NumPy promises no more than its items' alignment
+            product = builder.fmul(value, load, flags=("contract",))
+            builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
+        result = builder.load(total)
+        parts = [builder.extract_element(result, ir.IntType(32)(k)) for k in range(4)]
+        return context.make_tuple(builder, signature.return_type, parts)
+
+    return signature, generate
+
+
+# Numba passes the first argument itself, which type checkers do not know.
+gather: Any = intrinsic(_gather)
+
+
+@njit(cache=True, parallel=True)
+def multiply(pointers, columns, values, x, out):
+    """out = A x."""
+    rows = len(out)
+    for block in prange((rows + BLOCK - 1) // BLOCK):
+        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+            s = gather(values, columns, pointers[i], pointers[i + 1], x)
+            out[i, 0], out[i, 1], out[i, 2] = s[0], s[1], s[2]
+
+
+@njit(cache=True, parallel=True)
+def add_product(pointers, columns, values, x, out):
+    """out += A x."""
+    rows = len(out)
+    for block in prange((rows + BLOCK - 1) // BLOCK):
+        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+            s = gather(values, columns, pointers[i], pointers[i + 1], x)
+            for c in range(3):
+                out[i, c] += s[c]
+
+
+@njit(cache=True, parallel=True)
+def residual(pointers, columns, values, b, x, out):
+    """out = b - A x."""
+    rows = len(out)
+    for block in prange((rows + BLOCK - 1) // BLOCK):
+        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+            s = gather(values, columns, pointers[i], pointers[i + 1], x)
+            for c in range(3):
+                out[i, c] = b[i, c] - s[c]
+
+
+@njit(cache=True, parallel=True)
+def smooth_first(inverse_diagonal, scale, b, step, x):
+    """step = x = scale D^-1 b: the first step of smoothing from x = 0."""
+    rows = len(x)
+    for block in prange((rows + BLOCK - 1) // BLOCK):
+        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+            for c in range(3):
+                value = scale * inverse_diagonal[i] * b[i, c]
+                step[i, c] = value
+                x[i, c] = value
+
+
+@njit(cache=True, parallel=True)
+def smooth(pointers, columns, values, inverse_diagonal, keep, scale, b, step, x, out):
+    """step = keep step + scale D^-1 (b - A x);  out = x + step."""
+    rows = len(out)
+    for block in prange((rows + BLOCK - 1) // BLOCK):
+        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+            s = gather(values, columns, pointers[i], pointers[i + 1], x)
+            weight = scale * inverse_diagonal[i]
+            for c in range(3):
+                value = keep * step[i, c] + weight * (b[i, c] - s[c])
+                step[i, c] = value
+                out[i, c] = x[i, c] + value
+
+
+@njit(cache=True, parallel=True)
+def multiply_and_dot(pointers, columns, values, p, out, parts):
+    """out = A p; parts[:, :3]: p'out of each block of rows."""
+    rows = len(out)
+    for block in prange((rows + BLOCK - 1) // BLOCK):
+        t0, t1, t2 = 0.0, 0.0, 0.0
+        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+            s = gather(values, columns, pointers[i], pointers[i + 1], p)
+            out[i, 0], out[i, 1], out[i, 2] = s[0], s[1], s[2]
+            t0 += s[0] * p[i, 0]
+            t1 += s[1] * p[i, 1]
+            t2 += s[2] * p[i, 2]
+        parts[block, 0], parts[block, 1], parts[block, 2] = t0, t1, t2
+
+
+@njit(cache=True, parallel=True)
+def advance(alpha, p, image, x, r, rounded, parts):
+    """x += alpha p;  r -= alpha image;  rounded = r, in float32;  parts[:, :3]: the largest |x| of each block."""
+    rows = len(x)
+    for block in prange((rows + BLOCK - 1) // BLOCK):
+        for c in range(3):
+            parts[block, c] = 0.0
+        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+            for c in range(3):
+                x[i, c] += alpha[c] * p[i, c]
+                r[i, c] -= alpha[c] * image[i, c]
+                rounded[i, c] = r[i, c]
+                parts[block, c] = max(parts[block, c], abs(x[i, c]))
+
+
+@njit(cache=True, parallel=True)
+def compare(r, z, parts):
+    """parts[:, :6]: r'z of each block of rows, and its largest |z|, by column."""
+    rows = len(r)
+    for block in prange((rows + BLOCK - 1) // BLOCK):
+        for c in range(3):
+            dot, large = 0.0, 0.0
+            for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+                dot += r[i, c] * z[i, c]
+                large = max(large, abs(z[i, c]))
+            parts[block, c], parts[block, 3 + c] = dot, large
+
+
+@njit(cache=True, parallel=True)
+def turn(beta, z, p):
+    """p = z + beta p."""
+    rows = len(p)
+    for block in prange((rows + BLOCK - 1) // BLOCK):
+        for i in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+            for c in range(3):
+                p[i, c] = z[i, c] + beta[c] * p[i, c]
+
+
+@njit(cache=True)
+def aggregate(pointers, columns, values, strength, dominance):
+    """The aggregate of each vertex, -1 for none, and their number (Vanek, Mandel and Brezina 1996).
+
+    Neighbours are strong whose entry is at least `strength` times the largest of the row; a vertex whose diagonal is
+    over `dominance` times the sum of its other entries is in no aggregate: smoothing alone determines it.
+    """
+    n = len(pointers) - 1
+    largest = np.zeros(n)
+    of = np.full(n, -1, np.int32)
+    free = np.ones(n, np.bool_)
+    for i in range(n):
+        total, own = 0.0, 0.0
+        for e in range(pointers[i], pointers[i + 1]):
+            size = abs(values[e])
+            if columns[e] == i:
+                own = size
+            else:
+                total += size
+                largest[i] = max(largest[i], size)
+        free[i] = own <= dominance * total
+    count = 0
+    for i in range(n):  # a vertex with all its strong neighbours, where none of them is taken
+        if not free[i]:
+            continue
+        alone = of[i] < 0
+        for e in range(pointers[i], pointers[i + 1]):
+            j = columns[e]
+            strong = abs(values[e]) >= strength * max(largest[i], largest[j])
+            if not alone:
+                break
+            if j != i and strong and of[j] >= 0:
+                alone = False
+        if not alone:
+            continue
+        of[i] = count
+        for e in range(pointers[i], pointers[i + 1]):
+            j = columns[e]
+            if free[j] and abs(values[e]) >= strength * max(largest[i], largest[j]):
+                of[j] = count
+        count += 1
+    first = of.copy()
+    for i in range(n):  # what is left joins its strongest neighbour's,
+        if free[i] and of[i] < 0:
+            best = 0.0
+            for e in range(pointers[i], pointers[i + 1]):
+                j = columns[e]
+                if j != i and first[j] >= 0 and abs(values[e]) > best and abs(values[e]) >= strength * largest[i]:
+                    best, of[i] = abs(values[e]), first[j]
+    for i in range(n):  # or gathers what is left around it
+        if free[i] and of[i] < 0:
+            of[i] = count
+            for e in range(pointers[i], pointers[i + 1]):
+                j = columns[e]
+                if free[j] and of[j] < 0 and abs(values[e]) >= strength * largest[i]:
+                    of[j] = count
+            count += 1
+    return of, count
+
+
+@njit(cache=True)
+def filtered(pointers, columns, values, strength):
+    """The entries of A (nnz,) with those off the diagonal that are not strong in their row added to the diagonal."""
+    out = values.copy()
+    for i in range(len(pointers) - 1):
+        largest, lumped, own = 0.0, 0.0, -1
+        for e in range(pointers[i], pointers[i + 1]):
+            if columns[e] == i:
+                own = e
+            else:
+                largest = max(largest, abs(values[e]))
+        for e in range(pointers[i], pointers[i + 1]):
+            if e != own and abs(values[e]) < strength * largest:
+                lumped += values[e]
+                out[e] = 0.0
+        out[own] += lumped
+    return out
