@@ -8,9 +8,13 @@ from pathlib import Path
 import pytest
 
 from harness.machine import pinned_threads
+from harness.scene import Scene
 from harness.simulate import simulate
+from solvers.linear.supernodal import Supernodal
 from solvers.problem import StopRule
 from tests.bench.gates import THREADS, prepare, record, sheet
+from tests.bench.solves import system_matrix
+from tests.scenes import SCENES
 
 
 @pytest.mark.parametrize(
@@ -29,6 +33,25 @@ def test_matrices_have_as_many_entries_as_stored(solver: str, size: int, system:
     # Q has an entry for each vertex and two for each spring; the factor's number is that of the ordering.
     assert system == len(scene.mesh.rest) + 2 * len(scene.mesh.springs)
     assert facts == {"nnz_system": system} | ({"nnz_factor": factor} if factor else {})
+
+
+@pytest.mark.parametrize(
+    ("scene", "nonzeros", "panel_bytes", "flops"),
+    [
+        (sheet(32), 19_161, 283_776, 344_472),
+        (sheet(64), 103_273, 1_358_400, 1_728_456),
+        (sheet(128), 527_787, 6_387_392, 8_371_368),
+        (SCENES["block"](1e10), 6_157, 70_816, 90_672),
+        (SCENES["skirt"](1e10), 5_150, 79_040, 94_104),
+    ],
+    ids=["sheet 32", "sheet 64", "sheet 128", "block", "skirt"],
+)
+def test_a_supernodal_factor_is_as_large_as_stored(scene: Scene, nonzeros: int, panel_bytes: int, flops: int):
+    factor = Supernodal(system_matrix(scene))
+    assert (factor.nonzeros, factor.panel_bytes, factor.flops) == (nonzeros, panel_bytes, flops)
+    # Half of the bytes for half of the precision; the work is the same.
+    single = Supernodal(system_matrix(scene), precision="float32")
+    assert (single.panel_bytes, single.flops) == (panel_bytes // 2, flops)
 
 
 @pytest.mark.parametrize("solver", ["dense", "sparse", "numba"])
