@@ -8,13 +8,13 @@ An iteration from p to LG(p) is a preconditioned gradient step of length one, Q^
 energy never rises in it, because A'KA - Hessian is positive semidefinite. Exact pins are eliminated: their rows
 leave Q, and their columns go to the right-hand side.
 
-Three backends differ in how they do the two steps, and in nothing else: `DenseLocalGlobal` with NumPy's matrices,
-`SparseLocalGlobal` with SciPy's, `CompiledLocalGlobal` with a compiled local step.
+Backends differ in how they do the two steps, and in nothing else: `DenseLocalGlobal` with NumPy's matrices,
+`SparseLocalGlobal` with SciPy's, and `solvers.compiled` with steps that are compiled as a whole.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +22,7 @@ from scipy.sparse import csr_array
 
 from solvers import matrices
 from solvers.energies.springs import TINY, Springs
-from solvers.linear.factors import DenseCholesky, Factor, SimplicialCholesky, SparseLU
+from solvers.linear.factors import DenseCholesky, Factor, SparseLU
 from solvers.problem import (
     Positions,
     ProjectiveEnergy,
@@ -37,13 +37,18 @@ Project = Callable[[Positions, Positions, Positions], None]
 """(p, y, out): write y + A'K d(p) to `out`."""
 
 
+_COUNTS = {"nnz_factor": "nonzeros", "panel_bytes": "panel_bytes", "flops_per_solve": "flops"}
+"""What the facts tell of a factor that knows it."""
+
+
 @dataclass(frozen=True, eq=False)
 class PreparedLocalGlobal:
     """The iteration, over any backend's local step, factor and norm.
 
     project: the local step; factor: of Q's free rows and columns; coupling: Q's free rows and exactly pinned
     columns (f, x); norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins; trace: of the unpinned
-    part of Q [N/m]; facts: exact counts of what was built.
+    part of Q [N/m]; facts: exact counts of what was built; choice: the linear
+    solver in words.
     """
 
     system: System
@@ -53,6 +58,7 @@ class PreparedLocalGlobal:
     norm: Callable[[Positions], float]
     trace: float
     facts: dict[str, float]
+    choice: str
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """The iterates from `problem.first_guess`; each yielded array is overwritten two iterations later."""
@@ -166,6 +172,7 @@ class DenseLocalGlobal:
             lambda e: matrices.energy_norm(Q, e),
             float(np.diag(Q)[system.unpinned].sum()),
             {"nnz_system": float(np.count_nonzero(Q)), "nnz_factor": len(free) * (len(free) + 1) / 2},
+            "dense Cholesky",
         )
 
 
@@ -180,32 +187,7 @@ class SparseLocalGlobal:
             others = {type(e).__name__ for e in system.energies if not isinstance(e, ProjectiveEnergy)}
             raise Unsupported(f"sparse: local-global needs projective energies; not so: {', '.join(sorted(others))}")
 
-        def project(p: Positions, y: Positions, out: Positions) -> None:
-            out[:] = y
-            for energy in energies:
-                energy.add_projection(p, out)
-
-        return _prepared(system, energies, project, SparseLU, None)
-
-
-@dataclass(frozen=True)
-class CompiledLocalGlobal:
-    """A compiled local step in one pass over the vertices' springs, and a simplicial Cholesky factor."""
-
-    def prepare(self, system: System) -> PreparedLocalGlobal:
-        """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
-        from solvers.kernels.springs import Incidence  # Numba loads only where it is used
-
-        springs = only_springs(system, "numba")
-        incidence = Incidence.of(springs, system.vertices)
-        inertia = system.mass / system.time_step**2
-        return _prepared(
-            system,
-            [springs],
-            incidence.project,
-            SimplicialCholesky,
-            lambda e: incidence.energy_norm(e, inertia),
-        )
+        return prepared(system, energies, lambda Q: (SparseLU(Q), "SuperLU"))
 
 
 def only_springs(system: System, solver: str) -> Springs:
@@ -216,29 +198,33 @@ def only_springs(system: System, solver: str) -> Springs:
     return Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
 
 
-def _prepared(
+def prepared(
     system: System,
-    energies: list[ProjectiveEnergy] | list[Springs],
-    project: Project,
-    factorise: Callable[[csr_array], Factor],
-    norm: Callable[[Positions], float] | None,
+    energies: Sequence[ProjectiveEnergy],
+    factorise: Callable[[csr_array], tuple[Factor, str]],
 ) -> PreparedLocalGlobal:
-    """The parts that the sparse backends share."""
+    """The energies' own local steps, over a factor of the assembled Q that comes with its `choice`."""
     Q = matrices.assemble(system, energies)
     free = system.free
     rows = Q if len(free) == system.vertices else csr_array(Q[free])
     exact = system.pins.vertices[system.pins.exact]
     inner = rows if len(free) == system.vertices else csr_array(rows[:, free])
-    factor = factorise(inner) if len(free) else DenseCholesky(np.eye(0))
-    facts = {"nnz_system": float(Q.nnz)}
-    if factor.nonzeros is not None:
-        facts["nnz_factor"] = float(factor.nonzeros)
+    factor, choice = factorise(inner) if len(free) else (DenseCholesky(np.eye(0)), "nothing to solve for")
+    counts = {name: getattr(factor, attribute, None) for name, attribute in _COUNTS.items()}
+    facts = {"nnz_system": float(Q.nnz)} | {name: float(n) for name, n in counts.items() if n is not None}
+
+    def project(p: Positions, y: Positions, out: Positions) -> None:
+        out[:] = y
+        for energy in energies:
+            energy.add_projection(p, out)
+
     return PreparedLocalGlobal(
         system,
         project,
         factor,
         csr_array(rows[:, exact]),
-        norm or (lambda e: matrices.energy_norm(Q, e)),
+        lambda e: matrices.energy_norm(Q, e),
         float(Q.diagonal()[system.unpinned].sum()),
         facts,
+        choice,
     )

@@ -8,7 +8,7 @@ from typing import Any
 SOLVERS = {
     "dense": "solvers.local_global:DenseLocalGlobal",
     "sparse": "solvers.local_global:SparseLocalGlobal",
-    "numba": "solvers.local_global:CompiledLocalGlobal",
+    "numba": "solvers.compiled:CompiledLocalGlobal",
 }
 
 

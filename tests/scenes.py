@@ -19,8 +19,9 @@ from harness.mesh.surfaces import Skirt
 from harness.scene import Scene, build
 from harness.simulate import problem, simulate, start
 from harness.spec import MeshSource, SceneSpec
+from solvers.compiled import CompiledLocalGlobal
 from solvers.energies.springs import Springs
-from solvers.local_global import CompiledLocalGlobal, DenseLocalGlobal, SparseLocalGlobal
+from solvers.local_global import DenseLocalGlobal, SparseLocalGlobal
 from solvers.problem import Pins, Positions, Solver, StepProblem, StopRule, System
 
 BACKENDS: tuple[Solver, ...] = (DenseLocalGlobal(), SparseLocalGlobal(), CompiledLocalGlobal())

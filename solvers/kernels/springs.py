@@ -1,94 +1,174 @@
-"""The local step of springs, compiled: each vertex gathers from its own springs, so no two threads write to one place.
+"""The local step of springs, compiled: eight vertices at a time, each with the springs that end at it.
 
-    out_i = y_i + sum over springs (i, j) of k r (p_i - p_j) / |p_i - p_j|
+    out_i += y_i + sum over springs (i, j) of k r (p_i - p_j) / |p_i - p_j|                         `project`
+    out_i += y_i - h_i p_i + sum of (k r / |p_i - p_j| - k) (p_i - p_j),   minus the gradient       `correct`
 
-One pass, without A or d. A vertex adds in the order of its springs whatever the number of threads, so the bits
-do not depend on it.
+One pass, without A or d. Each spring is computed at both of its ends, so that nobody adds to another's sum: the bits do
+not depend on the number of threads.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from solvers.energies.springs import TINY, Springs
-from solvers.problem import Positions
+from solvers.kernels import springs_vectors as vectors
+from solvers.kernels.compiling import inner, kernel
+from solvers.kernels.springs_vectors import LANES
 
 _TINY_SQUARED = TINY * TINY
-# All of fastmath but what would let the compiler assume that there is no NaN and no infinity.
-_FAST = {"contract", "reassoc", "nsz", "arcp"}
+WINDOW = 128
+"""Neighbouring rows of which those with equally many springs are bundled: longer ones would scatter the reading."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Incidence:
-    """The springs at each vertex, in compressed rows.
+class Bundles(NamedTuple):
+    """Springs by their ends: bundles of eight vertices (b of them), and of each as many entries as one has springs.
 
-    start: (n + 1,); neighbour: (2m,), the other end; stiffness: k (2m,) [N/m]; pull: k r (2m,) [N];
-    direction: (2m, 3), from the neighbour to the vertex, taken at zero length.
+    own (8 b,): the row of each vertex; start (b + 1,): the first entry of each bundle; of each entry eight times the
+    row of the other end (neighbour), k r [N] (pull), k [N/m] (stiffness) and the spring, ~spring at its second end.
+    What fills up is vertex `nobody` with zeros, and springs of no strength to row `far`. direction (m, 3): taken at
+    zero length.
     """
 
+    own: NDArray[np.int32]
     start: NDArray[np.int64]
     neighbour: NDArray[np.int32]
-    stiffness: NDArray[np.float64]
     pull: NDArray[np.float64]
+    stiffness: NDArray[np.float64]
+    spring: NDArray[np.int32]
     direction: NDArray[np.float64]
 
     @classmethod
-    def of(cls, springs: Springs, n: int) -> Incidence:
-        """The incidence of springs over n vertices; self-loops, which stretch nothing, are left out."""
+    def of(
+        cls, springs: Springs, row: NDArray[np.int64], part: NDArray[np.int64], parts: int, nobody: int, far: int
+    ) -> tuple[Bundles, NDArray[np.int64]]:
+        """The bundles of springs between vertices in rows `row` (n,), and the first of each part (parts + 1,).
+
+        part (n,): which part of the rows, ascending with them, each vertex is in, -1 for one that does not move.
+        Self-loops, which stretch nothing, are left out.
+        """
         keep = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])
-        i, j = springs.edges[keep].T
-        rows, spring = np.concatenate([i, j]), np.concatenate([keep, keep])
-        order = np.argsort(rows, kind="stable")
-        sign = np.concatenate([np.ones(len(keep)), -np.ones(len(keep))])
-        direction = sign[:, None] * springs.rest_direction[spring]
-        k = springs.stiffness[spring]
+        ends = springs.edges[keep]
+        degree = np.bincount(ends.ravel(), minlength=len(row))
+        vertices = np.flatnonzero(part >= 0)
+        vertices = vertices[np.argsort(row[vertices])]
+        count = np.bincount(part[vertices], minlength=parts)
+        rank = np.arange(len(vertices)) - np.repeat(np.cumsum(count) - count, count)
+        vertices = vertices[np.lexsort((-degree[vertices], rank // WINDOW, part[vertices]))]
+        first = np.concatenate([[0], np.cumsum(-(-count // LANES))])
+        place = np.full(len(row), -1)
+        place[vertices] = LANES * first[part[vertices]] + rank
+        own = np.full(LANES * first[-1], nobody, np.int32)
+        own[place[vertices]] = row[vertices]
+
+        at = np.zeros(len(own), np.int64)
+        at[place[vertices]] = degree[vertices]
+        start = np.concatenate([[0], np.cumsum(at.reshape(-1, LANES).max(axis=1, initial=0))])
+        here, there = ends.T.ravel(), ends[:, ::-1].T.ravel()
+        spring = np.concatenate([keep, ~keep])
+        order = np.argsort(place[here], kind="stable")
+        order = order[np.searchsorted(place[here[order]], 0) :]
+        here, there, spring = place[here[order]], row[there[order]], spring[order]
+        nth = np.arange(len(here)) - np.searchsorted(here, here)
+        entry = LANES * (start[here // LANES] + nth) + here % LANES
+
+        def filled(values: NDArray[Any], filler: float) -> NDArray[Any]:
+            out = aligned(LANES * start[-1], values.dtype)
+            out[:] = filler
+            out[entry] = values
+            return out
+
+        k = springs.stiffness[np.maximum(spring, ~spring)]
+        r = springs.rest_length[np.maximum(spring, ~spring)]
         return cls(
-            np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]),
-            np.concatenate([j, i])[order].astype(np.int32),
-            np.ascontiguousarray(k[order]),
-            np.ascontiguousarray((k * springs.rest_length[spring])[order]),
-            np.ascontiguousarray(direction[order]),
-        )
-
-    def project(self, p: Positions, y: Positions, out: Positions) -> None:
-        """The local step: write y + A'K d(p) [N], shape (n, 3), to `out`."""
-        _project(p, y, self.start, self.neighbour, self.pull, self.direction, out)
-
-    def energy_norm(self, e: Positions, inertia: NDArray[np.float64]) -> float:
-        """|e|_Q [J^(1/2)] of a displacement (n, 3) [m] that vanishes at the pins; inertia: m/dt^2 (n,) [N/m]."""
-        share = np.empty(len(e))
-        _energy(e, inertia, self.start, self.neighbour, self.stiffness, share)
-        return float(np.sqrt(share.sum()))
+            own,
+            start,
+            filled(there.astype(np.int32), far),
+            filled(k * r, 0.0),
+            filled(k, 0.0),
+            filled(spring.astype(np.int32), 0),
+            np.array(springs.rest_direction, order="C"),
+        ), first
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
-def _project(p, y, start, neighbour, pull, direction, out):
-    for i in prange(len(p)):
-        x0, x1, x2 = p[i, 0], p[i, 1], p[i, 2]
-        s0, s1, s2 = y[i, 0], y[i, 1], y[i, 2]
-        for e in range(start[i], start[i + 1]):
-            j = neighbour[e]
-            v0, v1, v2 = x0 - p[j, 0], x1 - p[j, 1], x2 - p[j, 2]
-            squared = v0 * v0 + v1 * v1 + v2 * v2
+def aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
+    """Zeros that begin at a cache line, so that no row of four numbers lies in two."""
+    bytes_ = np.dtype(dtype).itemsize * size
+    raw = np.zeros(bytes_ + 64, np.uint8)
+    begin = -raw.ctypes.data % 64
+    return raw[begin : begin + bytes_].view(dtype)
+
+
+@inner
+def add_projection(bundles, begin, end, p, y, held, out, shift):
+    """Add y + A'K d(p) of the bundles from `begin` to `end` to rows of `out`, moved by `shift`."""
+    own, start, neighbour, pull, stiffness, _spring, _direction = bundles
+    for b in range(begin, end):
+        if vectors.project(p, own, b, neighbour, pull, stiffness, start[b], start[b + 1], y, held, out, shift):
+            _one_by_one(bundles, b, p, y, held, out, shift, False)
+
+
+@inner
+def add_descent(bundles, begin, end, p, y, held, out, shift):
+    """Add y - Q p + A'K d(p), minus the gradient, of the bundles from `begin` to `end` to rows of `out`."""
+    own, start, neighbour, pull, stiffness, _spring, _direction = bundles
+    for b in range(begin, end):
+        if vectors.correct(p, own, b, neighbour, pull, stiffness, start[b], start[b + 1], y, held, out, shift):
+            _one_by_one(bundles, b, p, y, held, out, shift, True)
+
+
+@inner
+def _one_by_one(bundles, b, p, y, held, out, shift, correct):
+    """A bundle in which a spring has no length: that takes the direction of its rest shape."""
+    for lane in range(LANES):
+        i = bundles.own[LANES * b + lane]
+        s0, s1, s2 = y[4 * i], y[4 * i + 1], y[4 * i + 2]
+        x0, x1, x2 = p[4 * i], p[4 * i + 1], p[4 * i + 2]
+        if correct:
+            s0, s1, s2 = s0 - held[i] * x0, s1 - held[i] * x1, s2 - held[i] * x2
+        for entry in range(bundles.start[b], bundles.start[b + 1]):
+            e = LANES * entry + lane
+            j = bundles.neighbour[e]
+            v0, v1, v2 = x0 - p[4 * j], x1 - p[4 * j + 1], x2 - p[4 * j + 2]
+            if correct:
+                k = bundles.stiffness[e]
+                s0, s1, s2 = s0 - k * v0, s1 - k * v1, s2 - k * v2
+            scale, squared = bundles.pull[e], v0 * v0 + v1 * v1 + v2 * v2
             if squared <= _TINY_SQUARED:
-                v0, v1, v2, squared = direction[e, 0], direction[e, 1], direction[e, 2], 1.0
-            scale = pull[e] / np.sqrt(squared)
-            s0 += scale * v0
-            s1 += scale * v1
-            s2 += scale * v2
-        out[i, 0], out[i, 1], out[i, 2] = s0, s1, s2
+                name = bundles.spring[e]
+                if name < 0:
+                    scale, name = -scale, ~name
+                v0, v1, v2 = bundles.direction[name]
+            else:
+                scale /= np.sqrt(squared)
+            s0, s1, s2 = s0 + scale * v0, s1 + scale * v1, s2 + scale * v2
+        at = 4 * (i + shift)
+        out[at], out[at + 1], out[at + 2] = out[at] + s0, out[at + 1] + s1, out[at + 2] + s2
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
-def _energy(e, inertia, start, neighbour, stiffness, share):
-    for i in prange(len(e)):
-        total = inertia[i] * (e[i, 0] ** 2 + e[i, 1] ** 2 + e[i, 2] ** 2)
-        for s in range(start[i], start[i + 1]):
-            j = neighbour[s]
-            v0, v1, v2 = e[i, 0] - e[j, 0], e[i, 1] - e[j, 1], e[i, 2] - e[j, 2]
-            total += 0.5 * stiffness[s] * (v0 * v0 + v1 * v1 + v2 * v2)
-        share[i] = total
+@inner
+def squared_norm(bundles, begin, end, e, measure):
+    """|e|_Q^2 [J] of displacements in rows of four, half of each spring at each end and `measure` [N/m] of each row."""
+    own, start, neighbour, pull, stiffness, _spring, _direction = bundles
+    total = 0.0
+    for b in range(begin, end):
+        total += vectors.energy(e, own, b, neighbour, pull, stiffness, start[b], start[b + 1], e, measure, e, 0)
+    return total
+
+
+@kernel
+def project(bundles, p, y, x, b, zero, out):
+    """Write y + A'K d(p), all (n, 3), to `out`; x, b: scratch of n + 2 rows of four, zero: the same, of
+    zeros."""
+    n = len(p)
+    for i in range(n):
+        for c in range(3):
+            x[4 * i + c] = p[i, c]
+            b[4 * i + c] = 0.0
+    add_projection(bundles, 0, len(bundles.start) - 1, x, zero, zero, b, 0)
+    for i in range(n):
+        for c in range(3):
+            out[i, c] = y[i, c] + b[4 * i + c]

@@ -13,7 +13,8 @@ import pytest
 from harness.load import scene_from_assignment
 from harness.scene import Scene, build
 from harness.simulate import FIRST_GUESSES
-from solvers.local_global import CompiledLocalGlobal, DenseLocalGlobal, SparseLocalGlobal, only_springs
+from solvers.compiled import CompiledLocalGlobal
+from solvers.local_global import DenseLocalGlobal, SparseLocalGlobal, only_springs
 from solvers.problem import Positions, Solver
 from tests.scenes import BACKENDS, SCENES, first_problem, random_problem, trajectory
 

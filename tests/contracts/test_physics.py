@@ -16,7 +16,7 @@ from harness.mesh.chain import Chain
 from harness.mesh.grid import Grid
 from harness.scene import Scene
 from harness.simulate import State, problem
-from solvers.local_global import CompiledLocalGlobal
+from solvers.compiled import CompiledLocalGlobal
 from solvers.problem import Positions, StopRule
 from tests.scenes import BACKENDS, scene, static_shape, trajectory
 
@@ -67,7 +67,7 @@ def test_a_mass_on_a_spring_follows_the_recurrence_of_implicit_euler(backend, st
     u, before, inertia = 0.0, -0.5 * DT, 1.0 / DT**2
     for found in extension:
         u, before = (inertia * (2 * u - before) + G) / (inertia + stretch), u
-        assert abs(found - u) <= 1e-13  # fifty steps of round-off in positions of order one
+        assert abs(found - u) <= 2e-13  # fifty steps of a few times the last digit of three, 4e-16
 
 
 @pytest.mark.parametrize("stretch", [10.0, 500.0, 5e4])

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
+from solvers.compiled import CompiledLocalGlobal
 from solvers.energies.springs import TINY, Springs
-from solvers.local_global import CompiledLocalGlobal, DenseLocalGlobal, SparseLocalGlobal, only_springs
+from solvers.local_global import DenseLocalGlobal, SparseLocalGlobal, only_springs
 from solvers.matrices import assemble
 from solvers.problem import NotPositiveDefinite, Pins, Positions, StepProblem, StopRule, System, Unsupported
 from tests.scenes import BACKENDS, SCENES, cloth, first_problem, random_network, random_problem
@@ -157,10 +158,11 @@ def test_the_facts_count_what_is_stored():
     edges = np.array([[i, i + 1] for i in range(9)])
     chain = Springs.at_rest(np.zeros((10, 3)), edges, np.ones(9))
     system = replace(problem.system, energies=(chain,))
-    facts = [backend.prepare(system).facts for backend in BACKENDS]
-    assert [fact["nnz_system"] for fact in facts] == [10 + 2 * 9] * 3
+    backends = (*BACKENDS[:2], *(CompiledLocalGlobal(linear) for linear in ("inverse", "supernodal", "cholespy")))
+    facts = [backend.prepare(system).facts for backend in backends]
+    assert [fact["nnz_system"] for fact in facts] == [10 + 2 * 9] * 5
     # A tree's factor has no fill-in; a dense one has the whole triangle; cholespy does not tell.
-    assert [fact.get("nnz_factor") for fact in facts] == [10 * 11 / 2, 10 + 9, None]
+    assert [fact.get("nnz_factor") for fact in facts] == [10 * 11 / 2, 10 + 9, 10 * 11 / 2, 10 + 9, None]
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from harness.trace import EnergyNorm, trace
-from solvers.local_global import CompiledLocalGlobal, SparseLocalGlobal, only_springs
+from solvers.compiled import CompiledLocalGlobal
+from solvers.local_global import SparseLocalGlobal, only_springs
 from solvers.matrices import assemble
 from tests.scenes import cloth, first_problem, frozen, random_problem
 

@@ -1,0 +1,213 @@
+"""Local-global iterations, compiled as a whole: no Python between a step's beginning and its end.
+
+Factors of float64 solve for positions, Q p = A'K d + y. Less precise ones solve for corrections,
+p <- p - Q^-1 grad g(p), with the gradient in float64: the iterations end where those of float64 do, to all of its
+digits, and only the way there differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from solvers.energies.springs import Springs
+from solvers.kernels import springs as kernels
+from solvers.kernels import step, step_ends
+from solvers.kernels.plan import Order, of_inverse, of_supernodal, vectors
+from solvers.linear.choice import Linear, Precision, factorise
+from solvers.linear.inverse import Inverse
+from solvers.linear.supernodal import Supernodal
+from solvers.local_global import PreparedLocalGlobal, Project, only_springs, prepared
+from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System
+
+_FAR = 1e100
+"""Where the springs end that fill up bundles: at no vertex, whatever the unit of length."""
+
+
+@dataclass(frozen=True)
+class CompiledLocalGlobal:
+    """Compiled steps over a linear solver that is chosen by size, or given.
+
+    linear: the solver of Q p = b; precision: of its stored entries.
+    """
+
+    linear: Linear = "auto"
+    precision: Precision = "float64"
+
+    def prepare(self, system: System) -> Prepared:
+        """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
+        springs = only_springs(system, "numba")
+        base = prepared(system, [springs], lambda Q: factorise(Q, self.linear, self.precision))
+        for kind, order in _ORDERS.items():
+            if isinstance(base.factor, kind):
+                return PreparedCompiled.of(base, springs, order(base.factor))
+        return replace(base, project=_projection(springs, system.vertices))
+
+
+_ORDERS: dict[type, Callable[[Any], Order]] = {Supernodal: of_supernodal, Inverse: of_inverse}
+"""The linear solvers whose panels the kernels go through; the others are called in between."""
+
+
+class _Work(NamedTuple):
+    """What the kernels write to: three vectors and scratch, the right-hand side, positions to be corrected or None."""
+
+    vectors: tuple[NDArray[Any], ...]
+    y: NDArray[np.float64]
+    p: NDArray[np.float64] | None
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedCompiled:
+    """The iterations over a factor's own rows (see `solvers.kernels.step`).
+
+    base: the same, step by step; plan: of an iteration; bundles: of the springs; rows: of the vertices; far: the last
+    row.
+    """
+
+    base: PreparedLocalGlobal
+    plan: step.Plan
+    bundles: kernels.Bundles
+    rows: step_ends.Rows
+    far: int
+
+    @classmethod
+    def of(cls, base: PreparedLocalGlobal, springs: Springs, order: Order) -> PreparedCompiled:
+        """The iterations over a factor that is cut into blocks."""
+        s, pins = base.system, base.system.pins
+        exact = pins.vertices[pins.exact]
+        nobody = order.rows + len(exact)
+        row = np.empty(s.vertices, np.int64)
+        slot = order.slot[: len(s.free)]  # those behind are padding
+        row[s.free] = slot
+        row[exact] = order.rows + np.arange(len(exact))
+        part = np.full(s.vertices, -1)
+        part[s.free] = np.searchsorted(order.spans[:, 0], slot, side="right") - 1
+        bundles, first = kernels.Bundles.of(springs, row, part, len(order.spans), nobody, nobody + 1)
+        inertia = s.mass / s.time_step**2
+        held, measure, loose = np.zeros((3, nobody + 2 + order.shift))
+        held[row] = measure[row] = inertia
+        _, soft, weight = s.penalty
+        held[row[soft]] += weight
+        measure[row[s.free]] -= 0.5 * base.coupling.sum(axis=1)
+        loose[row[s.unpinned]] = 1.0
+        corrects = order.squares.dtype != np.float64
+        coupling = csr_array((0, 0)).tocoo() if corrects else base.coupling.tocoo()
+        return cls(
+            base,
+            step.Plan(
+                order.squares,
+                order.panels,
+                order.places,
+                order.chunks,
+                order.top,
+                np.ascontiguousarray(np.column_stack([order.spans[:, :2], first[:-1], first[1:], order.spans[:, 2:]])),
+                order.leaf,
+                order.of_group,
+                held,
+                measure,
+                loose,
+                order.shift,
+            ),
+            bundles,
+            step_ends.Rows(
+                row,
+                inertia,
+                np.array(pins.weight),
+                np.array(pins.vertices),
+                np.array(coupling.data, np.float64),
+                row[s.free][coupling.coords[0]],
+                np.flatnonzero(pins.exact)[coupling.coords[1]],
+            ),
+            nobody + 1,
+        )
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """Exact counts of what was built."""
+        return self.base.facts
+
+    @property
+    def choice(self) -> str:
+        """The linear solver in words."""
+        return self.base.choice
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """The iterates from `problem.first_guess`; the yielded array is overwritten by the next one."""
+        (a, b, c, e), y, p = work = self._new()
+        target, force, pins, _, guess = _arrays(problem)
+        step_ends.state(self.rows, target, force, pins, y)
+        step_ends.start(self.rows, work.vectors, p, guess, pins)
+        out = np.empty_like(target)
+        while True:
+            step.iterate(self.plan, self.bundles, (a, b, c, e), y, p, 1, np.nan, 0.0, False, self._threads())
+            a, b = b, a
+            step_ends.fetch(self.rows, a if p is None else p, out)
+            yield out
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """Iterate until `stop` says so; without a tolerance only the last residual is computed."""
+        target, force, pins, current, guess = _arrays(problem)
+        out = np.empty_like(target)
+        fixed = self.plan, self.bundles, self.rows, *self._work, target, force, pins
+        threads = self._threads()
+        floor = stop.floor * self.base.trace**0.5
+        limit, yardstick, every = 0.0, float("nan"), stop.tolerance is not None
+        if stop.tolerance is not None:
+            _, yardstick, _, _ = step_ends.solve(*fixed, current, 1, 0.0, 0.0, False, threads, out)
+            limit = stop.tolerance * yardstick
+        count, residual, enough, at_rest = step_ends.solve(
+            *fixed, guess, stop.iterations, limit, floor, every, threads, out
+        )
+        stopped = "iterations" if not every or not (enough or at_rest) else "tolerance" if enough else "floor"
+        return Solution(out, count, residual, yardstick, stopped)
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """The local step over all springs, and a solve, at the first guess; within a solve blocks take turns."""
+        (a, b, _, _), y, p = work = self._new()
+        target, force, pins, _, guess = _arrays(problem)
+        step_ends.state(self.rows, target, force, pins, y)
+        step_ends.start(self.rows, work.vectors, p, guess, pins)
+        local = lambda: step.local(self.plan, self.bundles, a, y, p, b)  # noqa: E731
+        return {"local": local, "global": self.base.phases(problem)["global"]}
+
+    @cached_property
+    def _work(self) -> _Work:
+        return self._new()
+
+    def _new(self) -> _Work:
+        rows, dtype = len(self.plan.held), self.plan.squares.dtype
+        arrays = vectors(dtype, rows)
+        p = None if dtype == np.float64 else kernels.aligned(4 * rows)
+        for x in arrays[:3] if p is None else [p]:
+            x[4 * self.far] = _FAR
+        return _Work(arrays, kernels.aligned(4 * rows), p)
+
+    def _threads(self) -> int | None:
+        threads = numba.get_num_threads()
+        return threads if threads > 1 and self.plan.top[2] > 1 else None
+
+
+def _arrays(problem: StepProblem) -> list[Positions]:
+    """The problem's arrays. The kernels are compiled for arrays that may be written to: what may not is copied."""
+    p = problem
+    given = (p.target, p.force, p.pin_targets, p.current, p.first_guess)
+    return [x if x.flags.carray else np.array(x, np.float64, order="C") for x in given]
+
+
+def _projection(springs: Springs, n: int) -> Project:
+    """The compiled local step for a linear solver that is called from Python."""
+    bundles, _ = kernels.Bundles.of(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
+    x, b, zero = (kernels.aligned(4 * (n + 2)) for _ in range(3))
+    x[4 * (n + 1)] = _FAR
+
+    def project(p: Positions, y: Positions, out: Positions) -> None:
+        kernels.project(bundles, p, y, x, b, zero, out)
+
+    return project

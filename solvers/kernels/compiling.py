@@ -1,0 +1,18 @@
+"""How kernels are compiled: kept on disk, and without counting references to arrays.
+
+Kernels neither make arrays nor keep them, so there is nothing to count; counting took half of a step of a hundred
+vertices. Inner ones are called by kernels alone and need no wrappers for Python, which take longest to compile.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import njit
+
+_kept: Any = {"cache": True, "_nrt": False}
+_inner: Any = {**_kept, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+kernel: Any = njit(**_kept)
+inner: Any = njit(**_inner)
+inner_in_parallel: Any = njit(**_inner, parallel=True)

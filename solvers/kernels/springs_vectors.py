@@ -1,0 +1,194 @@
+"""The springs of eight vertices at a time, in LLVM vectors that a compiler does not find by itself.
+
+Positions have rows of four numbers, x, y, z and padding: one load brings a vertex, and eight loaded rows are transposed
+into vectors of x, y and z. Lane l holds a spring of vertex l, so that no two lanes add to one place.
+
+    1/|v|   from a guess by Lomont's trick (2003), e = 1 - s y^2, y <- y (1 - e)^(-1/2) by its series:
+            a step of degree 4 and one of degree 2 leave an error of about one unit in the last place
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from solvers.energies.springs import TINY
+
+LANES = 8
+_I32, _I64, _F64 = ir.IntType(32), ir.IntType(64), ir.DoubleType()
+_ROW, _WIDE = ir.VectorType(_F64, 4), ir.VectorType(_F64, LANES)
+_I8, _MASK = ir.IntType(8), ir.VectorType(ir.IntType(1), LANES)
+_BITS = ir.VectorType(_I64, LANES)
+_GUESS = 0x5FE6EB50C7B537A9
+_LEAST, _MOST = TINY * TINY, 1.7e308
+"""Squared lengths are kept between these, so that no guess is infinite."""
+
+Kind = Literal["project", "correct", "energy"]
+
+
+def _constant(value: float) -> ir.Constant:
+    return ir.Constant(_WIDE, [value] * LANES)
+
+
+class _Vectors:
+    """Vectors of eight float64, written with a builder."""
+
+    def __init__(self, builder: Any) -> None:
+        self.builder = builder
+
+    def shuffle(self, a: ir.Value, b: ir.Value, lanes: list[int]) -> Any:
+        return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(lanes)), lanes))
+
+    def load(self, pointer: Any, kind: ir.Type, align: int = 8) -> ir.Value:
+        return self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()), align=align)
+
+    def multiply_add(self, a: Any, b: Any, c: Any) -> Any:
+        """a b + c; `contract` lets the target fuse them where it can."""
+        return self.builder.fadd(self.builder.fmul(a, b, flags=("contract",)), c, flags=("contract",))
+
+    def subtract_product(self, c: Any, a: Any, b: Any) -> Any:
+        """c - a b."""
+        return self.builder.fsub(c, self.builder.fmul(a, b, flags=("contract",)), flags=("contract",))
+
+    def row(self, array: Any, place: Any) -> Any:
+        """Where row `place` of four numbers begins."""
+        return self.builder.gep(array, [self.builder.shl(place, _I64(2))])
+
+    def places(self, indices: Any) -> list[Any]:
+        """The eight int32 at a pointer."""
+        b = self.builder
+        return [b.zext(b.load(b.gep(indices, [_I64(lane)])), _I64) for lane in range(LANES)]
+
+    def gather(self, array: Any, places: list[Any]) -> list[Any]:
+        """x, y and z of eight rows."""
+        rows = [self.load(self.row(array, place), _ROW) for place in places]
+        pairs = [self.shuffle(rows[lane], rows[lane + 4], list(range(8))) for lane in range(4)]
+        low = [0, 8, 2, 10, 4, 12, 6, 14]
+        xz = [self.shuffle(pairs[i], pairs[i + 1], low) for i in (0, 2)]
+        y = [self.shuffle(pairs[i], pairs[i + 1], [k + 1 for k in low]) for i in (0, 2)]
+        first, second = [0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]
+        return [self.shuffle(a[0], a[1], lanes) for a, lanes in ((xz, first), (y, first), (xz, second))]
+
+    def rows(self, x: Any, y: Any, z: Any) -> list[Any]:
+        """Eight rows of x, y, z and zero."""
+        out = []
+        for lane in range(LANES):
+            xy = self.shuffle(x, y, [lane, LANES + lane])
+            z0 = self.shuffle(z, _constant(0.0), [lane, LANES])
+            out.append(self.shuffle(xy, z0, [0, 1, 2, 3]))
+        return out
+
+    def dot(self, a: list[Any]) -> Any:
+        """|a|^2 of eight vectors."""
+        squared = self.builder.fmul(a[0], a[0], flags=("contract",))
+        for component in a[1:]:
+            squared = self.multiply_add(component, component, squared)
+        return squared
+
+    def gathered(self, scalars: list[Any]) -> Any:
+        """Eight numbers as a vector."""
+        out: Any = _constant(0.0)
+        for lane, scalar in enumerate(scalars):
+            out = self.builder.insert_element(out, scalar, _I32(lane))
+        return out
+
+    def total(self, a: Any) -> Any:
+        """The sum of the lanes, taken pairwise."""
+        terms = [self.builder.extract_element(a, _I32(lane)) for lane in range(LANES)]
+        while len(terms) > 1:
+            terms = [self.builder.fadd(p, q) for p, q in zip(terms[::2], terms[1::2], strict=True)]
+        return terms[0]
+
+    def broadcast(self, scalar: Any) -> Any:
+        """A row of four times one number."""
+        single = self.builder.insert_element(ir.Constant(_ROW, [0.0] * 4), scalar, _I32(0))
+        return self.shuffle(single, single, [0] * 4)
+
+    def add_to(self, pointer: Any, row: Any) -> None:
+        """Add a row to one in memory, rounded to its type first."""
+        if pointer.type.pointee != _F64:
+            row = self.builder.fptrunc(row, ir.VectorType(pointer.type.pointee, 4))
+        size = 8 if pointer.type.pointee == _F64 else 4
+        total = self.builder.fadd(self.load(pointer, row.type, size), row)
+        self.builder.store(total, self.builder.bitcast(pointer, row.type.as_pointer()), align=size)
+
+    def inverse_root(self, s: Any) -> Any:
+        """1/sqrt(s), s taken to lie between _LEAST and _MOST."""
+        b = self.builder
+        for order, bound in (("<=", _constant(_LEAST)), (">=", _constant(_MOST))):
+            s = b.select(b.fcmp_ordered(order, s, bound), bound, s)
+        half = b.lshr(b.bitcast(s, _BITS), ir.Constant(_BITS, [1] * LANES))
+        y = b.bitcast(b.sub(ir.Constant(_BITS, [_GUESS] * LANES), half), _WIDE)
+        for coefficients in ([35 / 128, 5 / 16, 3 / 8, 1 / 2], [3 / 8, 1 / 2]):
+            e = self.subtract_product(_constant(1.0), b.fmul(s, y), y)
+            series = _constant(coefficients[0])
+            for c in coefficients[1:]:
+                series = self.multiply_add(series, e, _constant(c))
+            y = self.multiply_add(b.fmul(y, e), series, y)
+        return y
+
+
+def _over_chunk(kind: Kind):
+    """The code for a chunk: its eight vertices and their springs."""
+
+    def declare(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, out, shift):
+        def generate(context, builder: Any, signature, args):
+            x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, out, shift = (
+                context.make_array(argument)(context, builder, value).data
+                if isinstance(argument, types.Array)
+                else context.cast(builder, value, argument, types.int64)
+                for argument, value in zip(signature.args, args, strict=True)
+            )
+            v = _Vectors(builder)
+            places = v.places(builder.gep(own, [builder.mul(chunk, _I64(LANES))]))
+            centre = v.gather(x, places)
+            sums = [cgutils.alloca_once(builder, _WIDE) for _ in range(3)]
+            for accumulator in sums:
+                builder.store(_constant(0.0), accumulator)
+            short = cgutils.alloca_once(builder, _MASK)
+            builder.store(ir.Constant(_MASK, [0] * LANES), short)
+            with cgutils.for_range_slice(builder, begin, end, _I64(1), _I64) as (entry, _):
+                first = builder.mul(entry, _I64(LANES))
+                others = v.gather(x, v.places(builder.gep(neighbour, [first])))
+                arrow = [builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
+                squared = v.dot(arrow)
+                if kind == "energy":
+                    added = [squared]
+                    scale = v.load(builder.gep(stiffness, [first]), _WIDE)
+                else:
+                    added = arrow
+                    tiny = builder.fcmp_ordered("<=", squared, _constant(_LEAST))
+                    builder.store(builder.or_(builder.load(short), tiny), short)
+                    scale = builder.fmul(v.load(builder.gep(pull, [first]), _WIDE), v.inverse_root(squared))
+                if kind == "correct":
+                    scale = builder.fsub(scale, v.load(builder.gep(stiffness, [first]), _WIDE))
+                for term, accumulator in zip(added, sums, strict=False):
+                    builder.store(v.multiply_add(scale, term, builder.load(accumulator)), accumulator)
+            total = [builder.load(accumulator) for accumulator in sums]
+            weights = [builder.load(builder.gep(held, [place])) for place in places]
+            if kind == "energy":
+                lanes = v.multiply_add(v.dot(centre), v.gathered(weights), builder.fmul(_constant(0.5), total[0]))
+                return v.total(lanes)
+            any_short = builder.icmp_unsigned("!=", builder.bitcast(builder.load(short), _I8), _I8(0))
+            with builder.if_then(builder.not_(any_short), likely=True):
+                for place, row, weight in zip(places, v.rows(*total), weights, strict=True):
+                    row = builder.fadd(row, v.load(v.row(y, place), _ROW))
+                    if kind == "correct":
+                        row = v.subtract_product(row, v.broadcast(weight), v.load(v.row(x, place), _ROW))
+                    v.add_to(v.row(out, builder.add(place, shift)), row)
+            return any_short
+
+        returned = types.float64 if kind == "energy" else types.boolean
+        return returned(x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, out, shift), generate
+
+    return declare
+
+
+# Numba passes the first argument itself, which type checkers do not know.
+project: Any = intrinsic(_over_chunk("project"))
+correct: Any = intrinsic(_over_chunk("correct"))
+energy: Any = intrinsic(_over_chunk("energy"))

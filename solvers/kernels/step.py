@@ -1,0 +1,185 @@
+"""Local-global iterations over a factor's own rows, from a step's beginning to its end without Python.
+
+An iteration turns positions p^k into p^(k+1):
+
+    up      children first: the local step of each vertex, and the pass forwards
+    turn    the same for the top, and its pass backwards
+    down    parents first: the pass backwards
+
+Vertices of a subtree have springs among themselves and to their ancestors only. So once a pass backwards has left a
+subtree, all that its next local step reads is known: going down a block of subtrees, the next iteration goes up
+the same block while its panels are in the cache, and reads them from memory once. The order of all sums is the same
+with and without that, and whatever the number of threads.
+
+A vector has rows of four numbers, `Supernodal`'s slots and behind them the groups' copies of the top, the vertices that
+do not move, and two more for what fills up bundles. With `p` None it holds positions, and its solve gives the
+next ones; else corrections of the positions p (n rows in float64), which may be rounded to less.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from solvers.kernels.compiling import inner, inner_in_parallel, kernel
+from solvers.kernels.springs import add_descent, add_projection, squared_norm
+from solvers.linear.supernodal_solve import _backwards as backwards
+from solvers.linear.supernodal_solve import _forwards as forwards
+
+
+class Plan(NamedTuple):
+    """What is done in which order, and on what.
+
+    squares, panels, places, chunks: a factor's (see `solvers.linear.supernodal`); top (3,): the first and last of the
+    top's rows, and the number of groups; blocks (b, 7): of each its first and last slot and bundle, its first chunk,
+    and the last for the passes forwards and backwards; leaf (b,): whether it holds whole subtrees, whose vertices have
+    springs to each other and to ancestors alone; of_group (groups + 2,): the first block of each group and of the top;
+    held: m/dt^2 + w [N/m] of each row; measure: m/dt^2 and half of the springs to exactly
+    pinned vertices, which no bundle counts from there; loose: 1 for the rows of vertices that no pin holds, else 0;
+    shift: by how many rows a vertex's right-hand side lies behind its position.
+    """
+
+    squares: NDArray[np.float64]
+    panels: NDArray[np.float64]
+    places: NDArray[np.int32]
+    chunks: NDArray[np.int64]
+    top: NDArray[np.int64]
+    blocks: NDArray[np.int64]
+    leaf: NDArray[np.bool_]
+    of_group: NDArray[np.int64]
+    held: NDArray[np.float64]
+    measure: NDArray[np.float64]
+    loose: NDArray[np.float64]
+    shift: int
+
+
+@inner
+def _up(plan, bundles, block, x, y, p, out):
+    """The local step of a block at x (at p, where that is given), and its pass forwards."""
+    _, _, bundle, bundle_end, chunk, chunk_end, _ = plan.blocks[block]
+    if p is None:
+        add_projection(bundles, bundle, bundle_end, x, y, plan.held, out, plan.shift)
+    else:
+        add_descent(bundles, bundle, bundle_end, p, y, plan.held, out, plan.shift)
+    forwards(plan.panels, plan.places, plan.chunks, chunk, chunk_end, out)
+
+
+@inner
+def _down(plan, block, x, p):
+    """The pass backwards over a block, and the correction of its positions."""
+    slot, slot_end, _, _, chunk, _, chunk_end = plan.blocks[block]
+    backwards(plan.squares, plan.panels, plan.places, plan.chunks, chunk, chunk_end, x)
+    if p is not None:
+        for k in range(4 * slot, 4 * slot_end):
+            p[k] += x[k]
+
+
+@inner
+def _clear(plan, block, out):
+    begin, end = plan.blocks[block, 0] + plan.shift, plan.blocks[block, 1] + plan.shift
+    for k in range(4 * begin, 4 * end):
+        out[k] = 0.0
+
+
+@inner
+def _group(plan, bundles, group, x, y, p, out, down, up):
+    """A group: down with the vector x, and up again with `out`, block by block."""
+    begin, end = plan.of_group[group], plan.of_group[group + 1]
+    top = 4 * plan.top[0]
+    size = 4 * plan.top[1] - top
+    copy = top + (group + 1) * size
+    if down:
+        for k in range(size):
+            x[copy + k] = x[top + k]
+    if up:
+        for k in range(size):
+            out[copy + k] = 0.0
+        for block in range(begin, end):
+            if not plan.leaf[block]:
+                _clear(plan, block, out)
+    # First from the last block to the first, then from the first to the last.
+    for visit in range(2 * (end - begin)):
+        back = begin + visit < end
+        block = end - 1 - visit if back else 2 * begin - end + visit
+        if back and down:
+            _down(plan, block, x, p)
+        if up and plan.leaf[block] == back:
+            if back:
+                _clear(plan, block, out)
+            _up(plan, bundles, block, x, y, p, out)
+
+
+@inner
+def _turn(plan, bundles, x, y, p, out):
+    """The top: up at the positions x, and down again."""
+    top, top_end, groups = plan.top
+    size = 4 * (top_end - top)
+    for k in range(4 * top, 4 * top + size):
+        total = out[k + size]
+        for group in range(1, groups):
+            total += out[k + (group + 1) * size]
+        out[k] = total
+    for block in range(plan.of_group[-2], plan.of_group[-1]):
+        _up(plan, bundles, block, x, y, p, out)
+        _down(plan, block, out, p)
+
+
+@inner
+def _groups(plan, bundles, x, y, p, out, down, up):
+    for group in range(plan.top[2]):
+        _group(plan, bundles, group, x, y, p, out, down, up)
+
+
+@inner_in_parallel
+def _groups_in_parallel(plan, bundles, x, y, p, out, down, up):
+    for group in prange(plan.top[2]):
+        _group(plan, bundles, group, x, y, p, out, down, up)
+
+
+@inner
+def _residual(plan, bundles, x, before, p, e):
+    """|p^k - p^(k-1)|_Q [J^(1/2)] over the vertices that no pin holds; e: scratch."""
+    for i in range(len(plan.loose)):
+        for k in range(4 * i, 4 * i + 3):
+            e[k] = plan.loose[i] * (x[k] - before[k] if p is None else x[k])
+    return np.sqrt(squared_norm(bundles, 0, len(bundles.start) - 1, e, plan.measure))
+
+
+@kernel
+def local(plan, bundles, x, y, p, out):
+    """The local step alone, of all blocks."""
+    for k in range(len(out)):
+        out[k] = 0.0
+    if p is None:
+        add_projection(bundles, 0, len(bundles.start) - 1, x, y, plan.held, out, plan.shift)
+    else:
+        add_descent(bundles, 0, len(bundles.start) - 1, p, y, plan.held, out, plan.shift)
+
+
+@kernel
+def iterate(plan, bundles, vectors, y, p, iterations, limit, floor, every, threads):
+    """Iterate from the positions in the first vector, or from p where that is given, which then takes the positions.
+
+    vectors: three that take turns, and one for scratch, of float64; y: the constant right-hand side; every: whether
+    the iterations end once a residual is at most `limit` or `floor`; threads: None for one.
+    Returns how many were done, the last one's residual (nan where none was wanted: limit is nan), and the last vector.
+    """
+    a, b, c, e = vectors
+    residual = np.nan
+    k = 0
+    while True:
+        # Positions p^k are in a, or on the way there, and those before in c.
+        if threads is None:
+            _groups(plan, bundles, a, y, p, b, k > 0, k < iterations)
+        else:
+            _groups_in_parallel(plan, bundles, a, y, p, b, k > 0, k < iterations)
+        if k > 0 and (every or (k == iterations and not np.isnan(limit))):
+            residual = _residual(plan, bundles, a, c, p, e)
+        if k == iterations or (k > 0 and every and (residual <= limit or residual <= floor)):
+            return k, residual, a
+        _turn(plan, bundles, a, y, p, b)
+        a, b, c = b, c, a
+        k += 1

@@ -1,0 +1,102 @@
+"""A step's beginning and end: from the problem's arrays to the rows of the kernels, and back."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.kernels.compiling import inner, kernel
+from solvers.kernels.step import iterate
+
+
+class Rows(NamedTuple):
+    """Where vertices lie, and what is constant of their right-hand side.
+
+    row (n,): of each vertex; inertia: m/dt^2 (n,) [N/m]; weight: of each pin (q,) [N/m], infinite for an exact one;
+    pinned (q,): its vertex; coupling: Q's entries [N/m] between free and exactly pinned vertices, with the row of the
+    one (coupled) and the pin of the other (pin), none of them where corrections are solved for.
+    """
+
+    row: NDArray[np.int64]
+    inertia: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    pinned: NDArray[np.int64]
+    coupling: NDArray[np.float64]
+    coupled: NDArray[np.int64]
+    pin: NDArray[np.int64]
+
+
+@kernel
+def state(rows, target, force, pin_targets, y):
+    """y = M target/dt^2 + f + w C'C p_pin, with the exact pins' columns of Q moved to the right-hand side."""
+    for v in range(len(target)):
+        for c in range(3):
+            y[4 * rows.row[v] + c] = rows.inertia[v] * target[v, c] + force[v, c]
+    for q in range(len(rows.pinned)):
+        if rows.weight[q] < np.inf:
+            for c in range(3):
+                y[4 * rows.row[rows.pinned[q]] + c] += rows.weight[q] * pin_targets[q, c]
+    for k in range(len(rows.coupling)):
+        for c in range(3):
+            y[4 * rows.coupled[k] + c] -= rows.coupling[k] * pin_targets[rows.pin[k], c]
+
+
+@inner
+def pin(rows, pin_targets, x):
+    """Put the exactly pinned vertices on their targets."""
+    for q in range(len(rows.pinned)):
+        if rows.weight[q] == np.inf:
+            for c in range(3):
+                x[4 * rows.row[rows.pinned[q]] + c] = pin_targets[q, c]
+
+
+@inner
+def place(rows, positions, pin_targets, x):
+    """Positions to the rows of x, exactly pinned vertices on their targets; returns the largest coordinate."""
+    for v in range(len(positions)):
+        for c in range(3):
+            x[4 * rows.row[v] + c] = positions[v, c]
+    pin(rows, pin_targets, x)
+    largest = 0.0
+    for v in range(len(positions)):
+        for c in range(3):
+            largest = max(largest, abs(x[4 * rows.row[v] + c]))
+    return largest
+
+
+@kernel
+def fetch(rows, x, out):
+    """The rows of x back to positions (n, 3)."""
+    for v in range(len(out)):
+        for c in range(3):
+            out[v, c] = x[4 * rows.row[v] + c]
+
+
+@kernel
+def start(rows, vectors, p, positions, pin_targets):
+    """Put the positions to where the iterations begin; returns the largest coordinate."""
+    if p is not None:
+        return place(rows, positions, pin_targets, p)
+    pin(rows, pin_targets, vectors[1])
+    pin(rows, pin_targets, vectors[2])
+    return place(rows, positions, pin_targets, vectors[0])
+
+
+@kernel
+def solve(
+    plan, bundles, rows, vectors, y, p, target, force, pin_targets, guess, iterations, limit, floor, every, threads, out
+):
+    """A whole step; `limit`, `floor` and `every` as in `iterate`, but `floor` for a largest coordinate of one.
+
+    Returns the count of iterations, the residual [J^(1/2)], and whether it is at most `limit`, or `floor`.
+    """
+    state(rows, target, force, pin_targets, y)
+    floor *= start(rows, vectors, p, guess, pin_targets)
+    count, residual, x = iterate(plan, bundles, vectors, y, p, iterations, limit, floor, every, threads)
+    if p is None:
+        fetch(rows, x, out)
+    else:
+        fetch(rows, p, out)
+    return count, residual, residual <= limit, residual <= floor
