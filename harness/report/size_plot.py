@@ -15,14 +15,13 @@ from harness.report.page import axes, count, header, new_page, quantity, save, s
 from harness.report.style import HEIGHT, PAGE, RC, WIDTH, marks
 
 _LEFT, _TOP, _NAMES, _BELOW = 110, 130, 400, 70
-_DASHES = ("-", (0, (5, 2)), (0, (1, 1.6)), (0, (6, 2, 1, 2)), (0, (3, 1, 1, 1, 1, 1)))
 
 
 class Series(NamedTuple):
-    """The line of a candidate: its name, its solver (which has a colour), vertices and values (k,) each."""
+    """The line of a candidate: its name, the family that shares its colour, vertices and values (k,) each."""
 
     name: str
-    solver: str
+    family: str
     vertices: Sequence[int]
     values: Sequence[float]
 
@@ -30,25 +29,22 @@ class Series(NamedTuple):
 def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[Series], *, share: bool) -> None:
     """Draw to `path`, WIDTH x HEIGHT pixels, PNG; `share`: values are parts of a whole, drawn in percent.
 
-    Of one solver the candidates differ in their dashes and, beyond those, in the shade of its colour.
+    The line of a family's namesake is solid, those of its other members are dashed.
     """
     drawn = [line for line in series if line.values]
-    looks = marks(line.solver for line in drawn)
+    looks = marks(line.family for line in drawn)
     with matplotlib.rc_context(RC):
         page = new_page()
         header(page, title, facts, letters=84)
         ax = axes(page, _LEFT, _TOP, WIDTH - _LEFT - _NAMES, HEIGHT - _TOP - _BELOW)
         handles: list[tuple[float, Line2D]] = []
-        for k, line in enumerate(drawn):
-            place = sum(other.solver == line.solver for other in drawn[:k])
-            alike = sum(other.solver == line.solver for other in drawn)
-            look = looks[line.solver]
-            color = matplotlib.colormaps["viridis"](0.8 * place / max(1, alike - 1)) if alike > 3 else look.color
+        for line in drawn:
+            look = looks[line.family]
             (handle,) = ax.plot(
                 line.vertices,
                 line.values,
-                color=color,
-                linestyle=_DASHES[place % len(_DASHES)],
+                color=look.color,
+                linestyle="-" if line.name == line.family else (0, (4, 2)),
                 linewidth=1.8,
                 marker=look.marker,
                 markersize=6,

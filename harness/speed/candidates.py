@@ -51,10 +51,14 @@ class Candidate(Protocol):
 
 
 class SolverCandidate:
-    """A solver of the registry, asked for the same step each time."""
+    """A solver of the registry, asked for the same step each time.
 
-    def __init__(self, run: RunSpec, scene: Scene, problem: StepProblem) -> None:
-        self.run = run
+    Candidates that differ in their threads alone are timed on one factor, in `prepared`: large ones would not fit
+    into memory side by side.
+    """
+
+    def __init__(self, run: RunSpec, scene: Scene, problem: StepProblem, prepared: dict[str, Prepared]) -> None:
+        self.run, self._shared = run, prepared
         self.columns: dict[str, Any] = {}
         self._scene, self._problem = scene, problem
         self._solver = load(SOLVERS[run.solver.name])(**run.solver.parameters)
@@ -68,7 +72,7 @@ class SolverCandidate:
         prepared = self._solver.prepare(self._scene.system)
         seconds = perf_counter() - began
         if self._prepared is None:
-            self._prepared = prepared
+            self._prepared = prepared = self._shared.setdefault(str(self._solver), prepared)
             counts = self._scene.system.vertices, len(self._scene.springs.edges)
             self._work = work.count(prepared.facts, *counts, self.run.solver.parameters.get("precision", "float64"))
             self.columns = {name: int(value) for name, value in prepared.facts.items()}

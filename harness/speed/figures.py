@@ -50,7 +50,7 @@ class Figures(NamedTuple):
     size: int
     vertices: int
     label: str
-    solver: str
+    threads: int
     status: str
     reason: str | None
     choice: str | None
@@ -139,7 +139,7 @@ def _labels(firsts: Sequence[Row]) -> dict[str, str]:
 def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], machine: Machine) -> Figures:
     first = found[0]
     known = Figures(
-        *(first["scene"], first["size"], first["vertices"], label, first["solver"]),
+        *(first["scene"], first["size"], first["vertices"], label, first["threads"]),
         *(first["status"], first["reason"], first["choice"]),
     )
     if first["status"] != "ok":

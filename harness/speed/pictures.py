@@ -48,9 +48,9 @@ def _series(members: Sequence[Figures], picture: Picture) -> list[Series]:
     """A line for each candidate of a scene."""
     lines = []
     for label in dict.fromkeys(f.label for f in members):
-        points = [(f.vertices, picture.value(f), f.solver) for f in members if f.label == label]
-        told = [(n, value, solver) for n, value, solver in points if value is not None]
-        if told:
-            n, values, solvers = zip(*told, strict=True)
-            lines.append(Series(label, solvers[0], n, values))
+        points = [(f.vertices, value) for f in members if f.label == label and (value := picture.value(f)) is not None]
+        if points:
+            n, values = zip(*points, strict=True)
+            threads = next(f.threads for f in members if f.label == label)
+            lines.append(Series(label, label.removesuffix(f" x{threads}"), n, values))
     return lines

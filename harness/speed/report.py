@@ -23,6 +23,7 @@ from harness.spec import RunSpec, SolverSpec
 from harness.speed import yardstick
 from harness.speed.candidates import Candidate, MachineCandidate, SolverCandidate, YardstickCandidate
 from harness.speed.turns import Past, measure, name
+from solvers.problem import Prepared
 
 MACHINE, YARDSTICK = "machine", "eigen"
 
@@ -82,13 +83,14 @@ def _measured(
     scene = build(runs[0].scene, runs[0].size)
     stated = problem(scene, start(scene), runs[0].first_guess)
     program = partial(yardstick.build, folder / "build")
+    prepared: dict[str, Prepared] = {}
 
     def candidate(run: RunSpec) -> Candidate:
         if run.solver.name == MACHINE:
             return MachineCandidate(run)
         if run.solver.name == YARDSTICK:
             return YardstickCandidate(run, scene, stated, program, TEMPORARIES[run.solver.parameters["temporaries"]])
-        return SolverCandidate(run, scene, stated)
+        return SolverCandidate(run, scene, stated, prepared)
 
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
     return measure([candidate(run) for run in runs], counts, past, budget)

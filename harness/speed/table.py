@@ -83,7 +83,7 @@ def remarks(found: Sequence[Figures]) -> list[str]:
     for f in sorted(found, key=lambda f: f.status == "ok"):
         if f.status != "ok":
             told[f"{f.label}: {f.status}: {f.reason}"].append(str(f.size))
-        elif f.choice:
+        elif f.choice and "auto" in f.label.split():
             told[f"{f.label} chose {f.choice}"].append(str(f.size))
     said = [f"{words} (at {', '.join(sizes)})" for words, sizes in told.items()]
     for label, exponent in exponents(found).items():
