@@ -40,9 +40,7 @@ class InputError(SpringbenchError):
     def __init__(self, mistakes: Mistake | str | Sequence[Mistake]) -> None:
         if isinstance(mistakes, str):
             mistakes = Mistake(mistakes)
-        self.mistakes: tuple[Mistake, ...] = (
-            (mistakes,) if isinstance(mistakes, Mistake) else tuple(mistakes)
-        )
+        self.mistakes: tuple[Mistake, ...] = (mistakes,) if isinstance(mistakes, Mistake) else tuple(mistakes)
         super().__init__("\n".join(map(str, self.mistakes)))
 
 
