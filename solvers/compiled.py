@@ -25,7 +25,7 @@ from solvers.linear.choice import Linear, Precision, factorise
 from solvers.linear.inverse import Inverse
 from solvers.linear.supernodal import Supernodal
 from solvers.local_global import PreparedLocalGlobal, Project, only_springs, prepared
-from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System
+from solvers.problem import Positions, Solution, StepProblem, StopRule, System
 
 _FAR = 1e100
 """Where the springs end that fill up bundles: at no vertex, whatever the unit of length."""
@@ -41,7 +41,7 @@ class CompiledLocalGlobal:
     linear: Linear = "auto"
     precision: Precision = "float64"
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedLocalGlobal | PreparedCompiled:
         """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
         springs = only_springs(system, "numba")
         base = prepared(system, [springs], lambda Q: factorise(Q, self.linear, self.precision))

@@ -9,11 +9,20 @@ import numpy as np
 import pytest
 
 from harness.trace import EnergyNorm, trace
+from solvers.compiled import CompiledLocalGlobal
 from solvers.problem import Positions, StepProblem, StopRule
 from solvers.registry import SOLVERS, load
 from tests.scenes import cloth, first_problem, frozen, random_problem
 
-solvers = pytest.mark.parametrize("solver", [load(target)() for target in SOLVERS.values()], ids=list(SOLVERS))
+FORCED = {
+    "numba, inverse in float32": CompiledLocalGlobal("inverse", "float32"),
+    "numba, cholespy": CompiledLocalGlobal("cholespy"),
+    "numba, supernodal": CompiledLocalGlobal("supernodal"),
+    "numba, supernodal in float32": CompiledLocalGlobal("supernodal", "float32"),
+    "numba, supernodal in float16": CompiledLocalGlobal("supernodal", "float16"),
+}
+CHOICES = {name: load(target)() for name, target in SOLVERS.items()} | FORCED
+solvers = pytest.mark.parametrize("solver", CHOICES.values(), ids=list(CHOICES))
 
 PROBLEMS = {
     "cloth": lambda: first_problem(cloth(10)),

@@ -1,0 +1,199 @@
+"""The compiled step: its kernels against plain NumPy, its blocks, every linear solver and precision."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice, pairwise
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from solvers.compiled import CompiledLocalGlobal, PreparedCompiled
+from solvers.energies.springs import Springs
+from solvers.kernels import plan
+from solvers.kernels.springs import Bundles, aligned, project
+from solvers.linear.choice import Linear, Precision
+from solvers.local_global import SparseLocalGlobal
+from solvers.matrices import assemble, energy_norm
+from solvers.problem import Positions, StepProblem, StopRule
+from tests.scenes import cloth, first_problem, random_network, random_problem
+
+LINEAR: tuple[Linear, ...] = ("inverse", "supernodal")
+PRECISIONS: tuple[Precision, ...] = ("float64", "float32", "float16")
+DIRECT = [CompiledLocalGlobal(linear, precision) for linear in LINEAR for precision in PRECISIONS]
+"""The linear solvers whose panels the step goes through, in every precision."""
+LESS = [solver for solver in DIRECT if solver.precision != "float64"]
+ROUND_OFF = 1e-14
+"""Of a sum of some dozen terms, relative to their magnitude."""
+
+
+def named(solver: CompiledLocalGlobal) -> str:
+    return f"{solver.linear}, {solver.precision}"
+
+
+direct = pytest.mark.parametrize("solver", DIRECT, ids=named)
+less = pytest.mark.parametrize("solver", LESS, ids=named)
+
+
+def iterates(prepared, problem: StepProblem, count: int) -> list[Positions]:
+    return [p.copy() for p in islice(prepared.iterates(problem), count)]
+
+
+def local(springs: Springs, p: Positions, y: Positions) -> Positions:
+    """The local step by the kernel, over all vertices."""
+    n = len(p)
+    bundles, _ = Bundles.of(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
+    x, b, zero = (aligned(4 * (n + 2)) for _ in range(3))
+    x[4 * (n + 1)] = 1e100
+    out = np.empty_like(p)
+    project(bundles, p, y, x, b, zero, out)
+    return out
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1e-90, 1e-3, 1.0, 1e3, 1e100]))
+def test_the_local_step_is_that_of_the_energy(seed, scale):
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(1, 40)), int(rng.integers(0, 200))
+    _, springs = random_network(rng, n, m)
+    p, y = scale * rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
+    p[rng.random(n) < 0.2] = p[0]  # springs of no length beside others
+    wanted = y.copy()
+    springs.add_projection(p, wanted)
+    pull = np.bincount(springs.edges.ravel(), np.repeat(springs.stiffness * springs.rest_length, 2), n)
+    assert (np.abs(local(springs, p, y) - wanted) <= ROUND_OFF * (np.abs(y) + pull[:, None])).all()
+
+
+def test_positions_that_are_not_numbers_stay_so_where_they_are_and_at_their_neighbours():
+    rest = np.arange(12.0).reshape(4, 3)
+    springs = Springs.at_rest(rest, np.array([[0, 1], [1, 2], [2, 3]]), np.ones(3))
+    rest[0] = np.nan
+    assert np.isnan(local(springs, rest, np.zeros((4, 3)))).any(axis=1).tolist() == [True, True, False, False]
+
+
+def test_inverse_roots_are_right_to_the_last_digit():
+    lengths = 10.0 ** np.random.default_rng(0).uniform(-130, 130, 8000)
+    springs = Springs.at_rest(np.zeros((8001, 3)), np.array([[i, 8000] for i in range(8000)]), np.ones(8000))
+    springs = replace(springs, rest_length=np.ones(8000))
+    p = np.zeros((8001, 3))
+    p[:8000, 0] = lengths
+    unit = local(springs, p, np.zeros_like(p))[:8000, 0]
+    assert np.abs(unit - 1.0).max() <= 4 * np.finfo(float).eps  # a root, its reciprocal and two products
+
+
+PROBLEMS = {
+    "cloth": lambda: first_problem(cloth(8)),
+    "cloth, exact pins": lambda: first_problem(cloth(8, "exact")),
+    "random": lambda: random_problem(0, weights=(1e4, np.inf, 1e2)),
+    "random, not pinned": lambda: random_problem(1, weights=()),
+}
+problems = pytest.mark.parametrize("name", PROBLEMS)
+
+
+@direct
+@problems
+def test_every_precision_ends_where_float64_ends(solver, name):
+    problem = PROBLEMS[name]()
+    wanted = iterates(SparseLocalGlobal().prepare(problem.system), problem, 6000)[-1]
+    found = solver.prepare(problem.system).solve(problem, StopRule(6000)).positions
+    # What was asked of the method, of a scene of size one; rates of convergence leave less than 1e-11.
+    assert np.abs(found - wanted).max() <= 1e-9
+
+
+@less
+@problems
+@pytest.mark.parametrize("start", [1.0, 0.0], ids=["from the guess", "from one point"])
+def test_the_energy_never_rises_with_a_rounded_factor(solver, name, start):
+    problem = PROBLEMS[name]()
+    problem = replace(problem, first_guess=start * problem.first_guess)
+    iterated = iterates(solver.prepare(problem.system), problem, 60)
+    for before, after in pairwise(iterated):
+        # A hundred terms' round-off. The rounded factor still majorises: nothing is added for it.
+        assert problem.value(after) <= problem.value(before) + 1e-13 * problem.magnitude(before)
+    assert problem.value(iterated[-1]) < problem.value(iterated[0])
+
+
+@pytest.mark.parametrize("solver", [s for s in DIRECT if s.precision == "float64"], ids=named)
+@problems
+def test_collapsed_positions_come_apart_as_in_the_sparse_backend(solver, name):
+    problem = PROBLEMS[name]()
+    problem = replace(problem, first_guess=np.zeros_like(problem.target))
+    wanted = iterates(SparseLocalGlobal().prepare(problem.system), problem, 1)[0]
+    found = iterates(solver.prepare(problem.system), problem, 1)[0]
+    assert np.abs(found - wanted).max() <= 1e-10 * np.abs(wanted).max()  # a solve, by the condition of Q
+
+
+@pytest.mark.parametrize("solver", DIRECT[3:], ids=named)
+@pytest.mark.parametrize("size", [3000, 30_000], ids="blocks of {} bytes".format)
+def test_blocks_change_nothing_but_the_order_of_work(solver, size, monkeypatch):
+    """A sheet large enough for groups, in one block each and in many, with one thread and two."""
+    problem = first_problem(cloth(60))
+    whole = solver.prepare(problem.system)
+    monkeypatch.setattr(plan, "BLOCK_BYTES", size)
+    cut = solver.prepare(problem.system)
+    assert isinstance(cut, PreparedCompiled)
+    assert isinstance(whole, PreparedCompiled)
+    assert len(cut.plan.blocks) > 10 > len(whole.plan.blocks)
+    assert 0 < np.count_nonzero(cut.plan.leaf) < len(cut.plan.leaf)
+    expected = whole.solve(problem, StopRule(12)).positions
+    found = cut.solve(problem, StopRule(12)).positions
+    # Ancestors add what comes from below in another order: the last digits, of the precision that corrections have.
+    assert np.abs(found - expected).max() <= {"float64": 1e-11, "float32": 1e-4, "float16": 1e-4}[solver.precision]
+    np.testing.assert_array_equal(found, iterates(cut, problem, 12)[-1])
+
+
+@pytest.mark.skipif(numba.get_num_threads() < 2, reason="Numba was started with one thread")
+@pytest.mark.parametrize("solver", DIRECT[3:], ids=named)
+@pytest.mark.parametrize("stop", [StopRule(10), StopRule(200, 0.3)], ids=["count", "tolerance"])
+def test_the_bits_do_not_depend_on_the_number_of_threads(solver, stop):
+    problem = first_problem(cloth(60))
+    before, found = numba.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            numba.set_num_threads(threads)
+            found.append(solver.prepare(problem.system).solve(problem, stop))
+    finally:
+        numba.set_num_threads(before)
+    np.testing.assert_array_equal(found[0].positions, found[1].positions)
+    assert (found[0].residual, found[0].iterations) == (found[1].residual, found[1].iterations)
+
+
+@direct
+@problems
+def test_the_residual_is_measured_over_the_vertices_that_no_pin_holds(solver, name):
+    problem = PROBLEMS[name]()
+    system = problem.system
+    prepared = solver.prepare(system)
+    before, after = iterates(prepared, problem, 5)[-2:]
+    Q = assemble(system, [e for e in system.energies if isinstance(e, Springs)])
+    e = np.where(system.unpinned[:, None], after - before, 0.0)
+    solution = prepared.solve(problem, StopRule(5))
+    assert solution.residual == pytest.approx(energy_norm(Q, e), rel=1e-6)  # half the digits, or those of a correction
+
+
+def test_no_iteration_is_the_first_guess():
+    problem = random_problem(2)
+    for solver in DIRECT:
+        solution = solver.prepare(problem.system).solve(problem, StopRule(0))
+        soft = problem.system.free
+        np.testing.assert_array_equal(solution.positions[soft], problem.first_guess[soft])
+        assert solution.iterations == 0
+        assert np.isnan(solution.residual)
+
+
+def test_all_vertices_may_be_pinned_exactly():
+    problem = random_problem(3, n=4, m=8, weights=(np.inf,) * 4)
+    for solver in DIRECT:
+        found = solver.prepare(problem.system).solve(problem, StopRule(3)).positions
+        np.testing.assert_array_equal(found, problem.pin_targets)
+
+
+def test_a_prepared_solver_says_what_it_chose_and_counts_it():
+    system = first_problem(cloth(8)).system
+    for solver in DIRECT:
+        prepared = solver.prepare(system)
+        assert prepared.choice.startswith(solver.linear)
+        assert prepared.facts["panel_bytes"] > 0
+        assert prepared.facts["flops_per_solve"] > 0
