@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MultipleLocator, NullLocator
 
 from harness.report.page import axes, count, header, new_page, quantity, save, shorten
-from harness.report.style import HEIGHT, PAGE, RC, WIDTH, marks
+from harness.report.style import HEIGHT, PAGE, RC, WIDTH, mark
 
 _LEFT, _TOP, _NAMES, _BELOW = 110, 130, 400, 70
 
@@ -29,10 +29,11 @@ class Series(NamedTuple):
 def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[Series], *, share: bool) -> None:
     """Draw to `path`, WIDTH x HEIGHT pixels, PNG; `share`: values are parts of a whole, drawn in percent.
 
-    The line of a family's namesake is solid, those of its other members are dashed.
+    The line of a family's namesake is solid, those of its other members are dashed. A series without values is not
+    drawn; it keeps its family's colour free, so that pictures of the same candidates have the same colours.
     """
     drawn = [line for line in series if line.values]
-    looks = marks(line.family for line in drawn)
+    looks = {family: mark(k) for k, family in enumerate(dict.fromkeys(line.family for line in series))}
     with matplotlib.rc_context(RC):
         page = new_page()
         header(page, title, facts, letters=84)

@@ -52,5 +52,10 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "h")
 def marks(solvers: Iterable[str]) -> dict[str, Mark]:
     """A mark for each solver name: by the registry's order, then by alphabet."""
     names = (*SOLVERS, *sorted(set(solvers) - set(SOLVERS)))
-    # The marker moves on once more with each turn of the colours: 64 different pairs.
-    return {name: Mark(_COLORS[i % 8], _MARKERS[(i + i // 8) % 8]) for i, name in enumerate(names)}
+    return {name: mark(i) for i, name in enumerate(names)}
+
+
+def mark(number: int) -> Mark:
+    """The mark of this number, from 0: 64 different ones, the first 8 in different colours."""
+    # The marker moves on once more with each turn of the colours.
+    return Mark(_COLORS[number % 8], _MARKERS[(number + number // 8) % 8])

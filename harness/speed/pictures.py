@@ -48,9 +48,8 @@ def _series(members: Sequence[Figures], picture: Picture) -> list[Series]:
     """A line for each candidate of a scene."""
     lines = []
     for label in dict.fromkeys(f.label for f in members):
-        points = [(f.vertices, value) for f in members if f.label == label and (value := picture.value(f)) is not None]
-        if points:
-            n, values = zip(*points, strict=True)
-            threads = next(f.threads for f in members if f.label == label)
-            lines.append(Series(label, label.removesuffix(f" x{threads}"), n, values))
+        mine = [f for f in members if f.label == label]
+        points = sorted((f.vertices, value) for f in mine if (value := picture.value(f)) is not None)
+        family = label.removesuffix(f" x{mine[0].threads}")
+        lines.append(Series(label, family, [n for n, _ in points], [value for _, value in points]))
     return lines
