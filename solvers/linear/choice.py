@@ -44,6 +44,12 @@ _BYTES_PER_FLOP = 0.4
 _ITERATIONS = 10
 """Of conjugate gradients to their tolerance: 9 to 11 on sheets and solids of 1e4 to 1e6 vertices."""
 
+_ROUNDING: dict[Precision, float] = {"float64": 0.0, "float32": 0.5, "float16": 1.25}
+"""What rounding a factor needs beside its float64 panels, in their size; the fronts are gone by then."""
+
+_BYTES_PER_VERTEX = 200
+"""Of the structure of a factor: 180 on a sheet of 512 vertices a side."""
+
 _BYTES_READ, _BYTES_KEPT = 70, 60
 """Of an entry of Q by an iteration (with the coarse levels), and in memory at most while they are made; a vertex
 counts as four entries, for its vectors. The first fits sheets and solids of 1e6 vertices to a tenth, the second is
@@ -128,7 +134,7 @@ def estimate(s: Symbolic, precision: Precision = "float64") -> Estimate:
     panels = 8 * (layout.squares + layout.panels)
     kept = panels if precision == "float64" else 4 * layout.squares + half * layout.panels
     fronts, flops = _factorisation(s.parent, s.first, s.row_start, s.sequence)
-    memory = panels + (kept if precision != "float64" else 0) + 8 * fronts + 100 * len(s.slot)
+    memory = panels + max(8 * fronts, _ROUNDING[precision] * panels) + _BYTES_PER_VERTEX * len(s.slot)
     words = f"its factor has {s.nonzeros:,} entries, {_size(kept)} in {precision}, after {flops:.1e} flops"
     return Estimate(memory, 2 * kept + _BYTES_PER_FLOP * flops / _SOLVES, words)
 
