@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.effects.base import Contribution, Force, Pin, VelocityFilter
+from harness.effects.base import Contribution, Force, Pin, Steady, VelocityFilter
 from harness.errors import InputError, Mistake
 from harness.mesh.base import Mesh
 from harness.spec import SceneSpec
@@ -19,12 +19,14 @@ from solvers.problem import Pins, Positions, System
 class Scene:
     """What is simulated.
 
-    mesh: at rest, which is also the start; system: what is factorised; forces and filters: the effects';
+    mesh: at rest, which is also the start; system: what is factorised; load: the sum of the forces that never
+    change, (n, 3) [N], read-only; forces: those that change; filters: of the velocity;
     pin_targets: (q, 3) [m], in the order of `system.pins`; velocity: of every vertex at the start [m/s].
     """
 
     mesh: Mesh
     system: System
+    load: Positions
     forces: tuple[Force, ...]
     filters: tuple[VelocityFilter, ...]
     pin_targets: Positions
@@ -46,10 +48,17 @@ def build(spec: SceneSpec, size: int) -> Scene:
     parts = [_bound(spec, i, mesh, mass) for i in range(len(spec.effects))]
     pins, targets = _pins(parts)
     energies = tuple(energy for part in parts for energy in part.energies)
+    forces = [force for part in parts for force in part.forces]
+    load = np.zeros_like(mesh.rest)
+    for force in forces:
+        if isinstance(force, Steady):
+            load += force.force
+    load.flags.writeable = False
     return Scene(
         mesh=mesh,
         system=System(mass=mass, time_step=spec.time_step, energies=energies, pins=pins),
-        forces=tuple(force for part in parts for force in part.forces),
+        load=load,
+        forces=tuple(force for force in forces if not isinstance(force, Steady)),
         filters=tuple(one for part in parts for one in part.filters),
         pin_targets=targets,
         velocity=spec.velocity,

@@ -40,14 +40,15 @@ def start(scene: Scene) -> State:
 
 def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
     """The next step's problem from a state; `first_guess` is a key of `FIRST_GUESSES`."""
-    dt = scene.system.time_step
-    moved = state.positions - state.previous
+    dt, p = scene.system.time_step, state.positions
+    target = p - state.previous
     if scene.filters:
-        moved = dt * reduce(lambda v, filtered: filtered(v), scene.filters, moved / dt)
-    target = state.positions + moved
-    force = np.zeros_like(target)
-    for effect in scene.forces:
-        force += effect(state.positions, moved / dt, state.index * dt)
+        target = dt * reduce(lambda v, filtered: filtered(v), scene.filters, target / dt)
+    force = scene.load
+    if scene.forces:
+        v = target / dt
+        force = reduce(lambda total, effect: total + effect(p, v, state.index * dt), scene.forces, force)
+    target += p
     current = _pinned(scene, state.positions)
     stated = StepProblem(scene.system, target, force, scene.pin_targets, current, current)
     return FIRST_GUESSES[first_guess](stated, scene, state)

@@ -61,7 +61,18 @@ class Effect(Protocol):
         ...
 
 
-def steady(force: Positions) -> tuple[Force, ...]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Steady:
+    """A force (n, 3) [N] that never changes; a scene adds all of these up once."""
+
+    force: Positions
+
+    def __call__(self, p: Positions, v: Positions, t: float) -> Positions:
+        """The same force at all times."""
+        return self.force
+
+
+def steady(force: Positions) -> tuple[Steady, ...]:
     """A force (n, 3) [N] that never changes; none at all where it is zero everywhere."""
     force.flags.writeable = False
-    return (lambda p, v, t: force,) if force.any() else ()
+    return (Steady(force),) if force.any() else ()

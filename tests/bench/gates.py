@@ -7,7 +7,8 @@ what counts there is how long one waits, the wall time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,7 +28,7 @@ from harness.scene import Scene, build
 from harness.simulate import Step, simulate
 from harness.spec import SceneSpec
 from solvers.local_global import PreparedLocalGlobal
-from solvers.problem import Positions, Prepared, StopRule
+from solvers.problem import Positions, Prepared, Solution, StopRule
 from solvers.registry import SOLVERS, load
 
 THREADS = 1
@@ -74,7 +75,7 @@ def simulated(solver: str, size: int, frames: int) -> Work:
     """Whole steps through the harness; the last positions [m]."""
     scene = sheet(size)
     prepared = prepare(solver, scene)
-    return lambda: steps(scene, prepared, frames)[-1].solution.positions
+    return lambda: last(step.solution for step in simulate(scene, prepared, STOP, first_guess="current", frames=frames))
 
 
 def solved(solver: str, size: int, frames: int) -> Work:
@@ -82,7 +83,13 @@ def solved(solver: str, size: int, frames: int) -> Work:
     scene = sheet(size)
     prepared = prepare(solver, scene)
     problems = [step.problem for step in steps(scene, prepared, frames)]
-    return lambda: [prepared.solve(problem, STOP) for problem in problems][-1].positions
+    return lambda: last(prepared.solve(problem, STOP) for problem in problems)
+
+
+def last(solutions: Iterable[Solution]) -> Positions:
+    """The last solution's positions; the others are let go at once, for new pages of memory take time too."""
+    (solution,) = deque(solutions, maxlen=1)
+    return solution.positions
 
 
 def projected(solver: str, size: int, repeats: int, **parameters: str) -> Work:

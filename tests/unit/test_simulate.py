@@ -107,7 +107,7 @@ def test_forces_are_taken_at_the_start_of_the_step():
     np.testing.assert_array_equal(p, STATE.positions)
     np.testing.assert_allclose(v, (STATE.positions - STATE.previous) / DT, rtol=1e-15)
     assert t == 7 * DT
-    np.testing.assert_array_equal(stated.force, np.full((4, 3), 2.0))
+    np.testing.assert_array_equal(stated.force, MADE.load + 2.0)
 
 
 def test_filters_change_the_velocity_before_inertia_and_forces_see_it():
