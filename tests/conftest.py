@@ -1,13 +1,10 @@
-"""What every test shares: idle threads that do not spin, and properties that are the same in every run."""
+"""What every test shares: the libraries' settings, and properties that are the same in every run."""
 
 from __future__ import annotations
 
-import os
-
-# Numba's and BLAS's waiting threads would take the cores from each other; read when their libraries load.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
 from hypothesis import settings
+
+import harness  # noqa: F401  sets what Numba and OpenMP read when they load
 
 # derandomize: the same examples in every run; no deadline: a slow machine fails no test.
 settings.register_profile("suite", derandomize=True, deadline=None, max_examples=40, database=None)

@@ -72,10 +72,9 @@ def test_a_scene_without_effects_has_nothing_in_any_place():
 
 
 def test_forces_that_never_change_are_added_up_once():
-    made = scene(
-        Chain(), Gravity(), ConstantForce(force=(1.0, 2.0, 3.0)), Wind(force=(0.0, 0.0, 6.0)), size=4, mass=3.0
-    )
-    wanted = np.outer(made.system.mass, [0, -9.81, 0]) + [1, 2, 3] + np.outer(made.mesh.shares, [0, 0, 6])
+    effects = Gravity(), ConstantForce(force=(1.0, 2.0, 3.0)), Wind(force=(0.0, 0.0, 6.0))
+    made = scene(Chain(), *effects, size=4, mass=3.0)
+    wanted = np.outer(made.system.mass, [0, -9.81, 0]) + np.outer(made.mesh.shares, [0, 0, 6]) + np.array([1, 2, 3])
     np.testing.assert_allclose(made.load, wanted, rtol=1e-15)
     assert made.forces == ()
 
