@@ -31,8 +31,8 @@ Linear = Literal["auto", "inverse", "cholespy", "supernodal", "cg"]
 Precision = Literal["float64", "float32", "float16"]
 
 SMALL = 25
-"""Up to so many vertices the inverse is no slower: a whole step of 50 iterations takes as long at 9 and 25 vertices of a
-sheet, and 1.15 times as long as with the supernodal factor at 49, 1.5 times at 100."""
+"""Up to so many vertices the inverse is no slower: a whole step of 50 iterations takes as long at 9 and 25 vertices
+of a sheet, and 1.15 times as long as with the supernodal factor at 49, 1.5 times at 100."""
 
 _SOLVES = 200
 """In how many solves a factor has to pay for itself: 4 steps of 50 iterations. Sheets get a factor at any size, solids
