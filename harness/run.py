@@ -95,7 +95,8 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
     by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
     if by_frame[run.frames]["digest"] != measured.digest:
         raise RunFailed("the recorded pass ended at other positions than the timed pass")
-    facts = {name: int(value) for name, value in measured.prepared.facts.items()}
+    facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
+    facts["choice"] = measured.prepared.choice
     return [
         counts
         | facts

@@ -195,7 +195,15 @@ class Solution:
 
 
 class Prepared(Protocol):
-    """A solver that has factorised, coloured and compiled what one system needs."""
+    """A solver that has factorised, coloured and compiled what one system needs.
+
+    `choice` is a fifth member because whoever reads a row must learn what a solver chose by itself.
+    """
+
+    @property
+    def choice(self) -> str:
+        """What the solver chose by itself, and why, in words; empty where it had nothing to choose."""
+        ...
 
     @property
     def facts(self) -> dict[str, float]:

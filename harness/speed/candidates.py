@@ -76,7 +76,7 @@ class SolverCandidate:
             counts = self._scene.system.vertices, len(self._scene.springs.edges)
             self._work = work.count(prepared.facts, *counts, self.run.solver.parameters.get("precision", "float64"))
             self.columns = {name: int(value) for name, value in prepared.facts.items()}
-            self.columns["choice"] = getattr(prepared, "choice", None)
+            self.columns["choice"] = prepared.choice
         return seconds
 
     def turn(self) -> list[Reading]:

@@ -33,6 +33,7 @@ class Pushed:
 
     asked: list[tuple[StepProblem, StopRule]] = field(default_factory=list)
     facts: dict[str, float] = field(default_factory=dict)
+    choice: str = ""
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         yield problem.first_guess + 1.0

@@ -40,7 +40,7 @@ def test_a_solver_may_yield_the_same_array_every_time():
     prepared, norm = SparseLocalGlobal().prepare(problem.system), EnergyNorm(problem.system)
 
     class Reusing:
-        facts, solve, phases = prepared.facts, prepared.solve, prepared.phases
+        choice, facts, solve, phases = prepared.choice, prepared.facts, prepared.solve, prepared.phases
 
         def iterates(self, problem):
             out = np.empty_like(problem.target)
