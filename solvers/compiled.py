@@ -174,7 +174,10 @@ class PreparedCompiled:
         target, force, pins, _, guess = _arrays(problem)
         step_ends.state(self.rows, target, force, pins, y)
         step_ends.start(self.rows, work.vectors, p, guess, pins)
-        local = lambda: step.local(self.plan, self.bundles, a, y, p, b)  # noqa: E731
+
+        def local() -> None:
+            step.local(self.plan, self.bundles, a, y, p, b)
+
         return {"local": local, "global": self.base.phases(problem)["global"]}
 
     @cached_property

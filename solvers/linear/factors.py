@@ -81,7 +81,9 @@ class SimplicialCholesky:
         try:
             from cholespy import CholeskySolverD, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
         except ImportError as error:
-            raise Unsupported("numba: needs cholespy, which has no wheel for this machine; use sparse") from error
+            raise Unsupported(
+                "cholespy is not installed, for it has no wheel for this machine; leave `linear` out"
+            ) from error
         if not np.isfinite(Q.data).all():
             raise NotPositiveDefinite(_REASON)
         pointers, columns = Q.indptr.astype(np.int32), Q.indices.astype(np.int32)

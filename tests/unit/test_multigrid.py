@@ -37,7 +37,10 @@ def test_the_cycle_is_symmetric_and_positive_definite(Q):
 def test_a_cycle_takes_out_most_of_any_error(Q):
     multigrid, n = Multigrid(Q), len(Q.indptr) - 1
     x = right_hand_sides(n)
-    energy = lambda e: np.einsum("ij,ij->", e, Q @ e)  # noqa: E731
+
+    def energy(e):
+        return np.einsum("ij,ij->", e, Q @ e)
+
     rates = []
     for _ in range(12):  # what is left of the error is what the cycle is worst at
         following = x - cycle(multigrid, Q @ x)
