@@ -77,7 +77,6 @@ def observe(
 
 def largest_strain(scene: Scene, p: Positions) -> float:
     """The largest |length / rest length - 1| of a spring at p (n, 3) [m]; 0 without springs."""
-    stretchable = scene.springs.rest_length > 0.0
-    i, j = scene.springs.edges[stretchable].T
-    lengths = np.linalg.norm(p[i] - p[j], axis=1)
-    return float(np.abs(lengths / scene.springs.rest_length[stretchable] - 1.0).max(initial=0.0))
+    rest = scene.springs.rest_length
+    strain = np.divide(scene.springs.lengths(p), rest, out=np.ones_like(rest), where=rest > 0.0) - 1.0
+    return float(np.abs(strain).max(initial=0.0))

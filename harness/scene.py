@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from solvers.energies.springs import Springs
 from solvers.problem import Pins, Positions, System
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """What is simulated.
 
@@ -32,7 +33,7 @@ class Scene:
     pin_targets: Positions
     velocity: tuple[float, float, float]
 
-    @property
+    @cached_property
     def springs(self) -> Springs:
         """All springs that have stiffness: effect by effect, each in the mesh's order."""
         return Springs.joined([energy for energy in self.system.energies if isinstance(energy, Springs)])

@@ -65,6 +65,11 @@ class Springs:
     def _named(self) -> int:
         return int(self.edges.max(initial=-1)) + 1
 
+    def lengths(self, p: Positions) -> NDArray[np.float64]:
+        """The length of each spring [m] at p (n, 3), shape (m,)."""
+        v = self._incidence[0] @ p[: self._named]
+        return np.sqrt(np.einsum("ij,ij->i", v, v))
+
     def _vectors(self, p: Positions) -> tuple[Positions, NDArray[np.float64], Positions]:
         """v = A p (m, 3), the lengths |v| (m,) and the unit directions (m, 3)."""
         A, _ = self._incidence
@@ -77,8 +82,7 @@ class Springs:
 
     def value(self, p: Positions) -> float:
         """The elastic energy [J] at p, shape (n, 3)."""
-        _, length, _ = self._vectors(p)
-        return 0.5 * float(self.stiffness @ (length - self.rest_length) ** 2)
+        return 0.5 * float(self.stiffness @ (self.lengths(p) - self.rest_length) ** 2)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient A'K (A p - d) [N], shape (n, 3), to `out`."""
