@@ -65,6 +65,8 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
         raise
     except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
         found = [failure(error)]
+        for earlier in (files.recording, files.picture):  # of a time when it did not fail; they would hide this
+            earlier.unlink(missing_ok=True)
     result = [shared | row for row in found]
     rows.write(files.rows, result)
     return result
