@@ -123,11 +123,6 @@ class SceneSpec(SceneFields):
     lines: SkipValidation[Mapping[str, int]] = Field(default_factory=dict)
     """The lines of the keys in that file, for messages."""
 
-    @property
-    def sized(self) -> bool:
-        """Whether the mesh is generated, and so needs a size."""
-        return not self.mesh_digest
-
     @cached_property
     def digest(self) -> str:
         """SHA-256 of all that determines a run of the scene; mesh files count by content, not by name."""

@@ -15,7 +15,7 @@ Backends differ in how they do the two steps, and in nothing else: `DenseLocalGl
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -47,8 +47,7 @@ class PreparedLocalGlobal:
 
     project: the local step; factor: of Q's free rows and columns; coupling: Q's free rows and exactly pinned
     columns (f, x); norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins; trace: of the unpinned
-    part of Q [N/m]; facts: exact counts of what was built; choice: the linear
-    solver in words.
+    part of Q [N/m]; facts: exact counts of what was built; choice: the linear solver in words.
     """
 
     system: System
@@ -75,7 +74,9 @@ class PreparedLocalGlobal:
         previous = self._placed(problem.first_guess, problem)
         floor = stop.floor * float(np.abs(previous).max(initial=0.0)) * self.trace**0.5
         if stop.tolerance is not None:
-            yardstick = self._residual(next(self.iterates(self._restarted(problem))), problem.current)
+            yardstick = self._residual(
+                next(self.iterates(replace(problem, first_guess=problem.current))), problem.current
+            )
             limit = stop.tolerance * yardstick
         p, residual, iteration, stopped = previous, float("nan"), 0, "iterations"
         iterates = self.iterates(problem)
@@ -132,12 +133,6 @@ class PreparedLocalGlobal:
         e[self.system.pins.vertices] = 0.0
         return self.norm(e)
 
-    @staticmethod
-    def _restarted(problem: StepProblem) -> StepProblem:
-        """The same problem, started from the current positions."""
-        p = problem
-        return StepProblem(p.system, p.target, p.force, p.pin_targets, p.current, p.current)
-
 
 @dataclass(frozen=True)
 class DenseLocalGlobal:
@@ -164,14 +159,15 @@ class DenseLocalGlobal:
 
         free = system.free
         exact = system.pins.vertices[system.pins.exact]
+        factor = DenseCholesky(Q[np.ix_(free, free)])
         return PreparedLocalGlobal(
             system,
             project,
-            DenseCholesky(Q[np.ix_(free, free)]),
+            factor,
             csr_array(Q[np.ix_(free, exact)]),
             lambda e: matrices.energy_norm(Q, e),
             float(np.diag(Q)[system.unpinned].sum()),
-            {"nnz_system": float(np.count_nonzero(Q)), "nnz_factor": len(free) * (len(free) + 1) / 2},
+            _facts(int(np.count_nonzero(Q)), factor),
             "dense Cholesky",
         )
 
@@ -210,8 +206,6 @@ def prepared(
     exact = system.pins.vertices[system.pins.exact]
     inner = rows if len(free) == system.vertices else csr_array(rows[:, free])
     factor, choice = factorise(inner) if len(free) else (DenseCholesky(np.eye(0)), "nothing to solve for")
-    counts = {name: getattr(factor, attribute, None) for name, attribute in _COUNTS.items()}
-    facts = {"nnz_system": float(Q.nnz)} | {name: float(n) for name, n in counts.items() if n is not None}
 
     def project(p: Positions, y: Positions, out: Positions) -> None:
         out[:] = y
@@ -225,6 +219,12 @@ def prepared(
         csr_array(rows[:, exact]),
         lambda e: matrices.energy_norm(Q, e),
         float(Q.diagonal()[system.unpinned].sum()),
-        facts,
+        _facts(Q.nnz, factor),
         choice,
     )
+
+
+def _facts(entries: int, factor: Factor) -> dict[str, float]:
+    """The entries of Q, and what the factor knows of itself."""
+    counts = {name: getattr(factor, attribute, None) for name, attribute in _COUNTS.items()}
+    return {"nnz_system": float(entries)} | {name: float(n) for name, n in counts.items() if n is not None}

@@ -67,14 +67,16 @@ class Springs:
 
     def lengths(self, p: Positions) -> NDArray[np.float64]:
         """The length of each spring [m] at p (n, 3), shape (m,)."""
-        v = self._incidence[0] @ p[: self._named]
-        return np.sqrt(np.einsum("ij,ij->i", v, v))
+        return _lengths(self._along(p))
+
+    def _along(self, p: Positions) -> Positions:
+        """v = A p, (m, 3)."""
+        return self._incidence[0] @ p[: self._named]
 
     def _vectors(self, p: Positions) -> tuple[Positions, NDArray[np.float64], Positions]:
         """v = A p (m, 3), the lengths |v| (m,) and the unit directions (m, 3)."""
-        A, _ = self._incidence
-        v = A @ p[: self._named]
-        length = np.sqrt(np.einsum("ij,ij->i", v, v))
+        v = self._along(p)
+        length = _lengths(v)
         unit = v / np.maximum(length, TINY)[:, None]
         zero = length <= TINY
         unit[zero] = self.rest_direction[zero]
@@ -119,3 +121,7 @@ class Springs:
         indptr = np.concatenate([[0], np.cumsum(counts)])
         full = bsr_array((blocks[order], columns[order], indptr), shape=(3 * n, 3 * n))
         return without_zeros(csr_array(coo_array(full)))
+
+
+def _lengths(v: Positions) -> NDArray[np.float64]:
+    return np.sqrt(np.einsum("ij,ij->i", v, v))
