@@ -61,14 +61,14 @@ class Expansion:
     ) -> Iterable[RunSpec]:
         scene = self.scenes[scene_name]
         fixed = {k: v for k, v in self.fields.options if k not in GRID}
-        usual = {"frames": scene.frames, "first_guess": scene.first_guess}
+        usual = {"frames": scene.frames, "first_guess": scene.first_guess, "time_step": scene.time_step}
         for size, solver, values in product(sizes, solvers, product(*options.values())):
             chosen: dict[str, Any] = dict(zip(options, values, strict=True))
             chosen |= {key: value for key, value in usual.items() if chosen[key] is None}
             yield RunSpec(
                 sweep=self.name,
                 scene_name=scene_name,
-                scene=scene,
+                scene=scene.stepped(chosen["time_step"]),
                 size=size,
                 solver=solver,
                 **chosen,

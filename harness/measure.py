@@ -14,7 +14,7 @@ from time import perf_counter
 import numpy as np
 
 from harness.scene import Scene
-from harness.simulate import Step, simulate
+from harness.simulate import Step, prepare, simulate
 from solvers.problem import Positions, Prepared, Solver, StopRule
 
 PHASE_REPEATS = 3
@@ -63,7 +63,7 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
     prepared = None
     for round in range(settings.rounds + 1):
         began = perf_counter()
-        prepared = solver.prepare(scene.system)
+        prepared = prepare(scene, solver)
         timings.append(Timing("prepare", None, round, perf_counter() - began))
     assert prepared is not None
 
@@ -80,7 +80,7 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
     for round in range(settings.rounds):
         for step in steps(scene, prepared, settings):
             timings.append(Timing("step", step.index, round, step.seconds))
-            final = step.solution.positions
+            final = step.positions
             tick("timed pass")
     return Measured(prepared, timings, digest(final))
 
@@ -89,7 +89,7 @@ def steps(scene: Scene, prepared: Prepared, settings: Settings) -> Iterator[Step
     """The run's steps; raises Diverged as soon as a position is not finite."""
     run = simulate(scene, prepared, settings.stop, first_guess=settings.first_guess, frames=settings.frames)
     for step in run:
-        if not np.isfinite(step.solution.positions).all():
+        if not np.isfinite(step.positions).all():
             raise Diverged(f"positions are not finite from frame {step.index} on")
         yield step
 

@@ -38,8 +38,8 @@ def observe(
     found: dict[int, dict[str, Any]] = {}
 
     def look(step: Step) -> None:
-        p, s = step.solution.positions, step.solution
-        terms = step.problem.terms(p)
+        p, s = step.positions, step.solution
+        terms = step.problem.terms(s.positions)
         found[step.index] = {
             **{f"energy_{name}": value for name, value in terms.items()},
             "objective": sum(terms.values()),

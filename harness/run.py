@@ -89,7 +89,7 @@ def _reason(error: Exception) -> str:
 
 
 def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
-    scene = build(run.scene, run.size)
+    scene = build(run.scene, run.size, run.integrator)
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
     settings = Settings(StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
     solver = load(SOLVERS[run.solver.name])(**run.solver.parameters)
@@ -154,6 +154,7 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, measured: Measured) -> R
         "vertices": len(scene.mesh.rest),
         "springs": len(scene.springs.edges),
         "time_step": run.scene.time_step,
+        "integrator": run.integrator,
         "frames": run.frames,
         "iterations": run.iterations,
         "tolerance": run.tolerance or 0.0,
@@ -211,6 +212,7 @@ def common(run: RunSpec) -> dict[str, Any]:
         "solver": run.solver.name,
         "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
         "time_step": run.scene.time_step,
+        "integrator": run.integrator,
         "first_guess": run.first_guess,
         "max_iterations": run.iterations,
         "tolerance": run.tolerance,

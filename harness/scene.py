@@ -13,6 +13,7 @@ from harness.errors import InputError, Mistake
 from harness.mesh.base import Mesh
 from harness.spec import SceneSpec
 from solvers.energies.springs import Springs
+from solvers.integrators import IMPLICIT_EULER, INTEGRATORS, Integrator
 from solvers.problem import Pins, Positions, System
 
 
@@ -22,7 +23,8 @@ class Scene:
 
     mesh: at rest, which is also the start; system: what is factorised; load: the sum of the forces that never
     change, (n, 3) [N], read-only; forces: those that change; filters: of the velocity;
-    pin_targets: (q, 3) [m], in the order of `system.pins`; velocity: of every vertex at the start [m/s].
+    pin_targets: (q, 3) [m], in the order of `system.pins`; velocity: of every vertex at the start [m/s];
+    integrator: its factor is the system's.
     """
 
     mesh: Mesh
@@ -32,6 +34,7 @@ class Scene:
     filters: tuple[VelocityFilter, ...]
     pin_targets: Positions
     velocity: tuple[float, float, float]
+    integrator: Integrator = IMPLICIT_EULER
 
     @cached_property
     def springs(self) -> Springs:
@@ -39,8 +42,8 @@ class Scene:
         return Springs.joined([energy for energy in self.system.energies if isinstance(energy, Springs)])
 
 
-def build(spec: SceneSpec, size: int) -> Scene:
-    """Bind a scene to a mesh of one size; `size` means nothing to a mesh from a file.
+def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Scene:
+    """Bind a scene to a mesh of one size, which means nothing to a mesh from a file, and to an integrator by name.
 
     Raises InputError where the scene's parts do not fit together.
     """
@@ -57,12 +60,13 @@ def build(spec: SceneSpec, size: int) -> Scene:
     load.flags.writeable = False
     return Scene(
         mesh=mesh,
-        system=System(mass=mass, time_step=spec.time_step, energies=energies, pins=pins),
+        system=System(mass, spec.time_step, energies, pins, INTEGRATORS[integrator].factor),
         load=load,
         forces=tuple(force for force in forces if not isinstance(force, Steady)),
         filters=tuple(one for part in parts for one in part.filters),
         pin_targets=targets,
         velocity=spec.velocity,
+        integrator=INTEGRATORS[integrator],
     )
 
 

@@ -1,4 +1,4 @@
-"""Steps through time: p^t and p^(t-dt) make the step's problem, a prepared solver makes p^(t+dt)."""
+"""Steps through time: an integrator makes the step's problem, a prepared solver its minimiser, and that the motion."""
 
 from __future__ import annotations
 
@@ -10,84 +10,138 @@ from time import perf_counter
 import numpy as np
 
 from harness.scene import Scene
-from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule
+from solvers.integrators import IMPLICIT_EULER, Motion
+from solvers.problem import Positions, Prepared, Solution, Solver, Start, StepProblem, StopRule, System
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """positions p^t (n, 3) [m]; previous p^(t-dt) (n, 3) [m]; index of the last step, 0 at the start."""
+    """now, the motion at the start of the next step; before, one step earlier, None where there is none; index of
+    the last step, 0 at the start."""
 
-    positions: Positions
-    previous: Positions
+    now: Motion
+    before: Motion | None
     index: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """One step that was done: its index from 1, its problem, its solution, its wall seconds."""
+    """One step that was done: its problem, its solution, the state after it, its wall seconds."""
 
-    index: int
     problem: StepProblem
     solution: Solution
+    state: State
     seconds: float
+
+    @property
+    def index(self) -> int:
+        """Counted from 1."""
+        return self.state.index
+
+    @property
+    def positions(self) -> Positions:
+        """Where the vertices are after the step, (n, 3) [m]: not the solution, which may lie in the step's middle."""
+        return self.state.now.positions
 
 
 def start(scene: Scene) -> State:
     """The rest shape, moving with the scene's velocity."""
     rest = scene.mesh.rest
-    return State(rest, rest - scene.system.time_step * np.array(scene.velocity), 0)
+    return State(Motion(rest, np.tile(np.array(scene.velocity), (len(rest), 1))), None, 0)
 
 
 def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
     """The next step's problem from a state; `first_guess` is a key of `FIRST_GUESSES`."""
-    dt, p = scene.system.time_step, state.positions
-    target = p - state.previous
+    dt, time = scene.system.time_step, state.index * scene.system.time_step
+    now, before = state.now, state.before or state.now
     if scene.filters:
-        target = dt * reduce(lambda v, filtered: filtered(v), scene.filters, target / dt)
+        now = Motion(now.positions, reduce(lambda v, filtered: filtered(v), scene.filters, now.velocity))
+    starts = scene.integrator.history and state.before is None
+    method, system = (IMPLICIT_EULER, _first(scene)) if starts else (scene.integrator, scene.system)
+    target, origin = method.predict(now, before, dt)
+    begun = Start(now.positions, now.velocity, time, origin, method.factor**0.5 / dt)
     force = scene.load
     if scene.forces:
-        v = target / dt
-        force = reduce(lambda total, effect: total + effect(p, v, state.index * dt), scene.forces, force)
-    target += p
-    current = _pinned(scene, state.positions)
-    stated = StepProblem(scene.system, target, force, scene.pin_targets, current, current)
-    return FIRST_GUESSES[first_guess](stated, scene, state)
+        a = method.ahead
+        p, v = (x + a * (x - y) for x, y in zip(now, before, strict=True)) if a and state.before else now
+        force = reduce(lambda total, effect: total + effect(p, v, time + a * dt), scene.forces, force)
+    held = scene.pin_targets
+    if method.when < 1.0:
+        held = now.positions[system.pins.vertices] + method.when * (held - now.positions[system.pins.vertices])
+    current = _pinned(system, now.positions, held)
+    stated = StepProblem(system, target, force, held, current, current, begun)
+    return FIRST_GUESSES[first_guess](stated)
 
 
-def simulate(scene: Scene, prepared: Prepared, stop: StopRule, *, first_guess: str, frames: int) -> Iterator[Step]:
-    """The scene's first steps, one more each time it is asked; the clock stands still in between."""
-    state = start(scene)
-    for index in range(1, frames + 1):
+def prepare(scene: Scene, solver: Solver) -> Prepared:
+    """The solver, ready for all of the scene's steps; raises what `solver.prepare` raises."""
+    prepared = solver.prepare(scene.system)
+    return _Starting(solver.prepare(_first(scene)), prepared) if scene.integrator.history else prepared
+
+
+def simulate(
+    scene: Scene, prepared: Prepared, stop: StopRule, *, first_guess: str, frames: int, state: State | None = None
+) -> Iterator[Step]:
+    """The steps from a state (the scene's start if it is left out), one more each time it is asked, up to the frame
+    `frames`; the clock stands still in between. prepared: by `prepare`."""
+    state = state or start(scene)
+    while state.index < frames:
         began = perf_counter()
         stated = problem(scene, state, first_guess)
         solution = prepared.solve(stated, stop)
+        method = IMPLICIT_EULER if stated.system.factor == IMPLICIT_EULER.factor else scene.integrator
+        state = State(method.advance(stated.start, solution), state.now, state.index + 1)
         seconds = perf_counter() - began
-        yield Step(index, stated, solution, seconds)
-        state = State(solution.positions, state.positions, index)
+        yield Step(stated, solution, state, seconds)
 
 
-def _pinned(scene: Scene, p: Positions) -> Positions:
+class _Starting:
+    """Prepared for two systems, of which the first is that of the first step alone."""
+
+    def __init__(self, first: Prepared, then: Prepared) -> None:
+        self._first, self._then = first, then
+        self.choice, self.facts = then.choice, then.facts
+
+    def _of(self, problem: StepProblem) -> Prepared:
+        return self._first if problem.system.factor == IMPLICIT_EULER.factor else self._then
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        return self._of(problem).iterates(problem)
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        return self._of(problem).solve(problem, stop)
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        return self._of(problem).phases(problem)
+
+
+def _first(scene: Scene) -> System:
+    """The system of the first step of an integrator that needs a history."""
+    return replace(scene.system, factor=IMPLICIT_EULER.factor)
+
+
+def _pinned(system: System, p: Positions, targets: Positions) -> Positions:
     """A copy of p with its pinned vertices on their targets."""
     placed = p.copy()
-    placed[scene.system.pins.vertices] = scene.pin_targets
+    placed[system.pins.vertices] = targets
     return placed
 
 
-def _assignment(stated: StepProblem, scene: Scene, state: State) -> StepProblem:
+def _assignment(stated: StepProblem) -> StepProblem:
     """The current positions as they are, pinned vertices where the penalty left them."""
-    return replace(stated, first_guess=state.positions)
+    return replace(stated, first_guess=stated.start.positions)
 
 
-def _current(stated: StepProblem, scene: Scene, state: State) -> StepProblem:
+def _current(stated: StepProblem) -> StepProblem:
     return stated
 
 
-def _inertial(stated: StepProblem, scene: Scene, state: State) -> StepProblem:
+def _inertial(stated: StepProblem) -> StepProblem:
     """Where the vertices would go by inertia alone (Liu et al. 2013)."""
-    return replace(stated, first_guess=_pinned(scene, stated.target))
+    return replace(stated, first_guess=_pinned(stated.system, stated.target, stated.pin_targets))
 
 
-FIRST_GUESSES: dict[str, Callable[[StepProblem, Scene, State], StepProblem]] = {
+FIRST_GUESSES: dict[str, Callable[[StepProblem], StepProblem]] = {
     "assignment": _assignment,
     "current": _current,
     "inertial": _inertial,

@@ -10,26 +10,19 @@ from dataclasses import dataclass, fields
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, TypeVar
+from typing import Annotated, Any, Literal, Protocol
 
-from pydantic import (
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    GetJsonSchemaHandler,
-    SkipValidation,
-    WithJsonSchema,
-)
-from pydantic_core import core_schema
+from pydantic import BeforeValidator, ConfigDict, Field, SkipValidation, WithJsonSchema
 
 from harness.effects.base import Effect
 from harness.mesh.base import Mesh
-from harness.model import Model
+from harness.model import Many, Model
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 """Names of scenes and sweeps; they become names of files in the results."""
 
 FirstGuess = Literal["assignment", "current", "inertial"]
+IntegratorName = Literal["implicit-euler", "bdf2", "midpoint"]
 
 
 def _seconds(value: Any) -> Any:
@@ -123,34 +116,19 @@ class SceneSpec(SceneFields):
     lines: SkipValidation[Mapping[str, int]] = Field(default_factory=dict)
     """The lines of the keys in that file, for messages."""
 
+    def stepped(self, time_step: float) -> SceneSpec:
+        """The same scene with another time step [s]."""
+        if time_step == self.time_step:
+            return self
+        values: dict[str, Any] = {key: getattr(self, key) for key in SceneSpec.model_fields}
+        return SceneSpec.model_construct(None, **values | {"time_step": time_step})
+
     @cached_property
     def digest(self) -> str:
         """SHA-256 of all that determines a run of the scene; mesh files count by content, not by name."""
         content = self.model_dump(mode="json", include={"mass", "time_step", "velocity", "camera", "mesh", "effects"})
         content["mesh"] = self.mesh_digest or content["mesh"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-T = TypeVar("T")
-
-
-class _OneOrMany:
-    """Lets a single value stand for a list of one."""
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
-        def many(value: Any) -> tuple[Any, ...]:
-            return tuple(value) if isinstance(value, (list, tuple)) else (value,)
-
-        return core_schema.no_info_before_validator_function(many, handler(source))
-
-    def __get_pydantic_json_schema__(
-        self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        array = handler(schema)
-        return {"anyOf": [array["items"], array]}
-
-
-Many = Annotated[tuple[T, ...], Field(min_length=1), _OneOrMany()]
 
 
 Iterations = Annotated[int, Field(ge=1, le=100_000)]
@@ -166,6 +144,10 @@ class Grid(Model):
     """Iteration limit of a step."""
     tolerance: Many[Tolerance] = (None,)
     """Relative tolerance that ends a step's iterations; null does all of them."""
+    integrator: Many[IntegratorName] = ("implicit-euler",)
+    """How time is integrated."""
+    time_step: Many[TimeStep | None] = (None,)
+    """Time step [s]; null takes the scene's."""
     first_guess: Many[FirstGuess | None] = (None,)
     """Where a step's iteration starts; null is `assignment` for JSON scenes, else `current`."""
     threads: Many[Threads] = (1,)
@@ -202,6 +184,10 @@ class Include(Model):
     """Iteration limits of a step."""
     tolerance: Many[Tolerance] = ()
     """Relative tolerances; null is the run without one."""
+    integrator: Many[IntegratorName] = ()
+    """How time is integrated."""
+    time_step: Many[TimeStep] = ()
+    """Time steps [s]."""
     first_guess: Many[FirstGuess] = ()
     """Where a step's iteration starts."""
     threads: Many[Threads] = ()
@@ -252,8 +238,8 @@ class SolverSpec:
 class RunSpec:
     """One run. size: 0 where the mesh comes from a file.
 
-    frames and first_guess are resolved; tolerance: None does all iterations; convergence_frames: None is the
-    first, the middle and the last frame; strain_range: strain at the ends of the colour scale.
+    frames, time_step (which is the scene's own here) and first_guess are resolved; tolerance: None does all iterations;
+    convergence_frames: None is the first, the middle and the last; strain_range: strain at the colour scale's ends.
     """
 
     sweep: str
@@ -263,6 +249,8 @@ class RunSpec:
     solver: SolverSpec
     iterations: int
     tolerance: float | None
+    integrator: IntegratorName
+    time_step: float
     first_guess: FirstGuess
     threads: int
     frames: int

@@ -189,6 +189,8 @@ def _distinct(p: Planned, group: list[Planned]) -> str:
 _SHORT = {
     "iterations": "{} it.",
     "tolerance": "tol. {}",
+    "integrator": "{}",
+    "time_step": "dt {:.3g}",
     "first_guess": "{}",
     "threads": "{} thr.",
     "frames": "{} frames",

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numba
 import numpy as np
@@ -37,6 +37,9 @@ class CompiledLocalGlobal:
 
     linear: the solver of Q p = b; precision: of its stored entries.
     """
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
 
     linear: Linear = "auto"
     precision: Precision = "float64"
@@ -90,7 +93,7 @@ class PreparedCompiled:
         part = np.full(s.vertices, -1)
         part[s.free] = np.searchsorted(order.spans[:, 0], slot, side="right") - 1
         bundles, first = kernels.Bundles.of(springs, row, part, len(order.spans), nobody, nobody + 1)
-        inertia = s.mass / s.time_step**2
+        inertia = s.inertia
         held, measure, loose = np.zeros((3, nobody + 2 + order.shift))
         held[row] = measure[row] = inertia
         _, soft, weight = s.penalty

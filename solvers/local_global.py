@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -101,7 +102,7 @@ class PreparedLocalGlobal:
     def _constant(self, problem: StepProblem) -> Positions:
         """y, with the exact pins' columns of Q moved to the right-hand side."""
         s = self.system
-        y = s.mass[:, None] / s.time_step**2 * problem.target + problem.force
+        y = s.inertia[:, None] * problem.target + problem.force
         soft, vertices, weight = s.penalty
         y[vertices] += weight[:, None] * problem.pin_targets[soft]
         if s.pins.exact.any():
@@ -138,6 +139,9 @@ class PreparedLocalGlobal:
 class DenseLocalGlobal:
     """NumPy matrices and one dense Cholesky factor: for small meshes, and to be read beside the paper."""
 
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+
     def prepare(self, system: System) -> PreparedLocalGlobal:
         """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
         springs, n = only_springs(system, "dense"), system.vertices
@@ -145,7 +149,7 @@ class DenseLocalGlobal:
         A = matrices.signed_incidence_matrix_dense(springs.edges, n)
         M = matrices.mass_matrix_dense(system.mass)
         C = matrices.selection_matrix_dense(vertices, n)
-        Q = matrices.system_matrix_dense(A, springs.stiffness, M, system.time_step, C, weight)
+        Q = matrices.system_matrix_dense(A, springs.stiffness, system.factor * M, system.time_step, C, weight)
         matrices.require_determined(system, csr_array(Q))
         AtK = np.ascontiguousarray(A.T * springs.stiffness)
         r, rest_direction = springs.rest_length[:, None], springs.rest_direction
@@ -175,6 +179,9 @@ class DenseLocalGlobal:
 @dataclass(frozen=True)
 class SparseLocalGlobal:
     """SciPy sparse matrices and one sparse factorisation, for any projective energies."""
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
 
     def prepare(self, system: System) -> PreparedLocalGlobal:
         """Raises Unsupported for energies that are not projective, NotPositiveDefinite."""

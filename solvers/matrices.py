@@ -94,7 +94,7 @@ def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> csr_array:
     """
     n = system.vertices
     _, vertices, weight = system.penalty
-    held = system.mass / system.time_step**2 + np.bincount(vertices, weight, minlength=n)
+    held = system.inertia + np.bincount(vertices, weight, minlength=n)
     shares = (energy.stiffness_matrix(n) for energy in energies)
     Q = without_zeros(reduce(lambda total, share: total + share, shares, diagonal(held)))
     require_determined(system, Q)

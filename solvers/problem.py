@@ -2,10 +2,11 @@
 
 A step of implicit Euler minimises the incremental potential (Liu et al. 2013, eq. 6)
 
-    g(p) = sum of energies(p) + 1/(2 dt^2) |p - target|_M^2 - tr(p' f) + sum_pins w/2 |p_i - pin_i|^2
+    g(p) = sum of energies(p) + c/(2 dt^2) |p - target|_M^2 - tr(p' f) + sum_pins w/2 |p_i - pin_i|^2
 
-over the positions p, with target = 2 p^t - p^(t-dt). `StepProblem` states it in plain NumPy and float64:
-it is the oracle from which every accuracy figure is taken.
+over the positions p, with c = 1 and target = 2 p^t - p^(t-dt); other integrators have another c and another target
+(see `solvers.integrators`). `StepProblem` states it in plain NumPy and float64: it is the oracle from which every
+accuracy figure is taken.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,13 +79,20 @@ class System:
     """What stays fixed in a run, and so is factorised once.
 
     mass: (n,) [kg], zero is allowed where springs or pins hold the vertex; time_step: dt [s];
-    energies: potentials of the positions; pins: which vertices are pinned, and how.
+    energies: potentials of the positions; pins: which vertices are pinned, and how; factor: c of the time integrator
+    (see `solvers.integrators`), 1 for implicit Euler.
     """
 
     mass: NDArray[np.float64]
     time_step: float
     energies: tuple[Energy, ...] = ()
     pins: Pins = field(default_factory=Pins)
+    factor: float = 1.0
+
+    @cached_property
+    def inertia(self) -> NDArray[np.float64]:
+        """c m/dt^2 (n,) [N/m], the inertia's share of Q."""
+        return self.factor * self.mass / self.time_step**2
 
     @property
     def vertices(self) -> int:
@@ -111,13 +119,41 @@ class System:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """Where a step starts, for energies that depend on it and for methods that do not minimise.
+
+    positions: p^t (n, 3) [m]; velocity: v^t, filters included, (n, 3) [m/s]; time: t [s];
+    origin (n, 3) [m] and rate [1/s]: the unknown x moves with the velocity rate (x - origin).
+    """
+
+    positions: Positions
+    velocity: Positions
+    time: float
+    origin: Positions
+    rate: float
+
+    def velocity_at(self, x: Positions) -> Positions:
+        """The velocity [m/s] of the unknown x, both (n, 3)."""
+        return self.rate * (x - self.origin)
+
+
+@runtime_checkable
+class LaggedEnergy(Energy, Protocol):
+    """An energy that depends on where the step starts: damping, friction, obstacles that move."""
+
+    def begin_step(self, start: Start) -> Energy:
+        """The energy of this one step."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
 class StepProblem:
     """What one step minimises. All arrays are float64 and are never written to.
 
-    target: 2 p^t - p^(t-dt), velocity filters included, (n, 3) [m]; force: (n, 3) [N];
+    target: where inertia alone would bring the unknown, velocity filters included, (n, 3) [m]; force: (n, 3) [N];
     pin_targets: where the pins want their vertices, (q, 3) [m], in the order of `system.pins`;
     current: p^t with its pinned vertices on their targets, (n, 3) [m], the yardstick of the stop rule;
-    first_guess: where the iteration starts, (n, 3) [m].
+    first_guess: where the iteration starts, (n, 3) [m]; start: of the step.
     """
 
     system: System
@@ -126,16 +162,22 @@ class StepProblem:
     pin_targets: Positions
     current: Positions
     first_guess: Positions
+    start: Start
+
+    @cached_property
+    def energies(self) -> tuple[Energy, ...]:
+        """The system's energies, as they are in this step, in their order."""
+        return tuple(e.begin_step(self.start) if isinstance(e, LaggedEnergy) else e for e in self.system.energies)
 
     def terms(self, p: Positions) -> dict[str, float]:
         """The terms [J] of the objective at p, by name: energies (their class's name), inertia, force, pins."""
         s = self.system
         values: dict[str, float] = {}
-        for energy in s.energies:
+        for energy in self.energies:
             name = type(energy).__name__.lower()
             values[name] = values.get(name, 0.0) + energy.value(p)
         away = p - self.target
-        values["inertia"] = 0.5 / s.time_step**2 * float(s.mass @ np.einsum("ij,ij->i", away, away))
+        values["inertia"] = 0.5 * float(s.inertia @ np.einsum("ij,ij->i", away, away))
         values["force"] = -float(np.einsum("ij,ij->", p, self.force))
         soft, vertices, weight = s.penalty
         sag = p[vertices] - self.pin_targets[soft]
@@ -153,8 +195,8 @@ class StepProblem:
     def gradient(self, p: Positions) -> Positions:
         """The gradient of g at p [N], shape (n, 3); zero rows at exactly pinned vertices."""
         s = self.system
-        out = s.mass[:, None] / s.time_step**2 * (p - self.target) - self.force
-        for energy in s.energies:
+        out = s.inertia[:, None] * (p - self.target) - self.force
+        for energy in self.energies:
             energy.add_gradient(p, out)
         soft, vertices, weight = s.penalty
         out[vertices] += weight[:, None] * (p[vertices] - self.pin_targets[soft])
@@ -166,8 +208,8 @@ class StepProblem:
 class StopRule:
     """When a solve ends: after `iterations`, or before that once the residual is small enough.
 
-    The residual of an iteration from p to LG(p) is |p - LG(p)|_Q [J^(1/2)] over the unpinned vertices. With a
-    `tolerance` the solve ends when the residual is at most `tolerance` times its value at the current positions;
+    The residual at p is |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q [J^(1/2)] over the unpinned vertices, the same for every
+    method. With a `tolerance` the solve ends when it is at most `tolerance` times its value at the current positions;
     without one it does all iterations. `floor` is absolute: a residual that a mean displacement of `floor` times
     the largest coordinate would cause ends the solve too (only where a tolerance is set), so that a
     scene at rest stops at once.
@@ -182,9 +224,11 @@ class StopRule:
 class Solution:
     """Where a solve ended.
 
-    positions: (n, 3) [m]; iterations: how many were done; residual: |p - LG(p)|_Q [J^(1/2)] of the last
-    iteration, over the unpinned vertices; yardstick: the same at the current positions (nan when the rule
-    had no tolerance); stopped: "iterations", "tolerance" or "floor".
+    positions: (n, 3) [m]; iterations: how many were done; residual: |Q^-1 grad g|_Q [J^(1/2)] over the unpinned
+    vertices, at these positions or at those before the last iteration, where that is what the method knows (nan for
+    one that does not minimise); yardstick: the same at the current positions (nan when the rule had no tolerance);
+    stopped: "iterations", "tolerance", "floor", or "stalled" where round-off lets nothing descend any more;
+    velocity: (n, 3) [m/s] at the step's end, of a method that keeps its own.
     """
 
     positions: Positions
@@ -192,6 +236,7 @@ class Solution:
     residual: float
     yardstick: float
     stopped: str
+    velocity: Positions | None = None
 
 
 class Prepared(Protocol):
@@ -219,12 +264,19 @@ class Prepared(Protocol):
         ...
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """`local` and `global` as callables that do one such step at the first guess, to be timed apart."""
+        """The parts of an iteration by name (`local` and `global`), as callables to be timed apart; may be empty."""
         ...
 
 
 class Solver(Protocol):
-    """A frozen dataclass of a method's parameters."""
+    """A frozen dataclass of a method's parameters.
+
+    minimises: whether its iterates tend to a minimum of the step's objective; a method for which they do not is
+    graded on its trajectories. descends: whether the objective rises in no iteration, round-off apart.
+    """
+
+    minimises: ClassVar[bool]
+    descends: ClassVar[bool]
 
     def prepare(self, system: System) -> Prepared:
         """Factorise, colour, compile.

@@ -22,7 +22,7 @@ from harness.spec import MeshSource, SceneSpec
 from solvers.compiled import CompiledLocalGlobal
 from solvers.energies.springs import Springs
 from solvers.local_global import DenseLocalGlobal, SparseLocalGlobal
-from solvers.problem import Pins, Positions, Solver, StepProblem, StopRule, System
+from solvers.problem import Pins, Positions, Solver, Start, StepProblem, StopRule, System
 
 BACKENDS: tuple[Solver, ...] = (DenseLocalGlobal(), SparseLocalGlobal(), CompiledLocalGlobal())
 """The three ways to do one and the same local-global iteration."""
@@ -90,7 +90,7 @@ def first_problem(made: Scene, first_guess: str = "current") -> StepProblem:
 def trajectory(made: Scene, solver: Solver, frames: int, *, first_guess: str = "current", iterations: int = 50):
     """The positions (frames, n, 3) [m] after each step."""
     steps = simulate(made, solver.prepare(made.system), StopRule(iterations), first_guess=first_guess, frames=frames)
-    return np.array([step.solution.positions.copy() for step in steps])
+    return np.array([step.positions.copy() for step in steps])
 
 
 def static_shape(made: Scene, *, iterations: int = 20_000, tolerance: float = 1e-10) -> Positions:
@@ -118,7 +118,13 @@ def random_problem(seed: int, *, n: int = 12, m: int = 30, weights: tuple[float,
     target, force, guess = (rng.normal(size=(n, 3)) for _ in range(3))
     current = rest.copy()
     current[:q] = targets
-    return StepProblem(system, target, force, targets, current, guess)
+    return StepProblem(system, target, force, targets, current, guess, begun(system, target, current))
+
+
+def begun(system: System, target: Positions, current: Positions) -> Start:
+    """The start of a step of implicit Euler from the current positions, by which inertia leads to the target."""
+    dt = system.time_step
+    return Start(current, (target - current) / dt, 0.0, current, 1.0 / dt)
 
 
 def frozen(problem: StepProblem) -> StepProblem:

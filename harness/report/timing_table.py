@@ -52,7 +52,7 @@ class Run(NamedTuple):
 _SUMMARY = """
 select run_id, any_value(scene), any_value("size"), any_value(solver), any_value(vertices), any_value(springs),
     coalesce(any_value(status) filter (status <> 'ok'), 'ok'), any_value(reason) filter (status <> 'ok'),
-    any_value(to_json({'dt': time_step, 'guess': first_guess, 'iterations': max_iterations,
+    any_value(to_json({'integrator': integrator, 'dt': time_step, 'guess': first_guess, 'iterations': max_iterations,
                        'tolerance': tolerance, 'threads': threads})),
     any_value(parameters),
     1e3 * min(seconds) filter (phase = 'prepare' and round = 0),

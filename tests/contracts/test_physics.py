@@ -15,8 +15,9 @@ from harness.effects.springs import Springs
 from harness.mesh.chain import Chain
 from harness.mesh.grid import Grid
 from harness.scene import Scene
-from harness.simulate import State, problem
+from harness.simulate import State, prepare, simulate
 from solvers.compiled import CompiledLocalGlobal
+from solvers.integrators import Motion
 from solvers.problem import Positions, StopRule
 from tests.scenes import BACKENDS, scene, static_shape, trajectory
 
@@ -34,14 +35,9 @@ def moving(
     made: Scene, velocity: Positions, steps: int, stop: StopRule = CONVERGED
 ) -> list[tuple[Positions, Positions]]:
     """Positions and velocities at the start and after each step."""
-    dt, prepared = made.system.time_step, CompiledLocalGlobal().prepare(made.system)
-    state = State(made.mesh.rest, made.mesh.rest - dt * velocity, 0)
-    found = [(state.positions, velocity)]
-    for index in range(1, steps + 1):
-        solution = prepared.solve(problem(made, state, "current"), stop)
-        state = State(solution.positions, state.positions, index)
-        found.append((state.positions, (state.positions - state.previous) / dt))
-    return found
+    prepared, state = prepare(made, CompiledLocalGlobal()), State(Motion(made.mesh.rest, velocity), None, 0)
+    run = simulate(made, prepared, stop, first_guess="current", frames=steps, state=state)
+    return [(state.now.positions, velocity), *((now.positions, now.velocity) for now in (s.state.now for s in run))]
 
 
 def spinning(made: Scene, rate: float) -> Positions:
@@ -141,13 +137,13 @@ def test_implicit_euler_slows_a_spin_in_proportion_to_the_time_step():
 @pytest.mark.parametrize("iterations", [1, 3, 50])
 def test_a_step_never_ends_with_more_than_it_had(backend, iterations):
     """E(p') + |v' - v|^2_M / 2 <= E(p) + |v|^2_M / 2 after any number of iterations, since each of them descends."""
-    dt, mass, (springs,) = FREE.system.time_step, FREE.system.mass, FREE.system.energies
+    mass, (springs,) = FREE.system.mass, FREE.system.energies
     velocity = 2.0 * np.random.default_rng(3).normal(size=FREE.mesh.rest.shape)
-    state, prepared = State(FREE.mesh.rest, FREE.mesh.rest - dt * velocity, 0), backend.prepare(FREE.system)
-    for index in range(1, 30):
-        p = prepared.solve(problem(FREE, state, "current"), StopRule(iterations)).positions
-        v, after = (state.positions - state.previous) / dt, (p - state.positions) / dt
-        had = springs.value(state.positions) + 0.5 * mass @ np.sum(v**2, axis=1)
-        has = springs.value(p) + 0.5 * mass @ np.sum((after - v) ** 2, axis=1)
+    state = State(Motion(FREE.mesh.rest, velocity), None, 0)
+    prepared, stop = backend.prepare(FREE.system), StopRule(iterations)
+    for step in simulate(FREE, prepared, stop, first_guess="current", frames=30, state=state):
+        (p, v), (after, v_after) = state.now, step.state.now
+        had = springs.value(p) + 0.5 * mass @ np.sum(v**2, axis=1)
+        has = springs.value(after) + 0.5 * mass @ np.sum((v_after - v) ** 2, axis=1)
         assert has <= had * (1 + 1e-13)  # sums of some hundred terms
-        state = State(p, state.positions, index)
+        state = step.state

@@ -14,7 +14,7 @@ from solvers.energies.springs import TINY, Springs
 from solvers.local_global import DenseLocalGlobal, SparseLocalGlobal, only_springs
 from solvers.matrices import assemble
 from solvers.problem import NotPositiveDefinite, Pins, Positions, StepProblem, StopRule, System, Unsupported
-from tests.scenes import BACKENDS, SCENES, cloth, first_problem, random_network, random_problem
+from tests.scenes import BACKENDS, SCENES, begun, cloth, first_problem, random_network, random_problem
 
 VALUE = 1e-13
 """Round-off of the objective relative to its magnitude: sums of some hundred terms."""
@@ -102,7 +102,7 @@ def test_springs_of_almost_no_length_have_the_same_direction_in_every_backend(ba
     system = System(np.ones(2), 0.1, (springs,))
     guess = np.array([[0.0, 0, 0], [0.0, 0, length]])
     zero, none = np.zeros((2, 3)), np.empty((0, 3))
-    problem = StepProblem(system, zero, zero, none, zero, guess)
+    problem = StepProblem(system, zero, zero, none, zero, guess, begun(system, zero, zero))
     (p,) = iterates(backend, problem, 1)
     # Q^-1 A'K r e, with e the eigenvector (1, -1) of A'A: k r / (m/dt^2 + 2k).
     wanted = 100 * 2 / (100 + 200) * (np.array([0.0, 1, 0]) if length <= TINY else np.array([0.0, 0, 1]))
@@ -238,7 +238,7 @@ def test_stiffness_beyond_the_digits_of_inertia_leaves_numbers(backend):
     stiff = replace(springs, stiffness=np.full(30, 1e12))
     system = System(np.full(10, 1e-3), 1.0, (stiff,))
     zero, none = np.zeros((10, 3)), np.empty((0, 3))
-    problem = StepProblem(system, rest, zero, none, rest, rest + 1.0)
+    problem = StepProblem(system, rest, zero, none, rest, rest + 1.0, begun(system, rest, rest))
     solution = backend.prepare(system).solve(problem, StopRule(5, 1e-6))
     assert np.isfinite(solution.positions).all()
     assert solution.residual >= 0.0

@@ -1,0 +1,76 @@
+"""Time integrators, each a step problem of the same form: minimise over the unknown x
+
+    energies(x) + c/(2 dt^2) |x - target|_M^2 - tr(x' f),       Q = A'KA + c M/dt^2
+
+                     c     x             target                                    the velocity of x
+    implicit Euler   1     p^(t+dt)      p + dt v                                  (x - p)/dt
+    BDF2             9/4   p^(t+dt)      (4 p - p')/3 + 2 dt/9 (4 v - v')          3/(2 dt) (x - (4 p - p')/3)
+    midpoint         4     p^(t+dt/2)    p + dt/2 v                                2/dt (x - p)
+
+with p, v at the step's start and p', v' one step before it: the velocity is sqrt(c)/dt (x - origin) for all three.
+Implicit Euler is of order 1 and damps, the others of order 2; midpoint conserves quadratic energies (Hairer and
+Wanner, Solving Ordinary Differential Equations II, sections IV.12 and V.1; Hairer, Lubich and Wanner, Geometric
+Numerical Integration, section IV.2). External forces are those of the step's start for implicit Euler, as in Liu et
+al. 2013; for the others they are taken where extrapolation puts the motion at the time of x.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from solvers.problem import Positions, Solution, Start
+
+
+class Motion(NamedTuple):
+    """positions (n, 3) [m] and velocity (n, 3) [m/s] at one time."""
+
+    positions: Positions
+    velocity: Positions
+
+
+@dataclass(frozen=True, slots=True)
+class Integrator:
+    """factor: c; when: the time of x within the step, 1 at its end; ahead: that of the external forces;
+    history: whether it needs the motion one step before, so that implicit Euler makes the first step;
+    predict: from the motions now and one step before, and dt [s], to target and origin, each (n, 3) [m].
+    """
+
+    factor: float
+    when: float
+    ahead: float
+    history: bool
+    predict: Callable[[Motion, Motion, float], tuple[Positions, Positions]]
+
+    def advance(self, start: Start, solution: Solution) -> Motion:
+        """The motion at the step's end; a method that has a velocity of its own brings it in the solution."""
+        x = solution.positions
+        if solution.velocity is not None:
+            return Motion(x, solution.velocity)
+        v = start.velocity_at(x)
+        if self.when == 1.0:
+            return Motion(x, v)
+        return Motion(2.0 * x - start.positions, 2.0 * v - start.velocity)  # x and v are means over the step
+
+
+def _euler(now: Motion, before: Motion, dt: float) -> tuple[Positions, Positions]:
+    return now.positions + dt * now.velocity, now.positions
+
+
+def _bdf2(now: Motion, before: Motion, dt: float) -> tuple[Positions, Positions]:
+    origin = (4.0 * now.positions - before.positions) / 3.0
+    return origin + 2.0 * dt / 9.0 * (4.0 * now.velocity - before.velocity), origin
+
+
+def _midpoint(now: Motion, before: Motion, dt: float) -> tuple[Positions, Positions]:
+    return now.positions + 0.5 * dt * now.velocity, now.positions
+
+
+IMPLICIT_EULER = Integrator(1.0, 1.0, 0.0, False, _euler)
+INTEGRATORS = {
+    "implicit-euler": IMPLICIT_EULER,
+    "bdf2": Integrator(2.25, 1.0, 1.0, True, _bdf2),
+    "midpoint": Integrator(4.0, 0.5, 0.5, False, _midpoint),
+}
+"""The integrators by name."""
