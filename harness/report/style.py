@@ -38,24 +38,46 @@ RC: Any = {
 
 
 class Mark(NamedTuple):
-    """How one solver is drawn: a colour and a matplotlib marker."""
+    """How one solver is drawn: a colour, a matplotlib marker and a matplotlib line style."""
 
     color: str
     marker: str
+    dash: Any = "-"
 
+
+DASHED, DOTTED, DASH_DOTTED = (0, (5, 2)), (0, (1, 1.6)), (0, (6, 2, 1, 2))
 
 # Okabe and Ito's palette, less its yellow and black, which vanish on a light page or in the text.
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#6d4c9f", "#7a7a7a")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "h")
 
+# The solvers of a family share a colour and differ in line style; no two share a marker.
+_SOLVERS = {
+    "dense": Mark("#0072b2", "s", DOTTED),
+    "sparse": Mark("#0072b2", "o"),
+    "numba": Mark("#56b4e9", "D"),
+    "anderson": Mark("#009e73", "^"),
+    "chebyshev": Mark("#009e73", "v", DASHED),
+    "lbfgs": Mark("#e69f00", "P"),
+    "newton": Mark("#d55e00", "X"),
+    "newton-cg": Mark("#d55e00", "p", DASHED),
+    "hybrid": Mark(INK, "*"),
+    "xpbd": Mark("#cc79a7", "<"),
+    "xpbd-small-steps": Mark("#cc79a7", ">", DASHED),
+    "vbd": Mark("#6d4c9f", "h"),
+    "symplectic-euler": Mark("#7a7a7a", "d", DASH_DOTTED),
+}
+
 
 def marks(solvers: Iterable[str]) -> dict[str, Mark]:
-    """A mark for each solver name: by the registry's order, then by alphabet."""
-    names = (*SOLVERS, *sorted(set(solvers) - set(SOLVERS)))
-    return {name: mark(i) for i, name in enumerate(names)}
+    """A mark for each of the registry's solvers and of these; of names without one of their own by alphabet."""
+    names = {*SOLVERS, *solvers}
+    strangers = sorted(names - set(_SOLVERS))
+    looks = _SOLVERS | {name: mark(i) for i, name in enumerate(strangers)}
+    return {name: look for name, look in looks.items() if name in names}
 
 
 def mark(number: int) -> Mark:
-    """The mark of this number, from 0: 64 different ones, the first 8 in different colours."""
+    """The mark of this number, from 0: 64 different ones, the first 8 in different colours; no solver's own."""
     # The marker moves on once more with each turn of the colours.
-    return Mark(_COLORS[number % 8], _MARKERS[(number + number // 8) % 8])
+    return Mark(_COLORS[number % 8], _MARKERS[(number + number // 8) % 8], (0, (3, 1.2)))

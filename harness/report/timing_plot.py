@@ -13,16 +13,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
+from harness.report.labels import LINE, direct_labels
 from harness.report.page import axes, count, header, new_page, quantity, save, shorten, text
-from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark, marks
+from harness.report.style import DASH_DOTTED, DASHED, DOTTED, HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark, marks
 from harness.report.timing_table import Run, labels, runs
 
 _LEFT, _TOP, _RIGHT, _BOTTOM = 40, 118, WIDTH - 40, HEIGHT - 30
 _COLUMNS = 4  # scenes side by side
 _NOTES = 4  # failures told in words at the foot; all are marked in the panels
 _LETTERS = 34  # of a direct label
-_LINE = 17  # pixels between direct labels
-_DASHES = ("-", (0, (5, 2)), (0, (1, 1.6)), (0, (6, 2, 1, 2)))  # the variants of one solver
+_DASHES = (DASHED, DOTTED, DASH_DOTTED)  # the further variants of one solver
 
 
 def draw_timing(table: pa.Table, path: Path, title: str) -> None:
@@ -38,7 +38,7 @@ def draw_timing(table: pa.Table, path: Path, title: str) -> None:
     with matplotlib.rc_context(RC):
         page = new_page()
         header(page, title, _facts(table), letters=84)
-        bottom = _BOTTOM - _LINE * min(len(failed), _NOTES + 1)
+        bottom = _BOTTOM - LINE * min(len(failed), _NOTES + 1)
         columns = min(len(scenes), _COLUMNS) or 1
         width, height = (_RIGHT - _LEFT) / columns, (bottom - _TOP) / (ceil(len(scenes) / columns) or 1)
         for k, scene in enumerate(scenes):
@@ -92,20 +92,25 @@ def _scene(
     _scales(prepare, sizes, _times(found, "cold", "warm"), labels_share)
     prepare.set_xlabel("vertices", fontsize=9.5, loc="left")
     ends = []
-    for (name, members), dash in zip(series.items(), _variants(series), strict=True):
+    for (name, members), dash in zip(series.items(), _variants(series, looks), strict=True):
         look = looks[members[0].solver]
         ends += _draw_steps(step, name, members, look, dash)
         _draw_prepare(prepare, members, look)
-    _direct_labels(step, ends)
+    direct_labels(step, ends)
     _crosses(step, failed, looks)
     if not series:
         step.text(0.5, 0.5, "no run succeeded", transform=step.transAxes, ha="center", color=MUTED)
 
 
-def _variants(series: Mapping[str, Sequence[Run]]) -> list:
-    """A dash for each series: the first of its solver is solid."""
+def _variants(series: Mapping[str, Sequence[Run]], looks: Mapping[str, Mark]) -> list:
+    """A line style for each series: the solver's own for the first of a solver."""
+    dashes = []
     solvers = [members[0].solver for members in series.values()]
-    return [_DASHES[solvers[:k].count(solver) % len(_DASHES)] for k, solver in enumerate(solvers)]
+    for k, solver in enumerate(solvers):
+        own = looks[solver].dash
+        styles = [own, *(dash for dash in _DASHES if dash != own)]
+        dashes.append(styles[solvers[:k].count(solver) % len(styles)])
+    return dashes
 
 
 def _times(found: Sequence[Run], *fields: str) -> list[float]:
@@ -185,37 +190,6 @@ def _draw_prepare(ax: Axes, members: Sequence[Run], look: Mark) -> None:
             )
 
 
-def _direct_labels(ax: Axes, ends: list) -> None:
-    """Names at the right of the lines' ends; where lines end at the same size, moved apart."""
-    for column in sorted({x for x, *_ in ends}):
-        here = sorted((end for end in ends if end[0] == column), key=lambda end: end[1])
-        wanted = ax.transData.transform([(x, y) for x, y, *_ in here])
-        at = _spread(wanted[:, 1].tolist(), ax.bbox.y0 + 6, ax.bbox.y1 - 6)
-        for (x, y, words, color), height in zip(here, at, strict=True):
-            line = {"arrowstyle": "-", "color": color, "alpha": 0.45, "linewidth": 0.8, "shrinkA": 1, "shrinkB": 5}
-            ax.annotate(
-                words,
-                (x, y),
-                (wanted[0, 0] + 16, height),
-                textcoords="figure pixels",
-                va="center",
-                fontsize=9.5,
-                color=color,
-                arrowprops=line,
-            )
-
-
-def _spread(wanted: Sequence[float], bottom: float, top: float) -> list[float]:
-    """The sorted heights [pixels], at least _LINE apart: pushed up from below, then down from the top."""
-    at = list(wanted)
-    for k in range(1, len(at)):
-        at[k] = max(at[k], at[k - 1] + _LINE)
-    at[-1] = min(at[-1], top)
-    for k in reversed(range(len(at) - 1)):
-        at[k] = max(min(at[k], at[k + 1] - _LINE), bottom)
-    return at
-
-
 def _crosses(ax: Axes, failed: Sequence[Run], looks: Mapping[str, Mark]) -> None:
     """A cross at the upper edge for each failed run; those of one size below each other."""
     taken: dict[int, int] = {}
@@ -235,9 +209,9 @@ def _notes(page: Figure, failed: Sequence[Run], names: Mapping[str, str], top: f
     for k, run in enumerate(failed[:_NOTES]):
         where = f"{run.scene}, size {run.size}" if run.size else run.scene
         why = f"{run.status}: {run.reason}" if run.reason else run.status
-        text(page, _LEFT, top + _LINE * (k + 1), "×", size=11, color=INK)
+        text(page, _LEFT, top + LINE * (k + 1), "×", size=11, color=INK)
         words = f"{names[run.run_id]} on {where} {why}"
-        text(page, _LEFT + 18, top + _LINE * (k + 1), shorten(" ".join(words.split()), 190), size=9)
+        text(page, _LEFT + 18, top + LINE * (k + 1), shorten(" ".join(words.split()), 190), size=9)
     if len(failed) > _NOTES:
         rest = f"and {len(failed) - _NOTES} more, marked above"
-        text(page, _LEFT + 18, top + _LINE * (_NOTES + 1), rest, size=9, color=MUTED)
+        text(page, _LEFT + 18, top + LINE * (_NOTES + 1), rest, size=9, color=MUTED)

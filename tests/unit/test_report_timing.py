@@ -16,8 +16,9 @@ from PIL import Image
 from rich.console import Console
 
 from harness.report import page, timing_plot
+from harness.report.labels import LINE, spread
 from harness.report.style import HEIGHT, WIDTH, marks
-from harness.report.timing_plot import _spread, draw_timing
+from harness.report.timing_plot import draw_timing
 from harness.report.timing_table import labels, runs, summary_table
 from harness.rows import SCHEMA
 from solvers.registry import SOLVERS
@@ -170,8 +171,8 @@ def test_preparing_has_its_own_panel_cold_and_warm(sheets: list[Figure], tmp_pat
 
 @pytest.mark.parametrize("wanted", [[10.0, 11.0, 12.0], [10.0, 60.0, 99.0], [90.0, 95.0, 99.0]])
 def test_direct_labels_do_not_overlap_and_stay_on_the_panel(wanted: list[float]) -> None:
-    at = _spread(wanted, 6.0, 100.0)
-    assert (np.diff(at) >= timing_plot._LINE).all()
+    at = spread(wanted, 6.0, 100.0)
+    assert (np.diff(at) >= LINE).all()
     assert min(at) >= 6.0
     assert max(at) <= 100.0
 

@@ -1,0 +1,43 @@
+"""Names at the ends of lines, moved apart where lines end side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from matplotlib.axes import Axes
+
+LINE = 17
+"""Pixels between the names."""
+
+
+def direct_labels(ax: Axes, ends: list) -> None:
+    """Names at the right of the lines' ends; where lines end at the same size, moved apart."""
+    for column in sorted({x for x, *_ in ends}):
+        here = sorted((end for end in ends if end[0] == column), key=lambda end: end[1])
+        wanted = ax.transData.transform([(x, y) for x, y, *_ in here])
+        at = spread(wanted[:, 1].tolist(), ax.bbox.y0 + 6, ax.bbox.y1 - 6)
+        for (x, y, words, color), height in zip(here, at, strict=True):
+            # As shares of the figure: pixels mean something else in vector formats.
+            at_share = ax.figure.transFigure.inverted().transform((wanted[0, 0] + 16, height))
+            line = {"arrowstyle": "-", "color": color, "alpha": 0.45, "linewidth": 0.8, "shrinkA": 1, "shrinkB": 5}
+            ax.annotate(
+                words,
+                (x, y),
+                at_share,
+                textcoords="figure fraction",
+                va="center",
+                fontsize=9.5,
+                color=color,
+                arrowprops=line,
+            )
+
+
+def spread(wanted: Sequence[float], bottom: float, top: float) -> list[float]:
+    """The sorted heights [pixels], at least LINE apart: pushed up from below, then down from the top."""
+    at = list(wanted)
+    for k in range(1, len(at)):
+        at[k] = max(at[k], at[k - 1] + LINE)
+    at[-1] = min(at[-1], top)
+    for k in reversed(range(len(at) - 1)):
+        at[k] = max(min(at[k], at[k + 1] - LINE), bottom)
+    return at
