@@ -85,18 +85,8 @@ class Expansion:
             problem = f"is missing; the scene {scene_name} needs a mesh size (or give it a default_size)"
             self.document.report(problem, ("sizes",))
         for i, size in enumerate(sizes):
-            self._check_size(scene_name, size, ("sizes", i))
+            check_size(self.document, scene_name, self.scenes[scene_name], size, ("sizes", i))
         return sizes
-
-    def _check_size(self, scene_name: str, size: int, at: Key) -> None:
-        mesh = self.scenes[scene_name].mesh
-        if not isinstance(mesh, Generator):
-            return
-        if size < mesh.SMALLEST:
-            self.document.report(f"{size} is too small for the scene {scene_name}: {mesh.SMALLEST} at least", at)
-        elif (vertices := mesh.count(size)) > MAX_VERTICES:
-            problem = f"{size} gives the scene {scene_name} {vertices:,} vertices; at most {MAX_VERTICES:,}"
-            self.document.report(problem, at)
 
     def _included(self, i: int, entry: Include, options: Mapping[str, Sequence[Any]]) -> Iterable[Any]:
         chosen = {key: getattr(entry, key) or values[:1] for key, values in options.items()}
@@ -108,7 +98,7 @@ class Expansion:
             if isinstance(self.scenes[scene_name].mesh, Generator):
                 sizes = entry.size
                 for k, size in enumerate(sizes):
-                    self._check_size(scene_name, size, ("include", i, "size", k))
+                    check_size(self.document, scene_name, self.scenes[scene_name], size, ("include", i, "size", k))
                 if not sizes:
                     self.document.report(f"is missing; the scene {scene_name} has one", ("include", i, "size"))
             yield scene_name, sizes, solvers, chosen
@@ -138,6 +128,18 @@ class Expansion:
             if short:
                 problem = f"frame {frame} is not among the {short.frames} frames of {short.scene_name}"
                 self.document.report(problem, ("options", "convergence_frames", i))
+
+
+def check_size(document: Document, scene_name: str, scene: SceneSpec, size: int, at: Key) -> None:
+    """Note a mistake where a generated mesh has no such size."""
+    mesh = scene.mesh
+    if not isinstance(mesh, Generator):
+        return
+    if size < mesh.SMALLEST:
+        document.report(f"{size} is too small for the scene {scene_name}: {mesh.SMALLEST} at least", at)
+    elif (vertices := mesh.count(size)) > MAX_VERTICES:
+        problem = f"{size} gives the scene {scene_name} {vertices:,} vertices; at most {MAX_VERTICES:,}"
+        document.report(problem, at)
 
 
 def _matches(entry: Exclude, run: RunSpec) -> bool:

@@ -85,7 +85,7 @@ def load_scene(path: Path) -> SceneSpec:
 def scene_from_assignment(path: Path) -> SceneSpec:
     """The scene that equals an assignment file: same springs, force, pins, time step. Raises InputError."""
     document = Document(path, {})
-    _check_name(document)
+    check_name(document)
     if document.mistakes:
         raise document.error()
     assignment = read_assignment(path)
@@ -110,7 +110,7 @@ def _scene(document: Document) -> SceneSpec:
     data = document.data
     if "scenes" in data and "mesh" not in data:
         raise InputError(Mistake("is a sweep; a scene is wanted here", document.path))
-    _check_name(document)
+    check_name(document)
     own = document.check(SceneFile, data)
     mesh = _chosen(document, MESHES, data["mesh"], ("mesh",)) if "mesh" in data else None
     listed = data.get("effects", [])
@@ -161,6 +161,11 @@ def _with_paths(document: Document, model: type[Model], data: dict[str, Any], at
 
 def _sweep(document: Document) -> Sweep:
     """The sweep in a document, its scenes read from the files that it names."""
+    return _expanded(document, scenes_of(document))
+
+
+def scenes_of(document: Document) -> dict[str, SceneSpec]:
+    """The scenes by name, read from the files that the config lists under `scenes`; mistakes are noted."""
     scenes: dict[str, SceneSpec] = {}
     listed = document.data.get("scenes")
     for i, entry in enumerate(listed if isinstance(listed, list) else []):
@@ -176,29 +181,35 @@ def _sweep(document: Document) -> Sweep:
                 scenes[path.stem] = load_scene(path)
             except InputError as error:
                 document.mistakes.extend(error.mistakes)
-    return _expanded(document, scenes)
+    return scenes
+
+
+def solvers_of(document: Document) -> list[SolverSpec]:
+    """The solvers that the config lists under `solvers`, with all of their parameters; mistakes are noted."""
+    listed = document.data.get("solvers")
+    found = [
+        _solver(document, entry, ("solvers", i))
+        for i, entry in enumerate(listed if isinstance(listed, list) else [])
+        if isinstance(entry, (str, dict))  # the check of the whole config reports others
+    ]
+    return [solver for solver in found if solver]
 
 
 def _expanded(document: Document, scenes: dict[str, SceneSpec]) -> Sweep:
-    _check_name(document)
+    check_name(document)
     sweep = document.check(SweepFields, document.data)
-    listed = document.data.get("solvers")
-    solvers = [
-        _solver(document, entry, ("solvers", i))
-        for i, entry in enumerate(listed if isinstance(listed, list) else [])
-        if isinstance(entry, (str, dict))  # the check of the whole sweep reports others
-    ]
+    solvers = solvers_of(document)
     if sweep is None or document.mistakes:
         raise document.error()
-    runs = Expansion(document, document.path.stem, sweep, scenes, [s for s in solvers if s]).runs()
+    runs = Expansion(document, document.path.stem, sweep, scenes, solvers).runs()
     for name, scene in scenes.items():
-        document.mistakes.extend(_misfits(scene, [run.size for run in runs if run.scene_name == name]))
+        document.mistakes.extend(misfits(scene, [run.size for run in runs if run.scene_name == name]))
     if document.mistakes:
         raise document.error()
     return Sweep(document.path.stem, sweep.options, runs)
 
 
-def _misfits(scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:
+def misfits(scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:
     """What keeps the parts of a scene from fitting together, found at the smallest of the sizes."""
     try:
         if sizes:
@@ -239,7 +250,8 @@ def _is_assignment(path: Path) -> bool:
     return path.suffix.lower() == ".json"
 
 
-def _check_name(document: Document) -> None:
+def check_name(document: Document) -> None:
+    """Note a mistake where the file's name cannot name its results."""
     if not NAME.fullmatch(document.path.stem):
         wanted = "rename it to letters, digits, `.`, `_` and `-`, at most 64, the first a letter or a digit"
         document.report(f"the file's name becomes the name of results; {wanted}")

@@ -88,21 +88,21 @@ SCHEMA = pa.schema([pa.field(c.name, c.type) for c in COLUMNS])
 Row = Mapping[str, Any]
 
 
-def write(path: Path, rows: Iterable[Row]) -> None:
-    """Write one run's rows under a partial name and rename: a kill leaves the whole file or none."""
+def write(path: Path, rows: Iterable[Row], schema: pa.Schema = SCHEMA) -> None:
+    """Write one file's rows under a partial name and rename: a kill leaves the whole file or none."""
     rows = list(rows)
-    unknown = {key for row in rows for key in row} - set(SCHEMA.names)
+    unknown = {key for row in rows for key in row} - set(schema.names)
     if unknown:
         raise ValueError(f"rows have no columns {sorted(unknown)}")
     partial = path.with_name(f".{path.name}.partial")
     with partial.open("wb") as file:
-        pq.write_table(pa.Table.from_pylist(rows, schema=SCHEMA), file)
+        pq.write_table(pa.Table.from_pylist(rows, schema=schema), file)
         file.flush()
         os.fsync(file.fileno())
     os.replace(partial, path)
 
 
-def read(paths: Iterable[Path]) -> pa.Table:
+def read(paths: Iterable[Path], schema: pa.Schema = SCHEMA) -> pa.Table:
     """All rows of the files, in the order of the paths; files of an older schema get nulls.
 
     Raises InputError for a file that holds no rows.
@@ -113,4 +113,4 @@ def read(paths: Iterable[Path]) -> pa.Table:
             tables.append(pq.read_table(path))
         except (pa.ArrowInvalid, OSError) as error:
             raise InputError(Mistake(f"holds no rows ({error}); take it out of the results", path)) from error
-    return pa.concat_tables([SCHEMA.empty_table(), *tables], promote_options="default")
+    return pa.concat_tables([schema.empty_table(), *tables], promote_options="default")
