@@ -16,6 +16,9 @@ WIDTH, HEIGHT, DPI = 1600, 900, 100
 PAGE, INK, MUTED, RULE = "#fcfbf9", "#23262b", "#6c7078", "#dcdad5"
 """Background, text, secondary text, hairlines."""
 
+WARNING = "#b3261e"
+"""Words that a reader must not miss."""
+
 STRAIN_MAP = LinearSegmentedColormap.from_list("strain", STRAIN_COLOURS, N=512)
 """The scale of the recordings, from -strain_range to strain_range."""
 

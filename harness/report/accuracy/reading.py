@@ -1,0 +1,171 @@
+"""Reads the rows of an accuracy measurement into `harness.report.accuracy.table`."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from harness.errors import InputError, Mistake
+from harness.report.accuracy.table import Curve, Problem, Table, Values, Work
+
+ROUND_OFF = 100 * float(np.finfo(np.float64).eps)
+"""An energy this share of its terms' magnitude below g* is a lower minimum and not round-off: sums of up to 1e5
+terms err by some tens of eps."""
+
+_Row = dict[str, Any]
+_Label = Callable[[_Row], str]
+
+
+def read(folder: Path) -> Table:
+    """The rows under `folder`/accuracy. Raises InputError where there are none."""
+    tables = []
+    for path in sorted((folder / "accuracy").rglob("*.parquet")):
+        try:
+            tables.append(pq.read_table(path))
+        except (pa.ArrowInvalid, OSError) as error:
+            raise InputError(Mistake(f"holds no rows ({error}); take it out of the results", path)) from error
+    if not tables:
+        raise InputError(Mistake("holds no accuracy rows; run `springbench accuracy CONFIG` first", folder))
+    kinds: dict[str, list[_Row]] = defaultdict(list)
+    for row in pa.concat_tables(tables, promote_options="permissive").to_pylist():
+        kinds[row["kind"]].append(row)
+    label = _labels(kinds["curve"] + kinds["work"])
+    problems = _problems(kinds)
+    return Table(
+        tuple(problems.values()),
+        tuple(_curves(kinds, problems, label)),
+        tuple(_work(row, label) for row in kinds["work"]),
+        _machine(kinds["curve"] + kinds["work"]),
+    )
+
+
+def _problems(kinds: dict[str, list[_Row]]) -> dict[str, Problem]:
+    """By digest; a solver that went below all certified minima shows that they are not the lowest."""
+    lowest: dict[str, float] = {}
+    for row in kinds["curve"]:
+        if row["g"] is not None and row["g"] < lowest.get(row["problem"], np.inf):
+            lowest[row["problem"]] = row["g"]
+    minima: dict[str, list[_Row]] = defaultdict(list)
+    for row in kinds["minimum"]:
+        if row["g"] is not None:
+            minima[row["problem"]].append(row)
+    found: dict[str, Problem] = {}
+    for row in kinds["problem"]:
+        digest = row["problem"]
+        if digest is None or row["g0"] is None:
+            continue
+        known = sorted(minima[digest], key=lambda m: m["g"])
+        energies, noise = [m["g"] for m in known], ROUND_OFF * (row["magnitude"] or 0.0)
+        doubt = "" if known and known[0]["certified"] else "the lowest known minimum is not certified"
+        seen = lowest.get(digest, np.inf)
+        if not known:
+            doubt = "no minimum is known; gaps refer to the lowest energy that a solver reached"
+        elif seen < energies[0] - noise:
+            doubt = "a solver went below the lowest minimum that is certified; gaps refer to what it reached"
+        if doubt and seen < (energies or [np.inf])[0] - noise:
+            energies.insert(0, seen)
+        g0 = row.get("g0_inertial") if row["moment"].startswith("frame-") else row["g0"]
+        found[digest] = Problem(
+            **{name: row[name] for name in ("scene", "size", "vertices", "moment", "integrator", "time_step")},
+            **{name: _number(row[name]) for name in ("stiffness_ratio", "mean_rest_length", "magnitude")},
+            digest=digest,
+            frame=row["frame"] or 0,
+            g0=_number(g0 if g0 is not None else row["g0"]),
+            minima=tuple(energies),
+            doubt=doubt,
+        )
+    return found
+
+
+_WHO = ("problem", "solver", "parameters", "threads")
+
+
+def _curves(kinds: dict[str, list[_Row]], problems: dict[str, Problem], label: _Label) -> Iterable[Curve]:
+    prepared = {tuple(row[key] for key in _WHO): row for row in kinds["prepare"]}
+    groups: dict[tuple, list[_Row]] = defaultdict(list)
+    for row in kinds["curve"]:
+        groups[*(row[key] for key in _WHO), row["first_guess"]].append(row)
+    for key, rows in groups.items():
+        problem = problems.get(key[0])
+        if problem is not None:
+            yield _curve(problem, rows, prepared.get(key[:-1], {}), label(rows[0]))
+
+
+def _curve(problem: Problem, rows: Sequence[_Row], prepared: _Row, label: str) -> Curve:
+    points = sorted((row for row in rows if row["iteration"] is not None), key=lambda row: row["iteration"])
+    bad = next((row for row in rows if row["status"] != "ok"), rows[0])
+
+    def column(name: str) -> Values:
+        return np.array([_number(row[name]) for row in points], float)
+
+    rounds = min((len(row["seconds"] or ()) for row in points), default=0)
+    seconds = np.array([row["seconds"][:rounds] for row in points], float).reshape(len(points), rounds).T
+    warm = prepared.get("seconds") or [np.nan]
+    reached = next((row for row in reversed(points) if row.get("minimum_g") is not None), {})
+    return Curve(
+        problem=problem,
+        solver=rows[0]["solver"],
+        label=label,
+        parameters=rows[0]["parameters"] or "{}",
+        first_guess=rows[0]["first_guess"] or "",
+        threads=rows[0]["threads"] or 1,
+        iterations=column("iteration"),
+        gap=problem.gap(column("g")),
+        largest=column("largest_error") / problem.mean_rest_length,
+        stationarity=column("stationarity"),
+        seconds=seconds if rounds else np.full((1, len(points)), np.nan),
+        warm=float(np.median(warm)),
+        cold=_number(prepared.get("cold")),
+        branch=problem.branch(reached.get("minimum_g")) if reached.get("branch") is not None else None,
+        status=bad["status"],
+        reason=bad["reason"] or "",
+        recording=next((row["recording"] for row in rows if row.get("recording")), ""),
+    )
+
+
+def _work(row: _Row, label: _Label) -> Work:
+    names = ("scene", "size", "solver", "parameters", "integrator", "time_step", "tolerance", "iterations")
+    return Work(
+        **{name: row[name] for name in (*names, "first_guess", "status")},
+        label=label(row),
+        horizon=_number(row["horizon"]),
+        error=_number(row["error"]),
+        error_rms=_number(row.get("error_rms")),
+        seconds=_number(row["seconds_per_simulated"]),
+        reason=row["reason"] or "",
+    )
+
+
+def _labels(rows: Sequence[_Row]) -> _Label:
+    """Gives a row's solver, and those of its parameters and threads in which the solver's rows differ."""
+    values: dict[tuple[str, str], set[str]] = defaultdict(set)
+
+    def settings(row: _Row) -> _Row:
+        return {**json.loads(row["parameters"] or "{}"), "threads": row["threads"]}
+
+    for row in rows:
+        for key, value in settings(row).items():
+            values[row["solver"], key].add(str(value))
+
+    def label(row: _Row) -> str:
+        told = [f"{key} {value}" for key, value in settings(row).items() if len(values[row["solver"], key]) > 1]
+        return ", ".join([row["solver"], *told])
+
+    return label
+
+
+def _machine(rows: Sequence[_Row]) -> tuple[str, ...]:
+    cpus, threads = (sorted({row[key] for row in rows if row[key] is not None}) for key in ("cpu", "threads"))
+    count = [f"{', '.join(map(str, threads))} thread{'s' if threads != [1] else ''}"] if threads else []
+    return (*cpus[:2], *count)
+
+
+def _number(value: Any) -> float:
+    return np.nan if value is None else float(value)

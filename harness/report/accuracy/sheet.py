@@ -1,0 +1,162 @@
+"""What the pictures of accuracy share: a page with one legend at its right, logarithmic axes, notes at its foot."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogFormatterMathtext, LogLocator, NullLocator
+
+from harness.report.accuracy.times import duration
+from harness.report.page import axes, header, new_page, quantity, save, shorten, text
+from harness.report.style import DASH_DOTTED, DASHED, DOTTED, HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark, marks
+
+LEFT, TOP, RIGHT, BOTTOM = 40, 118, 1384, HEIGHT - 34
+"""Where panels may be, in pixels; right of it stands the legend."""
+
+_LINE, _NOTES = 17, 4
+
+
+@contextmanager
+def sheet(stem: Path, title: str, facts: Sequence[str]) -> Iterator[Figure]:
+    """A page that is saved as `stem`.png and `stem`.svg once it is drawn."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    # The salt makes the same picture the same file.
+    with matplotlib.rc_context({**RC, "svg.hashsalt": stem.name}):
+        page = new_page()
+        header(page, title, facts, letters=84)
+        yield page
+        save(page, stem.with_suffix(".png"))
+        partial = stem.with_name(f".{stem.name}.svg.partial")
+        page.savefig(partial, format="svg", metadata={"Date": None})
+        os.replace(partial, stem.with_suffix(".svg"))
+
+
+def files(stem: Path) -> list[Path]:
+    """The files that `sheet` leaves."""
+    return [stem.with_suffix(".png"), stem.with_suffix(".svg")]
+
+
+def looks(labelled: Iterable[tuple[str, str]]) -> dict[str, Mark]:
+    """A mark for each label of (label, solver); further labels of a solver keep its colour and marker."""
+    found: dict[str, Mark] = {}
+    pairs = sorted(set(labelled))
+    own = marks(solver for _, solver in pairs)
+    for solver, mark in own.items():
+        styles = [mark.dash, *(dash for dash in ("-", DASHED, DOTTED, DASH_DOTTED) if dash != mark.dash)]
+        labels = [label for label, its in pairs if its == solver]
+        found |= {label: mark._replace(dash=styles[k % len(styles)]) for k, label in enumerate(labels)}
+    return found
+
+
+def line(ax: Axes, x, y, look: Mark, *, spaced: bool = True, **more) -> None:
+    """A solver's line; `spaced` markers keep a distance, as iterates lie dense."""
+    more = {"linewidth": 1.5, "markersize": 5 * size(look), **more}
+    more |= {"markevery": 0.12} if spaced and len(x) > 3 else {}
+    ax.plot(x, y, color=look.color, linestyle=look.dash, marker=look.marker, mec=PAGE, mew=0.5, **more)
+
+
+def size(look: Mark) -> float:
+    """By how much a marker is enlarged so that all look equally large."""
+    return {"*": 1.8, "P": 1.35, "X": 1.35, "p": 1.2, "h": 1.15, "d": 1.2}.get(look.marker, 1.0)
+
+
+def legend(page: Figure, entries: Mapping[str, Mark], *, below: Sequence[tuple[Line2D, str]] = ()) -> None:
+    """The solvers at the page's right, then other marks and their meanings."""
+    handles = [
+        Line2D(
+            [],
+            [],
+            color=m.color,
+            linestyle=m.dash,
+            marker=m.marker,
+            lw=1.6,
+            ms=7 * size(m),
+            mec=PAGE,
+            label=shorten(name, 30),
+        )
+        for name, m in entries.items()
+    ]
+    for handle, meaning in below:
+        handle.set_label(meaning)
+        handles.append(handle)
+    place = ((RIGHT + 10) / WIDTH, 1 - (TOP + 14) / HEIGHT)
+    page.legend(
+        handles=handles, loc="upper left", bbox_to_anchor=place, frameon=False, fontsize=9.5, handlelength=3.2,
+        labelspacing=0.75, borderaxespad=0.0,
+    )  # fmt: skip
+
+
+def notes(page: Figure, words: Sequence[str]) -> None:
+    """What failed or is doubtful, in words at the foot: as many lines as fit, and how many more there are."""
+    shown = list(words) if len(words) <= _NOTES else [*words[: _NOTES - 1], f"and {len(words) - _NOTES + 1} more"]
+    for k, sentence in enumerate(shown):
+        y = HEIGHT - 16 - _LINE * (len(shown) - 1 - k)
+        text(page, LEFT, y, shorten(sentence, 230), size=9, color=MUTED)
+
+
+def foot(words: Sequence[str]) -> float:
+    """The height [pixels] above which panels and their axes' labels must stay for these notes."""
+    return BOTTOM - _LINE * min(len(words), _NOTES)
+
+
+def panel(page: Figure, left: float, top: float, width: float, height: float, title: str = "") -> Axes:
+    """Axes with a heading."""
+    ax = axes(page, left, top, width, height)
+    if title:
+        text(page, left, top - 8, title, size=10, color=INK)
+    ax.tick_params(length=3, labelsize=8.5)
+    ax.grid(axis="y")
+    ax.set_axisbelow(True)
+    return ax
+
+
+def log_axis(axis: Axis, low: float, high: float, *, unit: str = "power") -> None:
+    """A logarithmic axis from low to high; unit: power (of ten), time, plain or percent."""
+    set_scale, set_limits = (
+        (axis.axes.set_xscale, axis.axes.set_xlim)
+        if axis.axis_name == "x"
+        else (axis.axes.set_yscale, axis.axes.set_ylim)
+    )
+    set_scale("log")
+    set_limits(low, high)
+    decades = np.log10(high / low)
+    subs = (1.0,) if decades > 2.2 else (1.0, 3.0) if decades > 1.2 else (1.0, 2.0, 5.0)
+    axis.set_major_locator(LogLocator(subs=subs, numticks=7 if decades > 2.2 else 12))
+    axis.set_major_formatter(_FORMATTERS[unit])
+    axis.set_minor_locator(NullLocator())
+
+
+def iteration_axis(ax: Axes, last: float) -> None:
+    """Iterations by logarithms, with a place for the first guess, iteration 0."""
+    ax.set_xscale("symlog", linthresh=1.0, linscale=0.35)
+    ax.set_xlim(-0.08, 1.15 * max(last, 10.0))
+    decades = [10.0**k for k in range(6) if 10.0**k <= max(last, 10.0)]
+    ax.xaxis.set_major_locator(FixedLocator([0.0, *decades]))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: quantity(value)))
+    ax.xaxis.set_minor_locator(NullLocator())
+
+
+def limits(values: Iterable[float], *, least: float = 0.0, margin: float = 1.3) -> tuple[float, float]:
+    """Limits of a logarithmic axis: around all positive and finite values, none of them below `least`."""
+    array = np.array([value for value in values if np.isfinite(value) and value > 0.0])
+    if not len(array):
+        return 0.1, 10.0
+    low, high = max(float(array.min()), least) / margin, float(array.max()) * margin
+    return (low, high) if high > 10 * low else (np.sqrt(low * high / 10), np.sqrt(low * high * 10))
+
+
+_FORMATTERS = {
+    "power": LogFormatterMathtext(labelOnlyBase=False),
+    "time": FuncFormatter(lambda value, _: duration(value)),
+    "plain": FuncFormatter(lambda value, _: quantity(value)),
+    "percent": FuncFormatter(lambda value, _: f"{100 * value:.3g} %"),
+}

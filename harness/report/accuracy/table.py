@@ -1,0 +1,154 @@
+"""The rows of an accuracy measurement as problems, curves and simulations (schema: `harness/accuracy/rows.py`).
+
+The gap of an energy g is (g - g*)/(g0 - g*): g0 at the current positions (in the paper's reproduction at the inertial
+target), g* of the lowest minimum that is known. Rows hold energies, so a lower minimum mends all gaps at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A frozen step. vertices; g0, best, minima (ascending), magnitude [J]; mean_rest_length [m]; time_step [s].
+
+    doubt: why `best` is no certified minimum, empty where it is.
+    """
+
+    digest: str
+    scene: str
+    size: int
+    vertices: int
+    moment: str
+    frame: int
+    integrator: str
+    time_step: float
+    stiffness_ratio: float
+    mean_rest_length: float
+    magnitude: float
+    g0: float
+    minima: tuple[float, ...]
+    doubt: str
+
+    @property
+    def best(self) -> float:
+        """g* [J]; nan where nothing is known."""
+        return self.minima[0] if self.minima else np.nan
+
+    @property
+    def mesh(self) -> str:
+        """The scene and its size."""
+        return f"{self.scene} {self.size}" if self.size else self.scene
+
+    @property
+    def name(self) -> str:
+        """Mesh and moment; problems that differ in nothing else have the same."""
+        frame = "" if self.moment.startswith("frame") else f" (frame {self.frame})"
+        euler = "" if self.integrator == "implicit-euler" else f", {self.integrator}"
+        return f"{self.mesh}, {self.moment}{frame}{euler}"
+
+    @property
+    def round_off(self) -> float:
+        """The gap below which energies are round-off; infinite where the step starts at its minimum."""
+        scale = self.g0 - self.best
+        return float(np.finfo(np.float64).eps) * self.magnitude / scale if scale > 0 else np.inf
+
+    def gap(self, g: Values) -> Values:
+        """The gaps of energies [J]."""
+        return (g - self.best) / (self.g0 - self.best)
+
+    def branch(self, g: float | None) -> int | None:
+        """The number of the minimum with the energy g [J], 0 for the lowest; None for no minimum."""
+        if g is None or not self.minima:
+            return None
+        return int(np.argmin(np.abs(np.array(self.minima) - g)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """One solver's way to the minimum of one problem.
+
+    iterations, gap, largest [mean rest lengths], stationarity (k,); seconds (rounds, k), nan where not timed;
+    warm, cold: seconds to prepare, nan where not known; branch: the minimum that was reached;
+    status and reason: of the rows; recording: relative to the results' folder, or "".
+    """
+
+    problem: Problem
+    solver: str
+    label: str
+    parameters: str
+    first_guess: str
+    threads: int
+    iterations: Values
+    gap: Values
+    largest: Values
+    stationarity: Values
+    seconds: Values
+    warm: float
+    cold: float
+    branch: int | None
+    status: str
+    reason: str
+    recording: str
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """One simulation of a horizon [s]: its relative error, and wall seconds a simulated second (nan if it failed)."""
+
+    scene: str
+    size: int
+    solver: str
+    label: str
+    parameters: str
+    integrator: str
+    time_step: float
+    tolerance: float | None
+    iterations: int
+    first_guess: str
+    horizon: float
+    error: float
+    error_rms: float
+    seconds: float
+    status: str
+    reason: str
+
+    @property
+    def mesh(self) -> str:
+        """The scene and its size."""
+        return f"{self.scene} {self.size}" if self.size else self.scene
+
+    @property
+    def setting(self) -> str:
+        """What was chosen, in words."""
+        stop = f"{self.iterations} iterations" if self.tolerance is None else f"tolerance {self.tolerance:g}"
+        return f"{self.label}, {self.integrator}, dt {step_words(self.time_step)}, {stop}"
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """All that the rows say, in their order; machine: processor, threads and commit, in words."""
+
+    problems: tuple[Problem, ...]
+    curves: tuple[Curve, ...]
+    works: tuple[Work, ...]
+    machine: tuple[str, ...]
+
+
+def step_words(dt: float) -> str:
+    """A time step [s] in words: 1/30 s, or milliseconds where it is no whole part of a second."""
+    whole = round(1 / dt)
+    return f"1/{whole} s" if abs(whole * dt - 1) < 1e-9 else f"{1e3 * dt:.3g} ms"
+
+
+def without_frames(table: Table) -> Table:
+    """The table less the paper's problems (moments `frame-k`), which have a picture of their own."""
+    kept = tuple(p for p in table.problems if not p.moment.startswith("frame-"))
+    inside = {p.digest for p in kept}
+    return replace(table, problems=kept, curves=tuple(c for c in table.curves if c.problem.digest in inside))

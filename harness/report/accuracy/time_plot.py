@@ -1,0 +1,127 @@
+"""Seconds to each accuracy for every solver on a mesh: the step alone, and with set-up spread over many steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import inf
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
+
+from harness.report.accuracy.convergence import GUESSES
+from harness.report.accuracy.sheet import (
+    LEFT,
+    RIGHT,
+    TOP,
+    files,
+    foot,
+    legend,
+    limits,
+    line,
+    log_axis,
+    looks,
+    notes,
+    panel,
+    sheet,
+)
+from harness.report.accuracy.table import Curve, Problem, Table
+from harness.report.accuracy.times import STEPS, TARGETS, askable, crossings, power, seconds_to
+from harness.report.page import count, text
+from harness.report.style import INK, Mark
+
+_COLUMNS = {None: "the step alone", **{n: f"set-up over {count(n)} step{'s' if n > 1 else ''}" for n in STEPS}}
+
+
+def draw_times(table: Table, folder: Path) -> list[Path]:
+    """A picture for each mesh; of problems whose minimum is certified alone. Returns the files."""
+    drawn = []
+    marked = looks((curve.label, curve.solver) for curve in table.curves)
+    for mesh in dict.fromkeys(problem.mesh for problem in table.problems):
+        sure = [curve for curve in table.curves if curve.problem.mesh == mesh and not curve.problem.doubt]
+        if sure:
+            stem = folder / mesh.replace(" ", "-")
+            _draw(stem, mesh, sure, marked, table.machine)
+            drawn += files(stem)
+    return drawn
+
+
+def middle(curves: Sequence[Curve], target: float, steps: int | None = None) -> float:
+    """The median over a solver's problems that can be judged [s]; infinite where half of them are not solved."""
+    times = [seconds_to(curve, target, steps) for curve in curves if askable(curve.problem, target)]
+    # The upper of the two in the middle: a mean with infinity would hide what was solved or was not.
+    return sorted(times)[len(times) // 2] if times else np.nan
+
+
+def _draw(stem: Path, mesh: str, curves: list[Curve], marked: dict[str, Mark], machine: Sequence[str]) -> None:
+    problems: list[Problem] = list({curve.problem.digest: curve.problem for curve in curves}.values())
+    over = f"median over {len(problems)} steps" if len(problems) > 1 else problems[0].name
+    guesses = [guess for guess in GUESSES if any(curve.first_guess == guess for curve in curves)]
+    series = {
+        guess: {
+            label: [curve for curve in curves if (curve.label, curve.first_guess) == (label, guess)]
+            for label in marked
+            if any((curve.label, curve.first_guess) == (label, guess) for curve in curves)
+        }
+        for guess in guesses
+    }
+    words = _words(curves, guesses)
+    times = [middle(c, t, n) for group in series.values() for c in group.values() for t in TARGETS for n in _COLUMNS]
+    low, high = limits([*times, *(curve.warm for curve in curves)])
+    facts = [f"{count(problems[0].vertices)} vertices", over, "gap of the energy", *machine]
+    with sheet(stem, f"Time to accuracy: {mesh}", facts) as page:
+        width, gap = (RIGHT - LEFT - 62) / len(_COLUMNS) - 16, 84
+        height = (foot(words) - TOP - len(guesses) * gap) / max(len(guesses), 1)
+        for row, guess in enumerate(guesses):
+            top = TOP + 42 + row * (height + gap)
+            text(page, LEFT + 62, top - 32, GUESSES[guess], size=11, weight="bold")
+            for column, (steps, name) in enumerate(_COLUMNS.items()):
+                ax = panel(page, LEFT + 62 + column * (width + 16), top, width, height, name)
+                _panel(ax, series[guess], marked, steps, (low, high * (high / low) ** 0.12))
+                if column:
+                    ax.tick_params(labelleft=False)
+        used = {curve.label for curve in curves}
+        cross = Line2D([], [], color=INK, marker="x", linestyle="", markersize=7, markeredgewidth=2)
+        legend(page, {k: m for k, m in marked.items() if k in used}, below=[(cross, "not reached from here on")])
+        notes(page, words)
+
+
+def _panel(
+    ax: Axes, series: dict[str, list[Curve]], marked: dict[str, Mark], steps: int | None, span: tuple[float, float]
+) -> None:
+    """Times to all accuracies; a cross at the upper edge where a solver reaches the next one no more."""
+    ticks = [power(target) for target in TARGETS]
+    taken: dict[int, int] = {}
+    for label, curves in series.items():
+        look = marked[label]
+        times = np.array([middle(curves, target, steps) for target in TARGETS])
+        line(ax, np.arange(len(TARGETS)), np.where((times > 0) & np.isfinite(times), times, np.nan), look, spaced=False)
+        failed = np.flatnonzero(times == inf)
+        if len(failed):
+            at = int(failed[0])
+            place = taken[at] = taken.get(at, -1) + 1
+            x, y = at - 0.3 + 0.15 * (place % 5), 0.975 - 0.04 * (place // 5)
+            ax.plot(x, y, "x", color=look.color, transform=ax.get_xaxis_transform(), markersize=6, markeredgewidth=1.8)
+        if steps is None:
+            ax.plot(-1, np.median([curve.warm for curve in curves]), look.marker, color=look.color, markersize=5)
+    log_axis(ax.yaxis, *span, unit="time")
+    first = -1 if steps is None else 0
+    ax.set_xlim(first - 0.4, len(TARGETS) - 0.6)
+    ax.xaxis.set_major_locator(FixedLocator(range(first, len(TARGETS))))
+    ax.xaxis.set_major_formatter(FixedFormatter((["set-up"] if steps is None else []) + ticks))
+    ax.xaxis.set_minor_locator(NullLocator())
+    if steps is None:
+        ax.axvline(-0.5, color=INK, linewidth=0.6, alpha=0.4)
+
+
+def _words(curves: Sequence[Curve], guesses: Sequence[str]) -> list[str]:
+    """Who overtakes whom on the hardest step, the one of the last moment, from each first guess."""
+    words = []
+    for guess in guesses:
+        race = [curve for curve in curves if curve.problem is curves[-1].problem and curve.first_guess == guess]
+        sentences = crossings(race)
+        if sentences:
+            words.append(f"{curves[-1].problem.moment}, {GUESSES[guess]}: {'; '.join(sentences)}")
+    return words

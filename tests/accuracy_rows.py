@@ -1,0 +1,145 @@
+"""Rows of an accuracy measurement that nobody made: methods that converge at known rates and take known times."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from harness.accuracy.rows import SCHEMA
+
+# The gap falls by `rate` an iteration (Newton: squares); an iteration takes `cost` and preparing `setup` seconds a
+# vertex.
+METHODS = {
+    "sparse": {"rate": 0.93, "cost": 4e-7, "setup": 3e-6},
+    "numba": {"rate": 0.93, "cost": 5e-8, "setup": 2e-6},
+    "anderson": {"rate": 0.8, "cost": 9e-8, "setup": 2e-6},
+    "chebyshev": {"rate": 0.85, "cost": 6e-8, "setup": 2e-6},
+    "lbfgs": {"rate": 0.7, "cost": 1.2e-7, "setup": 2e-6},
+    "newton": {"rate": None, "cost": 4e-6, "setup": 0.0},
+    "newton-cg": {"rate": 0.3, "cost": 1.5e-6, "setup": 2e-6},
+    "hybrid": {"rate": 0.6, "cost": 1.3e-7, "setup": 2e-6},
+}
+KEPT = tuple(sorted({round(10 ** (k / 12)) for k in range(37)} | {0}))
+MACHINE = {"machine": "abc", "cpu": "A processor", "cores": 2, "threads": 1, "commit": "0" * 40}
+G, DROP = 0.25, 2.0  # g* and g0 - g* [J]
+ROUND_OFF = 1e-12  # the least gap that a method reaches
+
+
+def shared(scene: str, size: int, **more: Any) -> dict[str, Any]:
+    return {
+        "sweep": "accuracy",
+        "scene": scene,
+        "size": size,
+        "vertices": size * size,
+        "springs": 4 * size * size,
+        "integrator": "implicit-euler",
+        "time_step": 1 / 30,
+        "status": "ok",
+        **MACHINE,
+        **more,
+    }
+
+
+def problem(scene: str, size: int, moment: str, *, certified: bool = True, branches: int = 1) -> list[dict[str, Any]]:
+    """A frozen step, and its minima 0.1 J apart."""
+    digest = f"{scene}-{size}-{moment}"
+    row = shared(scene, size, problem=digest, moment=moment, frame=7)
+    facts = {"stiffness_ratio": 6.4e4, "mean_rest_length": 1 / size, "g0": G + DROP, "g0_inertial": G + 0.5 * DROP}
+    minima = [
+        row
+        | {"kind": "minimum", "branch": k, "g": G + 0.1 * k, "stationarity": 1e-14}
+        | {"smallest_eigenvalue": 0.1, "certified": certified}
+        for k in range(branches)
+    ]
+    return [row | facts | {"kind": "problem", "magnitude": 40.0}, *minima]
+
+
+def gaps(rate: float | None, iterations: Sequence[int], start: float) -> np.ndarray:
+    k = np.asarray(iterations, float)
+    fall = rate**k if rate else 0.5 ** (2.0 ** np.minimum(k, 8) - 1)
+    return np.maximum(start * fall, ROUND_OFF)
+
+
+def curve(
+    scene: str, size: int, moment: str, solver: str, *, guess: str = "current", branch: int = 0, **more: Any
+) -> Iterator[dict[str, Any]]:
+    """The rows of a solve: of preparing, then each iterate that is kept, down to round-off."""
+    method = METHODS[solver]
+    row = shared(scene, size, solver=solver, parameters="{}", problem=f"{scene}-{size}-{moment}", moment=moment)
+    row |= {"frame": 7, "first_guess": guess, **more}
+    yield row | {"kind": "prepare", "seconds": [method["setup"] * size**2] * 3, "cold": 1.0}
+    start = {"current": 1.0, "inertial": 0.2}[guess]
+    floor = 0.1 * branch / DROP
+    for k, gap in zip(KEPT, gaps(method["rate"], KEPT, start), strict=True):
+        g, stamp = G + DROP * (gap + floor), method["cost"] * size**2 * k
+        yield (
+            row
+            | {"kind": "curve", "iteration": k, "g": g, "branch": branch, "minimum_g": G + 0.1 * branch}
+            | {"largest_error": 0.3 * np.sqrt(gap), "rms_error": 0.1 * np.sqrt(gap), "stationarity": np.sqrt(gap)}
+            | {"seconds": [stamp * factor for factor in (0.97, 1.0, 1.1)], "iterations": 1000}
+        )
+        if gap <= ROUND_OFF:
+            return
+
+
+def failure(scene: str, size: int, moment: str, solver: str, status: str, reason: str) -> dict[str, Any]:
+    row = shared(scene, size, solver=solver, parameters="{}", problem=f"{scene}-{size}-{moment}", moment=moment)
+    return row | {"kind": "curve", "first_guess": "current", "status": status, "reason": reason}
+
+
+ORDER = {"implicit-euler": (1, 8.0), "bdf2": (2, 20.0), "midpoint": (2, 6.0)}
+
+
+def work(scene: str, size: int, solvers: Sequence[str] = ("numba", "hybrid", "xpbd")) -> Iterator[dict[str, Any]]:
+    """Simulations of a second: their error falls with the time step as the integrator's order says."""
+    for solver in solvers:
+        for integrator, (order, constant) in ORDER.items():
+            for dt in (1 / 30, 1 / 60, 1 / 120, 1 / 240):
+                for tolerance, iterations in ((None, 50), (1e-2, 1000), (1e-4, 1000)):
+                    slip = {None: 0.3, 1e-2: 0.05, 1e-4: 0.001}[tolerance] * (0.4 if solver == "hybrid" else 1.0)
+                    error = constant * dt**order + slip
+                    cost = {None: 50, 1e-2: 20, 1e-4: 90}[tolerance] * 5e-8 * size**2 / dt
+                    cost *= {"hybrid": 0.5, "xpbd": 0.3}.get(solver, 1.0)
+                    yield (
+                        shared(scene, size, solver=solver, parameters="{}", kind="work", problem="t")
+                        | {"integrator": integrator, "time_step": dt, "tolerance": tolerance, "iterations": iterations}
+                        | {"horizon": 1.0, "seconds": [cost] * 3, "seconds_per_simulated": cost, "error": error}
+                        | {"error_rms": 0.1 * error, "first_guess": "assignment", "iterations_done": 1500}
+                    )
+
+
+def write(folder: Path, rows: Sequence[dict[str, Any]]) -> Path:
+    """Write the rows as results; returns the folder."""
+    (folder / "accuracy").mkdir(parents=True, exist_ok=True)
+    table = pa.Table.from_pylist(list(rows), schema=SCHEMA)
+    pq.write_table(table, folder / "accuracy" / f"{len(list((folder / 'accuracy').iterdir()))}.parquet")
+    return folder
+
+
+def full() -> list[dict[str, Any]]:
+    """Three scenes, three sizes of one, all methods from both first guesses, failures and doubts among them."""
+    rows: list[dict[str, Any]] = []
+    for scene, sizes in (("net", (10, 24, 48)), ("curtain", (21,)), ("block", (8,))):
+        for size in sizes:
+            for moment in ("early", "middle", "violent"):
+                doubtful = scene == "block" and moment == "violent"
+                rows += problem(scene, size, moment, certified=not doubtful, branches=1 + (scene == "curtain"))
+                for solver in METHODS:
+                    for guess in ("current", "inertial"):
+                        branch = int(scene == "curtain" and solver == "newton" and guess == "inertial")
+                        rows += curve(scene, size, moment, solver, guess=guess, branch=branch)
+                if scene == "block":
+                    rows.append(failure(scene, size, moment, "dense", "unsupported", "dense knows springs alone"))
+                    rows.append(failure(scene, size, moment, "vbd", "diverged", "not finite from iteration 3 on"))
+        rows += work(scene, sizes[0])
+    return rows
+
+
+def parameters(**values: Any) -> str:
+    return json.dumps(values)
