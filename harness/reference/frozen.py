@@ -1,0 +1,129 @@
+"""Frozen step problems: single steps of a reference run, so that every solver answers the same question.
+
+The reference run takes converged steps (Newton's method), with pins exact whatever the scene says of them. Three of its
+moments are graded:
+
+    early     a tenth of the run, and the second step at least, before which BDF2 has no history
+    middle    half of it
+    violent   the step in which forces turn the motion away most from where inertia leads, the one of the largest
+
+        c/(2 dt^2) |x - target|_M^2        at the step's minimum x
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.scene import Scene, build
+from harness.simulate import FIRST_GUESSES, prepare, simulate
+from harness.spec import SceneSpec
+from solvers.problem import Pins, Solver, Start, StepProblem, StopRule
+
+MOMENTS = ("early", "middle", "violent")
+CONVERGED = StopRule(500, 1e-12)
+"""The reference run's steps: Newton's method takes the last digits in one iteration more."""
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frozen:
+    """One step of a reference run.
+
+    frame: the step, from 1; problem: exact pins, its first guess the current positions; digest: 12 hex digits of the
+    problem's arrays, of the gradient at the current positions, which stands for the energies, and of where it is from.
+    """
+
+    frame: int
+    problem: StepProblem
+    digest: str
+
+    def stated(self, first_guess: str) -> StepProblem:
+        """The problem with a first guess by name (`harness.simulate.FIRST_GUESSES`)."""
+        return FIRST_GUESSES[first_guess](self.problem)
+
+
+def bind(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Scene:
+    """The scene with all of its pins exact. Raises InputError."""
+    scene = build(spec, size, integrator)
+    vertices = scene.system.pins.vertices
+    return replace(scene, system=replace(scene.system, pins=Pins(vertices, np.full(len(vertices), np.inf))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceRun:
+    """problems: by frame, those asked for; violence (frames,) [J]: the inertia term at each step's minimum."""
+
+    problems: dict[int, StepProblem]
+    violence: NDArray[np.float64]
+
+
+def reference_run(scene: Scene, solver: Solver, length: int, wanted: Collection[int] = ()) -> ReferenceRun:
+    """The converged steps 1 to `length`; the problems of the frames wanted, or of the moments where none is."""
+    kept: dict[int, StepProblem] = {}
+    violence, keep = np.empty(length), set(wanted)
+    for step in simulate(scene, prepare(scene, solver), CONVERGED, first_guess="current", frames=length):
+        violence[step.index - 1] = step.problem.terms(step.solution.positions)["inertia"]
+        if not wanted:
+            keep = set(moment_frames(violence[: step.index], length).values())
+        kept[step.index] = step.problem
+        kept = {frame: problem for frame, problem in kept.items() if frame in keep}
+    return ReferenceRun(kept, violence)
+
+
+def moment_frames(violence: NDArray[np.float64], length: int) -> dict[str, int]:
+    """The frames of MOMENTS in a run of `length` steps, of whose first the violence (frames,) [J] is known."""
+    first = min(2, length)
+    return {
+        "early": max(first, -(-length // 10)),
+        "middle": max(first, (length + 1) // 2),
+        "violent": first + int(np.argmax(violence[first - 1 :])) if len(violence) >= first else 1,
+    }
+
+
+_ARRAYS = ("target", "force", "pin_targets", "current")
+_START = ("positions", "velocity", "origin")
+
+
+def freeze(frame: int, problem: StepProblem, origin: str) -> tuple[Frozen, Arrays]:
+    """A problem as a frozen one, and as the arrays to be saved; origin: what it was taken from, in words."""
+    system, start = problem.system, problem.start
+    arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
+    arrays |= {f"start_{name}": getattr(start, name) for name in _START}
+    arrays |= {"mass": system.mass, "pins": system.pins.vertices, "gradient": problem.gradient(problem.current)}
+    arrays |= {"step": [system.time_step, system.factor, start.time, start.rate], "frame": frame}
+    arrays = {name: np.asarray(value) for name, value in arrays.items()}
+    content = hashlib.sha256(origin.encode())
+    for name, array in arrays.items():
+        content.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
+    digest = content.hexdigest()[:12]
+    return Frozen(frame, problem, digest), arrays | {"digest": np.asarray(digest)}
+
+
+def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
+    """The frozen problem in saved arrays, bound to a scene; None where today's scene states another problem."""
+    time_step, factor, time, rate = arrays["step"].tolist()
+    system = replace(scene.system, factor=factor)
+    start = Start(*(arrays[f"start_{name}"] for name in _START[:2]), time, arrays["start_origin"], rate)
+    given = {name: arrays[name] for name in _ARRAYS}
+    for array in (*given.values(), start.positions, start.velocity, start.origin):
+        array.flags.writeable = False
+    problem = StepProblem(system, **given, first_guess=given["current"], start=start)
+    same = (
+        system.time_step == time_step
+        and np.array_equal(system.mass, arrays["mass"])
+        and np.array_equal(system.pins.vertices, arrays["pins"])
+        and _close(problem.gradient(problem.current), arrays["gradient"])
+    )
+    return Frozen(int(arrays["frame"]), problem, str(arrays["digest"])) if same else None
+
+
+def _close(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:
+    # Sums differ in their last digits between processors; another stiffness differs in the first.
+    return bool(np.abs(found - wanted).max(initial=0.0) <= 1e-9 * np.abs(wanted).max(initial=1e-300))

@@ -1,0 +1,123 @@
+"""The truth on disk: what was found once is found again by the digest of the question.
+
+    run-SCENE-SIZE-INTEGRATOR.npz             how violent each step of a reference run is
+    problem-SCENE-SIZE-INTEGRATOR-FRAME.npz   a frozen problem
+    minima-PROBLEM.npz                        the minima known of it
+    trajectory-QUESTION.npz                   a trajectory
+
+Files have a partial name until they are complete, and hold arrays only.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness.reference.frozen import Arrays, Frozen, bind, freeze, moment_frames, reference_run, thaw
+from harness.reference.minimiser import Minimum, Reference, find_minima, polish
+from harness.reference.scratch import ScratchNewton
+from harness.scene import Scene
+from harness.spec import IntegratorName, SceneSpec
+from solvers.problem import Positions, Solver
+
+
+@dataclass(frozen=True, slots=True)
+class Store:
+    """folder: of all references, shared by everyone who asks about the same scenes; solver: Newton's method."""
+
+    folder: Path
+    solver: Solver = field(default_factory=ScratchNewton)
+
+    def moments(self, spec: SceneSpec, size: int, integrator: IntegratorName = "implicit-euler") -> dict[str, Frozen]:
+        """The frozen problems of MOMENTS in the scene's `frames` steps. Raises InputError, RunFailed."""
+        asked = _Asked(spec, size, integrator)
+        path = self.folder / f"run-{asked.name}.npz"
+        violence = _read(path)["violence"] if path.exists() else np.empty(0)
+        frames = set(moment_frames(violence, spec.frames).values()) if len(violence) == spec.frames else set()
+        known = self._known(asked, frames)
+        if not known:
+            run = reference_run(asked.scene, self.solver, spec.frames)
+            _write(path, {"violence": run.violence})
+            violence, known = run.violence, {f: self._keep(asked, f, p) for f, p in run.problems.items()}
+        return {moment: known[frame] for moment, frame in moment_frames(violence, spec.frames).items()}
+
+    def frames(
+        self, spec: SceneSpec, size: int, frames: Collection[int], integrator: IntegratorName = "implicit-euler"
+    ) -> dict[int, Frozen]:
+        """The frozen problems of these frames, counted from 1. Raises InputError, RunFailed."""
+        asked = _Asked(spec, size, integrator)
+        known = self._known(asked, frames)
+        if not known:
+            run = reference_run(asked.scene, self.solver, max(frames), frames)
+            known = {frame: self._keep(asked, frame, problem) for frame, problem in run.problems.items()}
+        return known
+
+    def reference(self, frozen: Frozen) -> Reference:
+        """The minima known of a problem, found now if there is none. Its `best` raises Uncertified."""
+        path = self.folder / f"minima-{frozen.digest}.npz"
+        if path.exists():
+            return _minima(_read(path))
+        found = find_minima(frozen.problem, self.solver)
+        self._remember(frozen, found)
+        return found
+
+    def classify(self, frozen: Frozen, p: Positions) -> Minimum:
+        """The minimum in whose basin p (n, 3) [m] lies; one that is new and certified joins those known, and is the
+        new reference if it is the lowest. `reference(frozen).branch(minimum)` is its branch where it is certified."""
+        found, known = polish(frozen.problem, p, self.solver), self.reference(frozen)
+        joined = known.joined(found)
+        if joined is not known:
+            self._remember(frozen, joined)
+        return joined.minima[joined.branch(found)] if found.certified else found
+
+    def _known(self, asked: _Asked, frames: Collection[int]) -> dict[int, Frozen]:
+        """The problems of all of these frames, or none."""
+        paths = [self._problem(asked, frame) for frame in frames]
+        if not all(path.exists() for path in paths):
+            return {}
+        thawed = [thaw(_read(path), asked.scene) for path in paths]
+        return {one.frame: one for one in thawed if one} if all(thawed) else {}
+
+    def _problem(self, asked: _Asked, frame: int) -> Path:
+        return self.folder / f"problem-{asked.name}-{frame}.npz"
+
+    def _keep(self, asked: _Asked, frame: int, problem: Any) -> Frozen:
+        frozen, arrays = freeze(frame, problem, asked.name)
+        _write(self._problem(asked, frame), arrays)
+        return frozen
+
+    def _remember(self, frozen: Frozen, known: Reference) -> None:
+        fields = ("positions", "g", "error", "smallest_eigenvalue")
+        arrays = {name: np.array([getattr(minimum, name) for minimum in known.minima]) for name in fields}
+        _write(self.folder / f"minima-{frozen.digest}.npz", arrays | {"reason": np.array(known.reason)})
+
+
+class _Asked:
+    """A scene of one size by one integrator, and its name in file names."""
+
+    def __init__(self, spec: SceneSpec, size: int, integrator: IntegratorName) -> None:
+        self.scene: Scene = bind(spec, size, integrator)
+        self.name = f"{spec.digest[:12]}-{size}-{integrator}"
+
+
+def _minima(arrays: Arrays) -> Reference:
+    numbers = (arrays[name].tolist() for name in ("g", "error", "smallest_eigenvalue"))
+    columns = zip(arrays["positions"], *numbers, strict=True)
+    return Reference(tuple(Minimum(*values, certified=True) for values in columns), str(arrays["reason"]))
+
+
+def _read(path: Path) -> Arrays:
+    with np.load(path, allow_pickle=False) as stored:
+        return dict(stored)
+
+
+def _write(path: Path, arrays: Arrays) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.npz")
+    np.savez(partial, **arrays)
+    os.replace(partial, path)
