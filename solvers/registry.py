@@ -9,6 +9,7 @@ SOLVERS = {
     "dense": "solvers.local_global:DenseLocalGlobal",
     "sparse": "solvers.local_global:SparseLocalGlobal",
     "numba": "solvers.compiled:CompiledLocalGlobal",
+    "newton": "solvers.newton:Newton",
 }
 
 

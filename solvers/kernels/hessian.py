@@ -1,0 +1,146 @@
+"""The Hessian of springs, written straight into the entries of a matrix of 3 x 3 blocks, and its products.
+
+    H_e = k (nn' + lateral (I - nn')),   lateral = 1 - r/l,   n the direction of a spring, l its length
+
+A compressed spring (l < r) has a negative lateral part. It is scaled by `keep`: 1 leaves the Hessian exact, 0 makes it
+positive semidefinite spring by spring (Teran et al. 2005).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from solvers.kernels.compiling import inner, kernel
+from solvers.kernels.objective import along
+from solvers.problem import System
+
+
+class Places(NamedTuple):
+    """Where blocks lie in the entries of a matrix, in CSR, of the free vertices' coordinates.
+
+    A block is the place of its first entry; its rows lie `stride` apart. free (f,): vertices; diagonal (n,): their
+    blocks, -1 for a vertex that is not free; stride (n,); across (m, 2): the blocks of each spring from its first end
+    to its second and back, -1 where an end is not free.
+    """
+
+    free: NDArray[np.int64]
+    diagonal: NDArray[np.int64]
+    stride: NDArray[np.int64]
+    across: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, system: System, edges: NDArray[np.int64], graph: csr_array) -> Places:
+        """The places in a matrix whose pattern of blocks is `graph`, (f, f), sorted, over the free vertices."""
+        n, f = system.vertices, len(system.free)
+        degree = np.diff(graph.indptr).astype(np.int64)
+        first = np.asarray(graph.indptr[:-1], np.int64)
+        row = np.repeat(np.arange(f), degree)
+        column = np.asarray(graph.indices, np.int64)
+        place = 9 * first[row] + 3 * (np.arange(len(row)) - first[row])
+        key = row * f + column
+        number = np.full(n, -1)
+        number[system.free] = np.arange(f)
+        diagonal, stride = np.full(n, -1), np.zeros(n, np.int64)
+        diagonal[system.free] = place[np.searchsorted(key, np.arange(f) * (f + 1))]
+        stride[system.free] = 3 * degree
+        i, j = number[edges].T
+        inside = (i >= 0) & (j >= 0) & (i != j)
+        across = np.full((len(edges), 2), -1)
+        for side, (a, b) in enumerate([(i, j), (j, i)]):
+            across[inside, side] = place[np.searchsorted(key, a[inside] * f + b[inside])]
+        return cls(system.free, diagonal, stride, across)
+
+
+@inner
+def _curvature(terms, e, length, keep):
+    """k and the lateral stiffness [N/m] of spring e; one of zero length and positive rest length has none."""
+    k, r = terms.stiffness[e], terms.rest_length[e]
+    if length > 0.0:
+        lateral = 1.0 - r / length
+        return k, k * (lateral * keep if lateral < 0.0 else lateral)
+    return k, k if r == 0.0 else 0.0
+
+
+@inner
+def _add(values, place, stride, sign, xx, xy, xz, yy, yz, zz):
+    """Add sign times a symmetric block to the entries."""
+    values[place] += sign * xx
+    values[place + 1] += sign * xy
+    values[place + 2] += sign * xz
+    place += stride
+    values[place] += sign * xy
+    values[place + 1] += sign * yy
+    values[place + 2] += sign * yz
+    place += stride
+    values[place] += sign * xz
+    values[place + 1] += sign * yz
+    values[place + 2] += sign * zz
+
+
+@kernel
+def assemble(terms, places, p, keep, values):
+    """Write the Hessian [N/m] of springs, inertia and penalty pins at p (n, 3) to `values`."""
+    values[:] = 0.0
+    for v in places.free:
+        h = terms.inertia[v]
+        _add(values, places.diagonal[v], places.stride[v], 1.0, h, 0.0, 0.0, h, 0.0, h)
+    for q in range(len(terms.pinned)):
+        v, w = terms.pinned[q], terms.weight[q]
+        _add(values, places.diagonal[v], places.stride[v], 1.0, w, 0.0, 0.0, w, 0.0, w)
+    for e in range(len(terms.stiffness)):
+        i, j = terms.edges[e, 0], terms.edges[e, 1]
+        if i == j:
+            continue
+        n0, n1, n2, length = along(terms, e, p)
+        k, lateral = _curvature(terms, e, length, keep)
+        a = k - lateral
+        xx, xy, xz = a * n0 * n0 + lateral, a * n0 * n1, a * n0 * n2
+        yy, yz, zz = a * n1 * n1 + lateral, a * n1 * n2, a * n2 * n2 + lateral
+        if places.diagonal[i] >= 0:
+            _add(values, places.diagonal[i], places.stride[i], 1.0, xx, xy, xz, yy, yz, zz)
+        if places.diagonal[j] >= 0:
+            _add(values, places.diagonal[j], places.stride[j], 1.0, xx, xy, xz, yy, yz, zz)
+        if places.across[e, 0] >= 0:
+            _add(values, places.across[e, 0], places.stride[i], -1.0, xx, xy, xz, yy, yz, zz)
+            _add(values, places.across[e, 1], places.stride[j], -1.0, xx, xy, xz, yy, yz, zz)
+
+
+@kernel
+def linearise(terms, p, out):
+    """Write to out (m, 5) what `multiply` needs of each spring at p (n, 3): sqrt(k - lateral) n, its sign, lateral."""
+    for e in range(len(terms.stiffness)):
+        n0, n1, n2, length = along(terms, e, p)
+        k, lateral = _curvature(terms, e, length, 1.0)
+        a = k - lateral
+        root = np.sqrt(abs(a))
+        out[e, 0], out[e, 1], out[e, 2] = root * n0, root * n1, root * n2
+        out[e, 3], out[e, 4] = (1.0 if a >= 0.0 else -1.0), lateral
+
+
+@kernel
+def multiply(terms, linear, x, out):
+    """Write to `out` the product [N] of the exact Hessian of springs, inertia and penalty pins with x [m], (n, 3)."""
+    for v in range(len(x)):
+        for c in range(3):
+            out[v, c] = terms.inertia[v] * x[v, c]
+    for q in range(len(terms.pinned)):
+        v = terms.pinned[q]
+        for c in range(3):
+            out[v, c] += terms.weight[q] * x[v, c]
+    for e in range(len(terms.stiffness)):
+        i, j = terms.edges[e, 0], terms.edges[e, 1]
+        s0, s1, s2 = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+        along_it = linear[e, 3] * (linear[e, 0] * s0 + linear[e, 1] * s1 + linear[e, 2] * s2)
+        f0 = linear[e, 4] * s0 + along_it * linear[e, 0]
+        f1 = linear[e, 4] * s1 + along_it * linear[e, 1]
+        f2 = linear[e, 4] * s2 + along_it * linear[e, 2]
+        out[i, 0] += f0
+        out[i, 1] += f1
+        out[i, 2] += f2
+        out[j, 0] -= f0
+        out[j, 1] -= f1
+        out[j, 2] -= f2
