@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,10 +12,13 @@ from numpy.typing import NDArray
 from harness.effects.base import Contribution, Force, Pin, Steady, VelocityFilter
 from harness.errors import InputError, Mistake
 from harness.mesh.base import Mesh
+from harness.motion import Motion
 from harness.spec import SceneSpec
 from solvers.energies.springs import Springs
 from solvers.integrators import IMPLICIT_EULER, INTEGRATORS, Integrator
 from solvers.problem import Pins, Positions, System
+
+_LOG = logging.getLogger("springbench")
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +27,8 @@ class Scene:
 
     mesh: at rest, which is also the start; system: what is factorised; load: the sum of the forces that never
     change, (n, 3) [N], read-only; forces: those that change; filters: of the velocity;
-    pin_targets: (q, 3) [m], in the order of `system.pins`; velocity: of every vertex at the start [m/s];
-    integrator: its factor is the system's.
+    pin_targets: (q, 3) [m], in the order of `system.pins`; moving: which of them move, and how;
+    velocity: of every vertex at the start [m/s]; integrator: its factor is the system's.
     """
 
     mesh: Mesh
@@ -35,6 +39,16 @@ class Scene:
     pin_targets: Positions
     velocity: tuple[float, float, float]
     integrator: Integrator = IMPLICIT_EULER
+    moving: tuple[tuple[NDArray[np.int64], Motion], ...] = ()
+
+    def pins_at(self, time: float) -> Positions:
+        """Where the pins want their vertices at a time [s], (q, 3) [m]."""
+        if not self.moving:
+            return self.pin_targets
+        targets = self.pin_targets.copy()
+        for rows, motion in self.moving:
+            targets[rows] = motion.moved(self.pin_targets[rows], time)
+        return targets
 
     @cached_property
     def springs(self) -> Springs:
@@ -50,8 +64,9 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
     mesh = spec.mesh.build(size)
     mass = _mass(spec, mesh)
     parts = [_bound(spec, i, mesh, mass) for i in range(len(spec.effects))]
-    pins, targets = _pins(parts)
+    pins, targets, moving = _pins(parts)
     energies = tuple(energy for part in parts for energy in part.energies)
+    energies += tuple(energy for part in parts for derive in part.derived for energy in derive(energies))
     forces = [force for part in parts for force in part.forces]
     load = np.zeros_like(mesh.rest)
     for force in forces:
@@ -67,14 +82,18 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
         pin_targets=targets,
         velocity=spec.velocity,
         integrator=INTEGRATORS[integrator],
+        moving=moving,
     )
 
 
 def _bound(spec: SceneSpec, i: int, mesh: Mesh, mass: NDArray[np.float64]) -> Contribution:
     try:
-        return spec.effects[i].bind(mesh, mass, spec.time_step)
+        bound = spec.effects[i].bind(mesh, mass, spec.time_step)
     except InputError as error:
         raise InputError([replace(mistake, key=f"effects[{i}]") for mistake in error.mistakes]) from error
+    if bound.empty:
+        _LOG.info("effects[%d] (%s) does nothing with these parameters and is left out", i, spec.effects[i].kind)
+    return bound
 
 
 def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
@@ -85,17 +104,27 @@ def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
     return mesh.mass
 
 
-def _pins(parts: list[Contribution]) -> tuple[Pins, Positions]:
-    """All pins by vertex; a vertex may be named twice if both times mean the same."""
+def _pins(parts: list[Contribution]) -> tuple[Pins, Positions, tuple[tuple[NDArray[np.int64], Motion], ...]]:
+    """All pins by vertex, their targets, and which move; a vertex may be named twice if both times mean the same."""
     pins: list[Pin] = [pin for part in parts for pin in part.pins]
     if not pins:
-        return Pins(), np.empty((0, 3))
+        return Pins(), np.empty((0, 3)), ()
     vertices = np.concatenate([pin.vertices for pin in pins])
     weight = np.concatenate([np.full(len(pin.vertices), pin.weight) for pin in pins])
     targets = np.concatenate([pin.targets for pin in pins])
     unique, first, back = np.unique(vertices, return_index=True, return_inverse=True)
+    motions = list(dict.fromkeys(pin.motion for pin in pins))
+    motion, owner = (
+        np.repeat(of, [len(pin.vertices) for pin in pins])
+        for of in ([motions.index(pin.motion) for pin in pins], [i for i, part in enumerate(parts) for _ in part.pins])
+    )
     clash = (weight != weight[first][back]) | (targets != targets[first][back]).any(axis=1)
+    clash |= motion != motion[first][back]
     if clash.any():
-        vertex = int(vertices[clash][0])
-        raise InputError(f"pins: vertex {vertex} is pinned twice, to different places or with different weights")
-    return Pins(unique, weight[first]), targets[first]
+        one, two = owner[first][back][clash][0], owner[clash][0]
+        raise InputError(
+            f"pins: vertex {vertices[clash][0]} is pinned twice, by effects[{one}] and effects[{two}], to different "
+            "places, with different weights or with different motions"
+        )
+    moving = ((np.flatnonzero(motion[first] == k), path) for k, path in enumerate(motions) if path is not None)
+    return Pins(unique, weight[first]), targets[first], tuple(moving)

@@ -59,13 +59,13 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
     starts = scene.integrator.history and state.before is None
     method, system = (IMPLICIT_EULER, _first(scene)) if starts else (scene.integrator, scene.system)
     target, origin = method.predict(now, before, dt)
-    begun = Start(now.positions, now.velocity, time, origin, method.factor**0.5 / dt)
+    begun = Start(now.positions, now.velocity, time, origin, system.rate, time + method.when * dt)
     force = scene.load
     if scene.forces:
         a = method.ahead
         p, v = (x + a * (x - y) for x, y in zip(now, before, strict=True)) if a and state.before else now
         force = reduce(lambda total, effect: total + effect(p, v, time + a * dt), scene.forces, force)
-    held = scene.pin_targets
+    held = scene.pins_at(time + dt)
     if method.when < 1.0:
         held = now.positions[system.pins.vertices] + method.when * (held - now.positions[system.pins.vertices])
     current = _pinned(system, now.positions, held)

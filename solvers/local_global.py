@@ -14,7 +14,7 @@ Backends differ in how they do the two steps, and in nothing else: `DenseLocalGl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -25,6 +25,8 @@ from solvers import matrices
 from solvers.energies.springs import TINY, Springs
 from solvers.linear.factors import DenseCholesky, Factor, SparseLU
 from solvers.problem import (
+    Energy,
+    LaggedEnergy,
     Positions,
     ProjectiveEnergy,
     Solution,
@@ -48,7 +50,8 @@ class PreparedLocalGlobal:
 
     project: the local step; factor: of Q's free rows and columns; coupling: Q's free rows and exactly pinned
     columns (f, x); norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins; trace: of the unpinned
-    part of Q [N/m]; facts: exact counts of what was built; choice: the linear solver in words.
+    part of Q [N/m]; facts: exact counts of what was built; choice: the linear solver in words; begin: the local step
+    of one problem, where it differs from problem to problem.
     """
 
     system: System
@@ -59,13 +62,16 @@ class PreparedLocalGlobal:
     trace: float
     facts: dict[str, float]
     choice: str
+    begin: Callable[[StepProblem], Project] | None = None
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """The iterates from `problem.first_guess`; each yielded array is overwritten two iterations later."""
         constant, b = self._constant(problem), np.empty_like(problem.target)
+        project = self._local(problem)
         p, following = self._placed(problem.first_guess, problem), self._placed(problem.current, problem)
         while True:
-            self._advance(p, constant, b, following)
+            project(p, constant, b)
+            self._global(b, following)
             p, following = following, p
             yield p
 
@@ -95,9 +101,12 @@ class PreparedLocalGlobal:
         """The local and the global step at the first guess, as callables to be timed apart."""
         constant, b = self._constant(problem), np.empty_like(problem.target)
         p = self._placed(problem.first_guess, problem)
-        out = p.copy()
-        self.project(p, constant, b)
-        return {"local": lambda: self.project(p, constant, b), "global": lambda: self._global(b, out)}
+        out, project = p.copy(), self._local(problem)
+        project(p, constant, b)
+        return {"local": lambda: project(p, constant, b), "global": lambda: self._global(b, out)}
+
+    def _local(self, problem: StepProblem) -> Project:
+        return self.begin(problem) if self.begin else self.project
 
     def _constant(self, problem: StepProblem) -> Positions:
         """y, with the exact pins' columns of Q moved to the right-hand side."""
@@ -108,10 +117,6 @@ class PreparedLocalGlobal:
         if s.pins.exact.any():
             y[s.free] -= self.coupling @ problem.pin_targets[s.pins.exact]
         return y
-
-    def _advance(self, p: Positions, constant: Positions, b: Positions, out: Positions) -> None:
-        self.project(p, constant, b)
-        self._global(b, out)
 
     def _global(self, b: Positions, out: Positions) -> None:
         free = self.system.free
@@ -213,22 +218,29 @@ def prepared(
     exact = system.pins.vertices[system.pins.exact]
     inner = rows if len(free) == system.vertices else csr_array(rows[:, free])
     factor, choice = factorise(inner) if len(free) else (DenseCholesky(np.eye(0)), "nothing to solve for")
-
-    def project(p: Positions, y: Positions, out: Positions) -> None:
-        out[:] = y
-        for energy in energies:
-            energy.add_projection(p, out)
-
+    lagged = any(isinstance(energy, LaggedEnergy) for energy in energies)
     return PreparedLocalGlobal(
         system,
-        project,
+        _projection(energies),
         factor,
         csr_array(rows[:, exact]),
         lambda e: matrices.energy_norm(Q, e),
         float(Q.diagonal()[system.unpinned].sum()),
         _facts(Q.nnz, factor),
         choice,
+        (lambda problem: _projection(problem.energies)) if lagged else None,
     )
+
+
+def _projection(energies: Iterable[Energy]) -> Project:
+    projective = [energy for energy in energies if isinstance(energy, ProjectiveEnergy)]
+
+    def project(p: Positions, y: Positions, out: Positions) -> None:
+        out[:] = y
+        for energy in projective:
+            energy.add_projection(p, out)
+
+    return project
 
 
 def _facts(entries: int, factor: Factor) -> dict[str, float]:

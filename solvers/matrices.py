@@ -10,7 +10,7 @@ A self-loop (i = j) stretches nothing, so its row of A is empty.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import reduce
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array, csr_array, dia_array
 from scipy.sparse.csgraph import connected_components
 
-from solvers.problem import NotPositiveDefinite, ProjectiveEnergy, System
+from solvers.problem import Energy, LaggedEnergy, NotPositiveDefinite, ProjectiveEnergy, Start, System
 
 Dense = NDArray[np.float64]
 
@@ -95,10 +95,20 @@ def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> csr_array:
     n = system.vertices
     _, vertices, weight = system.penalty
     held = system.inertia + np.bincount(vertices, weight, minlength=n)
-    shares = (energy.stiffness_matrix(n) for energy in energies)
+    shares = (energy.stiffness_matrix(n) for energy in _begun(system, energies))
     Q = without_zeros(reduce(lambda total, share: total + share, shares, diagonal(held)))
     require_determined(system, Q)
     return Q
+
+
+def _begun(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[ProjectiveEnergy]:
+    """The energies in a step from anywhere, since lagged ones know their stiffness from its rate alone."""
+    nowhere = np.zeros((system.vertices, 3))
+    start = Start(nowhere, nowhere, 0.0, nowhere, system.rate, 0.0)
+    for energy in energies:
+        begun: Energy = energy.begin_step(start) if isinstance(energy, LaggedEnergy) else energy
+        if isinstance(begun, ProjectiveEnergy):
+            yield begun
 
 
 def require_determined(system: System, Q: csr_array) -> None:

@@ -89,6 +89,11 @@ class System:
     pins: Pins = field(default_factory=Pins)
     factor: float = 1.0
 
+    @property
+    def rate(self) -> float:
+        """sqrt(c)/dt [1/s], as `Start` has it."""
+        return self.factor**0.5 / self.time_step
+
     @cached_property
     def inertia(self) -> NDArray[np.float64]:
         """c m/dt^2 (n,) [N/m], the inertia's share of Q."""
@@ -123,7 +128,8 @@ class Start:
     """Where a step starts, for energies that depend on it and for methods that do not minimise.
 
     positions: p^t (n, 3) [m]; velocity: v^t, filters included, (n, 3) [m/s]; time: t [s];
-    origin (n, 3) [m] and rate [1/s]: the unknown x moves with the velocity rate (x - origin).
+    origin (n, 3) [m] and rate [1/s]: the unknown x moves with the velocity rate (x - origin);
+    until: the time of x [s], for what moves by itself (nan, which spoils all that depends on it, where it is not told).
     """
 
     positions: Positions
@@ -131,6 +137,7 @@ class Start:
     time: float
     origin: Positions
     rate: float
+    until: float = float("nan")
 
     def velocity_at(self, x: Positions) -> Positions:
         """The velocity [m/s] of the unknown x, both (n, 3)."""
@@ -139,7 +146,10 @@ class Start:
 
 @runtime_checkable
 class LaggedEnergy(Energy, Protocol):
-    """An energy that depends on where the step starts: damping, friction, obstacles that move."""
+    """An energy that depends on where the step starts: damping, friction, obstacles that move.
+
+    The stiffness of a projective one may depend on the start's rate and on nothing else of it, for Q is made once.
+    """
 
     def begin_step(self, start: Start) -> Energy:
         """The energy of this one step."""

@@ -5,6 +5,7 @@ An absent effect is an empty tuple: no flag, no branch, no allocation.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.mesh.base import Mesh
+from harness.motion import Motion
 from solvers.problem import Energy, Positions
 
 
@@ -27,17 +29,29 @@ class VelocityFilter(Protocol):
     """A change of the velocity at the start of a step."""
 
     def __call__(self, v: Positions) -> Positions:
-        """The changed velocity [m/s], shape (n, 3); anything linear in v."""
+        """The changed velocity [m/s], shape (n, 3)."""
+        ...
+
+
+class Derived(Protocol):
+    """Energies that follow from those of a scene's other effects."""
+
+    def __call__(self, energies: Sequence[Energy]) -> tuple[Energy, ...]:
+        """The energies to be added to these."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pin:
-    """Vertices (q,) held at targets (q, 3) [m] with a penalty weight [N/m]; an infinite weight is exact."""
+    """Vertices (q,) held at targets (q, 3) [m] with a penalty weight [N/m]; an infinite weight is exact.
+
+    motion: takes the targets along, where they move.
+    """
 
     vertices: NDArray[np.int64]
     targets: Positions
     weight: float
+    motion: Motion | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,10 +62,21 @@ class Contribution:
     forces: tuple[Force, ...] = field(default=())
     pins: tuple[Pin, ...] = field(default=())
     filters: tuple[VelocityFilter, ...] = field(default=())
+    derived: tuple[Derived, ...] = field(default=())
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing in any place."""
+        return not (self.energies or self.forces or self.pins or self.filters or self.derived)
 
 
 class Effect(Protocol):
     """A pydantic model with a literal `kind`."""
+
+    @property
+    def kind(self) -> str:
+        """The effect's name in `harness.effects.table`."""
+        ...
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
         """What the effect contributes on this mesh with these vertex masses [kg] and dt [s], once a scene.

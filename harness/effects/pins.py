@@ -1,4 +1,4 @@
-"""Pins: chosen vertices are held at their rest positions, by a penalty w/2 |p - p_rest|^2 or exactly."""
+"""Pins: chosen vertices are held at their rest positions, which may move, by a penalty w/2 |p - q|^2 or exactly."""
 
 from math import inf
 from typing import Literal
@@ -11,6 +11,7 @@ from harness.effects.base import Contribution, Pin
 from harness.errors import InputError, did_you_mean
 from harness.mesh.base import Mesh
 from harness.model import Model, Vector
+from harness.motion import Motion
 
 
 class Box(Model):
@@ -36,6 +37,8 @@ class Pins(Model):
     """Of the vertices chosen so far (all of them where nothing else is chosen), every k-th, from the first."""
     weight: PositiveFloat | Literal["exact"] = Field(default=1e10)
     """The penalty's weight w [N/m], or `exact`: the vertices are no unknowns any more."""
+    motion: Motion | None = None
+    """Key frames that take the pinned vertices along, all together."""
 
     @model_validator(mode="after")
     def _selects(self) -> "Pins":
@@ -49,7 +52,7 @@ class Pins(Model):
         if not len(vertices):
             raise InputError(f"pins: no vertex of the mesh lies in the box from {self.box}")
         weight = inf if self.weight == "exact" else float(self.weight)
-        return Contribution(pins=(Pin(vertices, mesh.rest[vertices], weight),))
+        return Contribution(pins=(Pin(vertices, mesh.rest[vertices], weight, self.motion),))
 
     def _chosen(self, mesh: Mesh) -> NDArray[np.int64]:
         n = len(mesh.rest)
