@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -88,7 +88,7 @@ def moment_frames(violence: NDArray[np.float64], length: int) -> dict[str, int]:
 
 
 _ARRAYS = ("target", "force", "pin_targets", "current")
-_START = ("positions", "velocity", "origin")
+_START = tuple(field.name for field in fields(Start))
 
 
 def freeze(frame: int, problem: StepProblem, origin: str) -> tuple[Frozen, Arrays]:
@@ -97,7 +97,7 @@ def freeze(frame: int, problem: StepProblem, origin: str) -> tuple[Frozen, Array
     arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
     arrays |= {f"start_{name}": getattr(start, name) for name in _START}
     arrays |= {"mass": system.mass, "pins": system.pins.vertices, "gradient": problem.gradient(problem.current)}
-    arrays |= {"step": [system.time_step, system.factor, start.time, start.rate], "frame": frame}
+    arrays |= {"time_step": system.time_step, "factor": system.factor, "frame": frame}
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
     content = hashlib.sha256(origin.encode())
     for name, array in arrays.items():
@@ -108,22 +108,27 @@ def freeze(frame: int, problem: StepProblem, origin: str) -> tuple[Frozen, Array
 
 def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
     """The frozen problem in saved arrays, bound to a scene; None where today's scene states another problem."""
-    time_step, factor, time, rate = arrays["step"].tolist()
-    system = replace(scene.system, factor=factor)
-    start = Start(*(arrays[f"start_{name}"] for name in _START[:2]), time, arrays["start_origin"], rate)
-    given = {name: arrays[name] for name in _ARRAYS}
-    for array in (*given.values(), start.positions, start.velocity, start.origin):
-        array.flags.writeable = False
+    system = replace(scene.system, factor=float(arrays["factor"]))
+    start = Start(**{name: _value(arrays[f"start_{name}"]) for name in _START})
+    given = {name: _value(arrays[name]) for name in _ARRAYS}
     problem = StepProblem(system, **given, first_guess=given["current"], start=start)
     same = (
-        system.time_step == time_step
+        system.time_step == arrays["time_step"]
         and np.array_equal(system.mass, arrays["mass"])
         and np.array_equal(system.pins.vertices, arrays["pins"])
-        and _close(problem.gradient(problem.current), arrays["gradient"])
+        and agree(problem.gradient(problem.current), arrays["gradient"])
     )
     return Frozen(int(arrays["frame"]), problem, str(arrays["digest"])) if same else None
 
 
-def _close(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:
-    # Sums differ in their last digits between processors; another stiffness differs in the first.
-    return bool(np.abs(found - wanted).max(initial=0.0) <= 1e-9 * np.abs(wanted).max(initial=1e-300))
+def _value(array: NDArray[np.float64]) -> Any:
+    """A number as such, an array read-only."""
+    array.flags.writeable = False
+    return array if array.ndim else float(array)
+
+
+def agree(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:
+    """Whether two arrays are the same but for the order of sums, which differs between processors."""
+    if found.shape != wanted.shape:
+        return False
+    return bool(np.abs(found - wanted).max(initial=0.0) <= 1e-9 * np.abs(wanted).max(initial=0.0))

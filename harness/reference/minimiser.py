@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,16 +137,23 @@ def free_hessian(problem: StepProblem, p: Positions) -> csr_array:
 
 def _smallest_eigenvalue(H: csr_array, factor: SparseLU) -> float:
     """Of a positive definite matrix [N/m], minus what round-off in its factor may have added."""
-
-    def solve(b: NDArray[np.float64]) -> NDArray[np.float64]:
-        x = np.empty_like(b)
-        factor.solve(b, x)
-        return x
-
-    inverse = LinearOperator(H.shape, matvec=solve, dtype=np.float64)
     start = np.random.default_rng(0).normal(size=H.shape[0])  # the same eigenvalue each time
-    (found,) = eigsh(H, k=1, sigma=0.0, OPinv=inverse, v0=start, tol=1e-6, return_eigenvectors=False)
-    return float(found) - 4.0 * np.finfo(float).eps * float(abs(H).sum(axis=1).max())
+    settings: Any = {"k": 1, "sigma": 0.0, "OPinv": _Inverse(factor, H.shape), "v0": start, "tol": 1e-6}
+    found: Any = eigsh(H, return_eigenvectors=False, **settings)
+    return float(found[0]) - 4.0 * np.finfo(float).eps * float(abs(H).sum(axis=1).max())
+
+
+class _Inverse(LinearOperator):
+    """H^-1 of a factorised H."""
+
+    def __init__(self, factor: SparseLU, shape: tuple[int, ...]) -> None:
+        super().__init__(np.dtype(np.float64), shape)
+        self._factor = factor
+
+    def _matvec(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        out = np.empty(x.size)
+        self._factor.solve(x.ravel(), out)
+        return out
 
 
 def _pinned(problem: StepProblem, p: Positions) -> Positions:

@@ -3,7 +3,7 @@
     run-SCENE-SIZE-INTEGRATOR.npz             how violent each step of a reference run is
     problem-SCENE-SIZE-INTEGRATOR-FRAME.npz   a frozen problem
     minima-PROBLEM.npz                        the minima known of it
-    trajectory-QUESTION.npz                   a trajectory
+    trajectory-SCENE-SIZE-TIMES.npz           positions and velocities at some times; SCENE without its time step
 
 Files have a partial name until they are complete, and hold arrays only.
 """
@@ -11,18 +11,20 @@ Files have a partial name until they are complete, and hold arrays only.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from harness.reference.frozen import Arrays, Frozen, bind, freeze, moment_frames, reference_run, thaw
+from harness.reference.frozen import Arrays, Frozen, agree, bind, freeze, moment_frames, reference_run, thaw
 from harness.reference.minimiser import Minimum, Reference, find_minima, polish
-from harness.reference.scratch import ScratchNewton
+from harness.reference.motion import Field
+from harness.reference.trajectory import Trajectory, integrate
 from harness.scene import Scene
 from harness.spec import IntegratorName, SceneSpec
+from solvers.newton import Newton
 from solvers.problem import Positions, Solver
 
 
@@ -31,7 +33,7 @@ class Store:
     """folder: of all references, shared by everyone who asks about the same scenes; solver: Newton's method."""
 
     folder: Path
-    solver: Solver = field(default_factory=ScratchNewton)
+    solver: Solver = field(default_factory=Newton)
 
     def moments(self, spec: SceneSpec, size: int, integrator: IntegratorName = "implicit-euler") -> dict[str, Frozen]:
         """The frozen problems of MOMENTS in the scene's `frames` steps. Raises InputError, RunFailed."""
@@ -75,6 +77,25 @@ class Store:
             self._remember(frozen, joined)
         return joined.minima[joined.branch(found)] if found.certified else found
 
+    def trajectory(self, spec: SceneSpec, size: int, times: Sequence[float], *, error: float) -> Trajectory:
+        """The trajectory at ascending times [s], by which relative errors down to `error` can be measured.
+
+        It is the same for every time step of the scene. Raises InputError, Unintegrable, Unpredictable.
+        """
+        scene = bind(spec, size)
+        name = f"{spec.stepped(1.0).digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
+        path = self.folder / f"trajectory-{name}.npz"
+        witness = Field(scene).witness()
+        stored = _read(path) if path.exists() else {"witness": np.empty(0)}
+        if agree(stored["witness"], witness):
+            found = Trajectory(*(stored[f.name] for f in fields(Trajectory)))
+        else:
+            found = integrate(scene, times)
+            arrays = {f.name: getattr(found, f.name) for f in fields(Trajectory)}
+            _write(path, arrays | {"witness": witness})
+        found.require(error)
+        return found
+
     def _known(self, asked: _Asked, frames: Collection[int]) -> dict[int, Frozen]:
         """The problems of all of these frames, or none."""
         paths = [self._problem(asked, frame) for frame in frames]
@@ -92,8 +113,8 @@ class Store:
         return frozen
 
     def _remember(self, frozen: Frozen, known: Reference) -> None:
-        fields = ("positions", "g", "error", "smallest_eigenvalue")
-        arrays = {name: np.array([getattr(minimum, name) for minimum in known.minima]) for name in fields}
+        names = ("positions", "g", "error", "smallest_eigenvalue")
+        arrays = {name: np.array([getattr(minimum, name) for minimum in known.minima]) for name in names}
         _write(self.folder / f"minima-{frozen.digest}.npz", arrays | {"reason": np.array(known.reason)})
 
 
@@ -119,5 +140,5 @@ def _read(path: Path) -> Arrays:
 def _write(path: Path, arrays: Arrays) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.npz")
-    np.savez(partial, **arrays)
+    np.savez(partial, allow_pickle=False, **arrays)
     os.replace(partial, path)

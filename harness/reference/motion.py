@@ -1,0 +1,111 @@
+"""The equations of motion as a first-order system y' = F(t, y), y the positions and velocities of the free vertices.
+
+    M p'' = f(p, p', t) - grad E(p) - c M p'
+
+Springs are summed by a compiled loop. An energy that depends on where a step starts is begun at the motion itself, so
+that its gradient at p is the force there. Ether drag is known by what it does to the velocity in a step, v <- kept v,
+and so has the rate c = -ln(kept) / dt; no other filter of the velocity has an equation of motion.
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+from math import log
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.errors import RunFailed
+from harness.scene import Scene
+from solvers.energies.springs import TINY, Springs
+from solvers.kernels.compiling import kernel
+from solvers.problem import LaggedEnergy, Positions, Start
+
+State = NDArray[np.float64]
+"""Positions [m] and velocities [m/s] of the free vertices, one after the other, shape (6 f,)."""
+
+
+class Unintegrable(RunFailed):
+    """The scene has no ordinary differential equation for all of its free vertices."""
+
+
+class Field:
+    """F of a scene whose pins are exact."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Raises Unintegrable."""
+        system = scene.system
+        self._scene, self._free, self._system = scene, system.free, system
+        self._mass = system.mass[self._free, None]
+        if not (self._mass > 0.0).all():
+            raise Unintegrable("vertices without mass have no acceleration; give them mass or pin them")
+        if not system.pins.exact.all():
+            raise Unintegrable("pins by penalty vibrate faster than can be followed; make them exact")
+        springs = scene.springs
+        self._springs = springs.edges, springs.stiffness, springs.rest_length, springs.rest_direction
+        self._others = tuple(energy for energy in system.energies if not isinstance(energy, Springs))
+        self._drag = _drag(scene)
+        self._p, self._v = scene.mesh.rest.copy(), np.zeros_like(scene.mesh.rest)
+        self._p[system.pins.vertices] = scene.pin_targets
+
+    @property
+    def start(self) -> State:
+        """The rest shape, moving with the scene's velocity."""
+        velocity = np.broadcast_to(np.array(self._scene.velocity), (len(self._free), 3))
+        return np.concatenate([self._scene.mesh.rest[self._free].ravel(), velocity.ravel()])
+
+    def motion(self, y: State) -> tuple[Positions, Positions]:
+        """Positions [m] and velocities [m/s] of all vertices, each (n, 3); overwritten by the next call."""
+        self._p[self._free], self._v[self._free] = y.reshape(2, -1, 3)
+        return self._p, self._v
+
+    def __call__(self, t: float, y: State) -> State:
+        """F(t, y)."""
+        p, v = self.motion(y)
+        push = np.negative(self._scene.load)
+        add_springs(p, *self._springs, push)
+        if self._others:
+            rate = self._system.rate
+            here = Start(p, v, t, p - v / rate, rate, t)
+            for energy in self._others:
+                (energy.begin_step(here) if isinstance(energy, LaggedEnergy) else energy).add_gradient(p, push)
+        for force in self._scene.forces:
+            push -= force(p, v, t)
+        out = np.empty_like(y).reshape(2, -1, 3)
+        out[0] = v[self._free]
+        out[1] = -push[self._free] / self._mass - self._drag * out[0]
+        return out.reshape(-1)
+
+    def witness(self) -> State:
+        """F at a state that stretches and moves everything: it stands for the equations of motion."""
+        y = self.start
+        return self(0.5, y + 0.01 * (self._scene.mesh.size or 1.0) * np.random.default_rng(1).normal(size=y.shape))
+
+
+@kernel
+def add_springs(p, edges, stiffness, rest_length, direction, out):
+    """Add the springs' gradient k (1 - r/l) (p_i - p_j) [N] at p (n, 3) [m] to `out` (n, 3)."""
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        x, y, z = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        pull = stiffness[e] * (length - rest_length[e])
+        if length > TINY:
+            fx, fy, fz = pull / length * x, pull / length * y, pull / length * z
+        else:
+            fx, fy, fz = pull * direction[e, 0], pull * direction[e, 1], pull * direction[e, 2]
+        out[i, 0] += fx
+        out[i, 1] += fy
+        out[i, 2] += fz
+        out[j, 0] -= fx
+        out[j, 1] -= fy
+        out[j, 2] -= fz
+
+
+def _drag(scene: Scene) -> float:
+    """The rate of the scene's ether drag [1/s]; raises Unintegrable for any other filter."""
+    v = np.random.default_rng(0).uniform(1.0, 2.0, scene.mesh.rest.shape)
+    kept = reduce(lambda v, filtered: filtered(v), scene.filters, v) / v
+    if not kept.min() > 0.0 or np.ptp(kept) > 1e-12 * kept.max():
+        raise Unintegrable("a filter of the velocity that does not scale all of it by one positive factor")
+    return -log(float(np.mean(kept))) / scene.system.time_step

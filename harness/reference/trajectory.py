@@ -1,0 +1,110 @@
+"""The trajectory that time stepping is graded against: an integration of the equations of motion as such.
+
+Dormand and Prince's method of order 8 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section
+II.10) at rtol 1e-12, checked by Adams methods of orders up to 12 (VODE; ibid., section III.1). A motion in which what
+is 1e-12 at the start grows past the error that is to be measured has no trajectory to grade against: it is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import ode, solve_ivp
+
+from harness.errors import RunFailed
+from harness.reference.motion import Field, State
+from harness.scene import Scene
+from solvers.problem import Positions
+
+RTOL = 1e-12
+PERTURBATION = 1e-12
+"""Of the rest shape's size, at every coordinate."""
+MARGIN = 0.1
+"""Of the error to be measured: what the reference itself may be wrong by."""
+
+
+class Unpredictable(RunFailed):
+    """The reference would be as uncertain as the error that is to be measured by it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """times (k,) [s]; positions (k, n, 3) [m] and velocities (k, n, 3) [m/s] then; moved (k,) [m]: the displacement
+    from the start, Frobenius norm over the free vertices. In the same norm, relative to it: disagreement (k,) of the
+    two methods; growth (k,) of the perturbation."""
+
+    times: NDArray[np.float64]
+    positions: Positions
+    velocities: Positions
+    moved: NDArray[np.float64]
+    disagreement: NDArray[np.float64]
+    growth: NDArray[np.float64]
+
+    def error(self, k: int, p: Positions) -> float:
+        """How far p (n, 3) [m] is from the positions at times[k], relative to the displacement from the start."""
+        return float(np.linalg.norm(p - self.positions[k])) / float(self.moved[k])
+
+    def require(self, error: float) -> None:
+        """Raises Unpredictable where a relative error of this size could not be told from the reference's own."""
+        for k, t in enumerate(self.times):
+            for found, what in ((self.growth[k], "a perturbation of 1e-12"), (self.disagreement[k], "round-off")):
+                if not found <= MARGIN * error:
+                    raise Unpredictable(
+                        f"after {t:g} s {what} has grown to {found:.1e} of the displacement: an error of {error:.1e} "
+                        "cannot be measured there; ask for a shorter horizon or a larger error"
+                    )
+
+
+def integrate(scene: Scene, times: Sequence[float]) -> Trajectory:
+    """The motion of a scene whose pins are exact, at ascending times after its start [s]. Raises Unintegrable."""
+    field = Field(scene)
+    start, size = field.start, scene.mesh.size or 1.0
+    nudge = np.zeros_like(start)
+    half = len(start) // 2
+    nudge[:half] = PERTURBATION * size * np.random.default_rng(0).choice([-1.0, 1.0], half)
+    atol = RTOL * size
+    path, perturbed = (_dop853(field, y, times, atol) for y in (start, start + nudge))
+    other = _adams(field, start, times, atol)
+    moved = _apart(path, start)
+    relative = np.divide(1.0, moved, out=np.full_like(moved, np.inf), where=moved > 0.0)
+    motions = [tuple(part.copy() for part in field.motion(y)) for y in path]
+    return Trajectory(
+        np.array(times, float),
+        np.array([p for p, _ in motions]),
+        np.array([v for _, v in motions]),
+        moved,
+        _apart(path, other) * relative,
+        _apart(path, perturbed) * relative,
+    )
+
+
+def _apart(path: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """|p - q|_F [m] of states (k, 6 f), by their positions."""
+    return np.linalg.norm((path - other)[:, : path.shape[1] // 2], axis=1)
+
+
+def _dop853(field: Callable[[float, State], State], y: State, times: Sequence[float], atol: float) -> NDArray:
+    """The states (k, 6 f); each time ends a step, for interpolation would not be as exact."""
+    path, begin = [], 0.0
+    for end in times:
+        solved = solve_ivp(field, (begin, end), y, "DOP853", [end], rtol=RTOL, atol=atol)
+        if not solved.success:
+            raise Unpredictable(f"the motion cannot be followed beyond {begin:g} s: {solved.message}")
+        y, begin = solved.y[:, -1], end
+        path.append(y)
+    return np.array(path)
+
+
+def _adams(field: Callable[[float, State], State], y: State, times: Sequence[float], atol: float) -> NDArray:
+    """The states (k, 6 f)."""
+    solver = ode(field).set_integrator("vode", method="adams", rtol=RTOL, atol=atol, order=12, nsteps=10**8)
+    solver.set_initial_value(y, 0.0)
+    path = []
+    for end in times:
+        path.append(np.array(solver.integrate(end)))
+        if not solver.successful():
+            raise Unpredictable(f"Adams methods cannot follow the motion up to {end:g} s")
+    return np.array(path)
