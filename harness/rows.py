@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -114,3 +116,16 @@ def read(paths: Iterable[Path], schema: pa.Schema = SCHEMA) -> pa.Table:
         except (pa.ArrowInvalid, OSError) as error:
             raise InputError(Mistake(f"holds no rows ({error}); take it out of the results", path)) from error
     return pa.concat_tables([schema.empty_table(), *tables], promote_options="default")
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Hold a folder of results for one process; whatever a killed one left half written is removed."""
+    with (folder / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(f"{folder}: another springbench is running this sweep; wait for it or stop it") from error
+        for partial in folder.glob("*/.*partial*"):
+            partial.unlink()
+        yield

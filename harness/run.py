@@ -203,9 +203,8 @@ def save_positions(path: Path, positions: np.ndarray) -> None:
 
 def common(run: RunSpec) -> dict[str, Any]:
     """The columns that are the same in all rows of a run."""
-    here = machine.describe()
     return {
-        "run_id": run.run_id(here.id),
+        "run_id": run.run_id(machine.describe().id),
         "sweep": run.sweep,
         "scene": run.scene_name,
         "size": run.size,
@@ -217,6 +216,14 @@ def common(run: RunSpec) -> dict[str, Any]:
         "max_iterations": run.iterations,
         "tolerance": run.tolerance,
         "threads": run.threads,
+        **provenance(),
+    }
+
+
+def provenance() -> dict[str, Any]:
+    """The columns that tell where, when and by which code something was measured."""
+    here = machine.describe()
+    return {
         "machine": here.id,
         "cpu": here.cpu,
         "cores": here.cores,

@@ -6,9 +6,7 @@ and a picture is drawn from the recording alone, so what a kill leaves undone is
 
 from __future__ import annotations
 
-import fcntl
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -88,7 +86,7 @@ def run_sweep(
             pass
     for part in ("rows", "recordings", "pictures"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    with _alone(folder):
+    with rows.alone(folder):
         planned = plan(runs, folder)
         todo = [p for p in planned if p.state == MISSING or again or positions]
         if len(todo) < len(planned):
@@ -116,19 +114,6 @@ def _outcome(found: list[dict[str, Any]]) -> str:
         return f"{found[0]['status']}: {found[0]['reason']}"
     best = min(row["seconds"] for row in found if row["phase"] == "step")
     return f"{1e3 * best:.3g} ms a step"
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Hold the folder for one process; whatever a killed one left half written is removed."""
-    with (folder / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise InputError(f"{folder}: another springbench is running this sweep; wait for it or stop it") from error
-        for partial in folder.glob("*/.*partial*"):
-            partial.unlink()
-        yield
 
 
 def _draw(

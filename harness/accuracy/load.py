@@ -15,6 +15,7 @@ from harness.expand import check_size
 from harness.load import check_name, misfits, scenes_of, solvers_of
 from harness.mesh.generator import Generator
 from harness.spec import SceneSpec, SolverSpec
+from solvers.registry import SOLVERS, load
 
 MAX_UNITS = 20_000
 
@@ -81,8 +82,10 @@ class _Expansion:
         self.document, self.scenes, self.solvers = document, scenes, solvers
 
     def curves(self, study: CurveStudy, at: Key) -> Iterator[CurveUnit]:
+        """One for each problem and solver; solvers that do not minimise have none."""
         how = How(study.threads, study.rounds, study.time_limit)
-        for case, moment, solver in product(self._cases(study, at), study.moment, self._solvers(study, at)):
+        solvers = [solver for solver in self._solvers(study, at) if load(SOLVERS[solver.name]).minimises]
+        for case, moment, solver in product(self._cases(study, at), study.moment, solvers):
             if isinstance(moment, int) and moment > case.scene.frames:
                 problem = f"frame {moment} is not among the {case.scene.frames} frames of {case.scene_name}"
                 self.document.report(problem, (*at, "moment"))

@@ -143,6 +143,11 @@ class CurveUnit:
         """The name of its file; measured otherwise, it takes the place of what was there."""
         return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{self.solver.name}-{_hash(self.point())}"
 
+    def problem_label(self) -> str:
+        """The name of the file of the step itself."""
+        problem = [*self.case.identity(), self.moment]
+        return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{_hash(problem)}"
+
 
 @dataclass(frozen=True, slots=True)
 class WorkUnit:
@@ -169,6 +174,10 @@ class WorkUnit:
     def label(self) -> str:
         """The name of its file; measured otherwise, it takes the place of what was there."""
         return f"{self.case.scene_name}-{self.case.size}-work-{self.solver.name}-{_hash(self.point())}"
+
+
+Unit = CurveUnit | WorkUnit
+"""What is measured at once, and stands in one file."""
 
 
 def _hash(content: Any) -> str:

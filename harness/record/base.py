@@ -36,7 +36,8 @@ class RecordingInfo:
     title: scene, size and solver in words; run_id; mesh; springs (m, 2) and their rest_lengths (m,) [m]: those of
     the scene, which may be fewer than the mesh's; pinned: vertices (q,); time_step [s];
     strain_range: the strain at the ends of the colour scale (0.1 is 10 %);
-    properties: everything else about the run and its machine, flat (scene, size, solver, iterations, cpu, ...).
+    properties: everything else about the run and its machine, flat (scene, size, solver, iterations, cpu, ...);
+    iterates: whether the frames are iterates of one solve, by their numbers, instead of steps of a run.
     """
 
     title: str
@@ -48,6 +49,7 @@ class RecordingInfo:
     time_step: float
     strain_range: float
     properties: Mapping[str, str | int | float | bool]
+    iterates: bool = False
 
 
 class Recorder(Protocol):

@@ -110,6 +110,7 @@ def blueprint(info: RecordingInfo, box: Box) -> rrb.Blueprint:
         name="Convergence (choose timeline: iteration)",
     )
     run = rrb.TextDocumentView(origin="/run", name="Run and machine")
+    tabs = (_solve(),) if info.iterates else (series, convergence)
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(
@@ -117,11 +118,21 @@ def blueprint(info: RecordingInfo, box: Box) -> rrb.Blueprint:
                 scale_view(info.strain_range),
                 row_shares=[9, 1],
             ),
-            rrb.Tabs(series, convergence, run, active_tab=0),
+            rrb.Tabs(*tabs, run, active_tab=0),
             column_shares=[3, 2],
         ),
-        *panels(info.time_step),
+        *panels(info.time_step, "iteration" if info.iterates else "frame"),
         auto_views=False,
+    )
+
+
+def _solve() -> rrb.Vertical:
+    """The plots of a solve, by the number of the iterate."""
+    return rrb.Vertical(
+        plot("log10 of the energy gap and of the stationarity, relative to the current positions", ["+ /solve/**"]),
+        plot("Energy [J]", ["+ /energy/**"]),
+        plot("Largest strain of a spring", ["+ /strain/largest"], legend=False),
+        name="By iteration",
     )
 
 
@@ -148,8 +159,8 @@ def run_document(info: RecordingInfo) -> str:
     return f"# {info.title}\n\n| | |\n|-|-|\n{rows}\n\n{colours}{hint}"
 
 
-def panels(time_step: float) -> tuple[rrb.TimePanel, rrb.SelectionPanel, rrb.BlueprintPanel]:
-    """Time by frame, played in real time as far as a screen can show it; nothing else in the way."""
+def panels(time_step: float, timeline: str = "frame") -> tuple[rrb.TimePanel, rrb.SelectionPanel, rrb.BlueprintPanel]:
+    """Time by frame or iteration, played in real time as far as a screen can show it; nothing else in the way."""
     fps = math.ceil(min(max(1 / time_step, 1.0), 120.0))
-    time = rrb.TimePanel(state="collapsed", timeline="frame", fps=fps)
+    time = rrb.TimePanel(state="collapsed", timeline=timeline, fps=fps)
     return time, rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="hidden")

@@ -6,7 +6,8 @@ name until it is complete and has been read back.
 
 Entities: `/scene/mesh` (positions, exact to float32), `/scene/pins`, `/scene/springs`; `/energy/*`, `/residual`,
 `/iterations`, `/strain/largest`, `/milliseconds/*` by `frame` and `time`; `/convergence/*/frame_*` also by
-`iteration`; `/network` (springs, rest lengths, pins), `/run` (Markdown) and the recording's properties.
+`iteration`; `/network` (springs, rest lengths, pins), `/run` (Markdown) and the recording's properties. Where the frames
+are the iterates of a solve, everything is by `iteration`, and `/solve/*` tells how it converges.
 """
 
 from __future__ import annotations
@@ -65,7 +66,8 @@ class RerunRecorder:
         strain, of_vertex = self._shading.strains(frame.positions)
         self._stream.set_time("frame", sequence=frame.index)
         self._stream.set_time("time", duration=frame.time)
-        self._stream.set_time("iteration", sequence=0)  # else that timeline would show no scene at all
+        # Of a run at 0, else that timeline would show no scene at all.
+        self._stream.set_time("iteration", sequence=frame.index if self._info.iterates else 0)
         self._log_mesh(p, self._shading.colours(of_vertex))
         self._log_pins(p)
         self._log_springs(p, strain)
@@ -95,6 +97,14 @@ class RerunRecorder:
                 *self._times(np.full(len(values), frame)),
             ]
             self._stream.send_columns(entity, index, rr.Scalars.columns(scalars=np.asarray(values, float)))
+
+    def solve(self, numbers: Sequence[int], curves: Mapping[str, Sequence[float]]) -> None:
+        """Record log10 of curves by name over the iterates with these numbers; of a recording of iterates."""
+        for name, values in curves.items():
+            entity = f"/solve/{name.replace(' ', '_')}"
+            self._style(entity, f"log10 of the {name}")
+            logarithms = rr.Scalars.columns(scalars=np.array([_log10(value) for value in values]))
+            self._stream.send_columns(entity, self._times(np.array(numbers)), logarithms)
 
     def close(self, milliseconds: Mapping[str, Sequence[float]]) -> Path:
         """Write the milliseconds of each phase by frame, from frame 1; finish the file and return its path."""
@@ -168,6 +178,8 @@ class RerunRecorder:
                 rows.clear()
 
     def _times(self, frames: NDArray[np.int64]) -> Iterable[rr.TimeColumn]:
+        if self._info.iterates:
+            return rr.TimeColumn("frame", sequence=frames), rr.TimeColumn("iteration", sequence=frames)
         return (
             rr.TimeColumn("frame", sequence=frames),
             rr.TimeColumn("time", duration=frames * self._info.time_step),
