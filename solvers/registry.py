@@ -9,6 +9,9 @@ SOLVERS = {
     "dense": "solvers.local_global:DenseLocalGlobal",
     "sparse": "solvers.local_global:SparseLocalGlobal",
     "numba": "solvers.compiled:CompiledLocalGlobal",
+    "anderson": "solvers.anderson:Anderson",
+    "chebyshev": "solvers.chebyshev:Chebyshev",
+    "lbfgs": "solvers.lbfgs:Lbfgs",
     "newton": "solvers.newton:Newton",
 }
 

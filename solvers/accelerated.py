@@ -1,0 +1,241 @@
+"""Accelerated first-order methods over one prefactored matrix: `anderson`, `chebyshev` and `lbfgs`.
+
+They share the iteration (`solvers.kernels.accelerate`) and differ in a direction's coefficients. Where springs are
+the only energies and the factor is one whose panels the kernels know, a step is compiled as a whole; else the
+same kernels take turns with the energies' own values and gradients, and with the factor's own solve.
+
+No iteration raises the objective, round-off apart: a trial that would is shortened or replaced by the plain
+correction, a local-global iteration, which descends by majorisation. Where that does not either, for all that round-off
+tells, the solve has "stalled", and its iterates stay where they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.compiled import _FAR as FAR
+from solvers.compiled import _ORDERS as ORDERS
+from solvers.compiled import PreparedCompiled
+from solvers.energies.springs import Springs
+from solvers.kernels import accelerate, accelerate_step
+from solvers.kernels.accelerate import Window
+from solvers.kernels.accelerate_springs import Shares
+from solvers.kernels.springs import aligned
+from solvers.linear.choice import Linear, Precision, factorise
+from solvers.local_global import PreparedLocalGlobal, only_springs, prepared
+from solvers.objective import Objective, StepObjective
+from solvers.problem import Positions, ProjectiveEnergy, Solution, StepProblem, StopRule, System, Unsupported
+
+
+@dataclass(frozen=True)
+class Method:
+    """name: in the registry; coefficients: which, see `accelerate_coefficients`; pairs: kept in the window; retries:
+    shorter steps along a direction before the plain correction; projective: whether other energies are refused."""
+
+    name: str
+    coefficients: int
+    pairs: int
+    retries: int
+    projective: bool
+
+
+class Run(Protocol):
+    """A solve that has begun. positions (n, 3): where it is; largest: coordinate of the first guess."""
+
+    positions: Positions
+    largest: float
+
+    def advance(self, iterations: int, limit: float, floor: float, every: bool) -> tuple[int, float, bool]:
+        """Iterate, as `accelerate_step.run` does."""
+        ...
+
+
+def prepare(system: System, method: Method, linear: Linear, precision: Precision) -> PreparedAccelerated:
+    """Factorise Q and compile. Raises Unsupported for energies that the method does not take, NotPositiveDefinite."""
+    projective = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
+    others = {type(e).__name__ for e in system.energies if not isinstance(e, ProjectiveEnergy)}
+    if method.projective and others:
+        raise Unsupported(f"{method.name}: needs projective energies; not so: {', '.join(sorted(others))}")
+    base = prepared(system, projective, lambda Q: factorise(Q, linear, precision))
+    if all(isinstance(energy, Springs) for energy in system.energies):
+        for kind, order in ORDERS.items():
+            if isinstance(base.factor, kind):
+                springs = only_springs(system, method.name)
+                compiled = PreparedCompiled.of(base, springs, order(base.factor))
+                return PreparedAccelerated(base, _Compiled(method, compiled))
+    return PreparedAccelerated(base, _Interpreted(method, base))
+
+
+class Engine(Protocol):
+    """Begins solves: kept for those whose memory may be used again, one at a time."""
+
+    def begin(self, problem: StepProblem, guess: Positions, *, kept: bool) -> Run:
+        """A run from a first guess (n, 3)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedAccelerated:
+    """A method, ready for a system. base: the prefactored Q; engine: what iterates."""
+
+    base: PreparedLocalGlobal
+    engine: Engine
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """Exact counts of what was built."""
+        return self.base.facts
+
+    @property
+    def choice(self) -> str:
+        """The linear solver in words."""
+        return self.base.choice
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """The iterates from `problem.first_guess`; the yielded array is overwritten by the next one."""
+        run = self.engine.begin(problem, problem.first_guess, kept=False)
+        while True:
+            run.advance(1, np.nan, 0.0, False)
+            yield run.positions
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """Iterate until `stop` says so, or round-off; without a tolerance only the last residual is computed."""
+        every, limit, yardstick = stop.tolerance is not None, 0.0, float("nan")
+        if stop.tolerance is not None:
+            _, yardstick, _ = self.engine.begin(problem, problem.current, kept=True).advance(0, 0.0, 0.0, False)
+            limit = stop.tolerance * yardstick
+        run = self.engine.begin(problem, problem.first_guess, kept=True)
+        floor = stop.floor * run.largest * self.base.trace**0.5
+        count, residual, stalled = run.advance(stop.iterations, limit, floor, every)
+        stopped = "iterations"
+        if every and count and residual <= max(limit, floor):
+            stopped = "tolerance" if residual <= limit else "floor"
+        elif stalled:
+            stopped = "stalled"
+        return Solution(run.positions, count, residual, yardstick, stopped)
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """None: an iteration has no parts that stand alone."""
+        return {}
+
+
+def _window(method: Method, entries: int, whole: int) -> Window:
+    """Memory for the unknowns' entries, in vectors that have `whole` of them."""
+    m = method.pairs
+    now = np.zeros(1, accelerate.NOW)
+    now["method"], now["retries"] = method.coefficients, method.retries
+    steps, images = aligned(m * entries), aligned(m * entries)
+    long, short = [aligned(whole) for _ in range(4)], [aligned(entries) for _ in range(2)]
+    (sy, wy), (sg, wg, a, b) = np.zeros((2, m, m)), np.zeros((4, m))
+    return Window(steps, images, *long, *short, sy=sy, wy=wy, sg=sg, wg=wg, a=a, b=b, now=now)
+
+
+class _Compiled:
+    """Springs alone, over a factor that is cut into blocks."""
+
+    def __init__(self, method: Method, compiled: PreparedCompiled) -> None:
+        self._method = method
+        plan, bundles, rows = compiled.plan, compiled.bundles, compiled.rows
+        pins = compiled.base.system.pins
+        # Corrections are solved for, so that nothing of the exact pins goes to the right-hand side.
+        self._rows = rows._replace(coupling=np.empty(0), coupled=np.empty(0, np.int64), pin=np.empty(0, np.int64))
+        self._entries = 4 * int(plan.blocks[:, 1].max())
+        self._plan, self._bundles, self._far = plan, bundles, compiled.far
+        self._shares = Shares.of(bundles, plan.held, rows.row[pins.vertices[pins.exact]])
+
+    @cached_property
+    def _kept(self) -> tuple[accelerate_step.Step, Window]:
+        return self._new()
+
+    def _new(self) -> tuple[accelerate_step.Step, Window]:
+        whole = 4 * len(self._plan.held)
+        window = _window(self._method, self._entries, whole)
+        window.trial[4 * self._far] = FAR
+        x = aligned(whole, self._plan.squares.dtype)
+        vectors = aligned(whole), x, aligned(whole), np.zeros(1)
+        return accelerate_step.Step(self._plan, self._bundles, self._shares, self._rows, *vectors), window
+
+    def begin(self, problem: StepProblem, guess: Positions, *, kept: bool) -> Run:
+        """See Engine."""
+        return _CompiledRun(*(self._kept if kept else self._new()), problem, guess)
+
+
+class _CompiledRun:
+    """See Run."""
+
+    def __init__(self, step: accelerate_step.Step, window: Window, problem: StepProblem, guess: Positions) -> None:
+        self._state = step, window
+        given = (problem.target, problem.force, problem.pin_targets, guess)
+        self.positions = np.empty_like(guess)
+        # The kernels are compiled for arrays that may be written to.
+        self.largest = accelerate_step.start(*self._state, *(np.array(x, order="C") for x in given))
+
+    def advance(self, iterations: int, limit: float, floor: float, every: bool) -> tuple[int, float, bool]:
+        """See Run."""
+        return accelerate_step.run(*self._state, iterations, limit, floor, every, self.positions)
+
+
+class _Interpreted:
+    """Any energies, and any factor."""
+
+    def __init__(self, method: Method, base: PreparedLocalGlobal) -> None:
+        self._method, self._base, self._objective = method, base, Objective(base.system)
+
+    def begin(self, problem: StepProblem, guess: Positions, *, kept: bool) -> Run:
+        """See Engine."""
+        window = _window(self._method, guess.size, guess.size)
+        return _InterpretedRun(self._base, window, StepObjective(self._objective, problem), guess)
+
+
+class _InterpretedRun:
+    """See Run."""
+
+    def __init__(self, base: PreparedLocalGlobal, window: Window, objective: StepObjective, guess: Positions) -> None:
+        self._base, self._window, self._objective = base, window, objective
+        self.positions, self._trial, self._there = (
+            x.reshape(-1, 3) for x in (window.position, window.trial, window.descent_there)
+        )
+        self._image = np.zeros_like(self._trial)
+        self._trial[:] = objective.placed(guess)
+        self.largest = float(np.abs(self._trial).max(initial=0.0))
+        self._look()
+        accelerate.begin(window, self._solved())
+
+    def _look(self) -> None:
+        np.negative(self._objective.gradient(self._trial), out=self._there)
+
+    def _solved(self) -> NDArray[np.float64]:
+        self._base._global(self._there, self._image)
+        return self._image.ravel()
+
+    def _residual(self) -> float:
+        e = self._window.correction.reshape(-1, 3).copy()
+        e[self._base.system.pins.vertices] = 0.0
+        return self._base.norm(e)
+
+    def advance(self, iterations: int, limit: float, floor: float, every: bool) -> tuple[int, float, bool]:
+        """See Run; the loop of `accelerate_step.run`."""
+        window, now = self._window, self._window.now
+        residual = self._residual() if iterations == 0 else np.inf
+        count, verdict = 0, accelerate.AGAIN
+        while count < iterations and not (every and residual <= max(limit, floor)):
+            accelerate.propose(window)
+            verdict = accelerate.AGAIN
+            while verdict == accelerate.AGAIN:
+                self._look()
+                rise, noise = self._objective.rise(self.positions, self._trial)
+                now["rise"], now["noise"] = rise, noise
+                verdict = accelerate.judge(window)
+            if verdict == accelerate.STALLED:
+                return count, self._residual(), True
+            count += 1
+            accelerate.accept(window, self._solved())
+            if every or count == iterations:
+                residual = self._residual()
+        return count, residual, False

@@ -1,0 +1,246 @@
+"""Accelerated descent: a direction from the last correction and earlier differences, and whether to take it.
+
+    c_k = -Q^-1 grad g(p_k) = LG(p_k) - p_k                       the plain correction, a local-global iteration
+    d   = scale c_k - sum over j of (a_j s_j + b_j w_j)           the accelerated one
+    s_j = p_(j+1) - p_j,   y_j = grad g(p_(j+1)) - grad g(p_j),   w_j = Q^-1 y_j = c_j - c_(j+1)
+
+A method is nothing but its coefficients (see `accelerate_coefficients`), which it takes from scalar products of the
+window's vectors. An iteration tries p + d, then shorter steps, then the plain correction, shorter and shorter:
+
+    g(p + t d) <= g(p) + DECREASE t min(0, grad g(p) d)           Armijo (1966)
+    or, where the two values agree up to round-off, the slope at p + t d is at most 1 - 2 FLATTER of what it was, the
+    other way round                                               approximate Wolfe (Hager and Zhang 2005)
+
+For projective energies Q majorises the Hessian, so that the plain correction passes at full length. Vectors are flat
+and know nothing of what their entries stand for; entries of vertices that do not move are zero.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from solvers.kernels.accelerate_coefficients import coefficients
+from solvers.kernels.compiling import _inner, inner, kernel
+
+DECREASE, FLATTER = 1e-4, 0.1
+AGAIN, ACCEPTED, STALLED = 0, 1, 2
+"""What `judge` says: evaluate the next trial, go there, or that round-off lets nothing descend."""
+
+_BLOCK = 512
+"""Entries that are gone through together, so that what all pairs need stays in the first cache."""
+
+_HALVINGS = 40
+
+# Sums may be reordered, which vectors need; NaN and infinity keep their meaning.
+_vectors: Any = njit(**_inner, fastmath={"contract", "reassoc", "nsz"})
+
+NOW = np.dtype(
+    [
+        ("method", np.int64),  # see `accelerate_coefficients`
+        ("retries", np.int64),  # shorter steps along d before the plain correction
+        ("count", np.int64),  # pairs in the window
+        ("newest", np.int64),  # the latest of them
+        ("tries", np.int64),  # trials rejected in this iteration
+        ("plain", np.int64),  # whether the trial is along c
+        ("rise", np.float64),  # g(trial) - g(p) [J]
+        ("noise", np.float64),  # what of it may be round-off
+        ("length", np.float64),  # t
+        ("slope", np.float64),  # grad g(p) d [J]
+        ("squared", np.float64),  # |c|_Q^2 [J]
+        ("scale", np.float64),
+        ("radius", np.float64),  # Chebyshev's: of convergence of the plain iteration
+        ("weight", np.float64),  # omega
+        ("degree", np.int64),  # of the polynomial
+        ("reference", np.float64),  # |c|_Q^2 where it began [J]
+    ]
+)
+"""Where an iteration is."""
+
+
+class Window(NamedTuple):
+    """The state of a solve. m: pairs kept; N: entries of a vector.
+
+    steps, images (m N,): s and w; position, trial: p and p + t d, N entries and maybe more that do not move; descent,
+    descent_there: -grad g at p and at the trial; correction, direction (N,): c and d; sy, wy (m, m): s_i y_j for i
+    not younger than j, and w_i y_j; sg, wg (m,): s_i grad g(p) and w_i grad g(p); a, b (m,); now: one of NOW.
+    """
+
+    steps: NDArray[np.float64]
+    images: NDArray[np.float64]
+    position: NDArray[np.float64]
+    trial: NDArray[np.float64]
+    descent: NDArray[np.float64]
+    descent_there: NDArray[np.float64]
+    correction: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    sy: NDArray[np.float64]
+    wy: NDArray[np.float64]
+    sg: NDArray[np.float64]
+    wg: NDArray[np.float64]
+    a: NDArray[np.float64]
+    b: NDArray[np.float64]
+    now: NDArray[Any]
+
+
+@kernel
+def begin(window, correction):
+    """Start at the trial point, where `descent_there` and the correction are known."""
+    now = window.now[0]
+    now.count, now.newest, now.radius, now.degree = 0, -1, 0.0, 0
+    now.squared = 0.0
+    for k in range(len(window.position)):
+        window.position[k] = window.trial[k]
+    for k in range(len(window.correction)):
+        window.descent[k], window.correction[k] = window.descent_there[k], correction[k]
+        now.squared += window.descent[k] * window.correction[k]
+
+
+@kernel
+def propose(window):
+    """The first trial of an iteration."""
+    now = window.now[0]
+    now.plain, now.tries = coefficients(window), 0
+    _combine(window)
+    _try(window, 1.0)
+
+
+@kernel
+def judge(window):
+    """What to do about a trial whose rise, noise and gradient are known."""
+    now = window.now[0]
+    if now.rise <= DECREASE * now.length * min(0.0, now.slope):
+        return ACCEPTED
+    even = abs(now.rise) <= now.noise
+    if even and now.slope < 0.0 and -_dot(window.descent_there, window.direction) <= (2.0 * FLATTER - 1.0) * now.slope:
+        return ACCEPTED
+    now.tries += 1
+    if now.plain and (even or now.tries > _HALVINGS):
+        return STALLED
+    if now.plain or (now.tries <= now.retries and now.slope < 0.0 and not even):
+        # The minimum of the parabola through both values and the slope, kept from being too short or too long.
+        excess = now.rise - now.slope * now.length
+        least = -0.5 * now.slope * now.length / excess if excess > 0.0 else 0.5
+        _try(window, now.length * min(max(least, 0.1), 0.5))
+        return AGAIN
+    now.plain, now.count, now.degree, now.tries = 1, now.count if now.retries == 0 else 0, 0, 0
+    for k in range(len(window.direction)):
+        window.direction[k] = window.correction[k]
+    now.slope = -now.squared
+    _try(window, 1.0)
+    return AGAIN
+
+
+@kernel
+def accept(window, correction):
+    """Go to the trial point, where `correction` is the plain one, and put the pair of this step into the window."""
+    now, m = window.now[0], len(window.a)
+    new = (now.newest + 1) % m
+    now.count = min(now.count + 1, m)
+    for j in range(m):
+        window.sg[j] = window.wg[j] = window.sy[j, new] = window.wy[j, new] = 0.0
+    now.squared = 0.0
+    size = len(window.direction)
+    for begin in range(0, size, _BLOCK):
+        end = min(size, begin + _BLOCK)
+        now.squared += _renew(
+            window.steps[new * size + begin : new * size + end],
+            window.images[new * size + begin : new * size + end],
+            window.position[begin:end],
+            window.trial[begin:end],
+            window.descent[begin:end],
+            window.descent_there[begin:end],
+            window.correction[begin:end],
+            correction[begin:end],
+            window.direction[begin:end],
+        )
+        for j in range(now.count):
+            sg, sy, wg, wy = _dots(
+                window.steps[j * size + begin : j * size + end],
+                window.images[j * size + begin : j * size + end],
+                window.descent[begin:end],
+                window.direction[begin:end],
+            )
+            window.sg[j] -= sg
+            window.wg[j] -= wg
+            window.sy[j, new] += sy
+            window.wy[j, new] += wy
+    for j in range(now.count):
+        window.wy[new, j] = window.wy[j, new]
+    now.newest = new
+
+
+@inner
+def _try(window, length):
+    window.now[0].length = length
+    for k in range(len(window.direction)):
+        window.trial[k] = window.position[k] + length * window.direction[k]
+
+
+@inner
+def _combine(window):
+    """The direction by the coefficients, and its slope."""
+    now, size = window.now[0], len(window.direction)
+    slope = 0.0
+    for begin in range(0, size, _BLOCK):
+        end = min(size, begin + _BLOCK)
+        direction = window.direction[begin:end]
+        _set(direction, now.scale, window.correction[begin:end])
+        for j in range(now.count):
+            _subtract(
+                direction,
+                window.a[j],
+                window.steps[j * size + begin : j * size + end],
+                window.b[j],
+                window.images[j * size + begin : j * size + end],
+            )
+        slope -= _dot(direction, window.descent[begin:end])
+    now.slope = slope
+
+
+@_vectors
+def _renew(step, image, position, trial, descent, there, correction, corrected, y):
+    """A block of s, w and y, and the new p, -grad g and c in the place of the old; returns its share of |c|_Q^2."""
+    squared = 0.0
+    for k in range(len(y)):
+        c = np.float64(corrected[k])
+        step[k] = trial[k] - position[k]
+        image[k] = correction[k] - c
+        y[k] = descent[k] - there[k]
+        position[k], descent[k], correction[k] = trial[k], there[k], c
+        squared += there[k] * c
+    return squared
+
+
+@_vectors
+def _dots(s, w, g, y):
+    sg = sy = wg = wy = 0.0
+    for k in range(len(s)):
+        sg += s[k] * g[k]
+        sy += s[k] * y[k]
+        wg += w[k] * g[k]
+        wy += w[k] * y[k]
+    return sg, sy, wg, wy
+
+
+@_vectors
+def _dot(a, b):
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
+
+
+@_vectors
+def _set(out, scale, c):
+    for k in range(len(out)):
+        out[k] = scale * c[k]
+
+
+@_vectors
+def _subtract(out, a, s, b, w):
+    for k in range(len(out)):
+        out[k] -= a * s[k] + b * w[k]

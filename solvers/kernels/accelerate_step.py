@@ -1,0 +1,130 @@
+"""A whole accelerated step over a factor's own rows, without Python; for systems whose energies are springs alone.
+
+The plan is that of `solvers.kernels.step`, in which positions are corrected; here a solve stands alone, because whether
+a trial is taken is known only when its objective is.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.kernels.accelerate import AGAIN, STALLED, Window, accept, begin, judge, propose
+from solvers.kernels.accelerate_springs import Shares, descend
+from solvers.kernels.compiling import inner, kernel
+from solvers.kernels.springs import Bundles, squared_norm
+from solvers.kernels.step import Plan
+from solvers.kernels.step_ends import Rows, fetch, place, state
+from solvers.linear.supernodal_solve import _backwards as backwards
+from solvers.linear.supernodal_solve import _forwards as forwards
+
+NOISE = 64.0 * np.finfo(np.float64).eps
+"""The rounding of thousands of terms of one sign, relative to their sum; measured: 10 eps."""
+
+
+class Step(NamedTuple):
+    """A system's plan, bundles, shares of the objective and rows, with vectors of all rows: y, the solve's (x) in the
+    factor's type, scratch (e, zero but in unknown rows); objective (1,): at the position [J]."""
+
+    plan: Plan
+    bundles: Bundles
+    shares: Shares
+    rows: Rows
+    y: NDArray[np.float64]
+    x: NDArray[Any]
+    e: NDArray[np.float64]
+    objective: NDArray[np.float64]
+
+
+@kernel
+def start(step: Step, window: Window, target, force, pin_targets, guess):
+    """Begin a step's solve; returns the guess's largest coordinate."""
+    state(step.rows, target, force, pin_targets, step.y)
+    largest = place(step.rows, guess, pin_targets, window.trial)
+    step.objective[0] = _evaluate(step, window)
+    _solve(step.plan, window.descent_there, len(window.direction), step.x)
+    begin(window, step.x)
+    return largest
+
+
+@kernel
+def run(step: Step, window: Window, iterations, limit, floor, every, out):
+    """Iterate, and put the positions to `out` (n, 3).
+
+    every: whether to end once a residual is at most `limit` or `floor`; limit: nan where no residual is wanted. Returns
+    how many iterations were done, the last one's residual [J^(1/2)], and whether round-off ended them.
+    """
+    now, count, verdict, there = window.now[0], 0, AGAIN, 0.0
+    residual = _residual(step, window) if iterations == 0 else np.inf
+    while count < iterations and not (every and (residual <= limit or residual <= floor)):
+        propose(window)
+        verdict = AGAIN
+        while verdict == AGAIN:
+            there = _evaluate(step, window)
+            now.rise, now.noise = there - step.objective[0], NOISE * abs(step.objective[0])
+            verdict = judge(window)
+        if verdict == STALLED:
+            residual = _residual(step, window)
+            break
+        count += 1
+        step.objective[0] = there
+        _solve(step.plan, window.descent_there, len(window.direction), step.x)
+        accept(window, step.x)
+        if every or (count == iterations and not np.isnan(limit)):
+            residual = _residual(step, window)
+    fetch(step.rows, window.position, out)
+    return count, residual, verdict == STALLED
+
+
+@inner
+def _evaluate(step, window):
+    return descend(
+        step.bundles,
+        step.shares,
+        window.trial,
+        step.y,
+        step.plan.held,
+        len(window.direction) // 4,
+        window.descent_there,
+    )
+
+
+@inner
+def _residual(step, window):
+    """|c|_Q [J^(1/2)] over the vertices that no pin holds."""
+    for i in range(len(window.correction) // 4):
+        for k in range(4 * i, 4 * i + 3):
+            step.e[k] = step.plan.loose[i] * window.correction[k]
+    return np.sqrt(squared_norm(step.bundles, 0, len(step.bundles.start) - 1, step.e, step.plan.measure))
+
+
+@inner
+def _solve(plan, b, size, x):
+    """Q x = b in rows: groups forwards, the top, groups backwards (see `solvers.linear.supernodal_solve`)."""
+    top, top_end, groups = plan.top
+    copied = 4 * (top_end - top)
+    for k in range(size):
+        x[4 * plan.shift + k] = b[k]
+    for group in range(groups):
+        copy = 4 * top + (group + 1) * copied
+        for k in range(copied):
+            x[copy + k] = 0.0
+        for block in range(plan.of_group[group], plan.of_group[group + 1]):
+            _, _, _, _, chunk, end, _ = plan.blocks[block]
+            forwards(plan.panels, plan.places, plan.chunks, chunk, end, x)
+    for k in range(4 * top, 4 * top + copied):
+        for group in range(groups):
+            x[k] += x[k + (group + 1) * copied]
+    for block in range(plan.of_group[-2], plan.of_group[-1]):
+        _, _, _, _, chunk, middle, end = plan.blocks[block]
+        forwards(plan.panels, plan.places, plan.chunks, chunk, middle, x)
+        backwards(plan.squares, plan.panels, plan.places, plan.chunks, chunk, end, x)
+    for group in range(groups):
+        copy = 4 * top + (group + 1) * copied
+        for k in range(copied):
+            x[copy + k] = x[4 * top + k]
+        for block in range(plan.of_group[group + 1] - 1, plan.of_group[group] - 1, -1):
+            _, _, _, _, chunk, _, end = plan.blocks[block]
+            backwards(plan.squares, plan.panels, plan.places, plan.chunks, chunk, end, x)
