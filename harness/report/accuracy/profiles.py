@@ -120,7 +120,7 @@ def _steps(ax, known, marked, target: float, *, start: float) -> None:
     high = 2.0 * max(float(finite.max(initial=start)), 5 * start)
     for k, look in enumerate(marked.values()):
         if len(known) and np.isfinite(values[k]).any():
-            x = np.concatenate([[low], np.sort(values[k][np.isfinite(values[k])]), [high]])
+            x = np.unique([low, *values[k][np.isfinite(values[k])], high])
             line(ax, x, share(values[k], x), look, drawstyle="steps-post")
     log_axis(ax.xaxis, low, high, unit="plain")
     ax.set_ylim(-0.02, 1.03)

@@ -19,6 +19,9 @@ ROUND_OFF = 100 * float(np.finfo(np.float64).eps)
 """An energy this share of its terms' magnitude below g* is a lower minimum and not round-off: sums of up to 1e5
 terms err by some tens of eps."""
 
+PAPER = "liu2013"
+"""The config that reproduces the paper; there g0 is taken at the inertial target."""
+
 _Row = dict[str, Any]
 _Label = Callable[[_Row], str]
 
@@ -62,7 +65,8 @@ def _problems(kinds: dict[str, list[_Row]]) -> dict[str, Problem]:
         if digest is None or row["g0"] is None:
             continue
         known = sorted(minima[digest], key=lambda m: m["g"])
-        energies, noise = [m["g"] for m in known], ROUND_OFF * (row["magnitude"] or 0.0)
+        energies, names = [m["g"] for m in known], [m["minimum"] for m in known]
+        noise = ROUND_OFF * (row["magnitude"] or 0.0)
         doubt = "" if known and known[0]["certified"] else "the lowest known minimum is not certified"
         seen = lowest.get(digest, np.inf)
         if not known:
@@ -71,15 +75,18 @@ def _problems(kinds: dict[str, list[_Row]]) -> dict[str, Problem]:
             doubt = "a solver went below the lowest minimum that is certified; gaps refer to what it reached"
         if doubt and seen < (energies or [np.inf])[0] - noise:
             energies.insert(0, seen)
-        g0 = row.get("g0_inertial") if row["moment"].startswith("frame-") else row["g0"]
+            names.insert(0, "")
+        paper = row["sweep"] == PAPER
         found[digest] = Problem(
             **{name: row[name] for name in ("scene", "size", "vertices", "moment", "integrator", "time_step")},
             **{name: _number(row[name]) for name in ("stiffness_ratio", "mean_rest_length", "magnitude")},
             digest=digest,
             frame=row["frame"] or 0,
-            g0=_number(g0 if g0 is not None else row["g0"]),
+            g0=_number(row["g0_inertial" if paper else "g0"]),
             minima=tuple(energies),
+            names=tuple(names),
             doubt=doubt,
+            paper=paper,
         )
     return found
 
@@ -108,7 +115,6 @@ def _curve(problem: Problem, rows: Sequence[_Row], prepared: _Row, label: str) -
     rounds = min((len(row["seconds"] or ()) for row in points), default=0)
     seconds = np.array([row["seconds"][:rounds] for row in points], float).reshape(len(points), rounds).T
     warm = prepared.get("seconds") or [np.nan]
-    reached = next((row for row in reversed(points) if row.get("minimum_g") is not None), {})
     return Curve(
         problem=problem,
         solver=rows[0]["solver"],
@@ -123,10 +129,10 @@ def _curve(problem: Problem, rows: Sequence[_Row], prepared: _Row, label: str) -
         seconds=seconds if rounds else np.full((1, len(points)), np.nan),
         warm=float(np.median(warm)),
         cold=_number(prepared.get("cold")),
-        branch=problem.branch(reached.get("minimum_g")) if reached.get("branch") is not None else None,
+        branch=problem.branch(rows[0]["minimum"]) if rows[0]["branch"] is not None else None,
         status=bad["status"],
         reason=bad["reason"] or "",
-        recording=next((row["recording"] for row in rows if row.get("recording")), ""),
+        recording=next((row["recording"] for row in rows if row["recording"]), ""),
     )
 
 
@@ -137,7 +143,7 @@ def _work(row: _Row, label: _Label) -> Work:
         label=label(row),
         horizon=_number(row["horizon"]),
         error=_number(row["error"]),
-        error_rms=_number(row.get("error_rms")),
+        error_rms=_number(row["error_rms_m"]),
         seconds=_number(row["seconds_per_simulated"]),
         reason=row["reason"] or "",
     )

@@ -16,9 +16,10 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A frozen step. vertices; g0, best, minima (ascending), magnitude [J]; mean_rest_length [m]; time_step [s].
+    """A frozen step. g0, minima (ascending), magnitude [J]; mean_rest_length [m]; time_step [s].
 
-    doubt: why `best` is no certified minimum, empty where it is.
+    names: of the minima, stable while their order may change; doubt: why `best` is no certified minimum, empty where
+    it is; paper: whether it belongs to the reproduction of the paper.
     """
 
     digest: str
@@ -34,7 +35,9 @@ class Problem:
     magnitude: float
     g0: float
     minima: tuple[float, ...]
+    names: tuple[str, ...]
     doubt: str
+    paper: bool
 
     @property
     def best(self) -> float:
@@ -63,11 +66,9 @@ class Problem:
         """The gaps of energies [J]."""
         return (g - self.best) / (self.g0 - self.best)
 
-    def branch(self, g: float | None) -> int | None:
-        """The number of the minimum with the energy g [J], 0 for the lowest; None for no minimum."""
-        if g is None or not self.minima:
-            return None
-        return int(np.argmin(np.abs(np.array(self.minima) - g)))
+    def branch(self, name: str | None) -> int | None:
+        """The number of the minimum of this name, 0 for the lowest; None for none."""
+        return self.names.index(name) if name in self.names else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,8 +148,12 @@ def step_words(dt: float) -> str:
     return f"1/{whole} s" if abs(whole * dt - 1) < 1e-9 else f"{1e3 * dt:.3g} ms"
 
 
-def without_frames(table: Table) -> Table:
-    """The table less the paper's problems (moments `frame-k`), which have a picture of their own."""
-    kept = tuple(p for p in table.problems if not p.moment.startswith("frame-"))
-    inside = {p.digest for p in kept}
-    return replace(table, problems=kept, curves=tuple(c for c in table.curves if c.problem.digest in inside))
+LONG = 500
+"""Iterations from which on a curve of the paper's reproduction is worth a picture of its own: Figure 2 has 1000."""
+
+
+def without_short(table: Table) -> Table:
+    """The table less the many short curves from which the paper's Figure 3 takes means."""
+    long = {c.problem.digest for c in table.curves if not c.problem.paper or c.iterations.max(initial=0.0) >= LONG}
+    problems = tuple(p for p in table.problems if p.digest in long)
+    return replace(table, problems=problems, curves=tuple(c for c in table.curves if c.problem.digest in long))

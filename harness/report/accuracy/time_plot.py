@@ -84,7 +84,7 @@ def _draw(stem: Path, mesh: str, curves: list[Curve], marked: dict[str, Mark], m
                     ax.tick_params(labelleft=False)
         used = {curve.label for curve in curves}
         cross = Line2D([], [], color=INK, marker="x", linestyle="", markersize=7, markeredgewidth=2)
-        legend(page, {k: m for k, m in marked.items() if k in used}, below=[(cross, "not reached from here on")])
+        legend(page, {k: m for k, m in marked.items() if k in used}, below=[(cross, "no longer reached")])
         notes(page, words)
 
 

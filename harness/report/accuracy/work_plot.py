@@ -1,0 +1,197 @@
+"""Work against precision: the error of a simulated second against the wall time that it takes, and the Pareto front."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from harness.report.accuracy.sheet import (
+    LEFT,
+    RIGHT,
+    TOP,
+    files,
+    foot,
+    legend,
+    limits,
+    log_axis,
+    looks,
+    notes,
+    panel,
+    sheet,
+    size,
+)
+from harness.report.accuracy.table import Table, Work, step_words
+from harness.report.accuracy.times import duration
+from harness.report.page import quantity, text
+from harness.report.style import INK, MUTED, PAGE, Mark
+
+NOT_MINIMISING = ("xpbd", "xpbd-small-steps", "symplectic-euler")
+"""Methods whose iterates do not tend to a minimum of the step's objective: graded on trajectories alone."""
+
+INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
+
+ERRORS = (0.1, 0.03, 0.01, 0.003, 0.001)
+"""The errors at which the front is told in words."""
+
+
+def is_default(work: Work) -> bool:
+    """Whether this is the assignment's default: implicit Euler at 1/30 s with 50 iterations of local-global."""
+    same_method = work.solver in ("dense", "sparse", "numba") and work.integrator == "implicit-euler"
+    return same_method and work.tolerance is None and work.iterations == 50 and abs(30 * work.time_step - 1) < 1e-9
+
+
+def default(works: Iterable[Work]) -> Work | None:
+    """The assignment's default among these, by the fastest of its backends."""
+    return min((w for w in works if is_default(w) and _known(w)), key=lambda w: w.seconds, default=None)
+
+
+def front(works: Iterable[Work]) -> list[Work]:
+    """Those that no other beats in both time and error, the cheapest first."""
+    kept: list[Work] = []
+    for work in sorted((w for w in works if _known(w)), key=lambda w: (w.seconds, w.error)):
+        if not kept or work.error < kept[-1].error:
+            kept.append(work)
+    return kept
+
+
+def findings(works: Sequence[Work]) -> list[str]:
+    """The cheapest way to each error that the default does not reach, or reaches for more, in words."""
+    base = default(works)
+    words = []
+    if base:
+        words.append(
+            f"the default ({base.setting}) has an error of {100 * base.error:.2g} % "
+            f"for {duration(base.seconds)} a simulated second"
+        )
+    for error in ERRORS:
+        best = next((work for work in front(works) if work.error <= error), None)
+        if best:
+            euler = min(
+                (w for w in works if same_method(w, base) and _known(w) and w.error <= error),
+                key=lambda w: w.seconds,
+                default=None,
+            )
+            against = (
+                f", 1/{quantity(euler.seconds / best.seconds)} of what the default's method needs" if euler else ""
+            )
+            words.append(f"{100 * error:g} %: {best.setting}: {duration(best.seconds)} a simulated second{against}")
+    return words
+
+
+def same_method(work: Work, base: Work | None) -> bool:
+    """Whether it differs from the default in the time step alone."""
+    return base is not None and (work.label, work.integrator, work.tolerance, work.iterations) == (
+        base.label,
+        base.integrator,
+        base.tolerance,
+        base.iterations,
+    )
+
+
+def draw_work(table: Table, folder: Path) -> list[Path]:
+    """A picture for each mesh, a panel for each integrator; returns the files."""
+    drawn = []
+    marked = looks((work.label, work.solver) for work in table.works)
+    for mesh in dict.fromkeys(work.mesh for work in table.works):
+        here = [work for work in table.works if work.mesh == mesh]
+        if any(_known(work) for work in here):
+            stem = folder / mesh.replace(" ", "-")
+            _draw(stem, mesh, here, marked, table.machine)
+            drawn += files(stem)
+    return drawn
+
+
+def _known(work: Work) -> bool:
+    return work.status == "ok" and np.isfinite([work.error, work.seconds]).all() and min(work.error, work.seconds) > 0
+
+
+def _draw(stem: Path, mesh: str, works: list[Work], marked: dict[str, Mark], machine: Sequence[str]) -> None:
+    words = _notes(works)
+    integrators = [name for name in INTEGRATORS if any(work.integrator == name for work in works)]
+    known = [work for work in works if _known(work)]
+    across, down = limits([w.seconds for w in known], margin=1.6), limits([w.error for w in known], margin=1.6)
+    facts = [f"{quantity(works[0].horizon)} s simulated", "time stepping and solver together", *machine]
+    with sheet(stem, f"Work and precision: {mesh}", facts) as page:
+        width = (RIGHT - LEFT - 62) / len(integrators) - 20
+        top = TOP + 46
+        text(page, LEFT + 62, TOP + 4, "error of the positions, relative to the way from the start", size=10.5)
+        for column, integrator in enumerate(integrators):
+            left = LEFT + 62 + column * (width + 20)
+            ax = panel(page, left, top, width, foot(words) - top - 46, integrator)
+            _panel(ax, [work for work in known if work.integrator == integrator], marked)
+            _front(ax, known)
+            log_axis(ax.xaxis, *across, unit="time")
+            log_axis(ax.yaxis, *down, unit="percent")
+            ax.set_xlabel("wall time a simulated second", fontsize=9, loc="left")
+            if column:
+                ax.tick_params(labelleft=False)
+        used = {work.label for work in works}
+        names = {
+            f"{label} †" if label.partition(",")[0] in NOT_MINIMISING else label: mark
+            for label, mark in marked.items()
+            if label in used
+        }
+        legend(page, names, below=_meanings())
+        notes(page, words)
+
+
+def _panel(ax: Axes, works: list[Work], marked: dict[str, Mark]) -> None:
+    """Points of one integrator; those that differ in the time step alone are joined."""
+    tolerances = sorted({work.tolerance for work in works if work.tolerance}, reverse=True)
+    chains: dict[tuple, list[Work]] = {}
+    for work in works:
+        chains.setdefault((work.label, work.tolerance, work.iterations, work.first_guess), []).append(work)
+    for (label, tolerance, *_), members in chains.items():
+        members.sort(key=lambda work: work.time_step)
+        look = marked[label]
+        grown = 4.0 + 1.6 * tolerances.index(tolerance) if tolerance else 5.0
+        ax.plot(
+            [work.seconds for work in members], [work.error for work in members], color=look.color, linestyle=look.dash,
+            linewidth=0.9, alpha=0.9, marker=look.marker, markersize=grown * size(look),
+            mfc=look.color if tolerance else PAGE, mec=PAGE if tolerance else look.color, mew=0.5 if tolerance else 1.1,
+        )  # fmt: skip
+    base = default(works)
+    if base:
+        ax.plot(base.seconds, base.error, "o", mfc="none", mec=INK, markersize=15, mew=1.6, zorder=6)
+        ax.annotate(
+            "the assignment's default", (base.seconds, base.error), (0, 13), textcoords="offset points",
+            fontsize=9, ha="center", color=INK, bbox={"facecolor": PAGE, "alpha": 0.8, "edgecolor": "none", "pad": 0.8},
+        )  # fmt: skip
+
+
+def _front(ax: Axes, works: list[Work]) -> None:
+    """The front of all integrators, the same in each panel: the least error that a budget buys."""
+    best = front(works)
+    if best:
+        x, y = [work.seconds for work in best], [work.error for work in best]
+        ax.plot(
+            [x[0], *x, 1e6], [1e6, *y, y[-1]], drawstyle="steps-post", color=MUTED, linewidth=5, alpha=0.28, zorder=1
+        )
+
+
+def _meanings() -> list[tuple[Line2D, str]]:
+    def dot(**more) -> Line2D:
+        return Line2D([], [], color=MUTED, marker="o", linestyle="", **more)
+
+    return [
+        (Line2D([], [], color=MUTED, linewidth=5, alpha=0.28), "Pareto front of all"),
+        (dot(mfc=PAGE, markersize=5), "fixed iterations"),
+        (dot(markersize=4), "loose tolerance"),
+        (dot(markersize=8), "tight tolerance"),
+    ]
+
+
+def _notes(works: Sequence[Work]) -> list[str]:
+    words = ["Joined points differ in the time step alone: " + ", ".join(map(step_words, _steps(works)))]
+    if any(work.solver in NOT_MINIMISING for work in works):
+        words.append("† does not minimise the step's objective: its limit is not the integrator's own solution")
+    failed = [work for work in works if work.status != "ok"]
+    return words + [f"× {work.setting}: {work.status}{': ' if work.reason else ''}{work.reason}" for work in failed]
+
+
+def _steps(works: Sequence[Work]) -> list[float]:
+    return sorted({work.time_step for work in works}, reverse=True)
