@@ -13,6 +13,10 @@ SOLVERS = {
     "chebyshev": "solvers.chebyshev:Chebyshev",
     "lbfgs": "solvers.lbfgs:Lbfgs",
     "newton": "solvers.newton:Newton",
+    "xpbd": "solvers.xpbd:Xpbd",
+    "xpbd-small-steps": "solvers.xpbd:XpbdSmallSteps",
+    "vbd": "solvers.vbd:VertexBlockDescent",
+    "symplectic-euler": "solvers.symplectic_euler:SymplecticEuler",
 }
 
 

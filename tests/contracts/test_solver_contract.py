@@ -16,6 +16,7 @@ from solvers.local_global import DenseLocalGlobal, SparseLocalGlobal
 from solvers.matrices import assemble, energy_norm
 from solvers.problem import Positions, StepProblem, StopRule
 from solvers.registry import SOLVERS, load
+from solvers.symplectic_euler import SymplecticEuler
 from tests.scenes import cloth, first_problem, frozen, random_problem
 
 FORCED = {
@@ -59,7 +60,8 @@ def iterates(prepared, problem: StepProblem, count: int) -> list[Positions]:
 def test_a_solve_ends_at_exactly_the_iterate_of_its_number(solver, problem, count):
     prepared = solver.prepare(problem.system)
     solution = prepared.solve(problem, StopRule(count))
-    assert solution.iterations == count or solution.stopped == "stalled"
+    done = 1 if isinstance(solver, SymplecticEuler) else count  # an explicit method has one iterate, again and again
+    assert solution.iterations == done or solution.stopped == "stalled"
     np.testing.assert_array_equal(solution.positions, iterates(prepared, problem, count)[-1])
 
 

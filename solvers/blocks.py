@@ -1,0 +1,71 @@
+"""The terms of a step that act on each vertex by itself: inertia, force and pins by penalty.
+
+    held_i/2 |p_i|^2 - y_i . p_i,      held = c m/dt^2 + w,      y = c m/dt^2 target + f + w p_pin
+
+They are one quadratic a vertex. So methods that go vertex by vertex or spring by spring take a pin of any weight
+exactly, by more weight on the vertex, without a further constraint that converges slowly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.problem import Positions, StepProblem, System, Unsupported
+
+
+def held(system: System) -> NDArray[np.float64]:
+    """What holds each vertex (n,) [N/m], infinite where a pin is exact."""
+    total = system.inertia.copy()
+    total[system.pins.vertices] += system.pins.weight
+    return total
+
+
+def pull(problem: StepProblem) -> Positions:
+    """y (n, 3) [N]; of exact pins what inertia and force are there."""
+    s = problem.system
+    y = s.inertia[:, None] * problem.target + problem.force
+    soft, vertices, weight = s.penalty
+    y[vertices] += weight[:, None] * problem.pin_targets[soft]
+    return y
+
+
+def anchors(problem: StepProblem) -> Positions:
+    """Where each vertex would go without springs, y/held (n, 3) [m]; exact pins on their targets.
+
+    In the form target + (f + w (p_pin - target))/held, which does not round where the force is small.
+    """
+    s = problem.system
+    weight, away = np.zeros(s.vertices), problem.force.copy()
+    soft, vertices, weights = s.penalty
+    weight[vertices] = weights
+    away[vertices] += weights[:, None] * (problem.pin_targets[soft] - problem.target[vertices])
+    return placed(problem.target + away / held(s)[:, None], problem)
+
+
+def placed(p: Positions, problem: StepProblem) -> Positions:
+    """A copy of p (n, 3) with the exactly pinned vertices on their targets."""
+    out = np.array(p, np.float64, order="C")
+    exact = problem.system.pins.exact
+    out[problem.system.pins.vertices[exact]] = problem.pin_targets[exact]
+    return out
+
+
+def require_mass(system: System, held: NDArray[np.float64], solver: str) -> None:
+    """Raise Unsupported where a vertex has nothing that holds it by itself, with the vertices at fault."""
+    loose = np.flatnonzero(held <= 0.0)
+    if len(loose):
+        named = ", ".join(map(str, loose[:5])) + (", ..." if len(loose) > 5 else "")
+        raise Unsupported(
+            f"{solver}: moves each vertex by its own mass; {len(loose)} of {system.vertices} have none and are not "
+            f"pinned ({named}): give them mass, or take a solver that minimises"
+        )
+
+
+def require_implicit_euler(system: System, solver: str) -> None:
+    """Raise Unsupported for a step of another integrator."""
+    if system.factor != 1.0:
+        raise Unsupported(
+            f"{solver}: divides the step by itself and keeps its own velocity, which takes the place of an integrator; "
+            "run it with the integrator implicit-euler"
+        )
