@@ -1,4 +1,4 @@
-"""The command line: `springbench run`, `speed`, `list`, `query`, `schema`, `inspect`, `view`, `gate`.
+"""The command line: `springbench run`, `speed`, `accuracy`, `recommend`, `list`, `query`, `schema`, `inspect`, and more.
 
 Exit codes: 0 all is well, 1 a run failed or a gate found a regression, 2 the user's mistake, 130 stopped by Ctrl-C.
 """
@@ -122,6 +122,58 @@ def speed(
     draw(found, folder / "pictures")
     _say(f"rows and pictures are in {folder}")
     raise typer.Exit(1 if any(f.status in ("failed", "diverged") for f in found) else 0)
+
+
+@app.command()
+def accuracy(
+    config: Annotated[Path, typer.Argument(help="An accuracy config (YAML).")],
+    results: Results = Path("results"),
+    again: Annotated[bool, typer.Option("--again", help="Measure all again, also what is there.")] = False,
+) -> None:
+    """Measure what accuracy costs in time: convergence on frozen steps, and errors of whole simulations."""
+    from harness.accuracy.load import load_accuracy
+    from harness.accuracy.run import failures, run_accuracy
+    from harness.progress import display
+    from harness.report.accuracy import draw
+
+    asked = load_accuracy(config)
+    folder = results / asked.name
+    files = run_accuracy(asked, folder, display(err), _say, again=again)
+    drawn = draw(folder)
+    _say(f"rows are in {folder / 'accuracy'}; {len(drawn)} pictures and pages tell of them, {drawn[-1]} of all")
+    failed = failures(files)
+    for line in failed:
+        _say(line)
+    raise typer.Exit(1 if failed else 0)
+
+
+@app.command()
+def recommend(
+    scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
+    error: Annotated[float, typer.Option(help="The error wanted, relative to the displacement from the start.")],
+    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
+    horizon: Annotated[float, typer.Option(help="After how many simulated seconds the error counts.")] = 1.0,
+    time_limit: Annotated[float, typer.Option(help="Wall seconds that a simulation may take.")] = 5.0,
+    results: Results = Path("results"),
+) -> None:
+    """Find the cheapest integrator, time step, tolerance and solver that keep to an error, and check them."""
+    from harness.accuracy.recommend import recommend as find
+    from harness.progress import display
+
+    found = find(
+        scene,
+        error,
+        size=size,
+        horizon=horizon,
+        time_limit=time_limit,
+        results=results,
+        display=display(err),
+        say=_say,
+    )
+    table = Table("", "error", "wall s per simulated s", "way")
+    for name, way in (("predicted", found.best), ("measured", found.checked)):
+        table.add_row(name, f"{way.error:.3g}", f"{way.cost:.4g}", str(way))
+    out.print(table)
 
 
 @app.command("list")

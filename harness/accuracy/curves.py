@@ -35,12 +35,12 @@ EXPLODED = 1e6
 WARM_UP = 2
 """Iterates whose time does not count against the limit: they compile."""
 
-_EACH = 20
+_EACH = 50
 _MANTISSAS = (1.0, 1.2, 1.5, 1.8, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.5)
 
 
 def kept(iteration: int) -> bool:
-    """Whether an iterate is graded: each of the first 20, and then 12 a decade."""
+    """Whether an iterate is graded: each of the first 50, and then 12 a decade."""
     if iteration <= _EACH:
         return True
     decade = 10 ** (len(str(iteration)) - 1)

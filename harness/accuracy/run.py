@@ -33,7 +33,6 @@ Row = dict[str, Any]
 def run_accuracy(
     accuracy: Accuracy,
     folder: Path,
-    references: Path,
     display: Display,
     say: Callable[[str], None],
     *,
@@ -41,7 +40,7 @@ def run_accuracy(
 ) -> list[Path]:
     """Do what is missing (all of it with `again`) and return the files of all units.
 
-    folder: of the config's results; references: of the truth, shared by all configs; say: prints a remark.
+    folder: of the config's results, beside which the truth is kept for all configs; say: prints a remark.
     Raises InputError.
     """
     units: Sequence[Unit] = (*accuracy.curves, *accuracy.work)
@@ -50,7 +49,7 @@ def run_accuracy(
             pass
     (folder / "accuracy").mkdir(parents=True, exist_ok=True)
     with rows.alone(folder):
-        run = _Run(accuracy.name, folder, Store(references), display, again)
+        run = _Run(accuracy.name, folder, references(folder.parent), display, again)
         todo = sum(not run.done(unit) for unit in units)
         if todo < len(units):
             say(f"{len(units) - todo} of {len(units)} units are there already")
@@ -65,6 +64,21 @@ def run_accuracy(
         finally:
             display.end()
     return [path for unit in units if (path := run.path(unit)).exists()]
+
+
+def references(results: Path) -> Store:
+    """The truth of all configs whose results are in one folder."""
+    return Store(results / ".references")
+
+
+def failures(files: Sequence[Path]) -> list[str]:
+    """Scene, size, moment, solver and reason of what failed; other statuses are results."""
+    found = [rows.read([path], SCHEMA).to_pylist()[0] for path in files]
+    return [
+        f"{r['scene']} {r['size']} {r['moment'] or r['integrator']} {r['solver']}: {r['reason']}"
+        for r in found
+        if r["status"] == "failed"
+    ]
 
 
 class _Run:
@@ -113,22 +127,12 @@ class _Run:
         """The simulations of one scene up to one horizon."""
         if all(self.done(unit) for unit in group):
             return
-        first = group[0]
-        trajectory = self._trajectory(first)
+        trajectory = trajectory_of(group[0], self._store)
         for unit in group:
             if not self.done(unit):
                 step = f"{unit.case.integrator} dt {unit.case.scene.time_step:.3g}"
                 self._display.run(f"{unit.case.title} {step} {unit.solver.name}", unit.how.rounds, 1)
                 self._write(unit, work_rows(unit, trajectory, lambda: self._display.tick("work")))
-
-    def _trajectory(self, unit: WorkUnit) -> Trajectory | Exception:
-        """The reference up to the horizon, or why there is none. Which errors it can tell, each row asks."""
-        try:
-            return self._store.trajectory(unit.case.scene, unit.case.size, [unit.horizon], error=1.0)
-        except InputError:
-            raise
-        except Exception as error:
-            return error
 
     def _write(self, unit: Unit, found: list[Row]) -> None:
         case = unit.case
@@ -147,3 +151,16 @@ class _Run:
         rows.write(self.path(unit), [shared | row for row in found], SCHEMA)
         bad = next((row for row in found if row["status"] != "ok"), None)
         self._display.finished(f"{bad['status']}: {bad['reason']}" if bad else "ok")
+
+
+def trajectory_of(unit: WorkUnit, store: Store) -> Trajectory | Exception:
+    """The reference up to the unit's horizon, or why there is none; which errors it can tell, each row asks.
+
+    Raises InputError.
+    """
+    try:
+        return store.trajectory(unit.case.scene, unit.case.size, [unit.horizon], error=1.0)
+    except InputError:
+        raise
+    except Exception as error:
+        return error

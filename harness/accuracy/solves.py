@@ -10,7 +10,7 @@ from time import perf_counter
 from typing import Any
 
 from harness import machine
-from harness.accuracy.curves import Curve, measure
+from harness.accuracy.curves import AT_REST, Curve, measure
 from harness.accuracy.failures import lost
 from harness.accuracy.oracle import Oracle, stiffness_ratio
 from harness.accuracy.recording import record
@@ -180,6 +180,8 @@ def _curve(unit: CurveUnit, prepared: Prepared, graded: Graded, first_guess: str
         shared |= {"status": "uncertified", "reason": graded.reference.reason}
     if reached:
         shared["branch"] = graded.reference.branch(reached)
+    elif curve.status == "ok" and curve.stationarity[-1] <= AT_REST:
+        shared["reason"] = "ended at a stationary point that is no minimum"
     if unit.recordings:
         shared["recording"] = str(record(unit, graded, first_guess, curve, folder).relative_to(folder))
     against = reached or next(iter(graded.reference.minima), None)

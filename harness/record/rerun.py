@@ -6,7 +6,7 @@ name until it is complete and has been read back.
 
 Entities: `/scene/mesh` (positions, exact to float32), `/scene/pins`, `/scene/springs`; `/energy/*`, `/residual`,
 `/iterations`, `/strain/largest`, `/milliseconds/*` by `frame` and `time`; `/convergence/*/frame_*` also by
-`iteration`; `/network` (springs, rest lengths, pins), `/run` (Markdown) and the recording's properties. Where the frames
+`iteration`; `/network` (springs, rest lengths, pins), `/run` (Markdown) and the recording's properties. Where frames
 are the iterates of a solve, everything is by `iteration`, and `/solve/*` tells how it converges.
 """
 
