@@ -1,0 +1,73 @@
+"""Dashpots: an edge resists the speed at which its length changes, by f = -c n n'(v_i - v_j).
+
+The direction n is that at the step's start, so the force is linear. Since the unknown moves with the velocity
+rate (x - origin), the force is the gradient of
+
+    E(x) = sum_e c_e rate/2 (n_e'(A x - A origin)_e)^2
+
+a projective energy (Bouaziz et al. 2014): the nearest vectors d_e without a speed along n_e make a plane. Equal and
+opposite forces along the edge as it was conserve linear and, by implicit Euler, angular momentum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from solvers.energies.edges import Edges, directions, rest_directions
+from solvers.problem import Positions, Start
+
+
+@dataclass(frozen=True, eq=False)
+class Dashpots(Edges):
+    """Dashpots along edges.
+
+    stiffness: c (m,) [N s/m] as made, which is c rate [N/m] at a rate of 1/s, and c rate once a step has begun;
+    direction: n (m, 3), that of the rest shape as made; offset: n'A origin (m,) [m], 0 as made.
+    """
+
+    direction: Positions
+    offset: NDArray[np.float64]
+
+    @classmethod
+    def along(cls, rest: Positions, edges: NDArray[np.int64], damping: NDArray[np.float64]) -> Dashpots:
+        """Dashpots along edges (m, 2) of a rest shape (n, 3) [m] with coefficients c (m,) [N s/m]."""
+        _, direction = rest_directions(rest, edges)
+        return cls(edges, damping, direction, np.zeros(len(edges)))
+
+    def begin_step(self, start: Start) -> Dashpots:
+        """The energy of a step."""
+        _, n = directions(self._along(start.positions), self.direction)
+        offset = _dot(n, self._along(start.origin))
+        return replace(self, stiffness=start.rate * self.stiffness, direction=n, offset=offset)
+
+    def _closing(self, p: Positions) -> NDArray[np.float64]:
+        """n'(A p - A origin), (m,) [m]."""
+        return _dot(self.direction, self._along(p)) - self.offset
+
+    def value(self, p: Positions) -> float:
+        """The energy [J] at p, shape (n, 3): half of what the dashpots take in the time 1/rate."""
+        return 0.5 * float(self.stiffness @ self._closing(p) ** 2)
+
+    def add_gradient(self, p: Positions, out: Positions) -> None:
+        """Add the gradient [N], shape (n, 3), to `out`."""
+        self._add(self._closing(p)[:, None] * self.direction, out)
+
+    def add_projection(self, p: Positions, out: Positions) -> None:
+        """The local step: add A'K d(p) [N], shape (n, 3), to `out`."""
+        self._add(self._along(p) - self._closing(p)[:, None] * self.direction, out)
+
+    def hessian(self, p: Positions) -> csr_array:
+        """The Hessian [N/m], shape (3n, 3n): k nn' an edge."""
+        return self._blocks(np.zeros(len(self.edges)), self.direction, len(p))
+
+
+class RayleighDashpots(Dashpots):
+    """The part of Rayleigh damping that is in proportion to the stiffness of springs."""
+
+
+def _dot(a: Positions, b: Positions) -> NDArray[np.float64]:
+    return np.einsum("ij,ij->i", a, b)

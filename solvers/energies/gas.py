@@ -1,0 +1,99 @@
+"""A fixed amount of gas at constant temperature in a closed surface: p V = p0 V0.
+
+    E(x) = -p0 V0 ln(V/V0),   V = sum over triangles of a.(b x c)/6,   grad E = -(p0 V0/V) grad V
+
+Without springs that hold it together the gas would expand for ever. A surface turned inside out has no such energy: it
+is infinite there, so that a line search turns back. The energy is not projective.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+
+from solvers.matrices import without_zeros
+from solvers.problem import Positions
+
+LARGEST_DENSE = 1_000
+"""Vertices up to which the Hessian has its dense part: 9 million entries, 100 MB."""
+
+_INSIDE_OUT = 1e-3
+"""Where the volume is not positive, the gradient is taken as if it were this fraction of that at rest."""
+
+_LEVI_CIVITA = np.array([np.cross(np.eye(3), e) for e in np.eye(3)])
+"""[a]x = sum_k a_k LC[k] is the matrix of the cross product, [a]x b = a x b."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gas:
+    """Gas in a closed surface.
+
+    triangles: (f, 3), outwards; pressure: p0 [Pa] at the volume: V0 [m^3].
+    """
+
+    triangles: NDArray[np.int64]
+    pressure: float
+    volume: float
+
+    def volume_at(self, p: Positions) -> float:
+        """V [m^3] at p, shape (n, 3); negative inside out."""
+        a, b, c = self._corners(p)
+        return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
+
+    def _corners(self, p: Positions) -> list[Positions]:
+        x = p - p.mean(axis=0)  # a closed surface may be moved; far from zero its volume would cancel
+        return [x[corner] for corner in self.triangles.T]
+
+    def value(self, p: Positions) -> float:
+        """The energy [J] at p, shape (n, 3), zero at rest; infinite where the volume is not positive."""
+        volume = self.volume_at(p)
+        return -self.pressure * self.volume * float(np.log(volume / self.volume)) if volume > 0.0 else np.inf
+
+    def _pressure_at(self, p: Positions) -> tuple[float, float]:
+        """The pressure [Pa] and the volume [m^3] that it is taken at."""
+        volume = self.volume_at(p)
+        volume = volume if volume > 0.0 else _INSIDE_OUT * self.volume
+        return self.pressure * self.volume / volume, volume
+
+    def _volume_gradient(self, p: Positions) -> Positions:
+        """grad V, (n, 3) [m^2]."""
+        a, b, c = self._corners(p)
+        out = np.zeros_like(p)
+        for corner, area in zip(self.triangles.T, (np.cross(b, c), np.cross(c, a), np.cross(a, b)), strict=True):
+            np.add.at(out, corner, area / 6.0)
+        return out
+
+    def add_gradient(self, p: Positions, out: Positions) -> None:
+        """Add the gradient [N], shape (n, 3), to `out`."""
+        out -= self._pressure_at(p)[0] * self._volume_gradient(p)
+
+    def hessian(self, p: Positions) -> csr_array:
+        """The Hessian [N/m], shape (3n, 3n): p/V grad V grad V' - p grad^2 V.
+
+        The first part is dense and positive semidefinite. Meshes of more than LARGEST_DENSE vertices get the second,
+        sparse and indefinite one alone: enough for a quasi-Newton method, not to tell a minimum from a saddle.
+        """
+        pressure, volume = self._pressure_at(p)
+        n = len(p)
+        H = csr_array(-pressure * self._volume_hessian(p))
+        if n <= LARGEST_DENSE:
+            g = self._volume_gradient(p).ravel()
+            H = csr_array(H + csr_array(pressure / volume * np.outer(g, g)))
+        return without_zeros(H)
+
+    def _volume_hessian(self, p: Positions) -> csr_array:
+        n = len(p)
+        cross = [np.einsum("fk,kij->fij", x, _LEVI_CIVITA) / 6.0 for x in self._corners(p)]
+        rows, columns, blocks = [], [], []
+        for k in range(3):  # d/d(next) and d/d(previous) of next x previous, the gradient at corner k
+            i, j, l = (self.triangles[:, (k + step) % 3] for step in range(3))
+            rows += [i, i]
+            columns += [j, l]
+            blocks += [-cross[(k + 2) % 3], cross[(k + 1) % 3]]
+        row, column = (3 * np.concatenate(part)[:, None, None] for part in (rows, columns))
+        row, column = np.broadcast_arrays(row + np.arange(3)[:, None], column + np.arange(3))
+        values = np.concatenate(blocks)
+        return csr_array(coo_array((values.ravel(), (row.ravel(), column.ravel())), shape=(3 * n, 3 * n)))
