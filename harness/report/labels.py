@@ -18,12 +18,12 @@ def direct_labels(ax: Axes, ends: list) -> None:
         at = spread(wanted[:, 1].tolist(), ax.bbox.y0 + 6, ax.bbox.y1 - 6)
         for (x, y, words, color), height in zip(here, at, strict=True):
             # As shares of the figure: pixels mean something else in vector formats.
-            at_share = ax.figure.transFigure.inverted().transform((wanted[0, 0] + 16, height))
+            x_share, y_share = ax.figure.transFigure.inverted().transform((wanted[0, 0] + 16, height))
             line = {"arrowstyle": "-", "color": color, "alpha": 0.45, "linewidth": 0.8, "shrinkA": 1, "shrinkB": 5}
             ax.annotate(
                 words,
                 (x, y),
-                at_share,
+                (x_share, y_share),
                 textcoords="figure fraction",
                 va="center",
                 fontsize=9.5,

@@ -164,7 +164,9 @@ def _vertical(ax: Axes, row: _Row, curves: Sequence[Curve], problem: Problem, co
         ax.tick_params(labelleft=False)
     if last and row is _ROWS[1]:
         scale = problem.mean_rest_length
-        metres = ax.secondary_yaxis("right", functions=(lambda y: y * scale, lambda y: y / scale))
+        metres = ax.secondary_yaxis(
+            "right", functions=(lambda y: np.asarray(y) * scale, lambda y: np.asarray(y) / scale)
+        )
         metres.tick_params(length=3, labelsize=8.5)
         ax.text(1.0, 1.03, "metres", transform=ax.transAxes, fontsize=8.5, color=MUTED)
 

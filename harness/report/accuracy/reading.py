@@ -78,8 +78,15 @@ def _problems(kinds: dict[str, list[_Row]]) -> dict[str, Problem]:
             names.insert(0, "")
         paper = row["sweep"] == PAPER
         found[digest] = Problem(
-            **{name: row[name] for name in ("scene", "size", "vertices", "moment", "integrator", "time_step")},
-            **{name: _number(row[name]) for name in ("stiffness_ratio", "mean_rest_length", "magnitude")},
+            scene=row["scene"],
+            size=row["size"],
+            vertices=row["vertices"],
+            moment=row["moment"],
+            integrator=row["integrator"],
+            time_step=row["time_step"],
+            stiffness_ratio=_number(row["stiffness_ratio"]),
+            mean_rest_length=_number(row["mean_rest_length"]),
+            magnitude=_number(row["magnitude"]),
             digest=digest,
             frame=row["frame"] or 0,
             g0=_number(row["g0_inertial" if paper else "g0"]),

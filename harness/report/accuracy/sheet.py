@@ -123,7 +123,7 @@ def log_axis(axis: Axis, low: float, high: float, *, unit: str = "power") -> Non
     """A logarithmic axis from low to high; unit: power (of ten), time, plain or percent."""
     set_scale, set_limits = (
         (axis.axes.set_xscale, axis.axes.set_xlim)
-        if axis.axis_name == "x"
+        if axis is axis.axes.xaxis
         else (axis.axes.set_yscale, axis.axes.set_ylim)
     )
     set_scale("log")

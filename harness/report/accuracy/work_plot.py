@@ -106,7 +106,7 @@ def draw_work(table: Table, folder: Path) -> list[Path]:
 
 
 def _known(work: Work) -> bool:
-    return work.status == "ok" and np.isfinite([work.error, work.seconds]).all() and min(work.error, work.seconds) > 0
+    return work.status == "ok" and 0.0 < work.error < np.inf and 0.0 < work.seconds < np.inf
 
 
 def _draw(stem: Path, mesh: str, works: list[Work], marked: dict[str, Mark], machine: Sequence[str]) -> None:

@@ -1,0 +1,156 @@
+"""What was found, in words (`findings.md`) and as a table for programs (`summary.json`)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness.report.accuracy import work_plot
+from harness.report.accuracy.convergence import GUESSES, remarks
+from harness.report.accuracy.growth import TARGET, growths
+from harness.report.accuracy.paper import FAR, comparisons
+from harness.report.accuracy.profiles import least_ratios
+from harness.report.accuracy.table import Curve, Table
+from harness.report.accuracy.times import STEPS, TARGETS, crossings, power, races, reach, seconds_to
+
+Chapters = dict[str, list[str]]
+
+
+def findings(table: Table) -> Chapters:
+    """Sentences by the title of their chapter; chapters without any are left out."""
+    chapters = {
+        "Time to accuracy": list(_times(table)),
+        "Over all steps": list(_profiles(table)),
+        "Work and precision": list(_works(table)),
+        "Growth with size": list(_growth(table)),
+        "Liu et al. 2013": list(_paper(table)),
+        "References that are not certified": [f"{p.name}: {p.doubt}" for p in table.problems if p.doubt],
+        "Other minima": [f"{c.problem.name}: {words}" for c in table.curves if c.branch for words in remarks([c])],
+    }
+    return {title: sentences for title, sentences in chapters.items() if sentences}
+
+
+def failures(table: Table) -> list[dict[str, str]]:
+    """Each run with a status other than ok: what it was, its status and the reason."""
+    curves = [
+        (f"{c.problem.name}, {GUESSES.get(c.first_guess, c.first_guess)}", c.label, c.status, c.reason)
+        for c in table.curves
+    ]
+    works = [(w.mesh, w.setting, w.status, w.reason) for w in table.works]
+    keys = ("where", "solver", "status", "reason")
+    return [dict(zip(keys, row, strict=True)) for row in dict.fromkeys(curves + works) if row[2] != "ok"]
+
+
+def summary(table: Table) -> list[dict[str, Any]]:
+    """One entry a curve: what it was, what it reached, and the seconds to each accuracy, null where not reached."""
+    return [_entry(curve) for curve in table.curves]
+
+
+def write_findings(path: Path, title: str, chapters: Chapters, failed: list[dict[str, str]]) -> None:
+    """Write the chapters and the failures as Markdown."""
+    lines = [f"# {title}", ""]
+    for chapter, sentences in chapters.items():
+        lines += [f"## {chapter}", "", *(f"- {sentence}" for sentence in sentences), ""]
+    if failed:
+        lines += ["## What did not succeed", "", "| where | solver | status | reason |", "|---|---|---|---|"]
+        lines += [
+            "| " + " | ".join(" ".join(v.split()).replace("|", "\\|") for v in row.values()) + " |" for row in failed
+        ]
+        lines += [""]
+    path.write_text("\n".join(lines), encoding="utf-8")
+
+
+def write_summary(path: Path, table: Table) -> None:
+    """Write the summary as JSON."""
+    path.write_text(json.dumps(summary(table), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _entry(curve: Curve) -> dict[str, Any]:
+    problem = curve.problem
+    found = {power(target): reach(curve, target) for target in TARGETS}
+    ended = np.flatnonzero(np.isfinite(curve.gap))
+    return {
+        "scene": problem.scene,
+        "size": problem.size,
+        "vertices": problem.vertices,
+        "moment": problem.moment,
+        "problem": problem.digest,
+        "certified": not problem.doubt,
+        "integrator": problem.integrator,
+        "time_step": problem.time_step,
+        "solver": curve.solver,
+        "parameters": json.loads(curve.parameters),
+        "threads": curve.threads,
+        "first_guess": curve.first_guess,
+        "status": curve.status,
+        "reason": curve.reason,
+        "minimum": curve.branch,
+        "iterations": int(curve.iterations[-1]) if len(curve.iterations) else None,
+        "gap": float(curve.gap[ended[-1]]) if len(ended) else None,
+        "set_up_seconds": _finite(curve.warm),
+        "set_up_cold_seconds": _finite(curve.cold),
+        "to_gap": {
+            name: reached
+            and {"iterations": reached.iteration, "seconds": reached.seconds}
+            | {"lower_quartile": reached.lower, "upper_quartile": reached.upper}
+            | {f"with_set_up_over_{n}": _finite(seconds_to(curve, float(name), n)) for n in STEPS}
+            for name, reached in found.items()
+        },
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _times(table: Table) -> Iterator[str]:
+    for (_, guess), race in races(table).items():
+        problem = race[0].problem
+        sentences = crossings(race)
+        if sentences:
+            doubt = " (reference not certified)" if problem.doubt else ""
+            yield f"{problem.name}, {GUESSES.get(guess, guess)}{doubt}: {'; '.join(sentences)}."
+
+
+def _profiles(table: Table) -> Iterator[str]:
+    for target in TARGETS:
+        found = {label: values for label, values in least_ratios(table, target).items() if len(values)}
+        if found:
+            wins = {label: int(np.sum(values <= 1.0)) for label, values in found.items()}
+            count = len(next(iter(found.values())))
+            first = sorted(wins, key=lambda label: -wins[label])[:3]
+            told = ", ".join(
+                f"{label} on {wins[label]} (at worst {_times_of(found[label])} the fastest)"
+                for label in first
+                if wins[label]
+            )
+            yield f"To {power(target)}, of {count} problems: fastest is {told}."
+
+
+def _times_of(values) -> str:
+    worst = float(np.max(values))
+    return f"{worst:.2g} times" if np.isfinite(worst) else "never reaching, against"
+
+
+def _works(table: Table) -> Iterator[str]:
+    for mesh in dict.fromkeys(work.mesh for work in table.works):
+        for sentence in work_plot.findings([work for work in table.works if work.mesh == mesh]):
+            yield f"{mesh}: {sentence}."
+
+
+def _growth(table: Table) -> Iterator[str]:
+    for g in growths(table):
+        if np.isfinite(g.exponent):
+            sizes = f"{g.vertices[0]} to {g.vertices[-1]} vertices"
+            where = f"{g.scene}, {GUESSES[g.first_guess]}"
+            yield f"{where}: {g.label} grows as n^{g.exponent:.2f} to {power(TARGET)} ({sizes})."
+
+
+def _paper(table: Table) -> Iterator[str]:
+    for found in comparisons(table):
+        far = max(found.ratio, 1 / found.ratio) > FAR
+        yield f"{found.sentence}{': differs by more than a factor of 2' if far else ''}."
