@@ -16,8 +16,8 @@ from solvers.problem import Positions, Prepared, Solution, Solver, Start, StepPr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """now, the motion at the start of the next step; before, one step earlier, None where there is none; index of
-    the last step, 0 at the start."""
+    """now, the motion at the start of the next step; before, one step earlier and filtered, None where there is none;
+    index of the last step, 0 at the start."""
 
     now: Motion
     before: Motion | None
@@ -53,9 +53,9 @@ def start(scene: Scene) -> State:
 def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
     """The next step's problem from a state; `first_guess` is a key of `FIRST_GUESSES`."""
     dt, time = scene.system.time_step, state.index * scene.system.time_step
-    now, before = state.now, state.before or state.now
-    if scene.filters:
-        now = Motion(now.positions, reduce(lambda v, filtered: filtered(v), scene.filters, now.velocity))
+    # `before` was filtered when it was `now`. Filtered once more it has decayed as long as `now` has (an integrating
+    # factor); without that, BDF2 would decay at twice the rate.
+    now, before = (_filtered(scene, motion) for motion in (state.now, state.before or state.now))
     starts = scene.integrator.history and state.before is None
     method, system = (IMPLICIT_EULER, _first(scene)) if starts else (scene.integrator, scene.system)
     target, origin = method.predict(now, before, dt)
@@ -90,7 +90,8 @@ def simulate(
         stated = problem(scene, state, first_guess)
         solution = prepared.solve(stated, stop)
         method = IMPLICIT_EULER if stated.system.factor == IMPLICIT_EULER.factor else scene.integrator
-        state = State(method.advance(stated.start, solution), state.now, state.index + 1)
+        before = Motion(stated.start.positions, stated.start.velocity)
+        state = State(method.advance(stated.start, solution), before, state.index + 1)
         seconds = perf_counter() - began
         yield Step(stated, solution, state, seconds)
 
@@ -113,6 +114,10 @@ class _Starting:
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         return self._of(problem).phases(problem)
+
+
+def _filtered(scene: Scene, motion: Motion) -> Motion:
+    return Motion(motion.positions, reduce(lambda v, filtered: filtered(v), scene.filters, motion.velocity))
 
 
 def _first(scene: Scene) -> System:

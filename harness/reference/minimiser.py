@@ -137,8 +137,9 @@ def free_hessian(problem: StepProblem, p: Positions) -> csr_array:
 
 def _smallest_eigenvalue(H: csr_array, factor: SparseLU) -> float:
     """Of a positive definite matrix [N/m], minus what round-off in its factor may have added."""
-    start = np.random.default_rng(0).normal(size=H.shape[0])  # the same eigenvalue each time
-    settings: Any = {"k": 1, "sigma": 0.0, "OPinv": _Inverse(factor, H.shape), "v0": start, "tol": 1e-6}
+    size = len(H.indptr) - 1
+    start = np.random.default_rng(0).normal(size=size)  # the same eigenvalue each time
+    settings: Any = {"k": 1, "sigma": 0.0, "OPinv": _Inverse(factor, size), "v0": start, "tol": 1e-6}
     found: Any = eigsh(H, return_eigenvectors=False, **settings)
     return float(found[0]) - 4.0 * np.finfo(float).eps * float(abs(H).sum(axis=1).max())
 
@@ -146,8 +147,8 @@ def _smallest_eigenvalue(H: csr_array, factor: SparseLU) -> float:
 class _Inverse(LinearOperator):
     """H^-1 of a factorised H."""
 
-    def __init__(self, factor: SparseLU, shape: tuple[int, ...]) -> None:
-        super().__init__(np.dtype(np.float64), shape)
+    def __init__(self, factor: SparseLU, size: int) -> None:
+        super().__init__(np.dtype(np.float64), (size, size))
         self._factor = factor
 
     def _matvec(self, x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -24,6 +24,9 @@ from solvers.problem import LaggedEnergy, Positions, Start
 State = NDArray[np.float64]
 """Positions [m] and velocities [m/s] of the free vertices, one after the other, shape (6 f,)."""
 
+TICK = 1e-5
+"""Seconds over which pins that move are seen to move: only what damps notices, and that to ten digits."""
+
 
 class Unintegrable(RunFailed):
     """The scene has no ordinary differential equation for all of its free vertices."""
@@ -46,7 +49,7 @@ class Field:
         self._others = tuple(energy for energy in system.energies if not isinstance(energy, Springs))
         self._drag = _drag(scene)
         self._p, self._v = scene.mesh.rest.copy(), np.zeros_like(scene.mesh.rest)
-        self._p[system.pins.vertices] = scene.pin_targets
+        self._p[system.pins.vertices] = scene.pins_at(0.0)
 
     @property
     def start(self) -> State:
@@ -54,14 +57,18 @@ class Field:
         velocity = np.broadcast_to(np.array(self._scene.velocity), (len(self._free), 3))
         return np.concatenate([self._scene.mesh.rest[self._free].ravel(), velocity.ravel()])
 
-    def motion(self, y: State) -> tuple[Positions, Positions]:
+    def motion(self, t: float, y: State) -> tuple[Positions, Positions]:
         """Positions [m] and velocities [m/s] of all vertices, each (n, 3); overwritten by the next call."""
         self._p[self._free], self._v[self._free] = y.reshape(2, -1, 3)
+        if self._scene.moving:
+            held, h = self._system.pins.vertices, TICK
+            self._p[held] = self._scene.pins_at(t)
+            self._v[held] = (self._scene.pins_at(t + h) - self._scene.pins_at(t - h)) / (2.0 * h)
         return self._p, self._v
 
     def __call__(self, t: float, y: State) -> State:
         """F(t, y)."""
-        p, v = self.motion(y)
+        p, v = self.motion(t, y)
         push = np.negative(self._scene.load)
         add_springs(p, *self._springs, push)
         if self._others:

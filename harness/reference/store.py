@@ -86,7 +86,7 @@ class Store:
         name = f"{spec.stepped(1.0).digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
         path = self.folder / f"trajectory-{name}.npz"
         witness = Field(scene).witness()
-        stored = _read(path) if path.exists() else {"witness": np.empty(0)}
+        stored: Arrays = _read(path) if path.exists() else {"witness": np.empty(0)}
         if agree(stored["witness"], witness):
             found = Trajectory(*(stored[f.name] for f in fields(Trajectory)))
         else:

@@ -32,11 +32,14 @@ class Unpredictable(RunFailed):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """times (k,) [s]; positions (k, n, 3) [m] and velocities (k, n, 3) [m/s] then; moved (k,) [m]: the displacement
-    from the start, Frobenius norm over the free vertices. In the same norm, relative to it: disagreement (k,) of the
-    two methods; growth (k,) of the perturbation."""
+    """times (k,) [s]; free: the vertices that are not pinned; positions (k, n, 3) [m] and velocities (k, n, 3) [m/s].
+
+    moved (k,) [m]: the displacement from the start, Frobenius norm over the free vertices. In the same norm, relative
+    to it: disagreement (k,) of the two methods; growth (k,) of the perturbation.
+    """
 
     times: NDArray[np.float64]
+    free: NDArray[np.int64]
     positions: Positions
     velocities: Positions
     moved: NDArray[np.float64]
@@ -45,7 +48,7 @@ class Trajectory:
 
     def error(self, k: int, p: Positions) -> float:
         """How far p (n, 3) [m] is from the positions at times[k], relative to the displacement from the start."""
-        return float(np.linalg.norm(p - self.positions[k])) / float(self.moved[k])
+        return float(np.linalg.norm((p - self.positions[k])[self.free])) / float(self.moved[k])
 
     def require(self, error: float) -> None:
         """Raises Unpredictable where a relative error of this size could not be told from the reference's own."""
@@ -70,9 +73,10 @@ def integrate(scene: Scene, times: Sequence[float]) -> Trajectory:
     other = _adams(field, start, times, atol)
     moved = _apart(path, start)
     relative = np.divide(1.0, moved, out=np.full_like(moved, np.inf), where=moved > 0.0)
-    motions = [tuple(part.copy() for part in field.motion(y)) for y in path]
+    motions = [tuple(part.copy() for part in field.motion(t, y)) for t, y in zip(times, path, strict=True)]
     return Trajectory(
         np.array(times, float),
+        scene.system.free,
         np.array([p for p, _ in motions]),
         np.array([v for _, v in motions]),
         moved,
