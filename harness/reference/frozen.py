@@ -20,9 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.errors import RunFailed
 from harness.scene import Scene, build
-from harness.simulate import FIRST_GUESSES, prepare, simulate
+from harness.simulate import FIRST_GUESSES, State, Step, prepare, simulate
 from harness.spec import SceneSpec
+from solvers.integrators import Motion
 from solvers.problem import Pins, Solver, Start, StepProblem, StopRule
 
 MOMENTS = ("early", "middle", "violent")
@@ -36,13 +38,21 @@ Arrays = Mapping[str, NDArray[Any]]
 class Frozen:
     """One step of a reference run.
 
-    frame: the step, from 1; problem: exact pins, its first guess the current positions; digest: 12 hex digits of the
-    problem's arrays, of the gradient at the current positions, which stands for the energies, and of where it is from.
+    frame: the step, from 1; problem: exact pins, its first guess the current positions; after: the motion at the
+    step's end; digest: 12 hex digits of the problem's arrays, of the gradient at the current positions, which stands
+    for the energies, and of where it is from.
     """
 
     frame: int
     problem: StepProblem
+    after: Motion
     digest: str
+
+    @property
+    def state(self) -> State:
+        """From which the reference run goes on."""
+        begun = self.problem.start
+        return State(self.after, Motion(begun.positions, begun.velocity), self.frame)
 
     def stated(self, first_guess: str) -> StepProblem:
         """The problem with a first guess by name (`harness.simulate.FIRST_GUESSES`)."""
@@ -56,25 +66,26 @@ def bind(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Scen
     return replace(scene, system=replace(scene.system, pins=Pins(vertices, np.full(len(vertices), np.inf))))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ReferenceRun:
-    """problems: by frame, those asked for; violence (frames,) [J]: the inertia term at each step's minimum."""
+def reference_run(
+    scene: Scene, solver: Solver, length: int, wanted: Collection[int] = (), state: State | None = None
+) -> tuple[dict[int, Step], NDArray[np.float64]]:
+    """Converged steps up to `length`, from a state (the start if it is left out).
 
-    problems: dict[int, StepProblem]
-    violence: NDArray[np.float64]
-
-
-def reference_run(scene: Scene, solver: Solver, length: int, wanted: Collection[int] = ()) -> ReferenceRun:
-    """The converged steps 1 to `length`; the problems of the frames wanted, or of the moments where none is."""
-    kept: dict[int, StepProblem] = {}
-    violence, keep = np.empty(length), set(wanted)
-    for step in simulate(scene, prepare(scene, solver), CONVERGED, first_guess="current", frames=length):
+    Returns the frames wanted, or the moments where none are, and the violence (length,) [J] of all steps, which is
+    their inertia term, nan before the state. Raises RunFailed where a step does not converge.
+    """
+    kept: dict[int, Step] = {}
+    violence, keep = np.full(length, np.nan), set(wanted)
+    run = simulate(scene, prepare(scene, solver), CONVERGED, first_guess="current", frames=length, state=state)
+    for step in run:
+        if step.solution.stopped == "iterations" or not np.isfinite(step.positions).all():
+            raise RunFailed(f"step {step.index} of the reference run does not converge")
         violence[step.index - 1] = step.problem.terms(step.solution.positions)["inertia"]
         if not wanted:
             keep = set(moment_frames(violence[: step.index], length).values())
-        kept[step.index] = step.problem
-        kept = {frame: problem for frame, problem in kept.items() if frame in keep}
-    return ReferenceRun(kept, violence)
+        kept[step.index] = step
+        kept = {frame: one for frame, one in kept.items() if frame in keep}
+    return kept, violence
 
 
 def moment_frames(violence: NDArray[np.float64], length: int) -> dict[str, int]:
@@ -91,19 +102,21 @@ _ARRAYS = ("target", "force", "pin_targets", "current")
 _START = tuple(field.name for field in fields(Start))
 
 
-def freeze(frame: int, problem: StepProblem, origin: str) -> tuple[Frozen, Arrays]:
-    """A problem as a frozen one, and as the arrays to be saved; origin: what it was taken from, in words."""
+def freeze(step: Step, origin: str) -> tuple[Frozen, Arrays]:
+    """A step as a frozen problem, and as the arrays to be saved; origin: what it was taken from, in words."""
+    problem, now = step.problem, step.state.now
     system, start = problem.system, problem.start
     arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
     arrays |= {f"start_{name}": getattr(start, name) for name in _START}
     arrays |= {"mass": system.mass, "pins": system.pins.vertices, "gradient": problem.gradient(problem.current)}
-    arrays |= {"time_step": system.time_step, "factor": system.factor, "frame": frame}
+    arrays |= {"time_step": system.time_step, "factor": system.factor, "frame": step.index}
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
     content = hashlib.sha256(origin.encode())
     for name, array in arrays.items():
         content.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
     digest = content.hexdigest()[:12]
-    return Frozen(frame, problem, digest), arrays | {"digest": np.asarray(digest)}
+    ends = {"after_positions": now.positions, "after_velocity": now.velocity, "digest": np.asarray(digest)}
+    return Frozen(step.index, problem, now, digest), arrays | ends
 
 
 def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
@@ -118,7 +131,8 @@ def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
         and np.array_equal(system.pins.vertices, arrays["pins"])
         and agree(problem.gradient(problem.current), arrays["gradient"])
     )
-    return Frozen(int(arrays["frame"]), problem, str(arrays["digest"])) if same else None
+    after = Motion(arrays["after_positions"], arrays["after_velocity"])
+    return Frozen(int(arrays["frame"]), problem, after, str(arrays["digest"])) if same else None
 
 
 def _value(array: NDArray[np.float64]) -> Any:

@@ -11,7 +11,7 @@ Files have a partial name until they are complete, and hold arrays only.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from harness.reference.minimiser import Minimum, Reference, find_minima, polish
 from harness.reference.motion import Field
 from harness.reference.trajectory import Trajectory, integrate
 from harness.scene import Scene
+from harness.simulate import Step
 from harness.spec import IntegratorName, SceneSpec
 from solvers.newton import Newton
 from solvers.problem import Positions, Solver
@@ -40,24 +41,30 @@ class Store:
         asked = _Asked(spec, size, integrator)
         path = self.folder / f"run-{asked.name}.npz"
         violence = _read(path)["violence"] if path.exists() else np.empty(0)
-        frames = set(moment_frames(violence, spec.frames).values()) if len(violence) == spec.frames else set()
-        known = self._known(asked, frames)
-        if not known:
-            run = reference_run(asked.scene, self.solver, spec.frames)
-            _write(path, {"violence": run.violence})
-            violence, known = run.violence, {f: self._keep(asked, f, p) for f, p in run.problems.items()}
-        return {moment: known[frame] for moment, frame in moment_frames(violence, spec.frames).items()}
+        moments = moment_frames(violence, spec.frames)
+        known = self._known(asked, moments.values()) if len(violence) == spec.frames else {}
+        if not set(moments.values()) <= set(known):
+            steps, violence = reference_run(asked.scene, self.solver, spec.frames)
+            _write(path, {"violence": violence})
+            known, moments = self._keep(asked, steps), moment_frames(violence, spec.frames)
+        return {moment: known[frame] for moment, frame in moments.items()}
 
     def frames(
         self, spec: SceneSpec, size: int, frames: Collection[int], integrator: IntegratorName = "implicit-euler"
     ) -> dict[int, Frozen]:
-        """The frozen problems of these frames, counted from 1. Raises InputError, RunFailed."""
+        """The frozen problems of these frames, counted from 1; the run goes on from the last one known before them.
+
+        Raises InputError, RunFailed.
+        """
         asked = _Asked(spec, size, integrator)
         known = self._known(asked, frames)
-        if not known:
-            run = reference_run(asked.scene, self.solver, max(frames), frames)
-            known = {frame: self._keep(asked, frame, problem) for frame, problem in run.problems.items()}
-        return known
+        if missing := set(frames) - set(known):
+            there = range(min(missing) - 1, 0, -1)
+            before = next((one for frame in there for one in self._known(asked, [frame]).values()), None)
+            state = before.state if before else None
+            steps, _ = reference_run(asked.scene, self.solver, max(missing), missing, state)
+            known |= self._keep(asked, steps)
+        return {frame: known[frame] for frame in frames}
 
     def reference(self, frozen: Frozen) -> Reference:
         """The minima known of a problem, found now if there is none. Its `best` raises Uncertified."""
@@ -65,7 +72,8 @@ class Store:
         if path.exists():
             return _minima(_read(path))
         found = find_minima(frozen.problem, self.solver)
-        self._remember(frozen, found)
+        if found.minima:
+            self._remember(frozen, found)
         return found
 
     def classify(self, frozen: Frozen, p: Positions) -> Minimum:
@@ -86,9 +94,9 @@ class Store:
         name = f"{spec.stepped(1.0).digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
         path = self.folder / f"trajectory-{name}.npz"
         witness = Field(scene).witness()
-        stored: Arrays = _read(path) if path.exists() else {"witness": np.empty(0)}
-        if agree(stored["witness"], witness):
-            found = Trajectory(*(stored[f.name] for f in fields(Trajectory)))
+        stored: dict[str, Any] = dict(_read(path)) if path.exists() else {}
+        if stored and agree(stored.pop("witness"), witness):
+            found = Trajectory(**stored)
         else:
             found = integrate(scene, times)
             arrays = {f.name: getattr(found, f.name) for f in fields(Trajectory)}
@@ -96,26 +104,26 @@ class Store:
         found.require(error)
         return found
 
-    def _known(self, asked: _Asked, frames: Collection[int]) -> dict[int, Frozen]:
-        """The problems of all of these frames, or none."""
-        paths = [self._problem(asked, frame) for frame in frames]
-        if not all(path.exists() for path in paths):
-            return {}
+    def _known(self, asked: _Asked, frames: Iterable[int]) -> dict[int, Frozen]:
+        """Those of the frames that are on disk and as the scene states them today."""
+        paths = [path for path in (self._problem(asked, frame) for frame in frames) if path.exists()]
         thawed = [thaw(_read(path), asked.scene) for path in paths]
-        return {one.frame: one for one in thawed if one} if all(thawed) else {}
+        return {one.frame: one for one in thawed if one}
 
     def _problem(self, asked: _Asked, frame: int) -> Path:
         return self.folder / f"problem-{asked.name}-{frame}.npz"
 
-    def _keep(self, asked: _Asked, frame: int, problem: Any) -> Frozen:
-        frozen, arrays = freeze(frame, problem, asked.name)
-        _write(self._problem(asked, frame), arrays)
-        return frozen
+    def _keep(self, asked: _Asked, steps: dict[int, Step]) -> dict[int, Frozen]:
+        kept = {}
+        for frame, step in steps.items():
+            kept[frame], arrays = freeze(step, asked.name)
+            _write(self._problem(asked, frame), arrays)
+        return kept
 
     def _remember(self, frozen: Frozen, known: Reference) -> None:
         names = ("positions", "g", "error", "smallest_eigenvalue")
         arrays = {name: np.array([getattr(minimum, name) for minimum in known.minima]) for name in names}
-        _write(self.folder / f"minima-{frozen.digest}.npz", arrays | {"reason": np.array(known.reason)})
+        _write(self.folder / f"minima-{frozen.digest}.npz", arrays)
 
 
 class _Asked:
@@ -129,7 +137,7 @@ class _Asked:
 def _minima(arrays: Arrays) -> Reference:
     numbers = (arrays[name].tolist() for name in ("g", "error", "smallest_eigenvalue"))
     columns = zip(arrays["positions"], *numbers, strict=True)
-    return Reference(tuple(Minimum(*values, certified=True) for values in columns), str(arrays["reason"]))
+    return Reference(tuple(Minimum(*values, certified=True) for values in columns))
 
 
 def _read(path: Path) -> Arrays:
