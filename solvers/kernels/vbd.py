@@ -11,6 +11,8 @@ from solvers.energies.springs import TINY, Springs
 from solvers.kernels.compiling import inner, kernel
 
 _TINY_SQUARED = TINY * TINY
+_ROUND_OFF = 1e-14
+"""Pivots up to this share of the diagonal's sum are round-off, of some ten springs."""
 
 
 class Blocks(NamedTuple):
@@ -59,17 +61,21 @@ class Blocks(NamedTuple):
 @inner
 def _newton(a, b, c, d, e, f, g0, g1, g2):
     """-B^-1 g for B = [[a, b, c], [b, d, e], [c, e, f]] by its factors L D L', and whether B is positive definite."""
+    least = _ROUND_OFF * (a + d + f)
+    if not a > least:
+        return 0.0, 0.0, 0.0, False
     l1, l2 = b / a, c / a
     second = d - l1 * b
+    if not second > least:
+        return 0.0, 0.0, 0.0, False
     l3 = (e - l2 * b) / second
     third = f - l2 * c - l3 * l3 * second
+    if not third > least:
+        return 0.0, 0.0, 0.0, False
     y1 = g1 - l1 * g0
-    y2 = g2 - l2 * g0 - l3 * y1
-    x2 = -y2 / third
+    x2 = -(g2 - l2 * g0 - l3 * y1) / third
     x1 = -y1 / second - l3 * x2
-    x0 = -g0 / a - l1 * x1 - l2 * x2
-    least = 1e-14 * (a + d + f)
-    return x0, x1, x2, a > least and second > least and third > least
+    return -g0 / a - l1 * x1 - l2 * x2, x1, x2, True
 
 
 @inner

@@ -1,0 +1,153 @@
+"""Vertex block descent: it descends, and ends where local-global does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice, pairwise
+
+import numpy as np
+import pytest
+
+from harness.simulate import FIRST_GUESSES
+from solvers.compiled import CompiledLocalGlobal
+from solvers.problem import NotPositiveDefinite, StepProblem, StopRule, Unsupported
+from solvers.vbd import VertexBlockDescent
+from tests.scenes import SCENES, cloth, first_problem, random_problem
+from tests.unit.test_xpbd import Other
+
+METHODS = {"plain": VertexBlockDescent(0.0), "accelerated": VertexBlockDescent()}
+methods = pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
+
+PROBLEMS = {
+    "chain": lambda: first_problem(SCENES["chain"](1e10)),
+    "net, exact pins": lambda: first_problem(SCENES["net"]("exact")),
+    "cloth": lambda: first_problem(cloth(8)),
+    "cloth, exact pins, inertial guess": lambda: first_problem(cloth(8, "exact"), "inertial"),
+    "random": lambda: random_problem(0, weights=(1e4, np.inf, 1e2)),
+    "random, not pinned": lambda: random_problem(1, weights=()),
+}
+problems = pytest.mark.parametrize("problem", [make() for make in PROBLEMS.values()], ids=list(PROBLEMS))
+
+
+def iterates(method, problem: StepProblem, count: int) -> list[np.ndarray]:
+    prepared = method.prepare(problem.system)
+    return [p.copy() for p in islice(prepared.iterates(problem), count)]
+
+
+@methods
+@problems
+@pytest.mark.parametrize("factor", [1.0, 2.25], ids="c = {:g}".format)
+def test_it_ends_at_the_minimiser_of_local_global(method, problem, factor):
+    problem = replace(problem, system=replace(problem.system, factor=factor))
+    # Near the minimiser, where the objective is convex: from far away they may choose other valleys.
+    wanted = CompiledLocalGlobal().prepare(problem.system).solve(problem, StopRule(30_000, 1e-13)).positions
+    near = replace(problem, first_guess=wanted + 1e-3 * np.random.default_rng(0).normal(size=wanted.shape))
+    found = method.prepare(problem.system).solve(near, StopRule(4000)).positions
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)  # what local-global's rate leaves at its tolerance
+
+
+STARTS = {
+    "the guess": lambda p, rng: p,
+    "one point": lambda p, rng: np.zeros_like(p),
+    "a line": lambda p, rng: p * [1.0, 0.0, 0.0],
+    "a tangle": lambda p, rng: rng.normal(size=p.shape),
+    "inside out": lambda p, rng: -p,
+    "far apart": lambda p, rng: 1e3 * rng.normal(size=p.shape),
+}
+
+
+@methods
+@problems
+@pytest.mark.parametrize("start", STARTS)
+def test_no_iteration_raises_the_objective(method, problem, start):
+    problem = replace(problem, first_guess=STARTS[start](problem.first_guess, np.random.default_rng(0)))
+    path = iterates(method, problem, 60)
+    for before, after in pairwise(path):
+        assert problem.value(after) <= problem.value(before) + 1e-13 * problem.magnitude(before)  # a hundred terms
+    assert problem.value(path[-1]) < problem.value(path[0])
+
+
+@methods
+@pytest.mark.parametrize("seed", range(5))
+def test_vertices_without_mass_descend_as_well(method, seed):
+    """Blocks of those are singular where their springs lie in a line or a plane: the majorant's step takes over."""
+    problem = random_problem(seed)
+    light = replace(problem.system, mass=np.where(np.arange(12) % 3, 0.0, problem.system.mass))
+    problem = replace(problem, system=light, first_guess=problem.current * [1.0, 1.0, 0.0])
+    for before, after in pairwise(iterates(method, problem, 40)):
+        assert np.isfinite(after).all()
+        assert problem.value(after) <= problem.value(before) + 1e-13 * problem.magnitude(before)
+
+
+@pytest.mark.parametrize(("name", "times"), [("cloth", 2), ("block", 4), ("tower", 4)])
+def test_acceleration_needs_a_fraction_of_the_iterations(name, times):
+    problem = first_problem(SCENES[name](1e10))
+    plain, fast = (iterates(method, problem, 100) for method in METHODS.values())
+    assert problem.value(fast[100 // times - 1]) <= problem.value(plain[-1])
+
+
+def test_a_single_vertex_takes_a_newton_step():
+    """One free vertex: the iteration is Newton's, and squares the error."""
+    made = random_problem(0, n=4, m=0, weights=(np.inf,) * 3)
+    springs = SCENES["chain"](1e10).springs
+    star = replace(springs, edges=np.array([[0, 3], [1, 3], [2, 3]]))
+    star = replace(star, stiffness=np.full(3, 50.0), rest_length=np.full(3, 0.2), rest_direction=np.eye(3))
+    problem = replace(made, system=replace(made.system, energies=(star,)))
+    gradients = [np.abs(problem.gradient(p)).max() for p in iterates(METHODS["plain"], problem, 6)]
+    steep = [g for g in gradients if g > 1e-6]
+    assert gradients[-1] <= 1e-11  # round-off of forces of some hundred newtons
+    assert len(steep) <= 4
+
+
+@methods
+def test_a_tolerance_ends_a_solve_at_the_first_iterate_whose_residual_is_below_it(method):
+    problem = first_problem(cloth(8))
+    prepared = method.prepare(problem.system)
+    yardstick = prepared.solve(problem, StopRule(1, 0.5)).yardstick
+    residuals = [prepared.solve(problem, StopRule(k)).residual for k in range(1, 40)]
+    below = next(k for k, residual in enumerate(residuals, 1) if residual <= 0.02 * yardstick)
+    solution = prepared.solve(problem, StopRule(100, 0.02))
+    assert (solution.iterations, solution.stopped) == (below, "tolerance")
+    assert solution.residual == residuals[below - 1]
+
+
+@methods
+def test_the_yardstick_is_taken_at_the_current_positions_whatever_the_first_guess(method):
+    found = []
+    for guess in FIRST_GUESSES:
+        problem = first_problem(replace(cloth(8), velocity=(1.0, 0.0, 0.0)), guess)
+        found.append(method.prepare(problem.system).solve(problem, StopRule(1, 1e-9)).yardstick)
+    assert len(set(found)) == 1
+
+
+@methods
+def test_a_scene_at_rest_stops_after_one_iteration(method):
+    problem = first_problem(cloth(8))
+    p = problem.current
+    still = replace(problem, target=p, force=np.zeros_like(p), first_guess=p)
+    solution = method.prepare(problem.system).solve(still, StopRule(50, 1e-6))
+    assert solution.iterations == 1
+    assert solution.stopped in ("floor", "tolerance")
+
+
+@methods
+def test_a_solve_that_diverged_says_so(method):
+    problem = random_problem(0, weights=())
+    lost = replace(problem, first_guess=np.full_like(problem.first_guess, np.nan))
+    solution = method.prepare(problem.system).solve(lost, StopRule(4, 1e-3))
+    assert (solution.iterations, solution.stopped) == (4, "iterations")
+    assert np.isnan(solution.residual)
+
+
+@pytest.mark.parametrize("radius", [-0.1, 1.0, 2.0, np.nan])
+def test_a_spectral_radius_is_less_than_one(radius):
+    with pytest.raises(ValueError, match="spectral_radius"):
+        VertexBlockDescent(radius)
+
+
+def test_what_it_cannot_do_is_said_before_any_work():
+    system = random_problem(0).system
+    with pytest.raises(Unsupported, match="Other"):
+        VertexBlockDescent().prepare(replace(system, energies=(*system.energies, Other())))
+    with pytest.raises(NotPositiveDefinite, match="nothing determines"):
+        VertexBlockDescent().prepare(replace(system, energies=(), mass=0.0 * system.mass))

@@ -1,0 +1,236 @@
+"""XPBD and its small steps against what theory says of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice, pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from harness.effects.gravity import Gravity
+from harness.effects.pins import Pins as PinsEffect
+from harness.effects.springs import Springs as SpringsEffect
+from harness.mesh.chain import Chain
+from harness.mesh.grid import Grid
+from harness.scene import Scene
+from harness.simulate import prepare, simulate
+from solvers.compiled import CompiledLocalGlobal
+from solvers.energies.springs import Springs
+from solvers.problem import Pins, StepProblem, StopRule, System, Unsupported
+from solvers.xpbd import Xpbd, XpbdSmallSteps
+from tests.scenes import SCENES, cloth, first_problem, random_problem, scene
+
+G, DT = 9.81, 1 / 30
+methods = pytest.mark.parametrize("method", [Xpbd(), XpbdSmallSteps()], ids=lambda m: type(m).__name__)
+
+
+def chain(time_step: float = DT, *, direction=(1.0, 0.0, 0.0), stretch: float = 20.0, at: str = "ends") -> Scene:
+    pins = PinsEffect.model_validate({"at": [at], "weight": "exact"})
+    mesh = Chain(length=2.0, direction=direction)
+    return scene(mesh, SpringsEffect(stretch=stretch), Gravity(), pins, size=10, time_step=time_step)
+
+
+def solved(method, problem: StepProblem, iterations: int) -> np.ndarray:
+    return method.prepare(problem.system).solve(problem, StopRule(iterations)).positions
+
+
+def minimiser(problem: StepProblem) -> np.ndarray:
+    return CompiledLocalGlobal().prepare(problem.system).solve(problem, StopRule(50_000, 1e-14)).positions
+
+
+@pytest.mark.parametrize("stretch", [2.0, 2e3, 2e6])
+@pytest.mark.parametrize("factor", [1.0, 2.25, 4.0], ids="c = {:g}".format)
+def test_springs_that_do_not_turn_reach_the_minimiser_of_the_step(stretch, factor):
+    problem = first_problem(chain(direction=(0.0, -1.0, 0.0), stretch=stretch, at="first"))
+    problem = replace(problem, system=replace(problem.system, factor=factor))
+    # A chain of ten: Gauss-Seidel needs some hundred passes where springs outweigh inertia. The rest is round-off.
+    np.testing.assert_allclose(solved(Xpbd(), problem, 5000), minimiser(problem), rtol=0, atol=1e-12)
+
+
+def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_step():
+    """A turn is of the way from the inertial target, dt^2, and so is the way that a force goes in a step."""
+    apart = []
+    for frames in (24, 48, 96):
+        made = chain(0.2 / frames)
+        prepared, stop = prepare(made, CompiledLocalGlobal()), StopRule(2000, 1e-12)
+        *_, last = simulate(made, prepared, stop, first_guess="current", frames=frames)
+        apart.append(np.abs(solved(Xpbd(), last.problem, 2000) - last.solution.positions).max())
+    ratios = [a / b for a, b in pairwise(apart)]
+    np.testing.assert_allclose(ratios, 16.0, rtol=0.1)  # the next order
+
+
+def test_multipliers_add_up_over_iterations_instead_of_stiffening_the_springs():
+    """Position based dynamics without them would pull springs to their rest lengths as the iterations go on."""
+    problem = first_problem(chain())
+    few, many = solved(Xpbd(), problem, 500), solved(Xpbd(), problem, 5000)
+    np.testing.assert_allclose(many, few, rtol=0, atol=1e-14)  # it has converged, and stays
+
+
+def test_tension_begins_at_zero_in_each_step():
+    problem = first_problem(chain())
+    prepared = Xpbd().prepare(problem.system)
+    one, two = (prepared.solve(problem, StopRule(3)).positions for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+
+
+@methods
+def test_a_free_cloth_falls_as_its_steps_say(method):
+    """v = -g t, and y after n steps of h is -g h^2 n (n + 1)/2: of the substeps for small steps, else of dt."""
+    made = scene(Grid(), SpringsEffect(stretch=300.0), Gravity(), size=6, time_step=DT)
+    frames, iterations = 12, 5
+    prepared, stop = prepare(made, method), StopRule(iterations)
+    *_, last = simulate(made, prepared, stop, first_guess="current", frames=frames)
+    n = frames * iterations if isinstance(method, XpbdSmallSteps) else frames
+    h = frames * DT / n
+    fallen = made.mesh.rest - [0.0, G * h**2 * n * (n + 1) / 2, 0.0]
+    np.testing.assert_allclose(last.positions, fallen, rtol=0, atol=1e-12)  # a hundred roundings of a metre
+    np.testing.assert_allclose(last.state.now.velocity[:, 1], -G * frames * DT, rtol=0, atol=1e-10)  # divided by h
+
+
+@methods
+def test_linear_momentum_is_conserved(method):
+    made = scene(Grid(), SpringsEffect(stretch=300.0), size=6, time_step=DT)
+    problem = first_problem(made)
+    velocity = np.random.default_rng(0).normal(size=problem.current.shape)
+    start = replace(problem.start, velocity=velocity)
+    problem = replace(problem, target=problem.current + DT * velocity, start=start)
+    solution = method.prepare(made.system).solve(problem, StopRule(7))
+    after = start.velocity_at(solution.positions) if solution.velocity is None else solution.velocity
+    # Round-off of positions, 1e-16, divided by the substep.
+    np.testing.assert_allclose(made.system.mass @ after, made.system.mass @ velocity, rtol=0, atol=1e-13)
+
+
+def test_one_small_step_is_one_iteration():
+    problem = first_problem(cloth(8))
+    np.testing.assert_allclose(
+        solved(XpbdSmallSteps(), problem, 1), solved(Xpbd(), problem, 1), rtol=0, atol=1e-14
+    )  # the same terms, added in another order
+
+
+def test_small_steps_converge_to_the_motion_in_first_order():
+    made = chain(0.1, stretch=200.0)
+    stated = first_problem(made)
+    free, n = made.system.free, made.system.vertices
+
+    def motion(t: float, state: np.ndarray) -> np.ndarray:
+        p, v = state.reshape(2, n, 3)
+        gradient = np.zeros((n, 3))
+        made.springs.add_gradient(p, gradient)
+        a = np.zeros((n, 3))
+        a[free] = (made.load - gradient)[free] / made.system.mass[free, None]
+        return np.concatenate([v.ravel(), a.ravel()])
+
+    begin = np.concatenate([stated.start.positions.ravel(), stated.start.velocity.ravel()])
+    truth = solve_ivp(motion, (0.0, 0.1), begin, "DOP853", rtol=1e-10, atol=1e-12).y[: 3 * n, -1].reshape(n, 3)
+    errors = [np.abs(solved(XpbdSmallSteps(), stated, k) - truth).max() for k in (200, 400, 800)]
+    ratios = [a / b for a, b in pairwise(errors)]
+    np.testing.assert_allclose(ratios, 2.0, rtol=0.05)  # the next order
+    assert errors[-1] <= 5e-3 * np.abs(truth - stated.current).max()  # of order 1/800
+
+
+def test_pins_that_move_do_so_evenly_in_small_steps():
+    rest = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    made = random_problem(0, n=2, m=0, weights=(np.inf, 1e12))
+    goal = rest + np.array([0.3, 0.2, 0.1])
+    start = replace(made.start, positions=rest, velocity=np.zeros((2, 3)))
+    problem = replace(made, pin_targets=goal, start=start, force=np.zeros((2, 3)))
+    solution = XpbdSmallSteps().prepare(made.system).solve(problem, StopRule(4))
+    assert solution.velocity is not None
+    np.testing.assert_array_equal(solution.positions[0], goal[0])
+    # The penalty gives way by 1e-12 of what inertia asks for, some hundred times that in the last of the substeps.
+    np.testing.assert_allclose(solution.positions[1], goal[1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(solution.velocity, (goal - rest) / made.system.time_step, rtol=1e-7)
+
+
+@methods
+@pytest.mark.parametrize("name", ["chain", "net", "cloth"])
+def test_the_heaviest_pins_by_penalty_are_exact_pins(method, name):
+    heavy, exact = (solved(method, first_problem(SCENES[name](w)), 20) for w in (1e14, "exact"))
+    np.testing.assert_allclose(heavy, exact, rtol=0, atol=1e-10)  # 1e14 N/m give way by 1e-13 m under the cloth
+
+
+@methods
+def test_springs_without_stiffness_and_loops_do_nothing(method):
+    problem = random_problem(3)
+    idle = Springs.at_rest(problem.current, np.array([[0, 5], [4, 4], [2, 9]]), np.array([0.0, 100.0, 0.0]))
+    with_, without = (replace(problem, system=replace(problem.system, energies=e)) for e in ((idle,), ()))
+    np.testing.assert_array_equal(solved(method, with_, 5), solved(method, without, 5))
+
+
+@methods
+def test_coincident_vertices_come_apart_along_the_rest_shape(method):
+    made = chain()
+    problem = first_problem(made)
+    collapsed = np.zeros_like(problem.current)
+    start = replace(problem.start, positions=collapsed)
+    problem = replace(problem, target=collapsed, start=start, pin_targets=np.zeros((2, 3)), force=0.0 * problem.force)
+    p = solved(method, problem, 4)
+    assert np.isfinite(p).all()
+    assert np.abs(p[1:-1, 0]).min() > 0.0
+    np.testing.assert_array_equal(p[:, 1:], 0.0)
+
+
+class Other:
+    """An energy that is not of springs."""
+
+    def value(self, p):
+        return 0.0
+
+    def add_gradient(self, p, out): ...
+
+    def hessian(self, p):
+        raise NotImplementedError
+
+
+def without_mass(system: System) -> System:
+    return replace(system, mass=np.where(np.arange(system.vertices) == 3, 0.0, system.mass))
+
+
+@methods
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        pytest.param(lambda s: replace(s, energies=(*s.energies, Other())), "Other", id="another energy"),
+        pytest.param(without_mass, r"1 of 12 have none and are not pinned \(3\)", id="no mass"),
+    ],
+)
+def test_what_it_cannot_do_is_said_before_any_work(method, change, told):
+    with pytest.raises(Unsupported, match=told):
+        method.prepare(change(random_problem(0).system))
+
+
+def test_small_steps_take_the_place_of_the_integrator():
+    with pytest.raises(Unsupported, match="implicit-euler"):
+        XpbdSmallSteps().prepare(replace(random_problem(0).system, factor=2.25))
+
+
+@methods
+def test_a_vertex_without_mass_may_be_pinned(method):
+    made = chain()
+    system = replace(made.system, mass=np.where(np.arange(10) == 0, 0.0, made.system.mass))
+    assert np.isfinite(solved(method, replace(first_problem(made), system=system), 3)).all()
+
+
+@methods
+def test_a_method_that_does_not_minimise_has_no_residual_and_no_tolerance(method):
+    problem = first_problem(cloth(6))
+    solution = method.prepare(problem.system).solve(problem, StopRule(5, 0.5))
+    assert (solution.iterations, solution.stopped) == (5, "iterations")
+    assert np.isnan([solution.residual, solution.yardstick]).all()
+
+
+def test_iterates_of_small_steps_are_whole_steps_in_ever_more_substeps():
+    problem = first_problem(chain())
+    prepared = XpbdSmallSteps().prepare(problem.system)
+    for k, p in enumerate(islice(prepared.iterates(problem), 4), 1):
+        np.testing.assert_array_equal(p, prepared.solve(problem, StopRule(k)).positions)
+
+
+def test_nothing_but_pins_needs_no_springs():
+    system = System(np.ones(3), DT, (), Pins(np.array([1]), np.array([np.inf])))
+    problem = replace(random_problem(0, n=3, m=0, weights=(np.inf,)), system=system)
+    np.testing.assert_allclose(
+        solved(Xpbd(), problem, 2)[[0, 2]], (problem.target + DT**2 * problem.force)[[0, 2]], rtol=1e-15
+    )
