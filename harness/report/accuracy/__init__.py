@@ -19,7 +19,7 @@ from harness.report.accuracy.work_plot import draw_work
 
 
 def draw(folder: Path) -> list[Path]:
-    """Draw all that the rows under `folder`/accuracy say to `folder`/report; returns the files, the page first.
+    """Draw all that the rows under `folder`/accuracy say to `folder`/report; returns the files, the page last.
 
     folder: of one config's results. Raises InputError where it holds no such rows.
     """
@@ -48,4 +48,4 @@ def draw(folder: Path) -> list[Path]:
         findings=list(chain.from_iterable(chapters.values())),
         failures=failed,
     )
-    return [page, words, numbers, *pictures]
+    return [*pictures, words, numbers, page]

@@ -101,9 +101,9 @@ def draw_growth(table: Table, stem: Path) -> list[Path]:
             ax = panel(page, left, top, width, height, f"{scene}, {GUESSES[guess]}")
             here = [g for g in found if (g.scene, g.first_guess) == (scene, guess)]
             sizes = sorted({n for g in here for n in (*g.vertices, *g.lost)}) or [1, 10]
-            # Room at the right for the names.
-            last = 1.2 * sizes[-1] * (sizes[-1] / sizes[0]) ** (1 / max(width / 170 - 1, 1))
-            log_axis(ax.xaxis, sizes[0] / 1.2, last, unit="plain")
+            # Room at the right for the names of lines whose power is known.
+            room = 1 / max(width / 170 - 1, 1) if any(np.isfinite(g.exponent) for g in here) else 0.0
+            log_axis(ax.xaxis, sizes[0] / 1.2, 1.2 * sizes[-1] * (sizes[-1] / sizes[0]) ** room, unit="plain")
             ax.xaxis.set_major_locator(FixedLocator(sizes[:: ceil(len(sizes) / 5)]))
             log_axis(ax.yaxis, low, high, unit="time")
             ax.tick_params(labelleft=column == 0)

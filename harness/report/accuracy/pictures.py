@@ -1,4 +1,4 @@
-"""A picture of the mesh of each frozen step, from the recording of a solve."""
+"""A picture of the mesh of each frozen step, the last iterate of a solve that was recorded."""
 
 from __future__ import annotations
 
@@ -29,6 +29,6 @@ def draw_meshes(table: Table, results: Path, folder: Path) -> dict[str, Path]:
             best = min(recorded, key=lambda curve: (curve.status != "ok", curve.gap[-1]))
             path = folder / f"{problem.scene}-{problem.size}-{problem.moment}-{problem.digest}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
-            draw_run(read_replay(results / best.recording), path)
+            draw_run(read_replay(results / best.recording, [-1]), path)
             drawn[problem.digest] = path
     return drawn

@@ -86,8 +86,8 @@ def iteration_seconds(race: Iterable[Curve], solver: str) -> float:
 
 
 _KINDS = (
-    ("within this many times the fastest solver's time", least_ratios, 1.0),
-    ("within the time of this many iterations of {}", iteration_ratios, 0.1),
+    ("within this many times the fastest solver's time", least_ratios),
+    ("within the time of this many iterations of {}", iteration_ratios),
 )
 
 
@@ -104,7 +104,7 @@ def draw_profiles(table: Table, stem: Path) -> list[Path]:
     with sheet(stem, "Performance and data profiles", ["share of the problems solved", steps, *table.machine]) as page:
         width = (RIGHT - LEFT - 50) / len(TARGETS) - 16
         height = (foot(words) - TOP - 170) / 2
-        for row, (heading, ratios, start) in enumerate(_KINDS):
+        for row, (heading, ratios) in enumerate(_KINDS):
             top = TOP + 46 + row * (height + 96)
             text(page, LEFT + 50, top - 30, heading.format(yardstick(table)), size=11, weight="bold")
             for column, target in enumerate(TARGETS):
@@ -112,18 +112,17 @@ def draw_profiles(table: Table, stem: Path) -> list[Path]:
                 problems = len(next(iter(found.values())))
                 name = f"to a gap of {power(target)}: {problems} problems"
                 ax = panel(page, LEFT + 50 + column * (width + 16), top, width, height, name)
-                _steps(ax, found, marked, start)
+                _steps(ax, found, marked)
                 ax.tick_params(labelleft=column == 0)
         legend(page, marked)
         notes(page, words)
     return files(stem)
 
 
-def _steps(ax: Axes, found: Mapping[str, Values], marked: Mapping[str, Mark], start: float) -> None:
+def _steps(ax: Axes, found: Mapping[str, Values], marked: Mapping[str, Mark]) -> None:
     """The profiles of all solvers as steps."""
     finite = np.concatenate([values[np.isfinite(values)] for values in found.values()])
-    low = min(start, float(finite.min(initial=start)))
-    high = 2.0 * max(float(finite.max(initial=start)), 5 * start)
+    low, high = finite.min(initial=1.0), 2.0 * finite.max(initial=5.0)
     for label, values in found.items():
         if np.isfinite(values).any():
             x = np.unique([low, *values[np.isfinite(values)], high])

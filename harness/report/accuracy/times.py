@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from math import ceil, inf, log
 
 import numpy as np
 
 from harness.report.accuracy.table import Curve, Problem, Table
+from harness.report.page import quantity
 
 TARGETS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
 """The gaps at which solvers are compared."""
@@ -86,23 +86,27 @@ def contested(race: Sequence[Curve], target: float) -> bool:
 
 
 def crossings(race: Iterable[Curve]) -> list[str]:
-    """Who is the fastest to which accuracy, set-up apart: a sentence for the coarsest, and one for each change."""
+    """Who is the fastest to which accuracy, set-up apart: a sentence for the coarsest, and one for each change.
+
+    A solver takes the lead where its upper quartile is below the leader's lower one: less may be chance.
+    """
     race = list(race)
-    leaders: list[tuple[float, Curve]] = []
+    sentences: list[str] = []
+    leader: Curve | None = None
     for target in _FINE:
-        if contested(race, target) and target > race[0].problem.round_off:
-            best = min(race, key=lambda curve: seconds_to(curve, target))
-            leaders.append((target, best))
-    if not leaders:
-        return []
-    target, first = leaders[0]
-    sentences = [f"at {power(target)} {first.label} is the fastest: {duration(seconds_to(first, target))}"]
-    for (_, before), (target, after) in pairwise(leaders):
-        if after is not before:
-            slower = seconds_to(before, target)
-            other = ", which does not reach it" if slower == inf else f" against {duration(slower)}"
-            who = f"from {power(target)} on {after.label} is faster than {before.label}"
-            sentences.append(f"{who}: {duration(seconds_to(after, target))}{other}")
+        if not contested(race, target) or target <= race[0].problem.round_off:
+            continue
+        times = {curve: reached for curve in race if (reached := reach(curve, target))}
+        best = min(times, key=lambda curve: times[curve].seconds)
+        if leader is None:
+            sentences.append(f"at {power(target)} {best.label} is the fastest: {duration(times[best].seconds)}")
+            leader = best
+        elif leader not in times or times[best].upper < times[leader].lower:
+            known = leader in times
+            other = f" against {duration(times[leader].seconds)}" if known else ", which does not reach it"
+            who = f"from {power(target)} on {best.label} is faster than {leader.label}"
+            sentences.append(f"{who}: {duration(times[best].seconds)}{other}")
+            leader = best
     return sentences
 
 
@@ -112,8 +116,6 @@ def power(value: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time in words with two significant digits: 41 ms, 1.3 s."""
-    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
-        if seconds >= 0.9995 * scale or unit == "µs":
-            return f"{seconds / scale:.2g} {unit}" if seconds < 99.5 * scale else f"{seconds / scale:.0f} {unit}"
-    raise AssertionError
+    """A time in words with three significant digits: 41.2 ms, 1.3 s."""
+    unit, scale = next(((u, s) for u, s in (("s", 1.0), ("ms", 1e-3)) if seconds >= 0.9995 * s), ("µs", 1e-6))
+    return f"{quantity(seconds / scale)} {unit}"

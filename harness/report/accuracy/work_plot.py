@@ -25,7 +25,7 @@ from harness.report.accuracy.sheet import (
     size,
 )
 from harness.report.accuracy.table import Table, Work, step_words
-from harness.report.accuracy.times import duration
+from harness.report.accuracy.times import duration, power
 from harness.report.page import quantity, text
 from harness.report.style import INK, MUTED, PAGE, Mark
 
@@ -113,6 +113,7 @@ def _draw(stem: Path, mesh: str, works: list[Work], marked: dict[str, Mark], mac
     words = _notes(works)
     integrators = [name for name in INTEGRATORS if any(work.integrator == name for work in works)]
     known = [work for work in works if _known(work)]
+    sizes = _sizes(works)
     across, down = limits([w.seconds for w in known], margin=1.6), limits([w.error for w in known], margin=1.6)
     facts = [f"{quantity(works[0].horizon)} s simulated", "time stepping and solver together", *machine]
     with sheet(stem, f"Work and precision: {mesh}", facts) as page:
@@ -122,7 +123,7 @@ def _draw(stem: Path, mesh: str, works: list[Work], marked: dict[str, Mark], mac
         for column, integrator in enumerate(integrators):
             left = LEFT + 62 + column * (width + 20)
             ax = panel(page, left, top, width, foot(words) - top - 46, integrator)
-            _panel(ax, [work for work in known if work.integrator == integrator], marked)
+            _panel(ax, [work for work in known if work.integrator == integrator], marked, sizes)
             _front(ax, known)
             log_axis(ax.xaxis, *across, unit="time")
             log_axis(ax.yaxis, *down, unit="percent")
@@ -135,20 +136,25 @@ def _draw(stem: Path, mesh: str, works: list[Work], marked: dict[str, Mark], mac
             for label, mark in marked.items()
             if label in used
         }
-        legend(page, names, below=_meanings())
+        legend(page, names, below=_meanings(sizes))
         notes(page, words)
 
 
-def _panel(ax: Axes, works: list[Work], marked: dict[str, Mark]) -> None:
-    """Points of one integrator; those that differ in the time step alone are joined."""
+def _sizes(works: Iterable[Work]) -> dict[float | None, float]:
+    """Sizes of the marks by tolerance, larger for tighter ones; None: fixed iterations."""
     tolerances = sorted({work.tolerance for work in works if work.tolerance}, reverse=True)
+    return {None: 5.0, **{tolerance: 4.0 + 1.6 * k for k, tolerance in enumerate(tolerances)}}
+
+
+def _panel(ax: Axes, works: list[Work], marked: dict[str, Mark], sizes: dict[float | None, float]) -> None:
+    """Points of one integrator; those that differ in the time step alone are joined."""
     chains: dict[tuple, list[Work]] = {}
     for work in works:
         chains.setdefault((work.label, work.tolerance, work.iterations, work.first_guess), []).append(work)
     for (label, tolerance, *_), members in chains.items():
         members.sort(key=lambda work: work.time_step)
         look = marked[label]
-        grown = 4.0 + 1.6 * tolerances.index(tolerance) if tolerance else 5.0
+        grown = sizes[tolerance]
         ax.plot(
             [work.seconds for work in members], [work.error for work in members], color=look.color, linestyle=look.dash,
             linewidth=0.9, alpha=0.9, marker=look.marker, markersize=grown * size(look),
@@ -158,8 +164,8 @@ def _panel(ax: Axes, works: list[Work], marked: dict[str, Mark]) -> None:
     if base:
         ax.plot(base.seconds, base.error, "o", mfc="none", mec=INK, markersize=15, mew=1.6, zorder=6)
         ax.annotate(
-            "the assignment's default", (base.seconds, base.error), (0, 13), textcoords="offset points",
-            fontsize=9, ha="center", color=INK, bbox={"facecolor": PAGE, "alpha": 0.8, "edgecolor": "none", "pad": 0.8},
+            "the assignment's default", (base.seconds, base.error), (2, 13), textcoords="offset points",
+            fontsize=9, ha="left", color=INK, bbox={"facecolor": PAGE, "alpha": 0.8, "edgecolor": "none", "pad": 0.8},
         )  # fmt: skip
 
 
@@ -173,16 +179,18 @@ def _front(ax: Axes, works: list[Work]) -> None:
         )
 
 
-def _meanings() -> list[tuple[Line2D, str]]:
+def _meanings(sizes: dict[float | None, float]) -> list[tuple[Line2D, str]]:
     def dot(**more) -> Line2D:
         return Line2D([], [], color=MUTED, marker="o", linestyle="", **more)
 
     return [
         (Line2D([], [], color=MUTED, linewidth=5, alpha=0.28), "Pareto front of all"),
-        (dot(mfc=PAGE, markersize=5), "fixed iterations"),
-        (dot(markersize=4), "loose tolerance"),
-        (dot(markersize=8), "tight tolerance"),
+        *((dot(mfc=PAGE if t is None else MUTED, markersize=grown), _stop(t)) for t, grown in sizes.items()),
     ]
+
+
+def _stop(tolerance: float | None) -> str:
+    return "fixed iterations" if tolerance is None else f"tolerance {power(tolerance)}"
 
 
 def _notes(works: Sequence[Work]) -> list[str]:
