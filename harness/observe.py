@@ -19,6 +19,9 @@ from harness.simulate import Step
 from harness.trace import EnergyNorm, trace
 from solvers.problem import Positions, Prepared
 
+_OWN = ("springs", "inertia", "force", "pins")
+"""Terms of the objective that have a column of their own."""
+
 
 def observe(
     scene: Scene,
@@ -41,7 +44,8 @@ def observe(
         p, s = step.positions, step.solution
         terms = step.problem.terms(s.positions)
         found[step.index] = {
-            **{f"energy_{name}": value for name, value in terms.items()},
+            **{f"energy_{name}": terms[name] for name in _OWN if name in terms},
+            "energy_effects": sum(value for name, value in terms.items() if name not in _OWN),
             "objective": sum(terms.values()),
             "largest_strain": largest_strain(scene, p),
             "iterations": s.iterations,

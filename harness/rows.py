@@ -61,6 +61,7 @@ COLUMNS = (
     Column("energy_inertia", _REAL, "J", "inertia term of the step's objective"),
     Column("energy_force", _REAL, "J", "external forces' term of the step's objective"),
     Column("energy_pins", _REAL, "J", "pin penalty of the step's objective"),
+    Column("energy_effects", _REAL, "J", "all other energies of the step's objective: bending, gas, damping and so on"),
     Column("objective", _REAL, "J", "the step's objective, the sum of all terms"),
     Column("largest_strain", _REAL, "", "largest |length / rest length - 1| of a spring after the step"),
     Column("digest", _TEXT, "", "SHA-256 of the positions after the step (float64 bytes)"),
