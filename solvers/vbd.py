@@ -3,8 +3,8 @@
     B_i d_i = -grad_i g(p),   p_i += d_i,   B_i = held_i I + sum over its springs of k (nn' + max(0, 1 - r/l) (I - nn'))
 
 with n the direction and l the length of a spring; compressed springs lose their negative lateral curvature, so B_i is
-positive definite. The paper skips the line search. Here a step that would raise the energy, which a few additions a
-spring tell, gives way to that of the majorant (held_i + sum of k) I, which cannot: so no sweep raises the objective.
+positive definite. The paper skips the line search. Here a step that would raise the energy gives way to that of the
+majorant (held_i + sum of k) I, which cannot: so no sweep raises the objective.
 Vertices go by colour: none is joined by a spring to another of its colour.
 
 Sweeps are accelerated by Chebyshev's semi-iteration with the spectral radius rho (Wang 2015),
@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -28,9 +27,15 @@ from numpy.typing import NDArray
 from solvers import blocks, colouring
 from solvers.compiled import CompiledLocalGlobal
 from solvers.kernels import vbd as kernels
-from solvers.kernels.xpbd import Constraints
+from solvers.kernels.accelerate_springs import Shares
+from solvers.kernels.springs import Bundles, aligned
+from solvers.kernels.springs_vectors import LANES
+from solvers.kernels.vbd_vectors import NUMBERS
 from solvers.local_global import only_springs
 from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System
+
+_FAR = 1e100
+"""Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
 
 
 @dataclass(frozen=True)
@@ -52,17 +57,27 @@ class VertexBlockDescent:
 
     def prepare(self, system: System) -> PreparedVertexBlockDescent:
         """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
-        springs = only_springs(system, "vbd")
+        springs, n = only_springs(system, "vbd"), system.vertices
         measure = CompiledLocalGlobal().prepare(system)
-        held = blocks.held(system)
-        coloured = colouring.of_vertices(springs.edges, system.vertices)
-        order = coloured.order[np.isfinite(held[coloured.order])]
+        coloured = colouring.of_vertices(springs.edges, n)
+        colour = np.empty(n, np.int64)
+        colour[coloured.order] = np.repeat(np.arange(coloured.colours), np.diff(coloured.start))
+        pinned = system.pins.vertices[system.pins.exact]
+        order = coloured.order[~np.isin(coloured.order, pinned)]
+        row = np.empty(n, np.int64)
+        row[order], row[pinned] = np.arange(len(order)), np.arange(len(order), n)
+        colour[pinned] = -1
+        bundles, _ = Bundles.of(springs, row, colour, coloured.colours, n, n + 1)
+        held, majorant = np.zeros(n + 2), np.ones(n + 2)
+        held[: len(order)] = majorant[: len(order)] = blocks.held(system)[order]
+        ends = np.repeat(bundles.own.reshape(-1, LANES), np.diff(bundles.start), axis=0)
+        np.add.at(majorant, ends.ravel(), bundles.stiffness)
+        shares = Shares.of(bundles, held, row[pinned])
         return PreparedVertexBlockDescent(
             system,
             self.spectral_radius,
-            kernels.Blocks.of(springs, order, held),
-            Constraints.of(springs, np.arange(len(springs.edges))),
-            np.where(np.isfinite(held), held, 0.0),
+            kernels.Blocks(bundles, shares, len(order), held, majorant),
+            row,
             measure,
             f"vertices in {coloured.colours} colours; for the residual alone {measure.choice}",
         )
@@ -70,14 +85,13 @@ class VertexBlockDescent:
 
 @dataclass(frozen=True, eq=False)
 class PreparedVertexBlockDescent:
-    """blocks: of the free vertices; springs: all of them; held (n,) [N/m], 0 at exact pins; measure: one iteration of
-    local-global from p tells the residual at p, and is asked for nothing else."""
+    """blocks: of the free vertices; row (n,): where each vertex is in them; measure: one iteration of local-global from
+    p tells the residual at p, and is asked for nothing else."""
 
     system: System
     spectral_radius: float
     blocks: kernels.Blocks
-    springs: Constraints
-    held: NDArray[np.float64]
+    row: NDArray[np.int64]
     measure: Prepared
     choice: str
 
@@ -87,24 +101,23 @@ class PreparedVertexBlockDescent:
         return self.measure.facts
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The iterates from `problem.first_guess`; the yielded array is overwritten by the next one."""
-        p, advance = self._begin(problem)
+        """The iterates from `problem.first_guess`."""
+        advance = self._begin(problem)
         while True:
-            advance(1)
-            yield p
+            yield advance(1)
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """Iterate until `stop` says so; the residual is that of the positions."""
-        p, advance = self._begin(problem)
+        advance = self._begin(problem)
         if stop.tolerance is None:
-            advance(stop.iterations)
+            p = advance(stop.iterations)
             return Solution(p, stop.iterations, self._residual(problem, p), np.nan, "iterations")
-        unpinned = self.system.unpinned[self.blocks.vertex]
-        floor = stop.floor * float(np.abs(p).max(initial=0.0)) * float(self.blocks.majorant[unpinned].sum()) ** 0.5
+        p, trace = problem.first_guess, self.blocks.majorant[self.row[self.system.unpinned]].sum()
+        floor = stop.floor * float(np.abs(p).max(initial=0.0)) * float(trace) ** 0.5
         yardstick = residual = self._residual(problem, problem.current)
         limit = stop.tolerance * yardstick
         for iteration in range(1, stop.iterations + 1):
-            advance(1)
+            p = advance(1)
             residual = self._residual(problem, p)
             if residual <= max(limit, floor):
                 return Solution(p, iteration, residual, yardstick, "tolerance" if residual <= limit else "floor")
@@ -114,13 +127,25 @@ class PreparedVertexBlockDescent:
         """None: an iteration has no parts."""
         return {}
 
-    def _begin(self, problem: StepProblem) -> tuple[Positions, Callable[[int], None]]:
-        """Positions at the first guess, and what does a number of iterations on them."""
-        p, y = blocks.placed(problem.first_guess, problem), blocks.pull(problem)
-        entries = int(np.diff(self.blocks.start).max(initial=0))
-        near, omega, before, older = np.empty(4 * entries), np.zeros(1), np.empty_like(p), p.copy()
-        fixed = self.blocks, self.springs, self.held, y, near, self.spectral_radius, omega, before, older, p
-        return p, partial(kernels.iterate, *fixed)
+    def _begin(self, problem: StepProblem) -> Callable[[int], Positions]:
+        """What does a number of iterations, from where those before ended, and gives a copy of the positions."""
+        p, y = (self._rows(x) for x in (blocks.placed(problem.first_guess, problem), blocks.pull(problem)))
+        p[-4] = _FAR
+        entries = int(np.diff(self.blocks.bundles.start).max(initial=0))
+        scratch = aligned(NUMBERS * LANES * entries)
+        work = kernels.Work(p.copy(), p.copy(), np.zeros_like(p), scratch, np.zeros(1), np.full(1, np.nan))
+
+        def advance(iterations: int) -> Positions:
+            kernels.iterate(self.blocks, y, self.spectral_radius, work, p, iterations)
+            return p.reshape(-1, 4)[self.row, :3].copy()
+
+        return advance
+
+    def _rows(self, x: Positions) -> NDArray[np.float64]:
+        """x (n, 3) in rows of four, and the two rows that fill up bundles."""
+        out = aligned(4 * (len(x) + 2))
+        out.reshape(-1, 4)[self.row, :3] = x
+        return out
 
     def _residual(self, problem: StepProblem, p: Positions) -> float:
         """|Q^-1 grad g(p)|_Q [J^(1/2)] over the unpinned vertices."""

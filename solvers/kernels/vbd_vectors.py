@@ -1,0 +1,130 @@
+"""The Newton steps of eight vertices of one colour, in LLVM vectors (see `solvers.kernels.springs_vectors`)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from solvers.kernels.springs_vectors import _I8, _I64, _LEAST, _MASK, _WIDE, LANES, _constant, _Vectors
+
+NUMBERS = 4
+"""What is kept of each spring between the two passes: its vector and its length."""
+
+_ROUND_OFF = 1e-14
+"""Pivots up to this share of the diagonal's sum are round-off, of some ten springs."""
+
+_ZERO, _HALF, _ONE = _constant(0.0), _constant(0.5), _constant(1.0)
+
+
+def _newton(v: _Vectors, block: list[Any], g: list[Any]) -> tuple[list[Any], Any]:
+    """-B^-1 g for B = [[a, b, c], [b, d, e], [c, e, f]] by its factors L D L', and where B is positive definite."""
+    builder: Any = v.builder
+    a, b, c, d, e, f = block
+    by_a = builder.fdiv(_ONE, a)
+    l1, l2 = builder.fmul(b, by_a), builder.fmul(c, by_a)
+    second = v.subtract_product(d, l1, b)
+    by_second = builder.fdiv(_ONE, second)
+    below = v.subtract_product(e, l2, b)
+    l3 = builder.fmul(below, by_second)
+    third = v.subtract_product(v.subtract_product(f, l2, c), l3, below)
+    y1 = v.subtract_product(g[1], l1, g[0])
+    y2 = v.subtract_product(v.subtract_product(g[2], l2, g[0]), l3, y1)
+    x2 = builder.fdiv(builder.fsub(_ZERO, y2), third)
+    x1 = v.subtract_product(builder.fmul(builder.fsub(_ZERO, y1), by_second), l3, x2)
+    x0 = v.subtract_product(builder.fmul(builder.fsub(_ZERO, g[0]), by_a), l1, x1)
+    x0 = v.subtract_product(x0, l2, x2)
+    least = builder.fmul(_constant(_ROUND_OFF), builder.fadd(builder.fadd(a, d), f))
+    large = [builder.fcmp_ordered(">", pivot, least) for pivot in (a, second, third)]
+    return [x0, x1, x2], builder.and_(builder.and_(large[0], large[1]), large[2])
+
+
+def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, majorant, near):
+    """A bundle's code: moves its vertices in x, and returns whether a spring is too short, when it moves none."""
+
+    def generate(context, builder: Any, signature, args):
+        x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, majorant, near = (
+            context.make_array(argument)(context, builder, value).data
+            if isinstance(argument, types.Array)
+            else context.cast(builder, value, argument, types.int64)
+            for argument, value in zip(signature.args, args, strict=True)
+        )
+        v = _Vectors(builder)
+        places = v.places(builder.gep(own, [builder.mul(chunk, _I64(LANES))]))
+
+        def at_vertices(array):
+            return v.gathered([builder.load(builder.gep(array, [place])) for place in places])
+
+        def kept(entry):
+            begins = builder.mul(builder.sub(entry, begin), _I64(LANES * NUMBERS))
+            return [builder.gep(near, [builder.add(begins, _I64(LANES * k))]) for k in range(NUMBERS)]
+
+        def wide(array, entry):
+            return v.load(builder.gep(array, [builder.mul(entry, _I64(LANES))]), _WIDE)
+
+        centre, weight = v.gather(x, places), at_vertices(held)
+        load = [v.subtract_product(here, weight, p) for here, p in zip(v.gather(y, places), centre, strict=True)]
+        # Minus the gradient, then the block's upper triangle, row by row.
+        first = [*load, weight, _ZERO, _ZERO, weight, _ZERO, weight]
+        sums = [cgutils.alloca_once_value(builder, value) for value in first]
+        short = cgutils.alloca_once_value(builder, ir.Constant(_MASK, [0] * LANES))
+        with cgutils.for_range_slice(builder, begin, end, _I64(1), _I64) as (entry, _):
+            others = v.gather(x, v.places(builder.gep(neighbour, [builder.mul(entry, _I64(LANES))])))
+            arrow = [builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
+            squared = v.dot(arrow)
+            tiny = builder.fcmp_ordered("<=", squared, _constant(_LEAST))
+            builder.store(builder.or_(builder.load(short), tiny), short)
+            root = v.inverse_root(squared)
+            for value, pointer in zip([*arrow, builder.fmul(squared, root)], kept(entry), strict=True):
+                builder.store(value, builder.bitcast(pointer, _WIDE.as_pointer()), align=8)
+            k = wide(stiffness, entry)
+            tension = builder.fsub(builder.fmul(wide(pull, entry), root), k)
+            compressed = builder.fcmp_ordered(">", tension, _ZERO)
+            lateral = builder.select(compressed, _ZERO, builder.fsub(_ZERO, tension))
+            axial = builder.fsub(k, lateral)
+            n = [builder.fmul(component, root) for component in arrow]
+            along = [builder.fmul(axial, component) for component in n]
+            added = [(tension, component) for component in arrow]
+            added += [(along[i], n[j]) for i in range(3) for j in range(i, 3)]
+            for index, ((one, other), accumulator) in enumerate(zip(added, sums, strict=True)):
+                total = v.multiply_add(one, other, builder.load(accumulator))
+                builder.store(builder.fadd(total, lateral) if index in (3, 6, 8) else total, accumulator)
+        force, block = [builder.load(s) for s in sums[:3]], [builder.load(s) for s in sums[3:]]
+        d, definite = _newton(v, block, [builder.fsub(_ZERO, component) for component in force])
+
+        # By how much the step raises the energy, from differences of lengths, which do not cancel.
+        half = builder.fmul(_HALF, weight)
+        rise = builder.fmul(half, v.dot(d))
+        for component, own_force in zip(d, load, strict=True):
+            rise = v.subtract_product(rise, component, own_force)
+        rises = cgutils.alloca_once_value(builder, rise)
+        with cgutils.for_range_slice(builder, begin, end, _I64(1), _I64) as (entry, _):
+            *arrow, length = [v.load(pointer, _WIDE) for pointer in kept(entry)]
+            moved = [builder.fadd(a, b) for a, b in zip(arrow, d, strict=True)]
+            squared = v.dot(moved)
+            both = v.multiply_add(squared, v.inverse_root(squared), length)
+            change = builder.fmul(builder.fadd(arrow[0], moved[0]), d[0])
+            for c in (1, 2):
+                change = v.multiply_add(builder.fadd(arrow[c], moved[c]), d[c], change)
+            mean = builder.fdiv(wide(pull, entry), both)
+            factor = builder.fsub(builder.fmul(_HALF, wide(stiffness, entry)), mean)
+            builder.store(v.multiply_add(factor, change, builder.load(rises)), rises)
+        better = builder.and_(definite, builder.fcmp_ordered("<=", builder.load(rises), _ZERO))
+        scale = builder.fdiv(_ONE, at_vertices(majorant))
+        safe = [builder.fmul(scale, component) for component in force]
+        ends = [builder.fadd(p, builder.select(better, a, b)) for p, a, b in zip(centre, d, safe, strict=True)]
+        any_short = builder.icmp_unsigned("!=", builder.bitcast(builder.load(short), _I8), _I8(0))
+        with builder.if_then(builder.not_(any_short), likely=True):
+            for place, row in zip(places, v.rows(*ends), strict=True):
+                builder.store(row, builder.bitcast(v.row(x, place), row.type.as_pointer()), align=8)
+        return any_short
+
+    arguments = x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, majorant, near
+    return types.boolean(*arguments), generate
+
+
+# Numba passes the first argument itself, which type checkers do not know.
+descend: Any = intrinsic(_bundle)
