@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from harness.errors import RunFailed
 from harness.scene import Scene
 from solvers.energies.springs import TINY, Springs
-from solvers.kernels.compiling import kernel
+from solvers.compiling import kernel
 from solvers.problem import LaggedEnergy, Positions, Start
 
 State = NDArray[np.float64]

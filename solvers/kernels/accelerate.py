@@ -24,7 +24,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from solvers.kernels.accelerate_coefficients import coefficients
-from solvers.kernels.compiling import _inner, inner, kernel
+from solvers.compiling import _inner, inner, kernel
 
 DECREASE, FLATTER = 1e-4, 0.1
 AGAIN, ACCEPTED, STALLED = 0, 1, 2

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from solvers.kernels.compiling import inner
+from solvers.compiling import inner
 
 CHEBYSHEV, ANDERSON, LBFGS = 0, 1, 2
 

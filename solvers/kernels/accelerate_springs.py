@@ -18,7 +18,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from solvers.kernels.compiling import inner
+from solvers.compiling import inner
 from solvers.kernels.springs import _TINY_SQUARED, Bundles, _one_by_one, aligned
 from solvers.kernels.springs_vectors import _F64, _I8, _I64, _LEAST, _MASK, _WIDE, LANES, _constant, _Vectors
 

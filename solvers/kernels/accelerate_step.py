@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from solvers.kernels.accelerate import AGAIN, STALLED, Window, accept, begin, judge, propose
 from solvers.kernels.accelerate_springs import Shares, descend
-from solvers.kernels.compiling import inner, kernel
+from solvers.compiling import inner, kernel
 from solvers.kernels.springs import Bundles, squared_norm
 from solvers.kernels.step import Plan
 from solvers.kernels.step_ends import Rows, fetch, place, state

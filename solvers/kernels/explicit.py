@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from solvers.kernels.compiling import kernel
+from solvers.compiling import kernel
 from solvers.kernels.springs import add_descent
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from solvers.kernels.compiling import inner, kernel
+from solvers.compiling import inner, kernel
 from solvers.kernels.objective import along
 from solvers.problem import System
 

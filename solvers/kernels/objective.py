@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.energies.springs import TINY, Springs
-from solvers.kernels.compiling import inner, kernel
+from solvers.compiling import inner, kernel
 from solvers.problem import Positions, StepProblem, System
 
 

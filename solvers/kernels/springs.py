@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from solvers.energies.springs import TINY, Springs
 from solvers.kernels import springs_vectors as vectors
-from solvers.kernels.compiling import inner, kernel
+from solvers.compiling import inner, kernel
 from solvers.kernels.springs_vectors import LANES
 
 _TINY_SQUARED = TINY * TINY

@@ -24,7 +24,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from solvers.kernels.compiling import inner, inner_in_parallel, kernel
+from solvers.compiling import inner, inner_in_parallel, kernel
 from solvers.kernels.springs import add_descent, add_projection, squared_norm
 from solvers.linear.supernodal_solve import _backwards as backwards
 from solvers.linear.supernodal_solve import _forwards as forwards

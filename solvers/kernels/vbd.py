@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.accelerate_springs import descend as objective
-from solvers.kernels.compiling import inner, kernel
+from solvers.compiling import inner, kernel
 from solvers.kernels.springs import Bundles, _one_by_one
 from solvers.kernels.springs_vectors import LANES
 from solvers.kernels.vbd_vectors import descend

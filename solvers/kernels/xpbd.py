@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.energies.springs import TINY, Springs
-from solvers.kernels.compiling import inner, kernel
+from solvers.compiling import inner, kernel
 
 _TINY_SQUARED = TINY * TINY
 
