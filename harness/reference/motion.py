@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from harness.errors import RunFailed
 from harness.scene import Scene
-from solvers.energies.springs import TINY, Springs
 from solvers.compiling import kernel
+from solvers.energies.springs import TINY, Springs
 from solvers.problem import LaggedEnergy, Positions, Start
 
 State = NDArray[np.float64]

@@ -23,8 +23,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from solvers.kernels.accelerate_coefficients import coefficients
 from solvers.compiling import _inner, inner, kernel
+from solvers.kernels.accelerate_coefficients import coefficients
 
 DECREASE, FLATTER = 1e-4, 0.1
 AGAIN, ACCEPTED, STALLED = 0, 1, 2

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from solvers.compiling import inner, kernel
 from solvers.kernels.accelerate import AGAIN, STALLED, Window, accept, begin, judge, propose
 from solvers.kernels.accelerate_springs import Shares, descend
-from solvers.compiling import inner, kernel
 from solvers.kernels.springs import Bundles, squared_norm
 from solvers.kernels.step import Plan
 from solvers.kernels.step_ends import Rows, fetch, place, state

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.energies.springs import TINY, Springs
 from solvers.compiling import inner, kernel
+from solvers.energies.springs import TINY, Springs
 from solvers.problem import Positions, StepProblem, System
 
 

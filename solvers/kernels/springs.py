@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from solvers.compiling import inner, kernel
 from solvers.energies.springs import TINY, Springs
 from solvers.kernels import springs_vectors as vectors
-from solvers.compiling import inner, kernel
 from solvers.kernels.springs_vectors import LANES
 
 _TINY_SQUARED = TINY * TINY

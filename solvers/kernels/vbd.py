@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from solvers.compiling import inner, kernel
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.accelerate_springs import descend as objective
-from solvers.compiling import inner, kernel
 from solvers.kernels.springs import Bundles, _one_by_one
 from solvers.kernels.springs_vectors import LANES
 from solvers.kernels.vbd_vectors import descend

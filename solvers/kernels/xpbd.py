@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.energies.springs import TINY, Springs
 from solvers.compiling import inner, kernel
+from solvers.energies.springs import TINY, Springs
 
 _TINY_SQUARED = TINY * TINY
 
