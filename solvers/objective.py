@@ -91,7 +91,7 @@ class Matrix:
     def entries(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.int64]:
         """Where the entries (rows, columns) lie among its values."""
         block = np.searchsorted(self._keys, rows // 3 * self._size + columns // 3)
-        return self.factor.pointers[rows] + 3 * (block - self.graph.indptr[rows // 3]) + columns % 3
+        return 9 * block + 3 * (rows % 3) + columns % 3
 
 
 class StepObjective:
@@ -149,7 +149,7 @@ class Hessian:
             rows, columns = rows[inside], columns[inside]
             self._matrix = whole.matrix_for(rows, columns)
             self._added = self._matrix.entries(rows, columns), total.data[inside]
-        self._values = np.empty(len(self._matrix.factor.columns))
+        self._values = np.empty((self._matrix.graph.nnz, 3, 3))
 
     def factorise(self, keep: float = 1.0, shift: NDArray[np.float64] | float = 0.0) -> bool:
         """Whether it is positive definite, and then ready for `solve`.
@@ -158,14 +158,14 @@ class Hessian:
         """
         hessian.assemble(self._terms, self._matrix.places, self._p, keep, self._values)
         if self._others is not None:
-            np.add.at(self._values, *self._added)
-        self._values[self._matrix.diagonal] += shift
+            np.add.at(self._values.reshape(-1), *self._added)
+        self._values.reshape(-1)[self._matrix.diagonal] += shift
         return self._matrix.factor.factorise(self._values)
 
     def solve(self, b: Positions) -> Positions:
         """Its inverse, as it was factorised last, times b (n, 3); zero at vertices that are not free."""
         out = np.zeros_like(b)
-        out[self._free] = self._matrix.factor.solve(b[self._free].ravel()).reshape(-1, 3)
+        out[self._free] = self._matrix.factor.solve(b[self._free])
         return out
 
     @cached_property

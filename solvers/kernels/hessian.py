@@ -20,39 +20,31 @@ from solvers.problem import System
 
 
 class Places(NamedTuple):
-    """Where blocks lie in the entries of a matrix, in CSR, of the free vertices' coordinates.
+    """Which blocks of a matrix over the free vertices are whose.
 
-    A block is the place of its first entry; its rows lie `stride` apart. free (f,): vertices; diagonal (n,): their
-    blocks, -1 for a vertex that is not free; stride (n,); across (m, 2): the blocks of each spring from its first end
-    to its second and back, -1 where an end is not free.
+    free (f,): vertices; diagonal (n,): their blocks, -1 for a vertex that is not free; across (m, 2): the blocks of
+    each spring from its first end to its second and back, -1 where an end is not free.
     """
 
     free: NDArray[np.int64]
     diagonal: NDArray[np.int64]
-    stride: NDArray[np.int64]
     across: NDArray[np.int64]
 
     @classmethod
     def of(cls, system: System, edges: NDArray[np.int64], graph: csr_array) -> Places:
         """The places in a matrix whose pattern of blocks is `graph`, (f, f), sorted, over the free vertices."""
         n, f = system.vertices, len(system.free)
-        degree = np.diff(graph.indptr).astype(np.int64)
-        first = np.asarray(graph.indptr[:-1], np.int64)
-        row = np.repeat(np.arange(f), degree)
-        column = np.asarray(graph.indices, np.int64)
-        place = 9 * first[row] + 3 * (np.arange(len(row)) - first[row])
-        key = row * f + column
+        key = np.repeat(np.arange(f), np.diff(graph.indptr)) * f + graph.indices
         number = np.full(n, -1)
         number[system.free] = np.arange(f)
-        diagonal, stride = np.full(n, -1), np.zeros(n, np.int64)
-        diagonal[system.free] = place[np.searchsorted(key, np.arange(f) * (f + 1))]
-        stride[system.free] = 3 * degree
+        diagonal = np.full(n, -1)
+        diagonal[system.free] = np.searchsorted(key, np.arange(f) * (f + 1))
         i, j = number[edges].T
         inside = (i >= 0) & (j >= 0) & (i != j)
         across = np.full((len(edges), 2), -1)
         for side, (a, b) in enumerate([(i, j), (j, i)]):
-            across[inside, side] = place[np.searchsorted(key, a[inside] * f + b[inside])]
-        return cls(system.free, diagonal, stride, across)
+            across[inside, side] = np.searchsorted(key, a[inside] * f + b[inside])
+        return cls(system.free, diagonal, across)
 
 
 @inner
@@ -66,31 +58,29 @@ def _curvature(terms, e, length, keep):
 
 
 @inner
-def _add(values, place, stride, sign, xx, xy, xz, yy, yz, zz):
-    """Add sign times a symmetric block to the entries."""
-    values[place] += sign * xx
-    values[place + 1] += sign * xy
-    values[place + 2] += sign * xz
-    place += stride
-    values[place] += sign * xy
-    values[place + 1] += sign * yy
-    values[place + 2] += sign * yz
-    place += stride
-    values[place] += sign * xz
-    values[place + 1] += sign * yz
-    values[place + 2] += sign * zz
+def _add(values, block, sign, xx, xy, xz, yy, yz, zz):
+    """Add sign times a symmetric block."""
+    values[block, 0, 0] += sign * xx
+    values[block, 0, 1] += sign * xy
+    values[block, 0, 2] += sign * xz
+    values[block, 1, 0] += sign * xy
+    values[block, 1, 1] += sign * yy
+    values[block, 1, 2] += sign * yz
+    values[block, 2, 0] += sign * xz
+    values[block, 2, 1] += sign * yz
+    values[block, 2, 2] += sign * zz
 
 
 @kernel
 def assemble(terms, places, p, keep, values):
-    """Write the Hessian [N/m] of springs, inertia and penalty pins at p (n, 3) to `values`."""
+    """Write the Hessian [N/m] of springs, inertia and penalty pins at p (n, 3) to the blocks `values`, (b, 3, 3)."""
     values[:] = 0.0
     for v in places.free:
         h = terms.inertia[v]
-        _add(values, places.diagonal[v], places.stride[v], 1.0, h, 0.0, 0.0, h, 0.0, h)
+        _add(values, places.diagonal[v], 1.0, h, 0.0, 0.0, h, 0.0, h)
     for q in range(len(terms.pinned)):
         v, w = terms.pinned[q], terms.weight[q]
-        _add(values, places.diagonal[v], places.stride[v], 1.0, w, 0.0, 0.0, w, 0.0, w)
+        _add(values, places.diagonal[v], 1.0, w, 0.0, 0.0, w, 0.0, w)
     for e in range(len(terms.stiffness)):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
         if i == j:
@@ -101,12 +91,12 @@ def assemble(terms, places, p, keep, values):
         xx, xy, xz = a * n0 * n0 + lateral, a * n0 * n1, a * n0 * n2
         yy, yz, zz = a * n1 * n1 + lateral, a * n1 * n2, a * n2 * n2 + lateral
         if places.diagonal[i] >= 0:
-            _add(values, places.diagonal[i], places.stride[i], 1.0, xx, xy, xz, yy, yz, zz)
+            _add(values, places.diagonal[i], 1.0, xx, xy, xz, yy, yz, zz)
         if places.diagonal[j] >= 0:
-            _add(values, places.diagonal[j], places.stride[j], 1.0, xx, xy, xz, yy, yz, zz)
+            _add(values, places.diagonal[j], 1.0, xx, xy, xz, yy, yz, zz)
         if places.across[e, 0] >= 0:
-            _add(values, places.across[e, 0], places.stride[i], -1.0, xx, xy, xz, yy, yz, zz)
-            _add(values, places.across[e, 1], places.stride[j], -1.0, xx, xy, xz, yy, yz, zz)
+            _add(values, places.across[e, 0], -1.0, xx, xy, xz, yy, yz, zz)
+            _add(values, places.across[e, 1], -1.0, xx, xy, xz, yy, yz, zz)
 
 
 @kernel

@@ -2,8 +2,8 @@
 
     H x = b,   H symmetric, 3n x 3n, its blocks where a graph of n vertices has entries
 
-The order of elimination is found on the graph, where it costs a third; the factorisation is the multifrontal one of
-`solvers.linear.supernodal`. A failure is an answer here, not an error: it says that H is not positive definite.
+The order of elimination and the supernodes are those of the graph. A failure is an answer here and no error: it says
+that H is not positive definite.
 """
 
 from __future__ import annotations
@@ -12,50 +12,82 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from solvers.linear.block_factor import Fronts, factorise, solve, whole
+from solvers.linear.block_vectors import ROWS
 from solvers.linear.ordering import nested_dissection
-from solvers.linear.supernodal import Layout
-from solvers.linear.supernodal_factor import factorise
-from solvers.linear.supernodal_solve import solve
-from solvers.linear.symbolic import analyse
+from solvers.linear.symbolic import Symbolic, analyse
 
 
 class BlockCholesky:
     """The factorisation of H for one pattern of blocks.
 
-    pointers (3n + 1,), columns: the CSR structure of H, whose three rows of a vertex have the same columns;
-    nonzeros: of its factor, diagonal included. Factorisations and solves share their arrays: one at a time.
+    nonzeros: entries of L, the diagonal's included. Factorisations and solves share their arrays: one at a time.
     """
 
     def __init__(self, graph: csr_array) -> None:
         """graph: (n, n), symmetric in its pattern, an entry for each block, the diagonal's included."""
-        starts, neighbours = np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int32)
-        degree = np.repeat(np.diff(starts), 3)
-        self.pointers = np.concatenate([[0], np.cumsum(3 * degree)])
-        within = np.arange(self.pointers[-1]) - np.repeat(self.pointers[:-1], 3 * degree)
-        block = np.repeat(np.repeat(starts[:-1], 3), 3 * degree) + within // 3
-        self.columns = (3 * neighbours[block] + within % 3).astype(np.int32)
-        order = 3 * nested_dissection(starts, neighbours)[:, None] + np.arange(3, dtype=np.int32)
-        s = analyse(self.pointers, self.columns, order.ravel())
-        layout = Layout.of(s)
-        self.nonzeros = s.nonzeros
-        squares, panels = np.empty(layout.squares), np.empty(layout.panels)
-        self._structure = (
-            s.slot, s.vertex, s.parent, s.first, s.row_start, s.rows, s.sequence,
-            layout.chunk_of, layout.chunks, squares, panels,
-        )  # fmt: skip
-        self._panels = (
-            squares, panels, layout.places, layout.chunks, layout.spans, layout.by_slot, layout.by_vertex,
-            np.zeros(4 * layout.rows),
-        )  # fmt: skip
-        self._b, self._x = np.zeros((2, len(self.pointers) - 1, 3))
+        pointers, neighbours = np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int32)
+        symbolic = analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
+        self.nonzeros = 9 * symbolic.nonzeros - 3 * (len(pointers) - 1)
+        self._fronts = _fronts(pointers, neighbours, symbolic)
+        f = self._fronts
+        below = np.diff(f.start) - f.own
+        room = _room(f, 3 * below * whole(3 * below))
+        self._panels, n = np.zeros(f.panel[-1] + ROWS), len(pointers) - 1
+        self._scratch = np.zeros((2, room)), np.zeros((2, len(f.own)), np.int64), *np.zeros((2, n), np.int64)
+        self._front = np.zeros(int((whole(3 * f.own) + whole(3 * below)).max(initial=0)) + ROWS)
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
-        """Factorise H with these entries, in the order of `columns`; False where it is not positive definite."""
-        return factorise(self.pointers, self.columns, values, *self._structure) < 0
+        """Factorise H with these blocks (b, 3, 3), in the order of the graph; False if it is not positive definite."""
+        return factorise(self._fronts, values, self._panels, *self._scratch)
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
-        """H^-1 b for b (3n,), or (3n, k) with k at most 3."""
-        wide = b.reshape(len(b), -1)
-        self._b[:, : wide.shape[1]] = wide
-        solve(*self._panels, self._b, self._x)
-        return self._x[:, : wide.shape[1]].reshape(b.shape).copy()
+        """H^-1 b, both (n, 3), by what was factorised last."""
+        x = np.array(b, order="C")
+        solve(self._fronts, self._panels, x, self._front)
+        return x
+
+
+def _fronts(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], symbolic: Symbolic) -> Fronts:
+    """The fronts of a structure, its supernodes numbered anew in the order in which they are done."""
+    s, sequence = symbolic, symbolic.sequence
+    number = np.empty(len(sequence) + 1, np.int64)
+    number[sequence] = np.arange(len(sequence))
+    number[-1] = -1
+    parent = number[s.parent[sequence]]
+    own = s.width[sequence].astype(np.int64)
+    first, rows = s.first.tolist(), s.row_start.tolist()
+    lists = [
+        s.vertex[np.append(np.arange(first[k], first[k] + s.width[k]), s.rows[rows[k] : rows[k + 1]])]
+        for k in sequence.tolist()
+    ]
+    start = np.concatenate([[0], np.cumsum([len(x) for x in lists])]).astype(np.int64)
+    members = np.concatenate(lists).astype(np.int64)
+    within = np.full(len(members), -1)
+    stack = np.zeros(len(own), np.int64)
+    place = np.empty(len(pointers) - 1, np.int64)
+    for k in range(len(own) - 1, -1, -1):
+        above = parent[k]
+        if above >= 0:
+            stack[k] = 1 - stack[above]
+            list_ = members[start[above] : start[above + 1]]
+            place[list_] = np.arange(len(list_))
+            within[start[k] + own[k] : start[k + 1]] = place[members[start[k] + own[k] : start[k + 1]]]
+    below = np.diff(start) - own
+    heights = whole(3 * own) + whole(3 * below)
+    panel = np.concatenate([[0], np.cumsum(3 * own * heights)])
+    rank = np.asarray(s.slot, np.int64)
+    return Fronts(pointers, neighbours.astype(np.int64), rank, start, members, own, within, parent, stack, panel)
+
+
+def _room(fronts: Fronts, sizes: NDArray[np.int64]) -> int:
+    """What each stack must hold at most, for updates of these sizes."""
+    top, most = [0, 0], 0
+    waiting: dict[int, int] = {}  # what waits for a supernode
+    for k, (above, side, size) in enumerate(zip(fronts.parent, fronts.stack, sizes, strict=True)):
+        most = max(most, top[side] + size)
+        top[1 - side] -= waiting.pop(k, 0)
+        if above >= 0:
+            top[side] += size
+            waiting[above] = waiting.get(above, 0) + size
+    return int(most)

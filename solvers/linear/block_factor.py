@@ -1,0 +1,257 @@
+"""The multifrontal Cholesky factorisation (Duff and Reid 1983) of a matrix of 3 x 3 blocks, and a solve with it.
+
+A front is the dense matrix of a supernode's columns and of the rows below. Its columns are a panel of L in the end, the
+rest is an update of its parent. It is factorised from left to right, a tile of columns at a time: the product of all
+columns to the left is subtracted at once, then the tile is divided by its own triangle. Updates wait on two stacks that
+take turns from level to level of the tree, so that each is made where it waits, while those of its children are read.
+
+Rows begin at whole vectors: those of a panel's columns, and those below, which is all the padding there is. What lies
+above the diagonal is never read.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from solvers.linear.block_vectors import ROWS, TILE, divide, subtract_columns, subtract_product, subtract_rows
+
+_NO_DIGITS = 4.0 * np.finfo(np.float64).eps
+"""A pivot this small beside its entry of the matrix is round-off."""
+
+
+class Fronts(NamedTuple):
+    """The structure of a factor over n vertices, s supernodes in a postorder.
+
+    pointers (n + 1,), neighbours: the graph of the matrix's blocks in CSR; rank (n,): when a vertex is eliminated;
+    start (s + 1,), members: of each supernode the vertices of its columns, and then of the rows below; own (s,): how
+    many are columns; within: of each member below its place among the parent's; parent (s,), -1 for a root;
+    stack (s,): which of the two its update waits on; panel (s + 1,): where its panel begins.
+    """
+
+    pointers: NDArray[np.int64]
+    neighbours: NDArray[np.int64]
+    rank: NDArray[np.int64]
+    start: NDArray[np.int64]
+    members: NDArray[np.int64]
+    own: NDArray[np.int64]
+    within: NDArray[np.int64]
+    parent: NDArray[np.int64]
+    stack: NDArray[np.int64]
+    panel: NDArray[np.int64]
+
+
+@njit(cache=True)
+def whole(rows):
+    """The rows of so many whole vectors as hold these."""
+    return (rows + ROWS - 1) // ROWS * ROWS
+
+
+@njit(cache=True)
+def factorise(fronts, values, panels, stacks, waiting, place, offset):
+    """Write L to `panels` from the blocks of the matrix, values (b, 3, 3); returns whether it is positive definite.
+
+    stacks (2, room): of updates; waiting (2, s), place (n,), offset (n,): scratch.
+    """
+    triangle = np.empty((TILE, TILE))
+    depth = np.zeros(2, np.int64)  # supernodes that wait
+    top = np.zeros(2, np.int64)  # numbers on each stack
+    for s in range(len(fronts.own)):
+        _, own, below, head, stride = _sizes(fronts, s)
+        size = stride - head
+        base, side = fronts.panel[s], fronts.stack[s]
+        update, begin = stacks[side], top[side]
+        panels[base : fronts.panel[s + 1]] = 0.0
+        update[begin : begin + 3 * below * size] = 0.0
+        _enter(fronts, s, values, panels, head, stride, place)
+        while depth[1 - side] > 0 and fronts.parent[waiting[1 - side, depth[1 - side] - 1]] == s:
+            depth[1 - side] -= 1
+            c = waiting[1 - side, depth[1 - side]]
+            rows = fronts.start[c + 1] - fronts.start[c] - fronts.own[c]
+            top[1 - side] -= 3 * rows * whole(3 * rows)
+            _extend(fronts, c, rows, stacks[1 - side], top[1 - side], own, head, stride, panels, base, update, begin,
+                    size, offset)  # fmt: skip
+        if not _eliminate(fronts, s, values, panels, head, stride, triangle):
+            return False
+        _update(panels, base, 3 * own, head, stride, update, begin, 3 * below, size)
+        waiting[side, depth[side]] = s
+        depth[side] += 1
+        top[side] += 3 * below * size
+        if fronts.parent[s] < 0:  # nobody takes what a root leaves
+            depth[side] -= 1
+            top[side] -= 3 * below * size
+    return True
+
+
+@njit(cache=True)
+def _enter(fronts, s, values, panels, head, stride, place):
+    """Put the matrix's blocks below the diagonal into the panel of a supernode."""
+    first, own = fronts.start[s], fronts.own[s]
+    for k in range(fronts.start[s + 1] - first):
+        place[fronts.members[first + k]] = 3 * k if k < own else head + 3 * (k - own)
+    for k in range(own):
+        v = fronts.members[first + k]
+        column = fronts.panel[s] + 3 * k * stride
+        for e in range(fronts.pointers[v], fronts.pointers[v + 1]):
+            u = fronts.neighbours[e]
+            if fronts.rank[u] >= fronts.rank[v]:
+                at = column + place[u]
+                for j in range(3):
+                    for i in range(3):
+                        panels[at + j * stride + i] = values[e, j, i]
+
+
+@njit(cache=True)
+def _extend(fronts, c, rows, source, at, own, head, stride, panels, base, update, begin, size, offset):
+    """Add the update of a child c to its parent's front."""
+    first = fronts.start[c] + fronts.own[c]
+    height = whole(3 * rows)
+    inside = 0
+    while inside < rows and fronts.within[first + inside] < own:
+        inside += 1
+    for k in range(rows):
+        q = fronts.within[first + k]
+        offset[k] = 3 * q if q < own else head + 3 * (q - own)
+    for b in range(inside):
+        for j in range(3):
+            column = base + (3 * fronts.within[first + b] + j) * stride
+            start = at + (3 * b + j) * height
+            for a in range(b, rows):
+                for i in range(3):
+                    panels[column + offset[a] + i] += source[start + 3 * a + i]
+    for b in range(inside, rows):
+        for j in range(3):
+            column = begin + (3 * (fronts.within[first + b] - own) + j) * size - head
+            start = at + (3 * b + j) * height
+            for a in range(b, rows):
+                for i in range(3):
+                    update[column + offset[a] + i] += source[start + 3 * a + i]
+
+
+@njit(cache=True)
+def _eliminate(fronts, s, values, panels, head, stride, triangle):
+    """Factorise the panel of a supernode; False at a pivot that is not positive."""
+    base, width = fronts.panel[s], 3 * fronts.own[s]
+    for tile in range(0, width, TILE):
+        columns = min(TILE, width - tile)
+        corner = base + tile * stride
+        above = tile // ROWS * ROWS
+        if tile > 0:
+            for r in range(above, stride, ROWS):
+                if columns == 6:
+                    subtract_product(panels, base + r, base + tile, stride, tile, panels, corner + r, stride, 6)
+                else:
+                    subtract_product(panels, base + r, base + tile, stride, tile, panels, corner + r, stride, 3)
+        for j in range(columns):
+            v = fronts.members[fronts.start[s] + (tile + j) // 3]
+            for i in range(j, columns):
+                entry = panels[corner + j * stride + tile + i]
+                for k in range(j):
+                    entry -= triangle[i, k] * triangle[j, k]
+                if i == j:
+                    if not entry > _NO_DIGITS * values[_diagonal(fronts, v), j % 3, j % 3]:
+                        return False
+                    triangle[j, j] = 1.0 / np.sqrt(entry)
+                else:
+                    triangle[i, j] = entry * triangle[j, j]
+        for r in range(above, stride, ROWS):
+            if columns == 6:
+                divide(panels, corner + r, stride, triangle, 6)
+            else:
+                divide(panels, corner + r, stride, triangle, 3)
+    return True
+
+
+@njit(cache=True)
+def _diagonal(fronts, v):
+    """Which block is the diagonal's of vertex v."""
+    e = fronts.pointers[v]
+    while fronts.neighbours[e] != v:
+        e += 1
+    return e
+
+
+@njit(cache=True)
+def _update(panels, base, width, head, stride, update, begin, columns, size):
+    """Subtract the product of a panel's rows below from the update."""
+    for tile in range(0, columns, TILE):
+        row, to = base + head, begin + tile * size
+        for r in range(tile // ROWS * ROWS, size, ROWS):
+            if columns - tile >= 6:
+                subtract_product(panels, row + r, row + tile, stride, width, update, to + r, size, 6)
+            else:
+                subtract_product(panels, row + r, row + tile, stride, width, update, to + r, size, 3)
+
+
+@njit(cache=True)
+def solve(fronts, panels, x, front):
+    """Overwrite x (n, 3) with H^-1 x; front: scratch, a vector longer than the largest front."""
+    y = np.empty(TILE)
+    for s in range(len(fronts.own)):
+        first, own, below, head, stride = _sizes(fronts, s)
+        front[: stride + ROWS] = 0.0
+        _gather(x, fronts.members, first, own, front, 0)
+        for tile in range(0, 3 * own, TILE):
+            columns, corner = min(TILE, 3 * own - tile), fronts.panel[s] + tile * stride + tile
+            for j in range(columns):
+                y[j] = front[tile + j]
+                for k in range(j):
+                    y[j] -= panels[corner + k * stride + j] * y[k]
+                y[j] /= panels[corner + j * stride + j]
+                front[tile + j] = y[j]
+            to = tile + columns
+            at, strips = corner + columns, (stride - to + ROWS - 1) // ROWS
+            if columns == 6:
+                subtract_columns(panels, at, stride, front, to, strips, y, 6)
+            else:
+                subtract_columns(panels, at, stride, front, to, strips, y, 3)
+        _scatter(front, 0, x, fronts.members, first, own)
+        for k in range(below):
+            for c in range(3):
+                x[fronts.members[first + own + k], c] += front[head + 3 * k + c]
+    for s in range(len(fronts.own) - 1, -1, -1):
+        first, own, below, head, stride = _sizes(fronts, s)
+        front[: stride + ROWS] = 0.0
+        _gather(x, fronts.members, first, own, front, 0)
+        _gather(x, fronts.members, first + own, below, front, head)
+        for tile in range((3 * own - 1) // TILE * TILE, -1, -TILE):
+            columns, corner = min(TILE, 3 * own - tile), fronts.panel[s] + tile * stride + tile
+            for j in range(columns):
+                y[j] = front[tile + j]
+            to = tile + columns
+            at, strips = corner + columns, (stride - to + ROWS - 1) // ROWS
+            if columns == 6:
+                subtract_rows(panels, at, stride, front, to, strips, y, 6)
+            else:
+                subtract_rows(panels, at, stride, front, to, strips, y, 3)
+            for j in range(columns - 1, -1, -1):
+                for k in range(j + 1, columns):
+                    y[j] -= panels[corner + j * stride + k] * y[k]
+                y[j] /= panels[corner + j * stride + j]
+                front[tile + j] = y[j]
+        _scatter(front, 0, x, fronts.members, first, own)
+
+
+@njit(cache=True)
+def _sizes(fronts, s):
+    """The first member of a supernode, its columns and rows below in vertices, and where those rows begin and end."""
+    first, own = fronts.start[s], fronts.own[s]
+    below, head = fronts.start[s + 1] - first - own, whole(3 * own)
+    return first, own, below, head, head + whole(3 * below)
+
+
+@njit(cache=True)
+def _gather(x, members, first, count, front, at):
+    for k in range(count):
+        for c in range(3):
+            front[at + 3 * k + c] = x[members[first + k], c]
+
+
+@njit(cache=True)
+def _scatter(front, at, x, members, first, count):
+    for k in range(count):
+        for c in range(3):
+            x[members[first + k], c] = front[at + 3 * k + c]
