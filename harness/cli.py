@@ -1,4 +1,4 @@
-"""The command line: `springbench run`, `speed`, `accuracy`, `recommend`, `list`, `query`, `schema`, `inspect`, and more.
+"""The command line: `springbench run`, `speed`, `accuracy`, `recommend`, `list`, `query`, `schema`, `inspect` and more.
 
 Exit codes: 0 all is well, 1 a run failed or a gate found a regression, 2 the user's mistake, 130 stopped by Ctrl-C.
 """

@@ -60,6 +60,8 @@ def load_any(path: Path, *, solvers: Sequence[str] = (), sizes: Sequence[int] = 
     """
     given = {key: value for key, value in options.items() if value is not None}
     document = Document(path, {}) if _is_assignment(path) else read_yaml(path)
+    if {"curves", "work"} & set(document.data):
+        raise InputError(Mistake("is an accuracy config; run it with `springbench accuracy`", path))
     if "scenes" in document.data:
         if solvers or sizes or given:
             raise InputError(Mistake("is a sweep, which says itself what to run; change the file instead", path))

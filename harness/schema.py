@@ -1,4 +1,5 @@
-"""The JSON Schema (draft 2020-12) of scenes and sweeps, for editors; made of the models that check configs."""
+"""The JSON Schema (draft 2020-12) of scenes, sweeps and accuracy configs, for editors; made of the models that check
+them."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, create_model
 from pydantic.json_schema import models_json_schema
 
+from harness.accuracy.spec import AccuracyFields
 from harness.effects.table import EFFECTS
 from harness.load import parameters_model
 from harness.mesh.table import MESHES
@@ -18,7 +20,7 @@ from solvers.registry import SOLVERS, load
 
 
 def schema() -> dict[str, Any]:
-    """The schema of a config, which is a scene or a sweep; it names every mesh, effect and solver."""
+    """The schema of a config: a scene, a sweep or an accuracy config; it names every mesh, effect and solver."""
     mesh = _one_of({kind: load(target) for kind, target in MESHES.items()}, "kind")
     effect = _one_of({kind: load(target) for kind, target in EFFECTS.items()}, "kind")
     solver = _one_of({name: parameters_model(name, load(target)) for name, target in SOLVERS.items()}, "name")
@@ -32,19 +34,17 @@ def schema() -> dict[str, Any]:
             Field(default=[], description=SceneFile.model_fields["effects"].description),
         ),
     )
-    sweep = create_model(
-        "Sweep",
-        __base__=SweepFields,
-        solvers=(
-            list[names | solver],  # pyright: ignore[reportInvalidTypeForm]
-            Field(description=SweepFields.model_fields["solvers"].description),
-        ),
-    )
-    _, document = models_json_schema([(scene, "validation"), (sweep, "validation")])
+    listed: Any = list[names | solver]  # pyright: ignore[reportInvalidTypeForm]
+    others = [
+        create_model(name, __base__=base, solvers=(listed, Field(description=base.model_fields["solvers"].description)))
+        for name, base in (("Sweep", SweepFields), ("Accuracy", AccuracyFields))
+    ]
+    models = (scene, *others)
+    _, document = models_json_schema([(model, "validation") for model in models])
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "springbench config",
-        "oneOf": [{"$ref": "#/$defs/Scene"}, {"$ref": "#/$defs/Sweep"}],
+        "oneOf": [{"$ref": f"#/$defs/{model.__name__}"} for model in models],
         **document,
     }
 

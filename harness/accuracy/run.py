@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -109,17 +110,18 @@ class _Run:
         except InputError:
             raise
         except Exception as error:  # no solver can be graded here; the other steps go on
+            why = [lost(error) | {"kind": "curve"}]
             for unit in group:
                 if not self.done(unit):
-                    self._write(unit, [lost(error) | {"kind": "curve"}])
+                    self._do(unit, str(first.moment), 1, lambda tick: why)
             return
         digest = graded.frozen.digest
         if self._moments.setdefault(digest, graded.moment) != graded.moment:
             return  # two moments of a scene may be one: its curves are there
         for unit in group:
             if not self.done(unit, digest):
-                self._display.run(f"{unit.case.title} {graded.moment} {unit.solver.name}", len(unit.first_guesses), 1)
-                self._write(unit, curve_rows(unit, graded, self._folder, lambda: self._display.tick("curves")))
+                measured = partial(curve_rows, unit, graded, self._folder)
+                self._do(unit, graded.moment, len(unit.first_guesses), measured)
         path = self._folder / "accuracy" / f"{first.problem_label()}.parquet"
         rows.write(path, [{"sweep": self._name, "unit": digest} | row for row in graded.rows()], SCHEMA)
 
@@ -131,11 +133,13 @@ class _Run:
         for unit in group:
             if not self.done(unit):
                 step = f"{unit.case.integrator} dt {unit.case.scene.time_step:.3g}"
-                self._display.run(f"{unit.case.title} {step} {unit.solver.name}", unit.how.rounds, 1)
-                self._write(unit, work_rows(unit, trajectory, lambda: self._display.tick("work")))
+                self._do(unit, step, unit.how.rounds, partial(work_rows, unit, trajectory))
 
-    def _write(self, unit: Unit, found: list[Row]) -> None:
+    def _do(self, unit: Unit, what: str, ticks: int, measured: Callable[[Callable[[], None]], list[Row]]) -> None:
+        """Measure a unit, which calls a function so many times on the way, and write its rows."""
         case = unit.case
+        self._display.run(f"{case.title} {what} {unit.solver.name}", ticks, 1)
+        found = measured(lambda: self._display.tick(what))
         shared = {
             "unit": unit.unit_id(self._machine),
             "sweep": self._name,

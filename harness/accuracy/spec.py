@@ -43,8 +43,6 @@ class Study(Model):
     """How time is integrated."""
     time_step: Many[TimeStep | None] = (None,)
     """Time step [s]; null takes the scene's."""
-    first_guess: Many[FirstGuess] = ("current",)
-    """Where a solve starts: `current` positions, `inertial` target."""
     threads: Threads = 1
     """Threads of Numba and of BLAS."""
     rounds: Rounds = 3
@@ -58,7 +56,9 @@ class CurveStudy(Study):
 
     moment: Many[Moment] = ("early", "middle", "violent")
     """Which steps are frozen: moments found from the scene's run, or numbers of frames."""
-    iterations: Iterations = 3000
+    first_guess: Many[FirstGuess] = ("current", "inertial")
+    """Where a solve starts: at the current positions (the assignment), at the inertial target (Liu et al. 2013)."""
+    iterations: Iterations = 2000
     """Iteration limit; a curve ends before it where it has converged."""
     recordings: bool = False
     """Whether each solve is recorded, to scrub through its iterates beside the mesh."""
@@ -69,6 +69,8 @@ class WorkStudy(Study):
 
     horizon: Annotated[float, Field(gt=0, le=1e4)] = 1.0
     """Simulated time [s]; a multiple of every time step."""
+    first_guess: Many[FirstGuess] = ("current",)
+    """Where a step's iteration starts."""
     iterations: Many[Iterations] = (50,)
     """Iteration limits of a step."""
     tolerance: Many[Tolerance] = (None,)

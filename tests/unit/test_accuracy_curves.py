@@ -1,0 +1,128 @@
+"""Curves: which iterates are graded, by which oracle, what ends them, and what their clock counts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import count, islice, pairwise
+from time import sleep
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.accuracy import curves
+from harness.accuracy.curves import Curve, kept, measure
+from harness.accuracy.oracle import Oracle
+from harness.errors import RunFailed
+from harness.reference.minimiser import polish
+from harness.trace import EnergyNorm
+from solvers.local_global import SparseLocalGlobal
+from solvers.newton import Newton
+from solvers.problem import Positions, StepProblem
+from tests.scenes import cloth, first_problem
+
+PROBLEM = first_problem(cloth(6, "exact"))
+MINIMUM = polish(PROBLEM, PROBLEM.current, Newton()).positions
+LOWEST = PROBLEM.value(MINIMUM)
+
+
+def test_each_early_iterate_is_graded_and_then_twelve_a_decade() -> None:
+    graded = [number for number in range(100_001) if kept(number)]
+    assert graded[:51] == list(range(51))
+    for decade in (100, 1000, 10_000):
+        assert sum(decade <= number < 10 * decade for number in graded) == 12
+        assert {decade, 2 * decade, 5 * decade} <= set(graded)
+
+
+def test_stationarity_is_the_step_of_local_global_relative_to_that_at_the_current_positions() -> None:
+    oracle, norm = Oracle(PROBLEM), EnergyNorm(PROBLEM.system)
+    prepared = SparseLocalGlobal().prepare(PROBLEM.system)
+    points = [PROBLEM.current, *(p.copy() for p in islice(prepared.iterates(PROBLEM), 4))]
+    steps = [norm(after - before) for before, after in pairwise(points)]
+    for p, step in zip(points, steps, strict=False):
+        # Two factorisations of one matrix solve it, each to round-off in a condition number of 1e3.
+        assert oracle.stationarity(p) == pytest.approx(step / steps[0], rel=1e-9)
+    assert oracle.stationarity(MINIMUM) < 1e-12  # round-off of a gradient beside 1 at the start
+
+
+def test_distances_leave_out_what_is_pinned() -> None:
+    moved = PROBLEM.current.copy()
+    moved[PROBLEM.system.pins.vertices] += 5.0
+    free = PROBLEM.system.free
+    moved[free[0], 1] += 0.3
+    largest, rms = Oracle(PROBLEM).distances(moved, PROBLEM.current)
+    assert (largest, rms) == pytest.approx((0.3, 0.3 / len(free) ** 0.5), rel=1e-12)  # round-off of a difference
+
+
+class Scripted:
+    """Prepared: a given sequence of iterates."""
+
+    def __init__(self, iterate: Callable[[int], Positions], pause: float = 0.0) -> None:
+        self.iterate, self.pause = iterate, pause
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        for number in count(1):
+            sleep(self.pause)
+            yield self.iterate(number)
+
+
+def towards(share: Callable[[int], float]) -> Callable[[int], Positions]:
+    """Iterates on the line from the minimum (share 0) to the current positions (1) and beyond."""
+    return lambda number: MINIMUM + share(number) * (PROBLEM.current - MINIMUM)
+
+
+def curve(prepared: Any, **more: Any) -> Curve:
+    limits: dict[str, Any] = {"iterations": 200, "time_limit": 60.0, "rounds": 2} | more
+    return measure(prepared, PROBLEM, Oracle(PROBLEM), LOWEST, **limits)
+
+
+ENDS = {
+    "it converges": (towards(lambda n: 0.5**n), "ok", ""),
+    "it converges too slowly": (towards(lambda n: 1 / (1 + n)), "ok", "limit of iterations"),
+    "it stands still far off": (towards(lambda n: max(0.5**n, 0.01)), "no-progress", "do not change"),
+    "it goes to and fro": (towards(lambda n: 0.5 + 0.1 * (n % 2)), "no-progress", "limit of iterations"),
+    "it explodes": (towards(lambda n: 10.0**n), "diverged", "exploded"),
+    "it is not a number": (towards(lambda n: np.nan if n == 3 else 0.5 / n), "diverged", "after 3 iterations"),
+}
+
+
+@pytest.mark.parametrize(("iterate", "status", "reason"), ENDS.values(), ids=ENDS)
+def test_a_curve_says_how_it_ended(iterate: Callable[[int], Positions], status: str, reason: str) -> None:
+    found = curve(Scripted(iterate))
+    assert found.status == status
+    assert reason in found.reason
+    assert found.numbers[0] == 0
+    assert len(found.numbers) == len(found.g) == len(found.stationarity) == len(found.positions) == len(found.seconds)
+
+
+def test_a_curve_ends_at_its_time_limit_without_the_iterates_that_compile() -> None:
+    found = curve(Scripted(towards(lambda n: 1 / (1 + n)), pause=0.02), time_limit=0.05, rounds=1)
+    assert found.status == "time-limit"
+    # Sleeping takes at least as long as asked: three iterates after the warm-up are over the limit, perhaps fewer.
+    assert curves.WARM_UP < found.numbers[-1] <= curves.WARM_UP + 3
+    assert found.seconds[-1, 0] >= 0.02 * found.numbers[-1]
+
+
+def test_grades_are_the_oracles_and_stamps_ascend_in_each_round() -> None:
+    prepared = SparseLocalGlobal().prepare(PROBLEM.system)
+    found = curve(prepared, iterations=120, rounds=3)
+    assert found.numbers == [number for number in range(121) if kept(number)]
+    for number, p, g in zip(found.numbers[1:], found.positions[1:], found.g[1:], strict=True):
+        expected = next(islice(prepared.iterates(PROBLEM), number - 1, None))
+        assert np.array_equal(p, expected)
+        assert g == PROBLEM.value(expected)
+    assert found.seconds.shape == (len(found.numbers), 3)
+    assert (found.seconds[0] == 0.0).all()
+    assert (np.diff(found.seconds, axis=0) > 0.0).all()
+
+
+def test_passes_that_differ_in_the_last_bit_are_a_failure() -> None:
+    calls = count()
+
+    def iterate(number: int) -> Positions:
+        p = towards(lambda n: 0.5**n)(number)
+        p[-1, 1] = np.nextafter(p[-1, 1], np.inf) if next(calls) > 40 else p[-1, 1]
+        return p
+
+    with pytest.raises(RunFailed, match="other positions"):
+        curve(Scripted(iterate))

@@ -1,0 +1,151 @@
+"""Accuracy configs become units of work: the studies' grids, what names a unit, and mistakes with their places."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from harness.accuracy.load import Accuracy, load_accuracy
+from harness.errors import InputError
+from harness.load import load_any
+from harness.scene import build
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+SHIPPED = [path for path in sorted(CONFIGS.glob("*.yaml")) if "\ncurves:" in path.read_text()]
+
+CLOTH = """
+mesh: {kind: grid}
+mass: 1
+time_step: 1/30
+frames: 5
+effects: [{kind: springs, stretch: 100}, {kind: pins, at: [top]}]
+"""
+CONFIG = """
+scenes: [cloth.yaml, other.yaml]
+solvers: [numba, {name: newton}, xpbd]
+curves:
+  - {scene: cloth, size: 4, moment: [early, 3], rounds: 7}
+work:
+  - {scene: other, size: [4, 5], solver: xpbd, horizon: 0.5, time_step: [1/30, 1/60], tolerance: [null, 0.1]}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("cloth.yaml", "other.yaml"):
+        (tmp_path / name).write_text(CLOTH)
+    return tmp_path
+
+
+def loaded(folder: Path, text: str) -> Accuracy:
+    (folder / "config.yaml").write_text(text)
+    return load_accuracy(folder / "config.yaml")
+
+
+def test_a_study_of_curves_asks_for_each_moment_and_solver_that_minimises(folder: Path) -> None:
+    units = loaded(folder, CONFIG).curves
+    assert [(u.moment, u.solver.name) for u in units] == [
+        ("early", "numba"),
+        ("early", "newton"),
+        (3, "numba"),
+        (3, "newton"),
+    ]
+    assert {(u.case.scene_name, u.case.size, u.first_guesses, u.how.rounds) for u in units} == {
+        ("cloth", 4, ("current", "inertial"), 7)
+    }
+
+
+def test_a_study_of_work_asks_for_all_combinations(folder: Path) -> None:
+    units = loaded(folder, CONFIG).work
+    found = {(u.case.scene_name, u.case.size, u.case.scene.time_step, u.tolerance, u.solver.name) for u in units}
+    assert found == {
+        ("other", size, dt, tolerance, "xpbd")
+        for size in (4, 5)
+        for dt in (1 / 30, 1 / 60)
+        for tolerance in (None, 0.1)
+    }
+    assert len(units) == len(found)
+
+
+def test_what_two_studies_ask_for_is_measured_as_the_first_says(folder: Path) -> None:
+    twice = CONFIG.replace("work:", "  - {scene: cloth, size: 4, moment: early, solver: newton, rounds: 2}\nwork:")
+    once, both = loaded(folder, CONFIG), loaded(folder, twice)
+    assert [(u.label(), u.how) for u in both.curves] == [(u.label(), u.how) for u in once.curves]
+
+
+def test_a_unit_keeps_its_file_and_changes_its_id_where_it_is_measured_otherwise(folder: Path) -> None:
+    accuracy = loaded(folder, CONFIG)
+    for unit in (accuracy.curves[0], accuracy.work[0]):
+        other = replace(unit, how=replace(unit.how, rounds=9))
+        assert other.label() == unit.label()
+        assert len({unit.unit_id("here"), other.unit_id("here"), unit.unit_id("there")}) == 3
+
+
+def test_a_changed_scene_is_another_point(folder: Path) -> None:
+    before = {unit.label() for unit in loaded(folder, CONFIG).curves}
+    (folder / "cloth.yaml").write_text(CLOTH.replace("stretch: 100", "stretch: 101"))
+    assert not before & {unit.label() for unit in loaded(folder, CONFIG).curves}
+
+
+MISTAKES = [
+    ("moment: [early", "momnt: [early", 5, "did you mean 'moment'"),
+    ("scene: cloth", "scene: clod", 5, "did you mean 'cloth'"),
+    ("solver: xpbd", "solver: xpdb", 7, "did you mean 'xpbd'"),
+    ("early, 3", "erly, 3", 5, "'early'"),
+    ("early, 3", "early, 6", 5, "frame 6 is not among the 5 frames of cloth"),
+    ("size: 4,", "", 5, "is missing; the scene cloth needs a mesh size"),
+    ("size: 4,", "size: 9999,", 5, "at most"),
+    ("horizon: 0.5", "horizon: 0.51", 7, "is no multiple of the time step 0.0333333 s"),
+    ("horizon: 0.5", "horizon: 0", 7, "greater than 0"),
+    ("rounds: 7", "time_limit: -1", 5, "greater than 0"),
+    ("cloth.yaml, ", "clod.yaml, ", 2, "there is no file"),
+    ("{name: newton}", "{name: newton, order: 2}", 3, "unknown key"),
+]
+
+
+@pytest.mark.parametrize(("before", "after", "line", "said"), MISTAKES, ids=[after for _, after, *_ in MISTAKES])
+def test_a_mistake_is_told_with_its_line(folder: Path, before: str, after: str, line: int, said: str) -> None:
+    with pytest.raises(InputError) as refused:
+        loaded(folder, CONFIG.replace(before, after))
+    assert any(m.line == line and said in m.problem for m in refused.value.mistakes), refused.value
+
+
+def test_a_sweep_and_an_accuracy_config_are_not_taken_for_each_other(folder: Path) -> None:
+    (folder / "sweep.yaml").write_text("scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [numba]\n")
+    with pytest.raises(InputError, match="neither `curves` nor `work`"):
+        load_accuracy(folder / "sweep.yaml")
+    loaded(folder, CONFIG)
+    with pytest.raises(InputError, match="springbench accuracy"):
+        load_any(folder / "config.yaml")
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_every_shipped_config_asks_for_curves_and_names_its_schema(path: Path) -> None:
+    assert load_accuracy(path).curves
+    assert path.read_text().splitlines()[0] == "# yaml-language-server: $schema=schema.json"
+
+
+PAPER = {("liu2013", 81): 1200, ("liu2013", 41): 600, ("liu2013", 21): 300, ("liu2013", 11): 150} | {
+    (f"liu2013-k{k}", 21): k for k in (600, 1200, 2400)
+}
+"""Stiffness [N/m] by scene and size."""
+
+
+def test_the_paper_is_reproduced_with_its_curtains() -> None:
+    units = load_accuracy(CONFIGS / "liu2013.yaml").curves
+    frames = {key: set() for key in PAPER}
+    for unit in units:
+        if unit.solver.name == "numba":
+            frames[unit.case.scene_name, unit.case.size].add(unit.moment)
+    assert all(found == set(range(1, 51)) for found in frames.values())
+    cases = {(unit.case.scene_name, unit.case.size): unit.case for unit in units}
+    for key, k in PAPER.items():
+        scene = build(cases[key].scene, key[1])
+        # The rule multiplies by a ratio of sizes: round-off of one product.
+        assert abs(scene.springs.stiffness / k - 1).max() < 1e-14
+        assert abs(scene.system.mass.sum() - 1.0) < 1e-12  # kg; round-off of the sum over 6,561 vertices
+        assert cases[key].scene.time_step == 1 / 30
+        if key[1] == 81:
+            assert len(scene.springs.edges) == 32_158
