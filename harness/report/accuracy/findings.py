@@ -14,7 +14,7 @@ from harness.report.accuracy.convergence import GUESSES, remarks
 from harness.report.accuracy.growth import TARGET, growths
 from harness.report.accuracy.paper import FAR, comparisons
 from harness.report.accuracy.profiles import least_ratios
-from harness.report.accuracy.table import Curve, Table
+from harness.report.accuracy.table import Curve, Table, without_short
 from harness.report.accuracy.times import STEPS, TARGETS, crossings, power, races, reach, seconds_to
 
 Chapters = dict[str, list[str]]
@@ -22,11 +22,12 @@ Chapters = dict[str, list[str]]
 
 def findings(table: Table) -> Chapters:
     """Sentences by the title of their chapter; chapters without any are left out."""
+    compared = without_short(table)
     chapters = {
-        "Time to accuracy": list(_times(table)),
-        "Over all steps": list(_profiles(table)),
+        "Time to accuracy": list(_times(compared)),
+        "Over all steps": list(_profiles(compared)),
         "Work and precision": list(_works(table)),
-        "Growth with size": list(_growth(table)),
+        "Growth with size": list(_growth(compared)),
         "Liu et al. 2013": list(_paper(table)),
         "References that are not certified": [f"{p.name}: {p.doubt}" for p in table.problems if p.doubt],
         "Other minima": [f"{c.problem.name}: {words}" for c in table.curves if c.branch for words in remarks([c])],

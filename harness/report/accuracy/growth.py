@@ -27,7 +27,7 @@ from harness.report.accuracy.sheet import (
 )
 from harness.report.accuracy.table import Curve, Table
 from harness.report.accuracy.time_plot import middle
-from harness.report.accuracy.times import power
+from harness.report.accuracy.times import left_out, power
 from harness.report.labels import direct_labels
 
 TARGET = 1e-3
@@ -83,6 +83,7 @@ def draw_growth(table: Table, stem: Path) -> list[Path]:
     guesses = [guess for guess in GUESSES if any(growth.first_guess == guess for growth in found)]
     words = [
         "Median over the steps of a mesh, set-up apart. Powers are fitted to three sizes or more.",
+        *left_out(problem for problem in table.problems if problem.scene in scenes),
         *(
             f"× {g.label} on {g.scene}, {GUESSES[g.first_guess]}, did not get there at {_listed(g.lost)} vertices"
             for g in found

@@ -32,7 +32,7 @@ from harness.report.accuracy.sheet import (
     sheet,
 )
 from harness.report.accuracy.table import Curve, Table, Values
-from harness.report.accuracy.times import TARGETS, askable, contested, power, races, seconds_to
+from harness.report.accuracy.times import TARGETS, askable, contested, left_out, power, races, seconds_to
 from harness.report.page import text
 from harness.report.style import Mark
 
@@ -96,11 +96,9 @@ def draw_profiles(table: Table, stem: Path) -> list[Path]:
     if not any(judged(table, target) for target in TARGETS):
         return []
     marked = looks((curve.label, curve.solver) for curve in table.curves)
-    doubtful = sum(bool(problem.doubt) for problem in table.problems)
     words = ["The step alone, set-up apart. A solver that failed, or was not tried, on a problem never solves it."]
-    if doubtful:
-        words.append(f"{doubtful} of {len(table.problems)} steps are left out: their minimum is not certified.")
-    steps = f"{len(table.problems) - doubtful} steps, first guesses apart"
+    words += left_out(table.problems)
+    steps = f"{sum(not problem.doubt for problem in table.problems)} steps, first guesses apart"
     with sheet(stem, "Performance and data profiles", ["share of the problems solved", steps, *table.machine]) as page:
         width = (RIGHT - LEFT - 50) / len(TARGETS) - 16
         height = (foot(words) - TOP - 170) / 2

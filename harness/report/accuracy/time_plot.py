@@ -28,7 +28,7 @@ from harness.report.accuracy.sheet import (
     sheet,
 )
 from harness.report.accuracy.table import Curve, Problem, Table
-from harness.report.accuracy.times import STEPS, TARGETS, askable, crossings, power, seconds_to
+from harness.report.accuracy.times import STEPS, TARGETS, askable, crossings, left_out, power, seconds_to
 from harness.report.page import count, text
 from harness.report.style import INK, Mark
 
@@ -43,7 +43,8 @@ def draw_times(table: Table, folder: Path) -> list[Path]:
         sure = [curve for curve in table.curves if curve.problem.mesh == mesh and not curve.problem.doubt]
         if sure:
             stem = folder / mesh.replace(" ", "-")
-            _draw(stem, mesh, sure, marked, table.machine)
+            doubtful = left_out(problem for problem in table.problems if problem.mesh == mesh)
+            _draw(stem, mesh, sure, marked, doubtful, table.machine)
             drawn += files(stem)
     return drawn
 
@@ -55,7 +56,14 @@ def middle(curves: Sequence[Curve], target: float, steps: int | None = None) -> 
     return sorted(times)[len(times) // 2] if times else np.nan
 
 
-def _draw(stem: Path, mesh: str, curves: list[Curve], marked: dict[str, Mark], machine: Sequence[str]) -> None:
+def _draw(
+    stem: Path,
+    mesh: str,
+    curves: list[Curve],
+    marked: dict[str, Mark],
+    doubtful: Sequence[str],
+    machine: Sequence[str],
+) -> None:
     problems: list[Problem] = list({curve.problem.digest: curve.problem for curve in curves}.values())
     over = f"median over {len(problems)} steps" if len(problems) > 1 else problems[0].name
     guesses = [guess for guess in GUESSES if any(curve.first_guess == guess for curve in curves)]
@@ -67,7 +75,7 @@ def _draw(stem: Path, mesh: str, curves: list[Curve], marked: dict[str, Mark], m
         }
         for guess in guesses
     }
-    words = _words(curves, guesses)
+    words = [*_words(curves, guesses), *doubtful]
     times = [middle(c, t, n) for group in series.values() for c in group.values() for t in TARGETS for n in _COLUMNS]
     low, high = limits([*times, *(curve.warm for curve in curves)])
     facts = [f"{count(problems[0].vertices)} vertices", over, "gap of the energy", *machine]

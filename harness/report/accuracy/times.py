@@ -71,6 +71,16 @@ def askable(problem: Problem, target: float) -> bool:
     return not problem.doubt and target > problem.round_off
 
 
+def left_out(problems: Iterable[Problem]) -> list[str]:
+    """A sentence about the steps that comparisons leave out, if there are any."""
+    problems = list(problems)
+    doubtful = [problem.name for problem in problems if problem.doubt]
+    if not doubtful:
+        return []
+    which = f": {', '.join(doubtful)}" if len(doubtful) < 4 else ""
+    return [f"{len(doubtful)} of {len(problems)} steps are left out, as their minimum is not certified{which}"]
+
+
 def races(table: Table) -> dict[tuple[str, str], list[Curve]]:
     """The curves that race from the same start: by problem and first guess, in the order of the rows."""
     found: dict[tuple[str, str], list[Curve]] = {}
@@ -91,6 +101,8 @@ def crossings(race: Iterable[Curve]) -> list[str]:
     A solver takes the lead where its upper quartile is below the leader's lower one: less may be chance.
     """
     race = list(race)
+    if len(race) < 2:
+        return []
     sentences: list[str] = []
     leader: Curve | None = None
     for target in _FINE:
