@@ -36,6 +36,6 @@ class Bending(Model):
         shared, count = np.unique(edges, axis=0, return_counts=True)
         if (count > 2).any():
             raise InputError(
-                f"bending: three triangles meet at the edge {shared[count > 2][0].tolist()}; repair the mesh"
+                f"bending: more than two triangles meet at the edge {shared[count > 2][0].tolist()}; repair the mesh"
             )
         return Contribution(energies=(bending.Bending.of(mesh.rest, triangles, self.stiffness),))
