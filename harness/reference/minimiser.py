@@ -1,9 +1,9 @@
 """The minimum that solvers are graded against: Newton's method to round-off, and a certificate.
 
 At a minimum grad g = 0 and the Hessian H is positive definite. Both are checked by the oracle, `solvers.problem`,
-whoever found the positions: Newton steps with a sparse factorisation of H go on for as long as they get shorter, so
-the last one, |H^-1 grad g|, tells how far round-off leaves the minimum; the factor's pivots tell that H is positive
-definite, and inverse iteration (Lanczos) gives its smallest eigenvalue. The energy is not convex: there may be
+whoever found the positions: H has a Cholesky factor, inverse iteration (Lanczos) by it gives the smallest eigenvalue,
+and steps |H^-1 grad g| go on for as long as each is shorter than half of the one before, so that the last one tells
+how far round-off leaves the minimum. The energy is not convex: there may be
 several minima. A basin is what Newton's method with a line search, which only descends, makes it.
 """
 
@@ -16,19 +16,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from harness.errors import RunFailed
 from harness.simulate import FIRST_GUESSES
-from solvers.linear.factors import SparseLU
+from solvers.linear.block import BlockCholesky
 from solvers.matrices import diagonal
-from solvers.problem import NotPositiveDefinite, Positions, Solver, StepProblem, StopRule
+from solvers.problem import Positions, Solver, StepProblem, StopRule
 
 TO_THE_END = StopRule(1000, 1e-14)
 NEAR = 1e-9
 """Of the shape's size: a certified minimum is known to this, and two that lie within a hundred times of it are one."""
-MOST_STEPS = 20
+REFACTORISATIONS = 5
 
 
 class Uncertified(RunFailed):
@@ -103,24 +103,26 @@ def polish(problem: StepProblem, p: Positions, solver: Solver) -> Minimum:
 def certify(problem: StepProblem, p: Positions) -> Minimum:
     """Newton steps from p (n, 3) [m], close to a minimum, to where round-off ends them; then the Hessian's spectrum."""
     p, free = _pinned(problem, p), problem.system.free
-    best, error, spectrum = p, np.inf, None
-    for _ in range(MOST_STEPS):
+    error, smallest = np.inf, np.nan
+    for _ in range(REFACTORISATIONS):
         H = free_hessian(problem, p)
-        try:
-            factor = SparseLU(H)
-        except NotPositiveDefinite:
+        factor = _factorised(H)
+        if factor is None:
+            smallest = np.nan
             break
-        step = np.empty((len(free), 3))
-        factor.solve(problem.gradient(p)[free].ravel(), step.reshape(-1))
-        length = float(np.linalg.norm(step, axis=1).max())
-        if not length < error:
+        smallest, begun, error = _smallest_eigenvalue(H, factor), p.copy(), np.inf
+        while True:
+            step = factor.solve(problem.gradient(p)[free])
+            length = float(np.linalg.norm(step, axis=1).max(initial=0.0))
+            if not length < 0.5 * error:  # round-off, or too far away for this Hessian
+                break
+            error = length
+            p[free] -= step
+        if np.abs(p - begun).max(initial=0.0) <= NEAR * _size(p):
             break
-        best, error, spectrum = p.copy(), length, (H, factor)
-        p[free] -= step
-    best.flags.writeable = False
-    smallest = _smallest_eigenvalue(*spectrum) if spectrum else np.nan
-    certified = error <= NEAR * _size(best) and smallest > 0.0
-    return Minimum(best, problem.value(best), error, smallest, bool(certified))
+    p.flags.writeable = False
+    certified = error <= NEAR * _size(p) and smallest > 0.0
+    return Minimum(p, problem.value(p), error, smallest, bool(certified))
 
 
 def free_hessian(problem: StepProblem, p: Positions) -> csr_array:
@@ -135,11 +137,19 @@ def free_hessian(problem: StepProblem, p: Positions) -> csr_array:
     return csr_array(csr_array(H)[free][:, free])
 
 
-def _smallest_eigenvalue(H: csr_array, factor: SparseLU) -> float:
-    """Of a positive definite matrix [N/m], minus what round-off in its factor may have added."""
+def _factorised(H: csr_array) -> BlockCholesky | None:
+    """The Cholesky factor of a Hessian, None where it is not positive definite."""
+    blocks = bsr_array(H, blocksize=(3, 3))
+    blocks.sort_indices()
+    factor = BlockCholesky(csr_array((np.ones(len(blocks.indices)), blocks.indices, blocks.indptr)))
+    return factor if factor.factorise(np.array(blocks.data, np.float64)) else None
+
+
+def _smallest_eigenvalue(H: csr_array, factor: BlockCholesky) -> float:
+    """Of a positive definite matrix [N/m], less what round-off in its factor may have added."""
     size = len(H.indptr) - 1
     start = np.random.default_rng(0).normal(size=size)  # the same eigenvalue each time
-    settings: Any = {"k": 1, "sigma": 0.0, "OPinv": _Inverse(factor, size), "v0": start, "tol": 1e-6}
+    settings: Any = {"k": 1, "sigma": 0.0, "OPinv": _Inverse(factor, size), "v0": start, "tol": 1e-3}
     found: Any = eigsh(H, return_eigenvectors=False, **settings)
     return float(found[0]) - 4.0 * np.finfo(float).eps * float(abs(H).sum(axis=1).max())
 
@@ -147,14 +157,12 @@ def _smallest_eigenvalue(H: csr_array, factor: SparseLU) -> float:
 class _Inverse(LinearOperator):
     """H^-1 of a factorised H."""
 
-    def __init__(self, factor: SparseLU, size: int) -> None:
+    def __init__(self, factor: BlockCholesky, size: int) -> None:
         super().__init__(np.dtype(np.float64), (size, size))
-        self._factor = factor
+        self._solve = factor.solve
 
     def _matvec(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        out = np.empty(x.size)
-        self._factor.solve(x.ravel(), out)
-        return out
+        return self._solve(x.reshape(-1, 3)).ravel()
 
 
 def _pinned(problem: StepProblem, p: Positions) -> Positions:

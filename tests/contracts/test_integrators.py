@@ -1,0 +1,195 @@
+"""What each time integrator promises at convergence: its order, and what it conserves.
+
+Order and conservation: Hairer and Wanner, Solving Ordinary Differential Equations II, sections IV.12 and V.1; Hairer,
+Lubich and Wanner, Geometric Numerical Integration, sections IV.1 and IV.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.effects.air_drag import AirDrag
+from harness.effects.base import Effect
+from harness.effects.ether_drag import EtherDrag
+from harness.effects.gravity import Gravity
+from harness.effects.pins import Pins
+from harness.effects.springs import Springs
+from harness.mesh.chain import Chain
+from harness.mesh.grid import Grid
+from harness.reference.trajectory import integrate
+from harness.scene import Scene, build
+from harness.simulate import State, prepare, simulate, start
+from harness.spec import MeshSource, SceneSpec
+from solvers.integrators import INTEGRATORS, Motion
+from solvers.newton import Newton
+from solvers.problem import Positions, Solver, StopRule
+from solvers.registry import SOLVERS, load
+
+CONVERGED = StopRule(100, 1e-13)
+ORDER = {"implicit-euler": 1, "bdf2": 2, "midpoint": 2}
+
+integrators = pytest.mark.parametrize("name", INTEGRATORS)
+
+
+def made(
+    name: str,
+    mesh: MeshSource,
+    *effects: Effect,
+    size: int,
+    time_step: float,
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Scene:
+    """A scene of 1 kg by an integrator."""
+    given = {"mesh": mesh, "effects": effects, "velocity": velocity, "time_step": time_step}
+    return build(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), size, name)
+
+
+def run(
+    scene: Scene, steps: int, solver: Solver | None = None, stop: StopRule = CONVERGED, state: State | None = None
+) -> list[Motion]:
+    """The motions at the start and after each step."""
+    state, prepared = state or start(scene), prepare(scene, solver or Newton())
+    path = simulate(scene, prepared, stop, first_guess="inertial", frames=steps, state=state)
+    return [state.now, *(step.state.now for step in path)]
+
+
+HELD = Pins(at=("first",), weight="exact")
+SWUNG = Pins.model_validate(
+    {
+        "at": ["first"],
+        "weight": "exact",
+        "motion": {"keys": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0], "turn": 40.0}]},
+    }
+)
+SOFT = Springs(stretch=20.0)
+
+
+def gusts(p: Positions, v: Positions, t: float) -> Positions:
+    """A force of place, speed and time, on each of a few vertices [N]."""
+    return np.sin(9.0 * t + p[:, :1]) * np.array([0.4, 1.0, -0.8]) - 0.3 * v
+
+
+PROBLEMS: dict[str, tuple[tuple[Effect, ...], tuple, tuple[float, float, float]]] = {
+    "swinging": ((SOFT, Gravity(), HELD), (), (0.5, 1.0, 2.0)),
+    "under a force of time, place and speed": ((SOFT, HELD), (gusts,), (1.0, 0.0, 0.5)),
+    "slowed by ether drag": ((SOFT, Gravity(), EtherDrag(rate=3.0), HELD), (), (0.0, 0.0, 0.0)),
+    "slowed by air": ((SOFT, Gravity(), AirDrag(coefficient=2.0), HELD), (), (1.0, 0.0, 2.0)),
+    "swung by its pin": ((SOFT, Gravity(), SWUNG), (), (0.5, 1.0, 0.0)),
+}  # fmt: skip
+
+
+@integrators
+@pytest.mark.parametrize("problem", PROBLEMS)
+def test_the_error_falls_with_the_methods_order(name, problem):
+    effects, forces, velocity = PROBLEMS[problem]
+    end, errors = 0.3, []
+    for steps in (24, 48, 96):
+        scene = made(name, Chain(), *effects, size=4, time_step=end / steps, velocity=velocity)
+        scene = replace(scene, forces=(*scene.forces, *forces))
+        errors.append(integrate(scene, [end]).error(0, run(scene, steps)[-1].positions))
+    orders = [np.log2(a / b) for a, b in pairwise(errors)]
+    # The next term of the error is smaller by a time step times the fastest frequency or rate of decay, at most 0.2.
+    np.testing.assert_allclose(orders, ORDER[name], rtol=0, atol=0.2)
+
+
+FREE = (Grid(), Springs(stretch=300.0))
+RNG = np.random.default_rng(4)
+
+
+def thrown(scene: Scene, *, spin: float, noise: float = 0.0) -> State:
+    """The rest shape, spinning about the vertical [1/s], with random speeds besides [m/s]."""
+    arm = scene.mesh.rest - scene.mesh.rest.mean(axis=0)
+    velocity = np.cross([0.0, spin, 0.0], arm) + noise * np.random.default_rng(4).normal(size=arm.shape)
+    return State(Motion(scene.mesh.rest, velocity), None, 0)
+
+
+@integrators
+def test_linear_momentum_is_conserved(name):
+    scene = made(name, *FREE, size=5, time_step=1 / 30)
+    momenta = [scene.system.mass @ v for _, v in run(scene, 15, state=thrown(scene, spin=2.0, noise=1.0))]
+    # Converged forces add up to 1e-13 of some tens of newtons, and round-off of positions over dt to 1e-14.
+    np.testing.assert_allclose(momenta, np.tile(momenta[0], (16, 1)), rtol=0, atol=1e-12)
+
+
+def euler_law(m: np.ndarray, path: list[Motion], dt: float) -> np.ndarray:
+    """L' - L - dt sum m v' x v, zero because springs are central where they pull, at p'."""
+    L = [np.cross(p, m * v).sum(axis=0) for p, v in path]
+    return np.array([b - a - dt * np.cross(m * w, v).sum(axis=0)
+                     for (a, b), ((_, v), (_, w)) in zip(pairwise(L), pairwise(path), strict=True)])  # fmt: skip
+
+
+def bdf2_law(m: np.ndarray, path: list[Motion], dt: float) -> np.ndarray:
+    """sum p'' x m (3 v'' - 4 v' + v)/2, zero for the same reason; the first step is one of implicit Euler."""
+    steps = zip(path, path[1:], path[2:], strict=False)
+    return np.array([np.cross(p, m * (1.5 * w - 2.0 * v + 0.5 * u)).sum(axis=0) for (_, u), (_, v), (p, w) in steps])
+
+
+def midpoint_law(m: np.ndarray, path: list[Motion], dt: float) -> np.ndarray:
+    """L' - L, zero: quadratic invariants are conserved."""
+    return np.diff([np.cross(p, m * v).sum(axis=0) for p, v in path], axis=0)
+
+
+LAWS: dict[str, Callable[[np.ndarray, list[Motion], float], np.ndarray]] = {
+    "implicit-euler": euler_law,
+    "bdf2": bdf2_law,
+    "midpoint": midpoint_law,
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_angular_momentum_obeys_the_methods_law(name):
+    scene = made(name, *FREE, size=5, time_step=1 / 30)
+    path = run(scene, 12, state=thrown(scene, spin=4.0, noise=0.5))
+    # What is left of forces of some tens of newtons, 1e-12 of them, and round-off of positions over dt.
+    np.testing.assert_allclose(LAWS[name](scene.system.mass[:, None], path, 1 / 30), 0.0, rtol=0, atol=2e-11)
+
+
+def quadratic(name: str) -> Scene:
+    """A net of springs without rest length, whose energy is quadratic."""
+    scene = made(name, *FREE, size=4, time_step=1 / 10)
+    springs = replace(scene.springs, rest_length=np.zeros(len(scene.springs.edges)))
+    return replace(scene, system=replace(scene.system, energies=(springs,)))
+
+
+def energies(scene: Scene, path: list[Motion]) -> np.ndarray:
+    """Kinetic and elastic energy [J] at each time."""
+    m = scene.system.mass
+    elastic = (sum(e.value(p) for e in scene.system.energies) for p, _ in path)
+    return np.array([0.5 * m @ np.sum(v**2, axis=1) + e for (_, v), e in zip(path, elastic, strict=True)])
+
+
+def test_midpoint_conserves_a_quadratic_energy():
+    scene = quadratic("midpoint")
+    found = energies(scene, run(scene, 40, state=thrown(scene, spin=2.0, noise=1.0)))
+    np.testing.assert_allclose(found, found[0], rtol=1e-12)  # forty steps of some roundings of sums of tens of terms
+
+
+@pytest.mark.parametrize("name", ["implicit-euler", "bdf2"])
+def test_the_others_damp_a_quadratic_energy(name):
+    scene = quadratic(name)
+    found = energies(scene, run(scene, 40, state=thrown(scene, spin=2.0, noise=1.0)))
+    assert found[-1] < 0.9 * found[0]
+    if name == "implicit-euler":
+        assert all(b <= a * (1.0 + 1e-12) for a, b in pairwise(found))  # as above
+
+
+MINIMISERS = [name for name, target in SOLVERS.items() if load(target).minimises]
+
+
+@integrators
+@pytest.mark.parametrize("solver", MINIMISERS)
+def test_every_minimiser_takes_the_steps_of_every_integrator(name, solver):
+    scene = made(name, Grid(), Springs(stretch=30.0), Gravity(), Pins(at=("top_corners",)), size=4, time_step=1 / 60)
+    stop = StopRule(20_000, 1e-11)
+    by_newton, found = (
+        np.array([p for p, _ in run(scene, 6, one, stop)]) for one in (Newton(), load(SOLVERS[solver])())
+    )
+    # The tolerance leaves 1e-11 of a step's residual, and a method that converges linearly some times more.
+    np.testing.assert_allclose(found, by_newton, rtol=0, atol=1e-9)
+    assert np.abs(by_newton - scene.mesh.rest).max() > 0.01

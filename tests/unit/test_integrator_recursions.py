@@ -1,0 +1,133 @@
+"""Each time integrator against the closed forms of its own recursion: free flight and a linear oscillator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice, pairwise
+
+import numpy as np
+import pytest
+
+from harness.effects.constant_force import ConstantForce
+from harness.effects.pins import Pins
+from harness.effects.springs import Springs
+from harness.mesh.chain import Chain
+from harness.scene import Scene
+from harness.simulate import State, prepare, simulate, start
+from solvers.integrators import INTEGRATORS, Motion
+from solvers.newton import Newton
+from solvers.problem import StopRule
+from tests.scenes import scene
+
+DT, STEPS = 1 / 30, 25
+CONVERGED = StopRule(100, 1e-14)
+
+integrators = pytest.mark.parametrize("name", INTEGRATORS)
+
+
+def by(made: Scene, name: str) -> Scene:
+    """The scene by another integrator."""
+    method = INTEGRATORS[name]
+    return replace(made, integrator=method, system=replace(made.system, factor=method.factor))
+
+
+def motions(made: Scene, state: State | None = None) -> list[Motion]:
+    """The motions at the start and after each step."""
+    state = state or start(made)
+    steps = simulate(made, prepare(made, Newton()), CONVERGED, first_guess="current", frames=STEPS, state=state)
+    return [state.now, *(step.state.now for step in steps)]
+
+
+# What a method's recursion adds to a t^2/2 after n steps, in units of a dt^2/2: implicit Euler takes each velocity from
+# the step's end; BDF2 makes that error in its first step alone, and e_n = (4 e_(n-1) - e_(n-2)) / 3 keeps 3/2 of it.
+LATE = {"implicit-euler": lambda n: n, "bdf2": lambda n: 1.5 * (1.0 - 3.0**-n), "midpoint": lambda n: 0.0 * n}
+
+
+@integrators
+def test_free_flight_follows_the_methods_own_parabola(name):
+    push, mass, velocity = np.array([3.0, -1.0, 0.5]), 2.0, (1.0, 2.0, -0.5)
+    force = ConstantForce.model_validate({"force": tuple(push)})
+    made = by(scene(Chain(), force, size=2, mass=mass, velocity=velocity), name)
+    n = np.arange(STEPS + 1.0)[:, None]
+    a = 2.0 * push / mass  # on each of the two vertices
+    positions = np.array([p[0] for p, _ in motions(made)])
+    wanted = n * DT * np.array(velocity) + 0.5 * a * DT**2 * (n**2 + LATE[name](n))
+    # A few roundings of positions of one metre in each step.
+    np.testing.assert_allclose(positions, made.mesh.rest[0] + wanted, rtol=0, atol=1e-13)
+    speeds = np.array([v[0] for _, v in motions(made)])
+    np.testing.assert_allclose(speeds, np.array(velocity) + n * DT * a, rtol=0, atol=1e-11)  # the same over dt
+
+
+def powers(name: str, z: complex) -> np.ndarray:
+    """w_n / w_0 of w' = i omega w, n = 0, ..., STEPS, where z = i omega dt."""
+    n = np.arange(STEPS + 1)
+    if name == "implicit-euler":
+        return (1.0 - z) ** -n
+    if name == "midpoint":
+        return ((1.0 + z / 2.0) / (1.0 - z / 2.0)) ** n
+    root = np.sqrt(1.0 + 2.0 * z)  # of (3 - 2 z) r^2 - 4 r + 1, from which 1/(1 - z) starts
+    one, two = (2.0 + root) / (3.0 - 2.0 * z), (2.0 - root) / (3.0 - 2.0 * z)
+    share = (1.0 / (1.0 - z) - two) / (one - two)
+    return share * one**n + (1.0 - share) * two**n
+
+
+@integrators
+@pytest.mark.parametrize("stiffness", [5.0, 500.0, 5e4])
+def test_a_mass_on_a_spring_turns_by_the_methods_own_powers(name, stiffness):
+    """Along its axis the spring is linear, and w = v + i omega u turns as w' = i omega w."""
+    speed, omega = 0.3, np.sqrt(stiffness)
+    springs, pins = Springs(rule="fixed", stretch=stiffness), Pins(at=("first",), weight="exact")
+    made = by(scene(Chain(), springs, pins, size=2, mass=2.0, velocity=(speed, 0.0, 0.0)), name)
+    found = motions(made)
+    w = speed * powers(name, 1j * omega * DT)
+    # Round-off of positions of one metre, which the spring makes a speed by its frequency.
+    np.testing.assert_allclose([p[1, 0] - 1.0 for p, _ in found], w.imag / omega, rtol=0, atol=1e-12)
+    np.testing.assert_allclose([v[1, 0] for _, v in found], w.real, rtol=0, atol=1e-12 * (omega + 1.0 / DT))
+
+
+def orbit(name: str, time_step: float) -> np.ndarray:
+    """The angular momenta of a mass that circles a pin on a spring of no rest length, which is linear."""
+    omega = 4.0
+    pins, springs = Pins(at=("first",), weight="exact"), Springs(rule="fixed", stretch=omega**2)
+    made = by(scene(Chain(), springs, pins, size=2, mass=2.0, time_step=time_step, velocity=(0.0, omega, 0.0)), name)
+    linear = replace(made.springs, rest_length=np.zeros(1))
+    made = replace(made, system=replace(made.system, energies=(linear,)))
+    return np.array([np.cross(p[1], v[1])[2] for p, v in motions(made)])
+
+
+@integrators
+def test_a_circular_orbit_keeps_the_angular_momentum_that_the_method_leaves_it(name):
+    """Position and velocity turn by the same powers, so that L_n = |w_n|^2 omega."""
+    # Rounded some tens of times, by some units of the last digit, and divided by dt in the velocity.
+    np.testing.assert_allclose(orbit(name, DT), 4.0 * np.abs(powers(name, 4.0j * DT)) ** 2, rtol=1e-11)
+
+
+@pytest.mark.parametrize(("name", "power"), [("implicit-euler", 2), ("bdf2", 4), ("midpoint", None)])
+def test_an_orbit_decays_by_the_methods_damping(name, power):
+    """|R(i w)| = 1 - w^2/2, 1 - w^4/4 and 1 a step of w = omega dt; BDF2 after its first steps."""
+    lost = [np.log(L[15] / L[-1]) for L in (orbit(name, dt) for dt in (DT, DT / 2, DT / 4))]
+    if power is None:
+        assert np.abs(lost).max() < 1e-12  # round-off
+    else:
+        # The next term is smaller by w^2, at most 0.02; BDF2's other root has decayed to 3^-15.
+        np.testing.assert_allclose([np.log2(a / b) for a, b in pairwise(lost)], power, rtol=0, atol=0.1)
+
+
+def test_bdf2_starts_with_a_step_of_implicit_euler():
+    made = scene(Chain(), Springs(stretch=10.0), size=4, velocity=(0.0, 1.0, 0.0))
+    first, second = (
+        list(islice(simulate(m, prepare(m, Newton()), CONVERGED, first_guess="current", frames=2), 2))
+        for m in (made, by(made, "bdf2"))
+    )
+    np.testing.assert_array_equal(first[0].positions, second[0].positions)
+    assert [step.problem.system.factor for step in second] == [1.0, 2.25]
+
+
+@integrators
+def test_the_unknown_moves_with_the_velocity_of_the_start(name):
+    """rate (target - origin) is the velocity that inertia alone leads to; for a steady flight it is that flight's."""
+    method, v = INTEGRATORS[name], np.array([[1.0, -2.0, 0.5]])
+    now, before = Motion(DT * v, v), Motion(0.0 * v, v)
+    target, origin = method.predict(now, before, DT)
+    np.testing.assert_allclose(target, (1.0 + method.when) * DT * v, rtol=1e-14)
+    np.testing.assert_allclose(method.factor**0.5 / DT * (target - origin), v, rtol=1e-13)
