@@ -78,7 +78,7 @@ class Comparison(NamedTuple):
     def sentence(self) -> str:
         """What differs."""
         return (
-            f"{self.curve}, {self.iterations} iterations: ours {self.ours:.2g} over {self.frames} "
+            f"{self.curve}, after {self.iterations} iteration{'s' if self.iterations > 1 else ''}: ours {self.ours:.2g} over {self.frames} "
             f"frame{'s' if self.frames > 1 else ''}, the paper's {self.theirs:.2g}, ratio {self.ratio:.2g}"
         )
 
