@@ -77,10 +77,10 @@ class Comparison(NamedTuple):
     @property
     def sentence(self) -> str:
         """What differs."""
-        return (
-            f"{self.curve}, after {self.iterations} iteration{'s' if self.iterations > 1 else ''}: ours {self.ours:.2g} over {self.frames} "
-            f"frame{'s' if self.frames > 1 else ''}, the paper's {self.theirs:.2g}, ratio {self.ratio:.2g}"
-        )
+        when = f"after {self.iterations} iteration{'s' if self.iterations > 1 else ''}"
+        over = f"over {self.frames} frame{'s' if self.frames > 1 else ''}"
+        values = f"ours {self.ours:.2g} {over}, the paper's {self.theirs:.2g}, ratio {self.ratio:.2g}"
+        return f"{self.curve}, {when}: {values}"
 
 
 def stiffness(problem: Problem) -> float:
