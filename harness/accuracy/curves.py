@@ -147,7 +147,6 @@ def _timed(prepared: Prepared, problem: StepProblem, count: int, expected: Posit
     """Wall seconds (count + 1,) from the start to the first guess (0), and to each iterate."""
     stamps = np.zeros(count + 1)
     p = problem.first_guess
-    gc.collect()
     gc.disable()  # a collection in the middle would be counted as the solver's
     try:
         began = perf_counter()

@@ -176,15 +176,16 @@ def _curve(unit: CurveUnit, prepared: Prepared, graded: Graded, first_guess: str
         "status": curve.status,
         "reason": curve.reason or None,
     }
-    if not known and curve.status == "ok":
-        shared |= {"status": "uncertified", "reason": graded.reference.reason}
+    reference = graded.reference  # again: this solver may have found a minimum
+    if not reference.minima and curve.status == "ok":
+        shared |= {"status": "uncertified", "reason": reference.reason}
     if reached:
-        shared["branch"] = graded.reference.branch(reached)
+        shared["branch"] = reference.branch(reached)
     elif curve.status == "ok" and curve.stationarity[-1] <= AT_REST:
         shared["reason"] = "ended at a stationary point that is no minimum"
     if unit.recordings:
         shared["recording"] = str(record(unit, graded, first_guess, curve, folder).relative_to(folder))
-    against = reached or next(iter(graded.reference.minima), None)
+    against = reached or next(iter(reference.minima), None)
     return [shared | row for row in _points(curve, graded.oracle, against)]
 
 

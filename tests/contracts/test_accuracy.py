@@ -1,0 +1,254 @@
+"""An accuracy config becomes rows: what they hold, what is done twice (nothing), and what a failure leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from harness import rows
+from harness.accuracy.load import load_accuracy
+from harness.accuracy.rows import SCHEMA
+from harness.accuracy.run import run_accuracy
+from harness.cli import main
+from harness.progress import Display
+from harness.record.reader import read_replay
+from harness.reference import store
+from harness.reference.minimiser import Minimum, Reference
+from solvers.local_global import SparseLocalGlobal
+from solvers.problem import Positions, Prepared, System
+from solvers.registry import SOLVERS
+
+SCENE = """
+mesh: {kind: grid}
+mass: 1.0
+time_step: 1/30
+frames: 8
+effects: [{kind: springs, stretch: 100}, {kind: gravity}, {kind: pins, at: [top_corners]}]
+"""
+CONFIG = """
+scenes: [cloth.yaml]
+solvers: [sparse, newton, symplectic-euler]
+curves:
+  - {size: 4, moment: [early, violent], iterations: 60, rounds: 2, recordings: true}
+work:
+  - {size: 4, horizon: 0.2, integrator: implicit-euler, time_step: [1/30, 1/60], iterations: 20, rounds: 2}
+"""
+UNITS = 2 * 2 + 2 * 3
+TIMES = ("seconds", "cold", "seconds_per_simulated", "started", "commit", "code")
+"""Columns that tell how long something took, and when and by which state of the code it was done."""
+
+
+class Quiet:
+    """A display that shows nothing, and is stopped after some units."""
+
+    def __init__(self, stop_after: int = 10**9) -> None:
+        self.finished_units, self._stop_after = 0, stop_after
+
+    def begin(self, runs: int, work: float) -> None: ...
+
+    def run(self, title: str, ticks: int, work: float) -> None: ...
+
+    def tick(self, phase: str) -> None: ...
+
+    def finished(self, outcome: str) -> None:
+        self.finished_units += 1
+        if self.finished_units == self._stop_after:
+            raise KeyboardInterrupt
+
+    def end(self) -> None: ...
+
+
+class Home:
+    """A config and its results."""
+
+    def __init__(self, folder: Path, config: str = CONFIG) -> None:
+        folder.mkdir(exist_ok=True)
+        (folder / "cloth.yaml").write_text(SCENE)
+        self.config, self.folder = folder / "config.yaml", folder / "results" / "config"
+        self.config.write_text(config)
+
+    def run(self, display: Display | None = None) -> int:
+        """How many units were done."""
+        display = display or Quiet()
+        run_accuracy(load_accuracy(self.config), self.folder, display, lambda line: None)
+        return getattr(display, "finished_units", 0)
+
+    def rows(self, kind: str, **values: Any) -> list[dict[str, Any]]:
+        """The rows of a kind that have these values, file by file."""
+        table = rows.read(sorted((self.folder / "accuracy").glob("*.parquet")), SCHEMA).to_pylist()
+        return [row for row in table if row["kind"] == kind and all(row[key] == v for key, v in values.items())]
+
+    def told(self) -> list[str]:
+        """All rows, less their times; as text, because what is not a number equals nothing."""
+        table = rows.read(sorted((self.folder / "accuracy").glob("*.parquet")), SCHEMA)
+        return list(map(repr, table.drop_columns(list(TIMES)).to_pylist()))
+
+    def written(self) -> dict[str, int]:
+        return {path.name: path.stat().st_mtime_ns for path in self.units()}
+
+    def units(self) -> Iterator[Path]:
+        for path in sorted((self.folder / "accuracy").glob("*.parquet")):
+            if rows.read([path], SCHEMA)["kind"][0].as_py() != "problem":
+                yield path
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
+    made = Home(tmp_path_factory.mktemp("accuracy") / "home")
+    assert made.run() == UNITS
+    return made
+
+
+def test_each_curve_is_of_a_problem_whose_minimum_is_certified(home: Home) -> None:
+    problems = {row["problem"]: row for row in home.rows("problem")}
+    assert {row["moment"] for row in problems.values()} == {"early", "violent"}
+    minima = {(row["problem"], row["minimum"]): row for row in home.rows("minimum")}
+    curves = home.rows("curve")
+    assert {(row["solver"], row["first_guess"]) for row in curves} == {
+        (solver, guess) for solver in ("sparse", "newton") for guess in ("current", "inertial")
+    }
+    for row in curves:
+        minimum = minima[row["problem"], row["minimum"]]
+        assert minimum["certified"]
+        assert minimum["smallest_eigenvalue"] > 0.0
+        assert len(row["seconds"]) == 2
+        assert row["largest_error"] >= row["rms_error"] >= 0.0
+
+
+def test_newton_s_method_reaches_the_minimum_by_energy_and_by_position(home: Home) -> None:
+    lowest = {row["problem"]: row["g"] for row in home.rows("minimum", branch=0)}
+    start = {row["problem"]: row["g0"] for row in home.rows("problem")}
+    length = {row["problem"]: row["mean_rest_length"] for row in home.rows("problem")}
+    for guess in ("current", "inertial"):
+        for problem, g in lowest.items():
+            curve = home.rows("curve", solver="newton", first_guess=guess, problem=problem)
+            first, last = curve[0], curve[-1]
+            assert last["status"] == "ok"
+            assert last["branch"] == 0
+            assert last["g"] - g <= 1e-9 * (start[problem] - g)  # where a curve ends
+            # An energy gap of 1e-9 is an error of its root, 3e-5 of the way that is to go.
+            assert last["largest_error"] < 1e-3 * length[problem]
+            if guess == "current":
+                assert (first["iteration"], first["g"]) == (0, start[problem])
+                assert first["stationarity"] == pytest.approx(1.0, rel=1e-12)  # by its definition, but for round-off
+
+
+def test_a_recording_shows_the_mesh_at_each_graded_iterate(home: Home) -> None:
+    curve = home.rows("curve", solver="sparse", first_guess="current", moment="violent")
+    replay = read_replay(home.folder / curve[0]["recording"])
+    assert replay.frames.tolist() == [row["iteration"] for row in curve]
+    assert np.isfinite(replay.positions).all()
+
+
+def test_methods_that_do_not_minimise_have_work_and_no_curves(home: Home) -> None:
+    assert not home.rows("curve", solver="symplectic-euler")
+    work = home.rows("work")
+    assert {(row["solver"], row["time_step"]) for row in work} == {
+        (solver, dt) for solver in ("sparse", "newton", "symplectic-euler") for dt in (1 / 30, 1 / 60)
+    }
+    assert all(row["status"] == "ok" and row["error"] > 0.0 for row in work)
+
+
+def test_what_is_done_is_not_done_again(home: Home) -> None:
+    before = home.written()
+    assert home.run() == 0
+    assert home.written() == before
+
+
+@pytest.mark.parametrize("after", [1, 4, 7])
+def test_a_config_that_was_stopped_goes_on_where_it_was(home: Home, tmp_path: Path, after: int) -> None:
+    stopped = Home(tmp_path / "home")
+    with pytest.raises(KeyboardInterrupt):
+        stopped.run(Quiet(stop_after=after))
+    there = stopped.written()
+    assert len(there) == after
+    assert stopped.run() == UNITS - after
+    assert there.items() <= stopped.written().items()
+    assert stopped.told() == home.told()
+
+
+def test_what_is_asked_otherwise_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
+    made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "early"))
+    assert made.run() == 2
+    files = set(made.written())
+    made.config.write_text(made.config.read_text().replace("rounds: 2", "rounds: 1"))
+    assert made.run() == 2
+    assert set(made.written()) == files
+    assert {len(row["seconds"]) for row in made.rows("curve")} == {1}
+
+
+def test_moments_that_are_one_step_are_measured_once(tmp_path: Path) -> None:
+    made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "[2, early, middle]"))
+    (tmp_path / "cloth.yaml").write_text(SCENE.replace("frames: 8", "frames: 2"))
+    made.run()
+    assert {row["moment"] for row in made.rows("curve")} == {"frame-2"}
+    assert len(made.rows("problem")) == 1
+
+
+def test_a_minimum_that_is_not_certified_is_told_and_nothing_is_graded_by_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store, "find_minima", lambda problem, solver: Reference((), "it ended on a saddle"))
+    monkeypatch.setattr(store, "polish", lambda problem, p, solver: Minimum(p, 0.0, 1.0, -1.0, certified=False))
+    made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "early"))
+    made.run()
+    (problem,) = made.rows("problem")
+    assert (problem["status"], problem["reason"]) == ("uncertified", "it ended on a saddle")
+    ended = made.rows("curve", solver="sparse")
+    assert {row["status"] for row in ended} == {"uncertified"}
+    assert all(row["largest_error"] is None and row["g"] is not None for row in ended)
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A solver that fails in its first iteration."""
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+
+    def prepare(self, system: System) -> Prepared:
+        prepared: Any = SparseLocalGlobal().prepare(system)
+
+        class Failing:
+            def iterates(self, problem: Any) -> Iterator[Positions]:
+                raise ArithmeticError("it slipped")
+
+            def __getattr__(self, name: str) -> Any:
+                return getattr(prepared, name)
+
+        failing: Any = Failing()
+        return failing
+
+
+def test_a_solver_that_fails_is_a_row_and_the_others_are_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(SOLVERS, "broken", f"{__name__}:Broken")
+    made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[sparse,", "[broken, sparse,"))
+    made.run()
+    for row in made.rows("curve", solver="broken"):
+        assert row["status"] == "failed"
+        assert "ArithmeticError: it slipped" in row["reason"]
+    assert {row["status"] for row in made.rows("curve", solver="newton")} == {"ok"}
+
+
+def commanded(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[int, str]:
+    monkeypatch.setattr("sys.argv", ["springbench", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    told = capsys.readouterr()
+    return int(ended.value.code or 0), told.out + told.err
+
+
+def test_the_command_measures_and_draws(
+    home: Home, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, told = commanded(capsys, monkeypatch, "accuracy", str(home.config), "--results", str(home.folder.parent))
+    assert code == 0, told
+    assert f"{UNITS} of {UNITS} units are there already" in told
+    assert (home.folder / "report" / "report.html").is_file()

@@ -1,0 +1,112 @@
+"""Work: errors against the reference trajectory, wall times, and what a simulation that fails leaves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.accuracy.run import trajectory_of
+from harness.accuracy.spec import Case, How, WorkUnit
+from harness.accuracy.work import work_rows
+from harness.effects.gravity import Gravity
+from harness.effects.pins import Pins
+from harness.effects.springs import Springs
+from harness.mesh.chain import Chain
+from harness.reference.frozen import bind
+from harness.reference.store import Store
+from harness.reference.trajectory import Trajectory, Unpredictable
+from harness.simulate import prepare, simulate
+from harness.spec import SceneSpec, SolverSpec
+from solvers.local_global import SparseLocalGlobal
+from solvers.problem import StopRule
+
+CHAIN = SceneSpec(
+    mesh=Chain(length=2.0),
+    mass=1.0,
+    time_step=1 / 30,
+    frames=1,
+    effects=(Springs(stretch=500.0), Gravity(), Pins.model_validate({"at": ["ends"]})),
+    path=Path("chain.yaml"),
+)
+HORIZON = 0.2
+UNIT = WorkUnit(
+    Case("chain", CHAIN, 5, "implicit-euler"),
+    HORIZON,
+    SolverSpec("sparse", {}),
+    "current",
+    iterations=20,
+    tolerance=None,
+    how=How(threads=1, rounds=2, time_limit=60.0),
+)
+
+
+@pytest.fixture(scope="module")
+def trajectory(tmp_path_factory: pytest.TempPathFactory) -> Trajectory:
+    found = trajectory_of(UNIT, Store(tmp_path_factory.mktemp("references")))
+    assert isinstance(found, Trajectory)
+    return found
+
+
+def row(unit: WorkUnit, trajectory: Trajectory | Exception) -> dict[str, Any]:
+    (found,) = work_rows(unit, trajectory, lambda: None)
+    return found
+
+
+def test_the_error_is_that_of_the_last_positions(trajectory: Trajectory) -> None:
+    found = row(UNIT, trajectory)
+    scene = bind(CHAIN, 5)
+    run = simulate(scene, prepare(scene, SparseLocalGlobal()), StopRule(20), first_guess="current", frames=6)
+    p = [step.positions.copy() for step in run][-1]
+    away, moved = p - trajectory.positions[-1], trajectory.positions[-1] - scene.mesh.rest
+    # The pinned vertices are in place in all three; what is left is round-off of sums.
+    assert found["error"] == pytest.approx(np.linalg.norm(away) / np.linalg.norm(moved), rel=1e-12)
+    assert found["error_rms_m"] == pytest.approx(np.linalg.norm(away) / 3**0.5, rel=1e-12)
+    assert found["iterations_done"] == 6 * 20
+
+
+def test_a_smaller_step_and_a_better_integrator_err_less(trajectory: Trajectory) -> None:
+    smaller = replace(UNIT, case=replace(UNIT.case, scene=CHAIN.stepped(1 / 120)))
+    better = replace(UNIT, case=replace(UNIT.case, integrator="midpoint"))
+    error = row(UNIT, trajectory)["error"]
+    # First order: a quarter of the step leaves about a quarter; second order is better still at this step.
+    assert row(smaller, trajectory)["error"] < 0.4 * error
+    assert row(better, trajectory)["error"] < 0.4 * error
+
+
+def test_each_round_has_a_time_and_their_median_is_the_cost(trajectory: Trajectory) -> None:
+    found = row(replace(UNIT, how=replace(UNIT.how, rounds=3)), trajectory)
+    assert len(found["seconds"]) == 3
+    assert all(seconds > 0.0 for seconds in found["seconds"])
+    assert found["seconds_per_simulated"] == np.median(found["seconds"]) / HORIZON
+
+
+LOST = [
+    ({"how": replace(UNIT.how, time_limit=1e-9)}, "time-limit", "was reached in frame"),
+    ({"solver": SolverSpec("symplectic-euler", {}), "case": replace(UNIT.case, integrator="bdf2")}, "unsupported", ""),
+]
+
+
+@pytest.mark.parametrize(("change", "status", "reason"), LOST, ids=[status for _, status, _ in LOST])
+def test_what_goes_wrong_is_a_status_with_a_reason(
+    trajectory: Trajectory, change: dict[str, Any], status: str, reason: str
+) -> None:
+    found = row(replace(UNIT, **change), trajectory)
+    assert (found["status"], "error" in found) == (status, False)
+    assert found["reason"]
+    assert reason in found["reason"]
+
+
+def test_an_error_below_the_reference_s_own_is_no_error(trajectory: Trajectory) -> None:
+    doubtful = replace(trajectory, growth=np.array([10.0]))
+    found = row(UNIT, doubtful)
+    assert (found["status"], "error" in found) == ("uncertified", False)
+
+
+def test_without_a_reference_nothing_is_simulated() -> None:
+    found = row(UNIT, Unpredictable("after 9 s a perturbation has grown"))
+    assert (found["status"], found["reason"]) == ("uncertified", "after 9 s a perturbation has grown")
+    assert "seconds" not in found
