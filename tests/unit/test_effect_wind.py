@@ -127,7 +127,8 @@ def test_gusts_vary_by_their_fraction_about_the_mean():
     # The slowest wave has a twentieth of a hertz: 100 of its periods average to a hundredth of its height. The shortest
     # is 12 m long, so that the plate feels all of it in one phase, but for one part in a hundred.
     np.testing.assert_allclose(found.mean(axis=0), [6.0, 0.0, 8.0], rtol=0, atol=0.05)
-    np.testing.assert_allclose(found.std(axis=0), 0.1 * 10.0, rtol=0.03)
+    # Two of the sixteen waves whose frequencies nearly agree beat for as long as this: an eighth of the mean square.
+    np.testing.assert_allclose(found.std(axis=0), 0.1 * 10.0, rtol=0.07)
 
 
 def test_gusts_of_nothing_are_the_constant_wind():
