@@ -5,9 +5,8 @@ moments are graded:
 
     early     a tenth of the run, and the second step at least, before which BDF2 has no history
     middle    half of it
-    violent   the step in which forces turn the motion away most from where inertia leads, the one of the largest
-
-        c/(2 dt^2) |x - target|_M^2        at the step's minimum x
+    violent   the step that has farthest to go: the largest g(current positions) - g(minimum), which is about the
+              kinetic energy while things fly, and more where they are caught
 """
 
 from __future__ import annotations
@@ -72,7 +71,8 @@ def reference_run(
     """Converged steps up to `length`, from a state (the start if it is left out).
 
     Returns the frames wanted, or the moments where none are, and the violence (length,) [J] of all steps, which is
-    their inertia term, nan before the state. Raises RunFailed where a step does not converge.
+    what the objective falls by from the current positions, nan before the state. Raises RunFailed where a step does
+    not converge.
     """
     kept: dict[int, Step] = {}
     violence, keep = np.full(length, np.nan), set(wanted)
@@ -80,7 +80,8 @@ def reference_run(
     for step in run:
         if step.solution.stopped == "iterations" or not np.isfinite(step.positions).all():
             raise RunFailed(f"step {step.index} of the reference run does not converge")
-        violence[step.index - 1] = step.problem.terms(step.solution.positions)["inertia"]
+        stated = step.problem
+        violence[step.index - 1] = stated.value(stated.current) - stated.value(step.solution.positions)
         if not wanted:
             keep = set(moment_frames(violence[: step.index], length).values())
         kept[step.index] = step
@@ -122,9 +123,10 @@ def freeze(step: Step, origin: str) -> tuple[Frozen, Arrays]:
 def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
     """The frozen problem in saved arrays, bound to a scene; None where today's scene states another problem."""
     system = replace(scene.system, factor=float(arrays["factor"]))
-    start = Start(**{name: _value(arrays[f"start_{name}"]) for name in _START})
-    given = {name: _value(arrays[name]) for name in _ARRAYS}
-    problem = StepProblem(system, **given, first_guess=given["current"], start=start)
+    begun: dict[str, Any] = {name: arrays[f"start_{name}"] for name in _START}
+    begun |= {name: float(value) for name, value in begun.items() if not value.ndim}
+    given = {name: arrays[name] for name in _ARRAYS}
+    problem = StepProblem(system, **given, first_guess=given["current"], start=Start(**begun))
     same = (
         system.time_step == arrays["time_step"]
         and np.array_equal(system.mass, arrays["mass"])
@@ -133,12 +135,6 @@ def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
     )
     after = Motion(arrays["after_positions"], arrays["after_velocity"])
     return Frozen(int(arrays["frame"]), problem, after, str(arrays["digest"])) if same else None
-
-
-def _value(array: NDArray[np.float64]) -> Any:
-    """A number as such, an array read-only."""
-    array.flags.writeable = False
-    return array if array.ndim else float(array)
 
 
 def agree(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:

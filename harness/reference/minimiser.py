@@ -25,7 +25,8 @@ from solvers.linear.block import BlockCholesky
 from solvers.matrices import diagonal
 from solvers.problem import Positions, Solver, StepProblem, StopRule
 
-TO_THE_END = StopRule(1000, 1e-14)
+TO_THE_END = StopRule(1000)
+"""Until round-off lets nothing descend any more: a tolerance would stop at saddles too."""
 NEAR = 1e-9
 """Of the shape's size: a certified minimum is known to this, and two that lie within a hundred times of it are one."""
 REFACTORISATIONS = 5
@@ -46,6 +47,13 @@ class Minimum:
     error: float
     smallest_eigenvalue: float
     certified: bool
+
+    @property
+    def flaw(self) -> str:
+        """What is wrong with a minimum that is not certified."""
+        if np.isnan(self.smallest_eigenvalue):
+            return "the Hessian has no Cholesky factor"
+        return f"its next step is still {self.error:.1e} m, the smallest eigenvalue {self.smallest_eigenvalue:.1e} N/m"
 
     @property
     def name(self) -> str:
@@ -89,8 +97,7 @@ def reference(found: Iterable[Minimum]) -> Reference:
     known, reason = Reference(()), ""
     for one in found:
         known = known.joined(one)
-        reason = f"Newton's method ended {one.error:.1e} m from a stationary point, where the Hessian's smallest "
-        reason += f"eigenvalue is {one.smallest_eigenvalue:.1e} N/m"
+        reason = f"no certified minimum: Newton's method ends where {one.flaw}"
     return known if known.minima else Reference((), reason)
 
 

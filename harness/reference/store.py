@@ -142,7 +142,10 @@ def _minima(arrays: Arrays) -> Reference:
 
 def _read(path: Path) -> Arrays:
     with np.load(path, allow_pickle=False) as stored:
-        return dict(stored)
+        arrays = dict(stored)
+    for array in arrays.values():
+        array.flags.writeable = False
+    return arrays
 
 
 def _write(path: Path, arrays: Arrays) -> None:

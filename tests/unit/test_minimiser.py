@@ -1,0 +1,203 @@
+"""Reference minima: certified by the oracle, told apart where there are several, and kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from harness.reference.frozen import Frozen
+from harness.reference.minimiser import Minimum, Reference, Uncertified, certify, find_minima, free_hessian, polish
+from harness.reference.store import Store
+from solvers.energies.springs import Springs
+from solvers.integrators import Motion
+from solvers.newton import Newton
+from solvers.problem import Pins, Positions, Solution, StepProblem, StopRule, System
+from tests.scenes import begun, cloth, first_problem, random_problem
+
+PROBLEMS: dict[str, Callable[[], StepProblem]] = {
+    "cloth": lambda: first_problem(cloth(6, "exact")),
+    "random, compressed and stretched": lambda: random_problem(2, weights=(np.inf, np.inf)),
+    "random, pinned by penalty too": lambda: random_problem(3),
+    "random, not pinned": lambda: random_problem(4, weights=()),
+}
+problems = pytest.mark.parametrize("problem", [make() for make in PROBLEMS.values()], ids=list(PROBLEMS))
+
+
+@dataclass(frozen=True)
+class Stays:
+    """A solver that ends where it begins."""
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+    choice: ClassVar[str] = ""
+    facts: ClassVar[dict[str, float]] = {}
+
+    def prepare(self, system: System) -> Any:
+        return self
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        yield problem.first_guess
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        return Solution(problem.first_guess.copy(), 1, 0.0, 0.0, "tolerance")
+
+    def phases(self, problem: StepProblem) -> dict:
+        return {}
+
+
+def snap_through(weight: float = 0.005, height: float = 0.2) -> StepProblem:
+    """A mass on four struts that are too long for their pins: it is stable above the pins and below them.
+
+    Its weight [N] makes the lower place the better one, for inertia is weak. It starts at a height [m] over the pins.
+    """
+    rest = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, 0.2, 0.0]])
+    springs = Springs.at_rest(rest, np.array([[0, 4], [1, 4], [2, 4], [3, 4]]), np.full(4, 100.0))
+    system = System(np.full(5, 1e-4), 0.1, (springs,), Pins(np.arange(4), np.full(4, np.inf)))
+    force, current = np.zeros((5, 3)), rest.copy()
+    force[4, 1], current[4, 1] = -weight, height
+    return StepProblem(system, current, force, rest[:4], current, current, begun(system, current, current))
+
+
+FLAT = snap_through(weight=0.0, height=0.0)
+"""Between its pins and without weight the mass is in balance, and about to snap."""
+
+
+def frozen(problem: StepProblem) -> Frozen:
+    return Frozen(1, problem, Motion(problem.current, problem.start.velocity), "0123456789ab")
+
+
+def lower(p: Positions) -> Positions:
+    """The mirror image below the pins."""
+    return p * np.array([1.0, -1.0, 1.0])
+
+
+@problems
+def test_the_hessian_is_the_derivative_of_the_gradient(problem):
+    p, free, h = problem.first_guess, problem.system.free, 1e-6
+    H = free_hessian(problem, p).toarray()
+    for column, (vertex, axis) in enumerate((v, a) for v in free for a in range(3)):
+        e = np.zeros_like(p)
+        e[vertex, axis] = h
+        difference = (problem.gradient(p + e) - problem.gradient(p - e))[free].ravel() / (2 * h)
+        # Central differences: h^2 of the third derivative, and round-off of the gradient over h.
+        np.testing.assert_allclose(H[:, column], difference, rtol=0, atol=1e-7 * np.abs(H).max())
+
+
+@problems
+def test_a_minimum_is_certified_by_the_oracle(problem):
+    for found in find_minima(problem, Newton()).minima:
+        assert found.certified
+        assert found.g == problem.value(found.positions)
+        values = np.linalg.eigvalsh(free_hessian(problem, found.positions).toarray())
+        assert values[0] > 0.0
+        assert found.smallest_eigenvalue == pytest.approx(values[0], rel=1e-3)  # as the inverse iteration is told
+        # What round-off leaves of the gradient moves the softest vertex by the error.
+        gradient = np.abs(problem.gradient(found.positions)).max()
+        assert gradient <= 10 * values[-1] * np.finfo(float).eps * np.abs(found.positions).max()
+        assert found.error <= 1e-12
+        assert not found.positions.flags.writeable
+        exact = problem.system.pins.exact
+        held = problem.system.pins.vertices[exact]
+        np.testing.assert_array_equal(found.positions[held], problem.pin_targets[exact])
+
+
+@problems
+def test_no_point_beside_a_minimum_is_lower(problem):
+    rng, best = np.random.default_rng(0), find_minima(problem, Newton()).best
+    for size in (1e-3, 1e-2):
+        for _ in range(20):
+            e = np.zeros_like(best.positions)
+            e[problem.system.free] = size * rng.normal(size=(len(problem.system.free), 3))
+            assert problem.value(best.positions + e) > best.g
+
+
+@problems
+def test_newtons_steps_go_on_to_round_off_from_wherever_a_solver_left_them(problem):
+    best = find_minima(problem, Newton()).best
+    for size in (1e-5, 1e-8):
+        start = best.positions + size * np.random.default_rng(1).normal(size=best.positions.shape)
+        found = certify(problem, start)
+        assert found.certified
+        # Two ends of the same descent; both know the minimum to round-off times the condition of a few thousand.
+        np.testing.assert_allclose(found.positions, best.positions, rtol=0, atol=1e-11)
+
+
+def test_a_saddle_is_not_certified():
+    assert not FLAT.gradient(FLAT.current).any()
+    found = certify(FLAT, FLAT.current)
+    assert not found.certified
+    assert np.isnan(found.smallest_eigenvalue)
+
+
+def test_the_search_for_a_minimum_leaves_a_saddle():
+    found = polish(FLAT, FLAT.current, Newton())
+    assert found.certified
+    assert abs(found.positions[4, 1]) > 0.1
+
+
+def test_a_point_that_is_no_minimum_is_never_a_reference(tmp_path):
+    reference = Store(tmp_path, Stays()).reference(frozen(FLAT))
+    assert reference.minima == ()
+    with pytest.raises(Uncertified, match="no Cholesky factor"):
+        _ = reference.best
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_lower_minimum_replaces_the_reference(tmp_path):
+    problem, store = snap_through(), Store(tmp_path)
+    one = frozen(problem)
+    above = store.reference(one).best
+    assert above.positions[4, 1] > 0.1
+    below = store.classify(one, lower(above.positions))
+    assert below.positions[4, 1] < -0.1
+    assert below.g < above.g
+    again = Store(tmp_path).reference(one)
+    assert [m.g for m in again.minima] == [below.g, above.g]
+    assert [again.branch(m) for m in (below, above)] == [0, 1]
+    assert again.best.name == below.name != above.name
+
+
+def test_a_point_belongs_to_the_minimum_that_newtons_method_finds_from_it(tmp_path):
+    problem, store = snap_through(), Store(tmp_path)
+    one = frozen(problem)
+    above = store.reference(one).best
+    rng, names = np.random.default_rng(0), {}
+    for side, start in (("above", above.positions), ("below", lower(above.positions))):
+        points = [start + 0.02 * rng.normal(size=(5, 3)) for _ in range(4)]
+        names[side] = {store.classify(one, p).name for p in points}
+    assert names["above"] == {above.name}  # one name each, whatever was found in between
+    assert len(names["below"]) == 1
+    assert len(store.reference(one).minima) == 2
+
+
+def test_a_point_that_leads_to_no_minimum_has_no_branch(tmp_path):
+    known = Store(tmp_path).reference(frozen(FLAT))
+    found = Store(tmp_path, Stays()).classify(frozen(FLAT), FLAT.current)
+    assert not found.certified
+    assert len(Store(tmp_path).reference(frozen(FLAT)).minima) == len(known.minima)
+
+
+def test_minima_are_found_once(tmp_path):
+    one = frozen(PROBLEMS["cloth"]())
+    found = Store(tmp_path).reference(one).best
+    again = Store(tmp_path, Stays()).reference(one).best
+    np.testing.assert_array_equal(found.positions, again.positions)
+    fields = ("g", "error", "smallest_eigenvalue", "certified", "name")
+    assert [getattr(found, f) for f in fields] == [getattr(again, f) for f in fields]
+    assert not again.positions.flags.writeable
+
+
+def test_minima_are_known_by_where_they_lie():
+    problem = snap_through()
+    above = find_minima(problem, Newton()).best
+    below = polish(problem, lower(above.positions), Newton())
+    nudged = replace(above, positions=above.positions + 1e-12)
+    known = Reference(()).joined(above).joined(nudged).joined(below)
+    assert [m.g for m in known.minima] == [below.g, above.g]
+    assert known.branch(nudged) == 1
+    uncertified = Minimum(above.positions + 0.5, -1e9, 0.1, float("nan"), False)
+    assert known.joined(uncertified) is known
