@@ -24,6 +24,7 @@ from solvers.kernels.plan import Order, of_inverse, of_supernodal, vectors
 from solvers.linear.choice import Linear, Precision, factorise
 from solvers.linear.inverse import Inverse
 from solvers.linear.supernodal import Supernodal
+from solvers.linear.team import Team
 from solvers.local_global import PreparedLocalGlobal, Project, only_springs, prepared
 from solvers.problem import Positions, Solution, StepProblem, StopRule, System
 
@@ -138,18 +139,23 @@ class PreparedCompiled:
 
     @property
     def choice(self) -> str:
-        """The linear solver in words."""
-        return self.base.choice
+        """The linear solver in words, and how many of the allowed threads a step uses where that is not all."""
+        allowed, used = numba.get_num_threads(), self._threads() or 1
+        if used == allowed:
+            return self.base.choice
+        why = "the system is too small to gain by a second" if used == 1 else f"its factor comes in {used} parts"
+        return f"{self.base.choice}; {used} of {allowed} threads: {why}"
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """The iterates from `problem.first_guess`; the yielded array is overwritten by the next one."""
         (a, b, c, e), y, p = work = self._new()
+        team = Team.of(int(self.plan.top[2]))
         target, force, pins, _, guess = _arrays(problem)
         step_ends.state(self.rows, target, force, pins, y)
         step_ends.start(self.rows, work.vectors, p, guess, pins)
         out = np.empty_like(target)
         while True:
-            step.iterate(self.plan, self.bundles, (a, b, c, e), y, p, 1, np.nan, 0.0, False, self._threads())
+            step.iterate(self.plan, self.bundles, (a, b, c, e), y, p, 1, np.nan, 0.0, False, self._threads(), team)
             a, b = b, a
             step_ends.fetch(self.rows, a if p is None else p, out)
             yield out
@@ -163,10 +169,10 @@ class PreparedCompiled:
         floor = stop.floor * self.base.trace**0.5
         limit, yardstick, every = 0.0, float("nan"), stop.tolerance is not None
         if stop.tolerance is not None:
-            _, yardstick, _, _ = step_ends.solve(*fixed, current, 1, 0.0, 0.0, False, threads, out)
+            _, yardstick, _, _ = step_ends.solve(*fixed, current, 1, 0.0, 0.0, False, threads, self._team, out)
             limit = stop.tolerance * yardstick
         count, residual, enough, at_rest = step_ends.solve(
-            *fixed, guess, stop.iterations, limit, floor, every, threads, out
+            *fixed, guess, stop.iterations, limit, floor, every, threads, self._team, out
         )
         stopped = "iterations" if not every or not (enough or at_rest) else "tolerance" if enough else "floor"
         return Solution(out, count, residual, yardstick, stopped)
@@ -184,6 +190,10 @@ class PreparedCompiled:
         return {"local": local, "global": self.base.phases(problem)["global"]}
 
     @cached_property
+    def _team(self) -> Team:
+        return Team.of(int(self.plan.top[2]))
+
+    @cached_property
     def _work(self) -> _Work:
         return self._new()
 
@@ -196,8 +206,9 @@ class PreparedCompiled:
         return _Work(arrays, kernels.aligned(4 * rows), p)
 
     def _threads(self) -> int | None:
-        threads = numba.get_num_threads()
-        return threads if threads > 1 and self.plan.top[2] > 1 else None
+        """As many as are allowed and as there are groups of subtrees; None for one."""
+        threads = min(numba.get_num_threads(), int(self.plan.top[2]))
+        return threads if threads > 1 else None
 
 
 def _arrays(problem: StepProblem) -> list[Positions]:

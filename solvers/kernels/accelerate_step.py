@@ -17,8 +17,7 @@ from solvers.kernels.accelerate_springs import Shares, descend
 from solvers.kernels.springs import Bundles, squared_norm
 from solvers.kernels.step import Plan
 from solvers.kernels.step_ends import Rows, fetch, place, state
-from solvers.linear.supernodal_solve import _backwards as backwards
-from solvers.linear.supernodal_solve import _forwards as forwards
+from solvers.linear.supernodal_solve import backwards, forwards
 
 NOISE = 64.0 * np.finfo(np.float64).eps
 """The rounding of thousands of terms of one sign, relative to their sum; measured: 10 eps."""

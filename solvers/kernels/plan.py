@@ -38,7 +38,8 @@ class Order(NamedTuple):
 
 def of_supernodal(factor: Supernodal) -> Order:
     """The order for a supernodal factor: each group cut into blocks, the top a block of its own."""
-    squares, panels, places, chunks, spans, by_slot, _, work = factor._arguments
+    squares, panels, at = factor.squares, factor.panels, factor.layout
+    places, chunks, spans = at.places, at.chunks, at.spans
     top, top_end = spans[-1, -2:].tolist()
     subtree, begin = _subtrees(chunks, places, top, squares.itemsize, panels.itemsize)
     blocks: list[tuple[int, int, bool]] = []
@@ -52,8 +53,8 @@ def of_supernodal(factor: Supernodal) -> Order:
     of_group.append(len(blocks))
     slots = np.append(chunks[:, 6], top_end)
     table = [(slots[first], slots[last], first, last, last) for first, last, _ in blocks]
-    slot = np.empty(len(by_slot), np.int64)
-    slot[by_slot[:, 0]] = by_slot[:, 1]
+    slot = np.empty(len(at.by_slot), np.int64)
+    slot[at.by_slot[:, 0]] = at.by_slot[:, 1]
     return Order(
         squares,
         panels,
@@ -64,14 +65,14 @@ def of_supernodal(factor: Supernodal) -> Order:
         np.array([leaf for _, _, leaf in blocks], bool),
         np.array(of_group),
         slot,
-        len(work) // 4,
+        at.rows,
         0,
     )
 
 
 def of_inverse(factor: Inverse) -> Order:
     """The order for a small inverse: panels of its columns that are only gone down, from right-hand sides behind."""
-    inverse = factor._inverse
+    inverse = factor.inverse
     n = len(inverse)
     first = np.arange(0, n, WIDTH)
     quads = np.minimum(WIDTH, n - first) // LANES

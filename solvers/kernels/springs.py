@@ -66,7 +66,7 @@ class Bundles(NamedTuple):
 
         at = np.zeros(len(own), np.int64)
         at[place[vertices]] = degree[vertices]
-        start = np.concatenate([[0], np.cumsum(at.reshape(-1, LANES).max(axis=1, initial=0))])
+        start = np.concatenate([[0], np.cumsum(at.reshape(-1, LANES).max(axis=1, initial=1))])
         here, there = ends.T.ravel(), ends[:, ::-1].T.ravel()
         spring = np.concatenate([keep, ~keep])
         order = np.argsort(place[here], kind="stable")

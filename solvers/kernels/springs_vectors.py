@@ -151,23 +151,41 @@ def _over_chunk(kind: Kind):
                 builder.store(_constant(0.0), accumulator)
             short = cgutils.alloca_once(builder, _MASK)
             builder.store(ir.Constant(_MASK, [0] * LANES), short)
-            with cgutils.for_range_slice(builder, begin, end, _I64(1), _I64) as (entry, _):
+
+            def read(entry):
+                """What an entry's springs need: k r, k, and the vector from their other ends with its square."""
                 first = builder.mul(entry, _I64(LANES))
                 others = v.gather(x, v.places(builder.gep(neighbour, [first])))
                 arrow = [builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
-                squared = v.dot(arrow)
+                weights = [v.load(builder.gep(array, [first]), _WIDE) for array in weighted]
+                return [*weights, v.dot(arrow), *arrow]
+
+            def add(values):
+                """Add an entry's springs to the sums."""
+                *weights, squared = values[: len(weighted) + 1]
+                added = values[len(weighted) + 1 :]
+                scale = weights[0]
                 if kind == "energy":
                     added = [squared]
-                    scale = v.load(builder.gep(stiffness, [first]), _WIDE)
                 else:
-                    added = arrow
                     tiny = builder.fcmp_ordered("<=", squared, _constant(_LEAST))
                     builder.store(builder.or_(builder.load(short), tiny), short)
-                    scale = builder.fmul(v.load(builder.gep(pull, [first]), _WIDE), v.inverse_root(squared))
+                    scale = builder.fmul(scale, v.inverse_root(squared))
                 if kind == "correct":
-                    scale = builder.fsub(scale, v.load(builder.gep(stiffness, [first]), _WIDE))
+                    scale = builder.fsub(scale, weights[1])
                 for term, accumulator in zip(added, sums, strict=False):
                     builder.store(v.multiply_add(scale, term, builder.load(accumulator)), accumulator)
+
+            # One entry is read while the one before is added: a root waits for its springs no longer than they do.
+            weighted = {"project": [pull], "correct": [pull, stiffness], "energy": [stiffness]}[kind]
+            waiting = [cgutils.alloca_once_value(builder, value) for value in read(begin)]
+            second = builder.add(begin, _I64(1))
+            with cgutils.for_range_slice(builder, second, end, _I64(1), _I64) as (entry, _):
+                following = read(entry)
+                add([builder.load(value) for value in waiting])
+                for value, place in zip(following, waiting, strict=True):
+                    builder.store(value, place)
+            add([builder.load(value) for value in waiting])
             total = [builder.load(accumulator) for accumulator in sums]
             weights = [builder.load(builder.gep(held, [place])) for place in places]
             if kind == "energy":

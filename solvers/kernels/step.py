@@ -9,7 +9,8 @@ An iteration turns positions p^k into p^(k+1):
 Vertices of a subtree have springs among themselves and to their ancestors only. So once a pass backwards has left a
 subtree, all that its next local step reads is known: going down a block of subtrees, the next iteration goes up
 the same block while its panels are in the cache, and reads them from memory once. The order of all sums is the same
-with and without that, and whatever the number of threads.
+with and without that, and whatever the number of threads. These are started once a step, not once an iteration: a
+thread that sleeps takes longer to wake than an iteration takes.
 
 A vector has rows of four numbers, `Supernodal`'s slots and behind them the groups' copies of the top, the vertices that
 do not move, and two more for what fills up bundles. With `p` None it holds positions, and its solve gives the
@@ -26,8 +27,8 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, inner_in_parallel, kernel
 from solvers.kernels.springs import add_descent, add_projection, squared_norm
-from solvers.linear.supernodal_solve import _backwards as backwards
-from solvers.linear.supernodal_solve import _forwards as forwards
+from solvers.linear.supernodal_solve import backwards, forwards
+from solvers.linear.team import claim, finish, following, go_on, last, start
 
 
 class Plan(NamedTuple):
@@ -56,6 +57,25 @@ class Plan(NamedTuple):
     shift: int
 
 
+# Over slices: where a loop begins is then known to be no negative index, and it is compiled to vectors.
+@inner
+def _zero(a):
+    for i in range(len(a)):
+        a[i] = 0.0
+
+
+@inner
+def _copy(a, b):
+    for i in range(len(a)):
+        b[i] = a[i]
+
+
+@inner
+def _add(a, b):
+    for i in range(len(a)):
+        b[i] += a[i]
+
+
 @inner
 def _up(plan, bundles, block, x, y, p, out):
     """The local step of a block at x (at p, where that is given), and its pass forwards."""
@@ -73,15 +93,13 @@ def _down(plan, block, x, p):
     slot, slot_end, _, _, chunk, _, chunk_end = plan.blocks[block]
     backwards(plan.squares, plan.panels, plan.places, plan.chunks, chunk, chunk_end, x)
     if p is not None:
-        for k in range(4 * slot, 4 * slot_end):
-            p[k] += x[k]
+        _add(x[4 * slot : 4 * slot_end], p[4 * slot : 4 * slot_end])
 
 
 @inner
 def _clear(plan, block, out):
     begin, end = plan.blocks[block, 0] + plan.shift, plan.blocks[block, 1] + plan.shift
-    for k in range(4 * begin, 4 * end):
-        out[k] = 0.0
+    _zero(out[4 * begin : 4 * end])
 
 
 @inner
@@ -92,11 +110,9 @@ def _group(plan, bundles, group, x, y, p, out, down, up):
     size = 4 * plan.top[1] - top
     copy = top + (group + 1) * size
     if down:
-        for k in range(size):
-            x[copy + k] = x[top + k]
+        _copy(x[top : top + size], x[copy : copy + size])
     if up:
-        for k in range(size):
-            out[copy + k] = 0.0
+        _zero(out[copy : copy + size])
         for block in range(begin, end):
             if not plan.leaf[block]:
                 _clear(plan, block, out)
@@ -117,35 +133,34 @@ def _turn(plan, bundles, x, y, p, out):
     """The top: up at the positions x, and down again."""
     top, top_end, groups = plan.top
     size = 4 * (top_end - top)
-    for k in range(4 * top, 4 * top + size):
-        total = out[k + size]
-        for group in range(1, groups):
-            total += out[k + (group + 1) * size]
-        out[k] = total
+    for group in range(groups):
+        begin = 4 * top_end + group * size
+        if group == 0:
+            _copy(out[begin : begin + size], out[4 * top : 4 * top_end])
+        else:
+            _add(out[begin : begin + size], out[4 * top : 4 * top_end])
     for block in range(plan.of_group[-2], plan.of_group[-1]):
         _up(plan, bundles, block, x, y, p, out)
         _down(plan, block, out, p)
 
 
 @inner
-def _groups(plan, bundles, x, y, p, out, down, up):
-    for group in range(plan.top[2]):
-        _group(plan, bundles, group, x, y, p, out, down, up)
-
-
-@inner_in_parallel
-def _groups_in_parallel(plan, bundles, x, y, p, out, down, up):
-    for group in prange(plan.top[2]):
-        _group(plan, bundles, group, x, y, p, out, down, up)
+def _displace(plan, part, x, before, p, e):
+    """e = p^k - p^(k-1) of the vertices that no pin holds, of a group or the top."""
+    begin, end = plan.of_group[part], plan.of_group[part + 1]
+    if begin < end:
+        for i in range(plan.blocks[begin, 0], plan.blocks[end - 1, 1]):
+            for k in range(4 * i, 4 * i + 3):
+                e[k] = plan.loose[i] * (x[k] - before[k] if p is None else x[k])
 
 
 @inner
-def _residual(plan, bundles, x, before, p, e):
-    """|p^k - p^(k-1)|_Q [J^(1/2)] over the vertices that no pin holds; e: scratch."""
-    for i in range(len(plan.loose)):
-        for k in range(4 * i, 4 * i + 3):
-            e[k] = plan.loose[i] * (x[k] - before[k] if p is None else x[k])
-    return np.sqrt(squared_norm(bundles, 0, len(bundles.start) - 1, e, plan.measure))
+def _squared(plan, bundles, part, e):
+    """|e|_Q^2 [J] of a group or the top: half of each spring's at either end."""
+    begin, end = plan.of_group[part], plan.of_group[part + 1]
+    if begin == end:
+        return 0.0
+    return squared_norm(bundles, plan.blocks[begin, 2], plan.blocks[end - 1, 3], e, plan.measure)
 
 
 @kernel
@@ -159,27 +174,70 @@ def local(plan, bundles, x, y, p, out):
         add_descent(bundles, 0, len(bundles.start) - 1, p, y, plan.held, out, plan.shift)
 
 
+@inner
+def _share(plan, bundles, vectors, y, p, iterations, limit, floor, every, team, first):
+    """A thread's share of the iterations: the groups from `first` on that no other thread does, and what follows them.
+
+    Phase 2 k is iteration k, phase 2 k + 1 measures it where that is wanted.
+    """
+    x0, x1, x2, e = vectors
+    turns = x0, x1, x2
+    groups = plan.top[2]
+    phase = 0
+    while phase >= 0:
+        k, measures = phase // 2, phase % 2 == 1
+        # Positions p^k are in a, or on the way there, and those before in c.
+        a, b, c = turns[k % 3], turns[(k + 1) % 3], turns[(k + 2) % 3]
+        for i in range(groups):
+            group = (first + i) % groups
+            if claim(team, group, phase):
+                if measures:
+                    _displace(plan, group, a, c, p, e)
+                    team.sums[group] = _squared(plan, bundles, group, e)
+                else:
+                    _group(plan, bundles, group, a, y, p, b, k > 0, k < iterations)
+                if last(team):
+                    enough = k == iterations
+                    if measures:
+                        total = _squared(plan, bundles, groups, e)
+                        for value in team.sums:
+                            total += value
+                        team.found[1] = np.sqrt(total)
+                        enough = enough or team.found[1] <= max(limit, floor)
+                    elif k > 0 and (every or (enough and not np.isnan(limit))):
+                        _displace(plan, groups, a, c, p, e)
+                        go_on(team, phase + 1)
+                        continue
+                    if enough:
+                        team.found[0] = k
+                        finish(team)
+                    else:
+                        _turn(plan, bundles, a, y, p, b)
+                        go_on(team, 2 * k + 2)
+        phase = following(team, phase)
+
+
+@inner_in_parallel
+def _side_by_side(plan, bundles, vectors, y, p, iterations, limit, floor, every, team, threads):
+    for thread in prange(threads):
+        _share(plan, bundles, vectors, y, p, iterations, limit, floor, every, team, thread * plan.top[2] // threads)
+
+
 @kernel
-def iterate(plan, bundles, vectors, y, p, iterations, limit, floor, every, threads):
+def iterate(plan, bundles, vectors, y, p, iterations, limit, floor, every, threads, team):
     """Iterate from the positions in the first vector, or from p where that is given, which then takes the positions.
 
     vectors: three that take turns, and one for scratch, of float64; y: the constant right-hand side; every: whether
     the iterations end once a residual is at most `limit` or `floor`; threads: None for one.
-    Returns how many were done, the last one's residual (nan where none was wanted: limit is nan), and the last vector.
+    Returns how many were done, the last one's residual |p^k - p^(k-1)|_Q [J^(1/2)] over the vertices that no pin
+    holds (nan where none was wanted: limit is nan), and the last vector.
     """
-    a, b, c, e = vectors
-    residual = np.nan
-    k = 0
-    while True:
-        # Positions p^k are in a, or on the way there, and those before in c.
-        if threads is None:
-            _groups(plan, bundles, a, y, p, b, k > 0, k < iterations)
-        else:
-            _groups_in_parallel(plan, bundles, a, y, p, b, k > 0, k < iterations)
-        if k > 0 and (every or (k == iterations and not np.isnan(limit))):
-            residual = _residual(plan, bundles, a, c, p, e)
-        if k == iterations or (k > 0 and every and (residual <= limit or residual <= floor)):
-            return k, residual, a
-        _turn(plan, bundles, a, y, p, b)
-        a, b, c = b, c, a
-        k += 1
+    start(team)
+    team.found[1] = np.nan
+    if threads is None:
+        _share(plan, bundles, vectors, y, p, iterations, limit, floor, every, team, 0)
+    else:
+        _side_by_side(plan, bundles, vectors, y, p, iterations, limit, floor, every, team, threads)
+    x0, x1, x2, _ = vectors
+    done = int(team.found[0])
+    return done, team.found[1], (x0, x1, x2)[done % 3]

@@ -86,15 +86,16 @@ def start(rows, vectors, p, positions, pin_targets):
 
 @kernel
 def solve(
-    plan, bundles, rows, vectors, y, p, target, force, pin_targets, guess, iterations, limit, floor, every, threads, out
-):
+    plan, bundles, rows, vectors, y, p, target, force, pin_targets, guess,
+    iterations, limit, floor, every, threads, team, out,
+):  # fmt: skip
     """A whole step; `limit`, `floor` and `every` as in `iterate`, but `floor` for a largest coordinate of one.
 
     Returns the count of iterations, the residual [J^(1/2)], and whether it is at most `limit`, or `floor`.
     """
     state(rows, target, force, pin_targets, y)
     floor *= start(rows, vectors, p, guess, pin_targets)
-    count, residual, x = iterate(plan, bundles, vectors, y, p, iterations, limit, floor, every, threads)
+    count, residual, x = iterate(plan, bundles, vectors, y, p, iterations, limit, floor, every, threads, team)
     if p is None:
         fetch(rows, x, out)
     else:

@@ -25,7 +25,8 @@ class Inverse:
     """The dense inverse of a symmetric positive definite Q; n^2 entries, so for small n.
 
     nonzeros: entries of one triangle; panel_bytes: what a solve reads of the inverse; flops: a solve's additions and
-    multiplications, padding included. `precision` is that of the stored inverse and of the product.
+    multiplications, padding included; inverse: padded with zeros. `precision` is that of the stored inverse and of
+    the product.
     """
 
     def __init__(self, Q: csr_array, *, precision: Literal["float64", "float32"] = "float64") -> None:
@@ -53,11 +54,11 @@ class Inverse:
         self.nonzeros: int | None = n * (n + 1) // 2
         self.panel_bytes = stored.nbytes
         self.flops = 2 * 3 * stored.size
-        self._inverse, self._columns = stored, np.zeros((3, padded), precision)
+        self.inverse, self._columns = stored, np.zeros((3, padded), precision)
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b, shape (n, 3), to `out`; b is left as it is and must not be `out`."""
-        multiply(self._inverse, self._columns, b, out)
+        multiply(self.inverse, self._columns, b, out)
 
 
 # Sums may be reordered, which vectors need; NaN and infinity keep their meaning.

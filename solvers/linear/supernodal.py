@@ -21,12 +21,16 @@ from scipy.sparse import csr_array
 
 from solvers.linear.ordering import nested_dissection
 from solvers.linear.supernodal_factor import factorise, keep_sums
-from solvers.linear.supernodal_solve import solve, solve_in_parallel
+from solvers.linear.supernodal_solve import solve
 from solvers.linear.supernodes import LANES, WIDTH
 from solvers.linear.symbolic import Symbolic, analyse
+from solvers.linear.team import Team
 from solvers.problem import NotPositiveDefinite, Positions
 
 Precision = Literal["float64", "float32", "float16"]
+
+_WORTH_THREADS = 4e6
+"""Bytes of panels from which a single solve gains by waking a second thread (a sheet of 110 vertices a side)."""
 
 
 class Layout(NamedTuple):
@@ -86,7 +90,9 @@ class Layout(NamedTuple):
         for g, (begin, stop) in enumerate(pairwise(base[bounds[:-1]])):
             part = places[begin:stop]
             part[part >= top] += (g + 1) * (end - top)
-        spans = spans[(spans[:, 0] < spans[:, 1]) | (np.arange(len(spans)) == len(spans) - 1)]
+        filled = spans[:-1, 0] < spans[:-1, 1]
+        filled[0] = True  # one group at least, though everything be in the top
+        spans = spans[np.append(filled, True)]
         rows_of_work = int(end + (len(spans) - 1) * (end - top))
         return cls(
             np.stack(columns, axis=1),
@@ -106,7 +112,8 @@ class Supernodal:
 
     nonzeros: entries of L, diagonal included, before supernodes are padded; panel_bytes: of all S and W; flops:
     additions and multiplications a solve, padding included; shares: the part of the entries in each group of
-    subtrees that a thread may do, and last in the top that one does alone. `precision` is that of the panels; the
+    subtrees that a thread may do, and last in the top that one does alone; squares, panels,
+    layout: all S, all W (float16 seen as uint16), and where they lie. `precision` is that of the panels; the
     factorisation is in float64, the solve in float64 for panels in that and in float32 for others. Solves of one
     factor share its work vector: they are done one at a time.
     """
@@ -143,19 +150,17 @@ class Supernodal:
         self.flops = int(2 * 3 * LANES * quads @ (own + 2 * below))
         entries = (own + 2 * below) * quads
         self.shares = [float(entries[a:e].sum() / max(1, entries.sum())) for a, e in layout.spans[:, :2]]
-        self._arguments = (
-            squares,
-            panels,
-            layout.places,
-            layout.chunks,
-            layout.spans,
-            layout.by_slot,
-            layout.by_vertex,
-            work,
-        )
+        self.squares, self.panels, self.layout = squares, panels, layout
+        self._work, self._team = work, Team.of(len(self.shares) - 1)
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b, shape (n, 3), to `out`; b is left as it is and must not be `out`."""
-        groups = len(self.shares) - 1
-        kernel = solve_in_parallel if groups > 1 and numba.get_num_threads() > 1 else solve
-        kernel(*self._arguments, b, out)
+        at = self.layout
+        solve(
+            *(self.squares, self.panels, at.places, at.chunks, at.spans, at.by_slot, at.by_vertex),
+            *(self._work, b, out, self._team, self._threads()),
+        )
+
+    def _threads(self) -> int | None:
+        threads = min(numba.get_num_threads(), len(self.shares) - 1)
+        return threads if threads > 1 and self.panel_bytes >= _WORTH_THREADS else None

@@ -16,12 +16,14 @@ are read one by one: unpacking a row makes an array of it first, which costs 20 
 
 from __future__ import annotations
 
-from numba import njit, prange
+from numba import prange
 
+from solvers.compiling import inner, inner_in_parallel, kernel
 from solvers.linear.supernodal_vectors import add_forward, set_backward
+from solvers.linear.team import claim, finish, following, go_on, last, start
 
 
-@njit(cache=True)
+@inner
 def _load(b, order, begin, end, work):
     """The right-hand sides b (n, 3) to rows of `work`."""
     rows = work.reshape(-1, 4)
@@ -31,7 +33,7 @@ def _load(b, order, begin, end, work):
             rows[k, c] = b[v, c]
 
 
-@njit(cache=True)
+@inner
 def _store(work, order, begin, end, out):
     """The solution in rows of `work` to out (n, 3)."""
     rows = work.reshape(-1, 4)
@@ -41,8 +43,8 @@ def _store(work, order, begin, end, out):
             out[v, c] = rows[k, c]
 
 
-@njit(cache=True)
-def _forwards(panels, index, chunks, begin, end, work):
+@inner
+def forwards(panels, index, chunks, begin, end, work):
     """The pass forwards over the chunks from `begin` to `end`."""
     for k in range(begin, end):
         offset, at, below, quads, first = chunks[k, 1], chunks[k, 2], chunks[k, 4], chunks[k, 5], chunks[k, 6]
@@ -56,8 +58,8 @@ def _forwards(panels, index, chunks, begin, end, work):
             add_forward(panels, offset, index, at, below, work, first, work, 0, 3)
 
 
-@njit(cache=True)
-def _backwards(squares, panels, index, chunks, begin, end, work):
+@inner
+def backwards(squares, panels, index, chunks, begin, end, work):
     """The pass backwards over the chunks from `end` down to `begin`."""
     for k in range(end - 1, begin - 1, -1):
         start, offset, at, own = chunks[k, 0], chunks[k, 1], chunks[k, 2], chunks[k, 3]
@@ -72,7 +74,7 @@ def _backwards(squares, panels, index, chunks, begin, end, work):
             set_backward(squares, start, own, panels, offset, index, at, below, work, first, 3)
 
 
-@njit(cache=True)
+@inner
 def _ascend(panels, index, chunks, spans, by_slot, by_vertex, work, b, group):
     """The pass forwards over a group."""
     chunk, chunk_end, begin, end = spans[group, :4]
@@ -81,10 +83,10 @@ def _ascend(panels, index, chunks, spans, by_slot, by_vertex, work, b, group):
     copy = 4 * (top_end + group * (top_end - top))
     for k in range(4 * (top_end - top)):
         work[copy + k] = 0.0
-    _forwards(panels, index, chunks, chunk, chunk_end, work)
+    forwards(panels, index, chunks, chunk, chunk_end, work)
 
 
-@njit(cache=True)
+@inner
 def _turn(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out):
     """Both passes over the top."""
     chunk, chunk_end, begin, end, top, top_end = spans[-1]
@@ -94,12 +96,12 @@ def _turn(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, ou
         copy = 4 * top_end + group * size
         for k in range(size):
             work[4 * top + k] += work[copy + k]
-    _forwards(panels, index, chunks, chunk, chunk_end, work)
-    _backwards(squares, panels, index, chunks, chunk, chunk_end, work)
+    forwards(panels, index, chunks, chunk, chunk_end, work)
+    backwards(squares, panels, index, chunks, chunk, chunk_end, work)
     _store(work, by_vertex, begin, end, out)
 
 
-@njit(cache=True)
+@inner
 def _descend(squares, panels, index, chunks, spans, by_slot, by_vertex, work, out, group):
     """The pass backwards over a group."""
     chunk, chunk_end, begin, end = spans[group, :4]
@@ -108,25 +110,44 @@ def _descend(squares, panels, index, chunks, spans, by_slot, by_vertex, work, ou
     copy = 4 * top_end + group * size
     for k in range(size):
         work[copy + k] = work[4 * top + k]
-    _backwards(squares, panels, index, chunks, chunk, chunk_end, work)
+    backwards(squares, panels, index, chunks, chunk, chunk_end, work)
     _store(work, by_vertex, begin, end, out)
 
 
-@njit(cache=True)
-def solve(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out):
-    """Q out = b on one thread."""
-    for group in range(len(spans) - 1):
-        _ascend(panels, index, chunks, spans, by_slot, by_vertex, work, b, group)
-    _turn(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out)
-    for group in range(len(spans) - 2, -1, -1):
-        _descend(squares, panels, index, chunks, spans, by_slot, by_vertex, work, out, group)
+@inner
+def _share(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out, team, first):
+    """A thread's share: the groups from `first` on that no other thread does, upwards, and then downwards."""
+    groups = len(spans) - 1
+    phase = 0
+    while phase >= 0:
+        for i in range(groups):
+            group = (first + i) % groups
+            if claim(team, group, phase):
+                if phase == 0:
+                    _ascend(panels, index, chunks, spans, by_slot, by_vertex, work, b, group)
+                else:
+                    _descend(squares, panels, index, chunks, spans, by_slot, by_vertex, work, out, group)
+                if last(team):
+                    if phase == 0:
+                        _turn(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out)
+                        go_on(team, 1)
+                    else:
+                        finish(team)
+        phase = following(team, phase)
 
 
-@njit(cache=True, parallel=True)
-def solve_in_parallel(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out):
-    """Q out = b on Numba's threads."""
-    for group in prange(len(spans) - 1):
-        _ascend(panels, index, chunks, spans, by_slot, by_vertex, work, b, group)
-    _turn(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out)
-    for group in prange(len(spans) - 1):
-        _descend(squares, panels, index, chunks, spans, by_slot, by_vertex, work, out, group)
+@inner_in_parallel
+def _side_by_side(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out, team, threads):
+    for thread in prange(threads):
+        first = thread * (len(spans) - 1) // threads
+        _share(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out, team, first)
+
+
+@kernel
+def solve(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out, team, threads):
+    """Q out = b; threads: None for one."""
+    start(team)
+    if threads is None:
+        _share(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out, team, 0)
+    else:
+        _side_by_side(squares, panels, index, chunks, spans, by_slot, by_vertex, work, b, out, team, threads)

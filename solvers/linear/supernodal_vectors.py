@@ -40,13 +40,40 @@ class _Vectors:
         wide = self.builder.bitcast(pointer, ir.VectorType(self.element, lanes).as_pointer())
         return self.builder.load(wide, align=self.size)
 
-    def entries(self, pointer: Any, kind: types.Array, lanes: int) -> ir.Value:
-        """Entries of a panel of this kind; float16 is widened."""
-        if kind.dtype != types.uint16:
-            return self.load(pointer, lanes)
-        half = ir.VectorType(ir.HalfType(), lanes)
-        short = self.builder.load(self.builder.bitcast(pointer, half.as_pointer()), align=2)
-        return self.builder.fpext(short, ir.VectorType(self.element, lanes))
+    def entries(self, pointer: Any, kind: types.Array, lanes: int, times: int = 1) -> ir.Value:
+        """Entries of a panel of this kind, all of them so many times; float16 is widened."""
+        half = kind.dtype == types.uint16
+        stored = ir.VectorType(ir.HalfType() if half else self.element, lanes)
+        found = self.builder.load(self.builder.bitcast(pointer, stored.as_pointer()), align=2 if half else self.size)
+        if times > 1:
+            found = self.shuffle(found, found, list(range(lanes)) * times)
+        return self.builder.fpext(found, ir.VectorType(self.element, lanes * times)) if half else found
+
+    def interleaved(self, rows: list[Any]) -> Any:
+        """Two or four vectors as one: the first entries of all, then the second ones, ..."""
+        while len(rows) > 1:
+            half = len(rows) // 2
+            lanes = rows[0].type.count
+            mixed = [k + side * lanes for k in range(lanes) for side in range(2)]
+            rows = [self.shuffle(a, b, mixed) for a, b in zip(rows[:half], rows[half:], strict=True)]
+        return rows[0]
+
+    def summed(self, rows: list[Any]) -> list[Any]:
+        """Of two or four vectors of as many neighbours four times, the sums of neighbours: four of each vector."""
+        many, size = len(rows), 1
+        while len(rows) > 1:  # each vector now holds parts of the sums of `size` of them
+            half = many // 2
+            sides = [
+                [4 * many * k + c * many + i + j
+                 for c in range(4) for i in range(begin, begin + half, size) for k in range(2) for j in range(size)]
+                for begin in (0, half)
+            ]  # fmt: skip
+            rows = [
+                self.builder.fadd(*(self.shuffle(a, b, lanes) for lanes in sides))
+                for a, b in zip(rows[::2], rows[1::2], strict=True)
+            ]
+            size *= 2
+        return [self.shuffle(rows[0], rows[0], [c * many + r for c in range(4)]) for r in range(many)]
 
     def prefetch(self, row: ir.Value, kind: Any, quads: int, distance: int) -> None:
         """Ask for the cache lines `distance` bytes on from a row of a panel of this kind."""
@@ -112,38 +139,36 @@ def _add_forward(typingctx, panel, offset, index, at, count, x, x_row, y, y_row,
         index = builder.gep(index, [at])
         x = builder.gep(x, [builder.mul(x_row, _I64(4))])
         y = builder.gep(y, [builder.mul(y_row, _I64(4))])
-        # As many rows of x in a vector as make 512 bits of float32; one of float64.
-        together = 4 if vectors.narrow else 1
-        xs = [vectors.load(builder.gep(x, [_I64(4 * j)]), 4 * together) for j in range(0, 4 * quads, together)]
-        with cgutils.for_range(builder, count) as loop:
-            row = builder.gep(panel, [builder.mul(loop.index, _I64(4 * quads))])
+        # 512 bits are as many columns of W as x has numbers in a row, for each of these numbers.
+        together = 4 if vectors.narrow else 2
+        rows = [vectors.load(builder.gep(x, [_I64(4 * j)]), 4) for j in range(4 * quads)]
+        xs = [vectors.interleaved(rows[j : j + together]) for j in range(0, 4 * quads, together)]
+
+        def product(r):
+            """Row r times x, before the sums over columns that lie side by side."""
+            row = builder.gep(panel, [builder.mul(r, _I64(4 * quads))])
             vectors.prefetch(row, kind, quads, _AHEAD)
-            place = builder.zext(builder.load(builder.gep(index, [loop.index])), _I64)
+            total = None
+            for j, wide in enumerate(xs):
+                w = vectors.entries(builder.gep(row, [_I64(together * j)]), kind, together, 4)
+                total = vectors.multiply_add(w, wide, total)
+            return total
+
+        def add(r, row):
+            place = builder.zext(builder.load(builder.gep(index, [r])), _I64)
             target = builder.gep(y, [builder.mul(place, _I64(4))])
-            sums = []
-            if vectors.narrow:
-                pairs = [
-                    vectors.entries(builder.gep(row, [_I64(4 * q)]), kind, 4 * min(2, quads - q))
-                    for q in range(0, quads, 2)
-                ]
-                for q in range(quads):
-                    w = pairs[q // 2]
-                    spread = vectors.shuffle(w, w, [4 * (q % 2) + j // 4 for j in range(16)])
-                    sums.append(vectors.multiply_add(spread, xs[q], sums.pop() if q >= 2 else None))
-                total = vectors.total(sums)
-                for lanes in (8, 4):
-                    low = vectors.shuffle(total, total, range(lanes))
-                    total = builder.fadd(low, vectors.shuffle(total, total, range(lanes, 2 * lanes)))
-                total = builder.fadd(total, vectors.load(target, 4))
-            else:
-                start = vectors.load(target, 4)
-                for q in range(quads):
-                    acc = start if q == 0 else None
-                    for j in range(4 * q, 4 * q + 4):
-                        acc = vectors.multiply_add(vectors.broadcast(builder.gep(row, [_I64(j)]), 4), xs[j], acc)
-                    sums.append(acc)
-                total = vectors.total(sums)
-            vectors.store(total, target)
+            vectors.store(builder.fadd(row, vectors.load(target, 4)), target)
+
+        whole = builder.udiv(count, _I64(together))
+        with cgutils.for_range(builder, whole) as loop:
+            first = builder.mul(loop.index, _I64(together))
+            places = [builder.add(first, _I64(k)) for k in range(together)]
+            for r, row in zip(places, vectors.summed([product(r) for r in places]), strict=True):
+                add(r, row)
+        done = builder.mul(whole, _I64(together))
+        with cgutils.for_range(builder, builder.sub(count, done)) as loop:
+            r = builder.add(done, loop.index)
+            add(r, vectors.summed([product(r)] * together)[0])
         return context.get_dummy_value()
 
     return signature, generate
@@ -164,7 +189,7 @@ def _set_backward(typingctx, square, start, own, panel, offset, index, at, below
         panel = builder.gep(panel, [offset])
         index = builder.gep(index, [at])
         out = builder.gep(y, [builder.mul(x_row, _I64(4))])
-        group = 8 if vectors.narrow else 4  # entries in 256 bits
+        group = 16 if vectors.narrow else 8  # entries in 512 bits
         groups = [(j, min(group, 4 * quads - j)) for j in range(0, 4 * quads, group)]
         # Enough sums side by side to hide the latency of an addition.
         unroll = max(1, 4 // len(groups))

@@ -160,6 +160,13 @@ def test_the_bits_do_not_depend_on_the_number_of_threads(solver, stop):
     assert (found[0].residual, found[0].iterations) == (found[1].residual, found[1].iterations)
 
 
+def test_a_small_system_keeps_to_one_thread_and_says_so(monkeypatch):
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
+    small, large = (CompiledLocalGlobal().prepare(cloth(size).system).choice for size in (12, 60))
+    assert small.endswith("; 1 of 2 threads: the system is too small to gain by a second")
+    assert "threads" not in large
+
+
 @direct
 @problems
 def test_the_residual_is_measured_over_the_vertices_that_no_pin_holds(solver, name):

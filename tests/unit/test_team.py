@@ -1,0 +1,64 @@
+"""Threads that share tasks: each is done once a phase, phases come one after the other, and nobody is waited for."""
+
+from __future__ import annotations
+
+from threading import Thread
+
+import numpy as np
+import pytest
+
+from solvers.compiling import kernel
+from solvers.linear.team import Team, claim, finish, following, go_on, last, start
+
+begin = kernel(lambda team: start(team))
+
+
+@kernel
+def work(team, first, phases, log, by):
+    """A thread that adds the phase to each task's entry of `log`, and one to its own count `by` of tasks."""
+    tasks = len(team.sums)
+    phase = 0
+    while phase >= 0:
+        for i in range(tasks):
+            task = (first + i) % tasks
+            if claim(team, task, phase):
+                log[task] = 3 * log[task] + phase
+                by[0] += 1
+                if last(team):
+                    # All tasks of this phase are done and none of the next one is begun.
+                    for other in range(tasks):
+                        if log[other] != log[0]:
+                            by[1] += 1
+                    if phase == phases:
+                        finish(team)
+                    else:
+                        go_on(team, phase + 1)
+        phase = following(team, phase)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("tasks", [1, 4])
+def test_each_task_is_done_once_a_phase_and_phases_do_not_mix(threads, tasks):
+    phases = 300
+    team, log, counts = Team.of(tasks), np.zeros(tasks, np.int64), np.zeros((threads, 2), np.int64)
+    begin(team)
+    crew = [Thread(target=work, args=(team, k, phases, log, counts[k])) for k in range(threads)]
+    for thread in crew:
+        thread.start()
+    for thread in crew:
+        thread.join()
+    assert counts[:, 0].sum() == tasks * (phases + 1)
+    assert counts[:, 1].sum() == 0
+    expected = np.int64(0)
+    with np.errstate(over="ignore"):
+        for phase in range(phases + 1):
+            expected = np.int64(3) * expected + np.int64(phase)  # in the order of phases, wrapped as the kernel's
+    np.testing.assert_array_equal(log, expected)
+
+
+def test_one_that_comes_when_all_is_done_does_nothing():
+    team, log, counts = Team.of(3), np.zeros(3, np.int64), np.zeros((2, 2), np.int64)
+    begin(team)
+    for k in range(2):
+        work(team, k, 7, log, counts[k])
+    assert counts.tolist() == [[24, 0], [0, 0]]
