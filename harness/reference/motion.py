@@ -25,7 +25,8 @@ State = NDArray[np.float64]
 """Positions [m] and velocities [m/s] of the free vertices, one after the other, shape (6 f,)."""
 
 TICK = 1e-5
-"""Seconds over which pins that move are seen to move: only what damps notices, and that to ten digits."""
+"""Seconds over which the speed of moving pins is taken, which damping alone notices: good to ten digits, but a corner
+of their path is rounded."""
 
 
 class Unintegrable(RunFailed):

@@ -71,8 +71,7 @@ def integrate(scene: Scene, times: Sequence[float]) -> Trajectory:
     atol = RTOL * size
     path, perturbed = (_dop853(field, y, times, atol) for y in (start, start + nudge))
     other = _adams(field, start, times, atol)
-    moved = _apart(path, start)
-    relative = np.divide(1.0, moved, out=np.full_like(moved, np.inf), where=moved > 0.0)
+    moved, unknown = _apart(path, start), np.full(len(path), np.inf)
     motions = [tuple(part.copy() for part in field.motion(t, y)) for t, y in zip(times, path, strict=True)]
     return Trajectory(
         np.array(times, float),
@@ -80,8 +79,7 @@ def integrate(scene: Scene, times: Sequence[float]) -> Trajectory:
         np.array([p for p, _ in motions]),
         np.array([v for _, v in motions]),
         moved,
-        _apart(path, other) * relative,
-        _apart(path, perturbed) * relative,
+        *(np.divide(_apart(path, q), moved, out=unknown.copy(), where=moved > 0.0) for q in (other, perturbed)),
     )
 
 
