@@ -31,7 +31,7 @@ from tests.scenes import scene
 MOVES = Motion(keys=(Key(time=0.0), Key(time=1.0, offset=(0.1, 0.2, 0.0), turn=90.0)))
 
 BEND = Bending(stiffness=0.5)
-LIMITS = StrainLimits(longest=1.02, shortest=0.98, stiffness=3000.0)
+LIMITS = StrainLimits(longest=1.02, shortest=0.98, stiffness=500.0)
 DASHPOTS = Dashpots(stretch=2.0)
 RAYLEIGH = Rayleigh(mass=0.5, stiffness=0.02)
 DRAG = AirDrag(coefficient=2.0)

@@ -1,0 +1,115 @@
+"""An effect that a scene does not list is not there: not imported, not in Q, not in a single bit of the motion."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.effects.table import EFFECTS
+from harness.load import load_scene
+from harness.scene import build
+from solvers.matrices import assemble
+from tests.effects import BEND, DASHPOTS, DRAG, LIMITS, cloth
+
+ROOT = Path(__file__).resolve().parents[2]
+SCENE = ROOT / "configs" / "scenes" / "hanging-cloth.yaml"
+LISTED = {"springs", "gravity", "ether-drag", "pins"}
+ABSENT = sorted(set(EFFECTS) - LISTED)
+
+ENERGIES = {
+    "bending": ["solvers.energies.bending", "solvers.energies.quadratic"],
+    "strain-limits": ["solvers.energies.strain_limits"],
+    "dashpots": ["solvers.energies.dashpots"],
+    "air-drag": ["solvers.energies.quadratic"],
+    "rayleigh": ["solvers.energies.quadratic", "solvers.energies.dashpots"],
+    "attachments": ["solvers.energies.attachments"],
+    "gas": ["solvers.energies.gas"],
+}
+"""The energies that an effect brings along."""
+
+PROBE = """
+import hashlib, json, sys
+from pathlib import Path
+
+class Hidden:
+    def find_spec(self, name, path=None, target=None):
+        if name in {hidden}:
+            raise ImportError(name + " is hidden")
+
+sys.meta_path.insert(0, Hidden())
+import harness
+if {load}:
+    from harness.effects.table import EFFECTS
+    from solvers.registry import load
+    for target in EFFECTS.values():
+        load(target)
+from harness.load import load_scene
+from harness.scene import build
+from harness.simulate import prepare, simulate
+from solvers.local_global import SparseLocalGlobal
+from solvers.problem import StopRule
+made = build(load_scene(Path({scene!r})), 10)
+steps = simulate(made, prepare(made, SparseLocalGlobal()), StopRule(10), first_guess="current", frames=5)
+digests = [hashlib.sha256(step.positions.tobytes()).hexdigest() for step in steps]
+print(json.dumps({{"modules": sorted(sys.modules), "digests": digests}}))
+"""
+
+
+def probe(*, hidden: list[str] = [], load: bool = False) -> dict:  # noqa: B006
+    """What a fresh process imports and computes, with modules hidden, or with all effects loaded first."""
+    script = PROBE.format(hidden=hidden, load=load, scene=str(SCENE))
+    told = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
+    return json.loads(told.stdout)
+
+
+def modules(effects: list[str]) -> list[str]:
+    own = [EFFECTS[kind].partition(":")[0] for kind in effects]
+    return own + [module for kind in effects for module in ENERGIES.get(kind, [])]
+
+
+@pytest.fixture(scope="module")
+def plain() -> dict:
+    return probe()
+
+
+def test_checking_and_running_a_scene_imports_only_the_effects_that_it_names(plain):
+    assert set(modules(sorted(LISTED))) <= set(plain["modules"])
+    assert not set(modules(ABSENT)) & set(plain["modules"])
+
+
+def test_the_motion_has_the_same_bits_with_the_other_effects_hidden_or_loaded(plain):
+    assert probe(hidden=modules(ABSENT))["digests"] == plain["digests"]
+    loaded = probe(load=True)
+    assert set(modules(ABSENT)) <= set(loaded["modules"])
+    assert loaded["digests"] == plain["digests"]
+
+
+def test_every_energy_module_belongs_to_an_effect():
+    always = {"edges", "springs", "__init__"}
+    files = {path.stem for path in (ROOT / "solvers" / "energies").glob("*.py")} - always
+    owned = {module.rpartition(".")[2] for bound in ENERGIES.values() for module in bound}
+    assert owned == files
+
+
+def test_the_system_matrix_has_no_entry_from_an_absent_effect():
+    bare, dashpots, limits, drag, bend = (
+        assemble(made.system, [*made.system.energies])  # pyright: ignore[reportArgumentType]
+        for made in (cloth(), cloth(DASHPOTS), cloth(LIMITS), cloth(DRAG), cloth(BEND))
+    )
+    # These lie where springs and masses lie, so Q has other numbers and no more of them; bending reaches further.
+    assert bare.nnz == dashpots.nnz == limits.nnz == drag.nnz < bend.nnz
+    made = cloth()
+    springs, n = made.springs, len(made.mesh.rest)
+    assert bare.nnz == n + 2 * len(np.unique(np.sort(springs.edges, axis=1), axis=0))
+
+
+def test_a_scene_has_nothing_but_what_it_lists():
+    made = build(load_scene(SCENE), 6)
+    assert [type(energy).__name__ for energy in made.system.energies] == ["Springs"]
+    assert (made.forces, made.moving, len(made.filters)) == ((), (), 1)
+    assert made.pins_at(3.0) is made.pin_targets

@@ -1,0 +1,82 @@
+"""Every solver that takes an effect finds the same minimum with it; the others refuse it by name."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from harness.simulate import prepare, simulate
+from solvers.local_global import SparseLocalGlobal
+from solvers.problem import Positions, Solver, StepProblem, StopRule, Unsupported
+from solvers.registry import SOLVERS, load
+from tests.effects import SCENES, integrated, stepped
+
+SOLVED: dict[str, Solver] = {
+    name: solver for name, solver in ((name, load(target)()) for name, target in SOLVERS.items()) if solver.minimises
+}
+INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
+TAKE_ALL = {"newton", "newton-cg", "hybrid", "lbfgs"}
+PROJECTIVE = {"sparse", "anderson", "chebyshev"}
+"""Who takes what; those not named take springs only."""
+STOP = StopRule(5000, 1e-11)
+
+
+def takes(solver: str, scene: str) -> bool:
+    return solver in TAKE_ALL or (solver in PROJECTIVE and "gas" not in scene)
+
+
+@cache
+def minimum(scene: str, integrator: str) -> tuple[StepProblem, Positions]:
+    """The problem of a scene's step and its minimum, by Newton's method."""
+    problem = stepped(SCENES[scene](), integrator)
+    return problem, SOLVED["newton"].prepare(problem.system).solve(problem, StopRule(100, 1e-12)).positions
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("solver", SOLVED)
+def test_solvers_agree_at_convergence_or_refuse_by_name(solver, scene):
+    for integrator in INTEGRATORS if "all" in scene else INTEGRATORS[:1]:
+        problem, wanted = minimum(scene, integrator)
+        if not takes(solver, scene):
+            with pytest.raises(Unsupported) as refusal:
+                SOLVED[solver].prepare(problem.system)
+            known = {type(energy).__name__ for energy in problem.energies} - {"Springs"}
+            assert any(name in str(refusal.value) for name in known)
+        else:
+            found = SOLVED[solver].prepare(problem.system).solve(problem, STOP).positions
+            # Local-global converges linearly: its last step, 1e-11 of the first, is up to 1e-3 of what is left to go.
+            np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_minimum_has_no_force_left(scene):
+    problem, p = minimum(scene, "implicit-euler")
+    forces = np.abs(problem.gradient(problem.current)).max()
+    assert np.abs(problem.gradient(p)).max() <= 1e-6 * forces  # the pins of 1e10 N/m and positions of 1e-16: 1e-6 N
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("scene", [name for name in SCENES if "gas" not in name])
+def test_local_global_descends_with_every_projective_energy(scene, integrator):
+    problem = stepped(SCENES[scene](), integrator)
+    values, iterates = (
+        [problem.value(problem.first_guess)],
+        SparseLocalGlobal().prepare(problem.system).iterates(problem),
+    )
+    for _ in range(40):
+        p = next(iterates)
+        assert problem.value(p) <= values[-1] + 1e-13 * problem.magnitude(p)  # sums of some hundred terms
+        values.append(problem.value(p))
+    assert values[-1] < values[0]
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_scene_runs_for_a_while_and_stays_finite(scene, integrator):
+    made = integrated(SCENES[scene](), integrator)
+    solver = SOLVED["lbfgs"]
+    for step in simulate(made, prepare(made, solver), StopRule(30), first_guess="current", frames=15):
+        assert np.isfinite(step.positions).all()
+        assert np.abs(step.positions).max() < 5.0  # sheets and balloons of a metre, and falls of half a second
