@@ -14,7 +14,7 @@ from time import perf_counter
 import numpy as np
 
 from harness.scene import Scene
-from harness.simulate import Step, prepare, simulate
+from harness.simulate import Step, prepare, simulate, start
 from solvers.problem import Positions, Prepared, Solver, StopRule
 
 PHASE_REPEATS = 3
@@ -76,7 +76,7 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
                 timings.append(Timing(phase, step.index, round, perf_counter() - began))
         tick("warm up and phases")
 
-    final = scene.mesh.rest
+    final = start(scene).now.positions
     for round in range(settings.rounds):
         for step in steps(scene, prepared, settings):
             timings.append(Timing("step", step.index, round, step.seconds))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from harness.measure import Settings, digest, steps
 from harness.record.base import Frame, Recorder
 from harness.scene import Scene
-from harness.simulate import Step
+from harness.simulate import Step, start
 from harness.trace import EnergyNorm, trace
 from solvers.problem import Positions, Prepared
 
@@ -62,7 +62,7 @@ def observe(
 
     norm = EnergyNorm(scene.system) if recorder and convergence else None
     if recorder:
-        recorder.frame(Frame(0, 0.0, scene.mesh.rest, {}, float("nan"), 0))
+        recorder.frame(Frame(0, 0.0, start(scene).now.positions, {}, float("nan"), 0))
     with ThreadPoolExecutor(1) as beside:
         looked: Future[None] | None = None
         for step in steps(scene, prepared, settings):

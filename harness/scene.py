@@ -14,21 +14,24 @@ from harness.errors import InputError, Mistake
 from harness.mesh.base import Mesh
 from harness.motion import Motion
 from harness.spec import SceneSpec
+from harness.start import Rest
 from solvers.energies.springs import Springs
 from solvers.integrators import IMPLICIT_EULER, INTEGRATORS, Integrator
-from solvers.problem import Pins, Positions, System
+from solvers.matrices import assemble
+from solvers.problem import NotPositiveDefinite, Pins, Positions, ProjectiveEnergy, System
 
 _LOG = logging.getLogger("springbench")
+AT_REST = Rest()
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
     """What is simulated.
 
-    mesh: at rest, which is also the start; system: what is factorised; load: the sum of the forces that never
-    change, (n, 3) [N], read-only; forces: those that change; filters: of the velocity;
+    mesh: at rest; start: how the start differs from that; system: what is factorised; load: the sum of the forces
+    that never change, (n, 3) [N], read-only; forces: those that change; filters: of the velocity;
     pin_targets: (q, 3) [m], in the order of `system.pins`; moving: which of them move, and how;
-    velocity: of every vertex at the start [m/s]; integrator: its factor is the system's.
+    velocity: of every vertex at the start [m/s], less the start's spin; integrator: its factor is the system's.
     """
 
     mesh: Mesh
@@ -40,6 +43,7 @@ class Scene:
     velocity: tuple[float, float, float]
     integrator: Integrator = IMPLICIT_EULER
     moving: tuple[tuple[NDArray[np.int64], Motion], ...] = ()
+    start: Rest = AT_REST
 
     def pins_at(self, time: float) -> Positions:
         """Where the pins want their vertices at a time [s], (q, 3) [m]."""
@@ -73,9 +77,13 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
         if isinstance(force, Steady):
             load += force.force
     load.flags.writeable = False
+    system = System(mass, spec.time_step, energies, pins, INTEGRATORS[integrator].factor)
+    _require_determined(system)
+    start = spec.start or AT_REST
+    start.positions(mesh.rest)  # refuses what the mesh lacks
     return Scene(
         mesh=mesh,
-        system=System(mass, spec.time_step, energies, pins, INTEGRATORS[integrator].factor),
+        system=system,
         load=load,
         forces=tuple(force for force in forces if not isinstance(force, Steady)),
         filters=tuple(one for part in parts for one in part.filters),
@@ -83,6 +91,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
         velocity=spec.velocity,
         integrator=INTEGRATORS[integrator],
         moving=moving,
+        start=start,
     )
 
 
@@ -102,6 +111,16 @@ def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
     if mesh.mass is None:
         raise InputError(Mistake("is missing; this mesh brings no masses, so give the total [kg]", key="mass"))
     return mesh.mass
+
+
+def _require_determined(system: System) -> None:
+    """Raise InputError where nothing determines the position of a vertex without mass."""
+    if system.mass.all():
+        return
+    try:
+        assemble(system, [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)])
+    except NotPositiveDefinite as error:
+        raise InputError(Mistake(str(error), key="mesh")) from error
 
 
 def _pins(parts: list[Contribution]) -> tuple[Pins, Positions, tuple[tuple[NDArray[np.int64], Motion], ...]]:

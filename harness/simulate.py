@@ -45,9 +45,9 @@ class Step:
 
 
 def start(scene: Scene) -> State:
-    """The rest shape, moving with the scene's velocity."""
-    rest = scene.mesh.rest
-    return State(Motion(rest, np.tile(np.array(scene.velocity), (len(rest), 1))), None, 0)
+    """The scene's start, moving with its velocity and its spin."""
+    p = scene.start.positions(scene.mesh.rest)
+    return State(Motion(p, scene.velocity + scene.start.velocity(p)), None, 0)
 
 
 def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:

@@ -17,6 +17,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, SkipValidation, WithJso
 from harness.effects.base import Effect
 from harness.mesh.base import Mesh
 from harness.model import Many, Model
+from harness.start import AnyStart
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 """Names of scenes and sweeps; they become names of files in the results."""
@@ -75,6 +76,8 @@ class SceneFields(Model):
     """Number of steps to simulate."""
     velocity: tuple[Speed, Speed, Speed] = (0.0, 0.0, 0.0)
     """Velocity of every vertex at the start [m/s]."""
+    start: AnyStart | None = None
+    """How the start differs from the rest shape."""
     default_size: Size | None = None
     """Mesh size where neither a sweep nor the command line gives sizes."""
     camera: Camera | None = None
@@ -128,6 +131,8 @@ class SceneSpec(SceneFields):
         """SHA-256 of all that determines a run of the scene; mesh files count by content, not by name."""
         content = self.model_dump(mode="json", include={"mass", "time_step", "velocity", "camera", "mesh", "effects"})
         content["mesh"] = self.mesh_digest or content["mesh"]
+        if self.start:
+            content["start"] = self.start.model_dump(mode="json")
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

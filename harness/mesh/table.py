@@ -8,5 +8,7 @@ MESHES: dict[str, str] = {
     "balloon": "harness.mesh.surfaces:Balloon",
     "tower": "harness.mesh.solids:Tower",
     "block": "harness.mesh.solids:Block",
+    "star": "harness.mesh.star:Star",
+    "network": "harness.mesh.network:Network",
     "file": "harness.mesh.files:File",
 }
