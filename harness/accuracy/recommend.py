@@ -32,7 +32,7 @@ from solvers.integrators import INTEGRATORS
 REFINEMENTS = (0.5, 1, 2, 4, 8)
 """Steps in the horizon, relative to those of the scene's own time step."""
 
-IMPLICIT, EXPLICIT = ["numba", "lbfgs", "newton", "hybrid"], ["symplectic-euler", "xpbd-small-steps"]
+IMPLICIT, EXPLICIT = ["numba", "lbfgs", "newton"], ["symplectic-euler", "xpbd-small-steps"]
 WAYS: list[dict[str, Any]] = [
     {"solver": IMPLICIT, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": list(INTEGRATORS)},
     {"solver": ["numba", *EXPLICIT], "iterations": 50},
@@ -84,7 +84,10 @@ def recommend(
             raise InputError(Mistake(f"came {value:g}; wanted a number above 0", key=key))
     scene = load_scene(path)
     size = (size or scene.default_size or 0) if isinstance(scene.mesh, Generator) else 0
-    asked = _grid(path, scene, size, horizon, time_limit)
+    try:
+        asked = _grid(path, scene, size, horizon, time_limit)
+    except InputError as error:  # the studies are ours; what is wrong came with an option
+        raise InputError(list(dict.fromkeys(map(_of_option, error.mistakes)))) from error
     ways, reasons = _known(path.stem, scene, size, horizon, results)
     if not any(way.error <= error for way in ways):
         say(f"nothing measured of {path.stem} {size or ''} keeps to an error of {error:g}: measuring")
@@ -110,6 +113,11 @@ def _grid(path: Path, scene: SceneSpec, size: int, horizon: float, time_limit: f
     if fields is None or document.mistakes:
         raise document.error()
     return replace(expand(document, fields, {path.stem: scene}, solvers), name=f"recommend-{path.stem}")
+
+
+def _of_option(mistake: Mistake) -> Mistake:
+    """A mistake in a study as one in the option that its key came from."""
+    return Mistake(mistake.problem, key="--" + mistake.key.rpartition(".")[2].replace("_", "-"))
 
 
 def _known(

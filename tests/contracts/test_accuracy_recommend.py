@@ -1,0 +1,126 @@
+"""Recommendations: the cheapest way to an error, from what was measured, checked by one more simulation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from harness import rows
+from harness.accuracy import recommend as module
+from harness.accuracy.recommend import Recommendation, recommend
+from harness.accuracy.rows import SCHEMA
+from harness.cli import main
+from harness.errors import InputError, RunFailed
+from tests.contracts.test_accuracy import Quiet
+
+SCENE = """
+mesh: {kind: chain, length: 2.0}
+mass: 1.0
+time_step: 1/30
+frames: 8
+default_size: 4
+effects: [{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, at: [ends]}]
+"""
+REFINEMENTS = (1, 4)
+WAYS = [
+    {"solver": ["sparse"], "tolerance": 1e-3, "iterations": 200, "integrator": ["implicit-euler", "midpoint"]},
+    {"solver": ["sparse"], "iterations": 5},
+]
+COUNT = len(REFINEMENTS) * 3
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A grid of six simulations."""
+    for name, value in (("WAYS", WAYS), ("REFINEMENTS", REFINEMENTS), ("IMPLICIT", ["sparse"]), ("EXPLICIT", [])):
+        monkeypatch.setattr(module, name, value)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    (tmp_path / "chain.yaml").write_text(SCENE)
+    return tmp_path / "chain.yaml"
+
+
+def asked(scene: Path, error: float, **more: Any) -> tuple[Recommendation, int]:
+    """The answer, and how many simulations were measured for it."""
+    display, results = Quiet(), scene.parent / "results"
+    options: dict[str, Any] = {"size": None, "horizon": 0.2, "time_limit": 60.0} | more
+    found = recommend(scene, error, results=results, display=display, say=lambda line: None, **options)
+    return found, display.finished_units
+
+
+def measured(scene: Path) -> list[Path]:
+    return sorted((scene.parent / "results").glob("*/accuracy/*-work-*.parquet"))
+
+
+def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: Path) -> None:
+    found, count = asked(scene, 0.1)
+    assert count == COUNT
+    table = rows.read(measured(scene), SCHEMA).to_pylist()
+    within = [row for row in table if row["error"] <= 0.1]
+    assert 0 < len(within) < len(table), "the error separates nothing"
+    cheapest = min(within, key=lambda row: row["seconds_per_simulated"])
+    assert (found.best.error, found.best.cost) == (cheapest["error"], cheapest["seconds_per_simulated"])
+    assert found.best.unit.case.scene.time_step == cheapest["time_step"]
+    assert found.checked.error == found.best.error  # the same simulation gives the same positions
+    assert found.checked.cost > 0.0
+
+
+def test_what_was_measured_is_not_measured_again(scene: Path) -> None:
+    first, _ = asked(scene, 0.1)
+    again, count = asked(scene, 0.1)
+    assert count == 0
+    assert again.best == first.best
+
+
+def test_what_was_measured_of_another_scene_or_on_another_machine_is_no_answer(scene: Path) -> None:
+    asked(scene, 0.1)
+    scene.write_text(SCENE.replace("200", "210"))
+    assert asked(scene, 0.1)[1] == COUNT
+    for path in measured(scene):
+        table = pq.read_table(path)
+        for column, value in (("machine", "0" * 12), ("unit", "measured there")):
+            k = table.schema.get_field_index(column)
+            table = table.set_column(k, column, pa.array([value] * len(table)))
+        pq.write_table(table, path)
+    assert asked(scene, 0.1)[1] == COUNT
+    assert asked(scene, 0.1, horizon=0.4)[1] == COUNT
+
+
+def test_an_error_that_nothing_keeps_to_is_told_with_the_nearest(scene: Path) -> None:
+    with pytest.raises(RunFailed, match=r"nothing that was measured keeps to an error of 1e-12 .* midpoint") as told:
+        asked(scene, 1e-12)
+    assert "ask for a larger --error or a shorter --horizon" in str(told.value)
+
+
+@pytest.mark.parametrize("option", ["error", "horizon", "time_limit"])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_what_is_no_number_above_zero_is_a_mistake(scene: Path, option: str, value: float) -> None:
+    with pytest.raises(InputError, match="wanted a number above 0"):
+        asked(scene, **{"error": 0.1, option: value})
+
+
+def test_a_mesh_has_to_have_a_size(scene: Path) -> None:
+    scene.write_text(SCENE.replace("default_size: 4", ""))
+    with pytest.raises(InputError, match="^--size: is missing; the scene chain needs a mesh size"):
+        asked(scene, 0.1)
+    with pytest.raises(InputError, match="^--size: came 1; should be greater than or equal to 2$"):
+        asked(scene, 0.1, size=1)
+
+
+def test_the_command_shows_what_it_predicts_and_what_it_measured(
+    scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = str(scene.parent / "results")
+    options = ["--error", "0.1", "--horizon", "0.2", "--results", results]
+    monkeypatch.setattr("sys.argv", ["springbench", "recommend", str(scene), *options])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    told = capsys.readouterr()
+    assert not ended.value.code, told.err
+    assert all(word in told.out for word in ("predicted", "measured", "sparse", "time step"))
