@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from harness.errors import RunFailed
 from harness.scene import Scene
+from harness.simulate import start
 from solvers.compiling import kernel
 from solvers.energies.springs import TINY, Springs
 from solvers.problem import LaggedEnergy, Positions, Start
@@ -54,9 +55,8 @@ class Field:
 
     @property
     def start(self) -> State:
-        """The rest shape, moving with the scene's velocity."""
-        velocity = np.broadcast_to(np.array(self._scene.velocity), (len(self._free), 3))
-        return np.concatenate([self._scene.mesh.rest[self._free].ravel(), velocity.ravel()])
+        """The scene's start."""
+        return np.concatenate([part[self._free].ravel() for part in start(self._scene).now])
 
     def motion(self, t: float, y: State) -> tuple[Positions, Positions]:
         """Positions [m] and velocities [m/s] of all vertices, each (n, 3); overwritten by the next call."""

@@ -190,6 +190,6 @@ def test_every_minimiser_takes_the_steps_of_every_integrator(name, solver):
     by_newton, found = (
         np.array([p for p, _ in run(scene, 6, one, stop)]) for one in (Newton(), load(SOLVERS[solver])())
     )
-    # The tolerance leaves 1e-11 of a step's residual, and a method that converges linearly some times more.
-    np.testing.assert_allclose(found, by_newton, rtol=0, atol=1e-9)
+    # 1e-11 of a step's residual is 1e-12 m along stiff springs, and some hundred times that along the softest way.
+    np.testing.assert_allclose(found, by_newton, rtol=0, atol=1e-8)
     assert np.abs(by_newton - scene.mesh.rest).max() > 0.01
