@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from time import perf_counter
 
-import numpy as np
-
 from harness.scene import Scene
 from solvers.integrators import IMPLICIT_EULER, Motion
 from solvers.problem import Positions, Prepared, Solution, Solver, Start, StepProblem, StopRule, System
