@@ -183,7 +183,7 @@ def _curve(unit: CurveUnit, prepared: Prepared, graded: Graded, first_guess: str
         shared["branch"] = reference.branch(reached)
     elif curve.status == "ok" and curve.stationarity[-1] <= AT_REST:
         shared["reason"] = "ended at a stationary point that is no minimum"
-    if unit.recordings:
+    if unit.recordings and first_guess == unit.first_guesses[0]:
         shared["recording"] = str(record(unit, graded, first_guess, curve, folder).relative_to(folder))
     against = reached or next(iter(reference.minima), None)
     return [shared | row for row in _points(curve, graded.oracle, against)]

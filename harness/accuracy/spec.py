@@ -61,7 +61,7 @@ class CurveStudy(Study):
     iterations: Iterations = 2000
     """Iteration limit; a curve ends before it where it has converged."""
     recordings: bool = False
-    """Whether each solve is recorded, to scrub through its iterates beside the mesh."""
+    """Whether the solve from the first of the guesses is recorded, to scrub through its iterates beside the mesh."""
 
 
 class WorkStudy(Study):

@@ -107,9 +107,9 @@ def test_what_is_no_number_above_zero_is_a_mistake(scene: Path, option: str, val
 
 def test_a_mesh_has_to_have_a_size(scene: Path) -> None:
     scene.write_text(SCENE.replace("default_size: 4", ""))
-    with pytest.raises(InputError, match="^--size: is missing; the scene chain needs a mesh size"):
+    with pytest.raises(InputError, match=r"^--size: is missing; the scene chain needs a mesh size"):
         asked(scene, 0.1)
-    with pytest.raises(InputError, match="^--size: came 1; should be greater than or equal to 2$"):
+    with pytest.raises(InputError, match=r"^--size: came 1; should be greater than or equal to 2$"):
         asked(scene, 0.1, size=1)
 
 
