@@ -203,7 +203,7 @@ def list_runs(config: Config, results: Results = Path("results")) -> None:
 
 @app.command()
 def query(
-    sql: Annotated[str, typer.Argument(help="A query over the table `rows`.")],
+    sql: Annotated[str, typer.Argument(help="A query over the tables `rows` and `accuracy`.")],
     results: Results = Path("results"),
     csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""SQL over the rows of all sweeps (DuckDB on the Parquet files)."""
+"""SQL over the rows of all sweeps and accuracy configs (DuckDB on the Parquet files)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import duckdb
+import pyarrow as pa
 from rich.table import Table
 
 from harness import rows
@@ -36,15 +37,17 @@ class Answer:
 
 
 def answer(sql: str, results: Path) -> Answer:
-    """What a query says of the table `rows`; it can read nothing else and write nothing.
+    """What a query says of the tables `rows` and `accuracy`; it can read nothing else and write nothing.
 
     Raises InputError where there are no rows, or with DuckDB's message where the query is wrong.
     """
-    files = sorted(results.glob("*/rows/*.parquet"))
-    if not files:
+    files = {table: sorted(results.glob(f"*/{table}/*.parquet")) for table in ("rows", "accuracy")}
+    if not any(files.values()):
         raise InputError(f"{results}: holds no rows; run a sweep first, or name its folder with --results")
     with duckdb.connect() as connection:
-        connection.register("rows", rows.read(files))
+        connection.register("rows", rows.read(files["rows"]))
+        if files["accuracy"]:
+            connection.register("accuracy", rows.read(files["accuracy"], pa.schema([])))
         connection.execute("SET enable_external_access = false; SET lock_configuration = true")
         try:
             found = connection.execute(sql)

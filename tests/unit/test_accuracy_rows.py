@@ -1,0 +1,35 @@
+"""The rows of accuracy measurements: their columns are documented, and queries see them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from harness import rows
+from harness.accuracy.rows import COLUMNS, SCHEMA
+from harness.query import answer
+from harness.rows import COLUMNS as RUN_COLUMNS
+
+README = Path(__file__).resolve().parents[2] / "results" / "README.md"
+SHARED = {column.name for column in RUN_COLUMNS} - {"status", "seconds"}
+
+
+@pytest.mark.parametrize("column", [c for c in COLUMNS if c.name not in SHARED], ids=lambda column: column.name)
+def test_every_column_of_its_own_is_documented(column: rows.Column) -> None:
+    line = f"| `{column.name}` | {column.unit} | {column.meaning.replace('|', chr(92) + '|')} |"
+    assert line in README.read_text().splitlines()
+
+
+def test_columns_are_named_once() -> None:
+    assert len(set(SCHEMA.names)) == len(COLUMNS)
+
+
+def test_a_query_sees_the_accuracy_rows_of_all_configs(tmp_path: Path) -> None:
+    for name, error in (("first", 0.5), ("second", 0.25)):
+        (tmp_path / name / "accuracy").mkdir(parents=True)
+        row = {"kind": "work", "sweep": name, "error": error, "seconds": [0.1, 0.2]}
+        rows.write(tmp_path / name / "accuracy" / "a.parquet", [row], SCHEMA)
+    found = answer("SELECT sweep, list_min(seconds) FROM accuracy ORDER BY error", tmp_path)
+    assert found.values == [("second", 0.1), ("first", 0.1)]
+    assert answer("SELECT count(*) FROM rows", tmp_path).values == [(0,)]
