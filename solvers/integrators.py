@@ -11,7 +11,9 @@ with p, v at the step's start and p', v' one step before it: the velocity is sqr
 Implicit Euler is of order 1 and damps, the others of order 2; midpoint conserves quadratic energies (Hairer and
 Wanner, Solving Ordinary Differential Equations II, sections IV.12 and V.1; Hairer, Lubich and Wanner, Geometric
 Numerical Integration, section IV.2). External forces are those of the step's start for implicit Euler, as in Liu et
-al. 2013; for the others they are taken where extrapolation puts the motion at the time of x.
+al. 2013; for the others they are taken where extrapolation puts the motion at the time of x. Filters of the velocity
+act before a step, half a step early for midpoint: its positions keep order 2 from a start at rest, and have order 1
+from a moving one.
 """
 
 from __future__ import annotations
