@@ -64,7 +64,9 @@ def run(
     integrator: Annotated[str | None, typer.Option(help="For a scene: implicit-euler, bdf2, midpoint.")] = None,
     time_step: Annotated[float | None, typer.Option(help="For a scene: time step [s].")] = None,
     first_guess: Annotated[str | None, typer.Option(help="For a scene: assignment, current, inertial.")] = None,
-    threads: Annotated[int | None, typer.Option(help="For a scene: threads of Numba and BLAS.")] = None,
+    threads: Annotated[
+        str | None, typer.Option(help="For a scene: threads of Numba and BLAS; auto, the default: of idle cores.")
+    ] = None,
     rounds: Annotated[int | None, typer.Option(help="For a scene: repetitions of the timed pass.")] = None,
     positions: Annotated[
         Path | None, typer.Option(help="Store the positions after every step (float64, .npz) of one run.")
@@ -84,7 +86,7 @@ def run(
         "integrator": integrator,
         "time_step": time_step,
         "first_guess": first_guess,
-        "threads": threads,
+        "threads": int(threads) if threads and threads.isdecimal() else threads,
         "rounds": rounds,
     }
     sweep = load_any(config, solvers=solver or (), sizes=size or (), **options)

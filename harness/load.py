@@ -21,7 +21,7 @@ from harness.mesh.generator import Generator
 from harness.mesh.table import MESHES
 from harness.model import Model
 from harness.scene import build
-from harness.spec import NAME, Options, RunSpec, SceneFile, SceneSpec, SolverSpec, SweepFields
+from harness.spec import AUTO, NAME, Options, RunSpec, SceneFile, SceneSpec, SolverSpec, SweepFields
 from solvers.registry import SOLVERS, load
 
 ASSIGNMENT_FRAMES = 30
@@ -70,7 +70,7 @@ def load_any(path: Path, *, solvers: Sequence[str] = (), sizes: Sequence[int] = 
         raise InputError(Mistake("is neither a scene (it has no `mesh`) nor a sweep (it has no `scenes`)", path))
     scene = scene_from_assignment(path) if _is_assignment(path) else _scene(document)
     keys = {"scenes": [path.name], "sizes": list(sizes), "solvers": list(solvers) or [DEFAULT_SOLVER]}
-    asked = Document(path, {**keys, "options": given})
+    asked = Document(path, {**keys, "options": {"threads": AUTO, **given}})
     return _expanded(asked, {path.stem: scene})
 
 

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import psutil
 from threadpoolctl import threadpool_limits
@@ -20,6 +21,9 @@ from harness.errors import InputError, Mistake
 
 _ROOT = Path(__file__).resolve().parents[1]
 _PACKAGES = ("harness", "solvers")
+_LOOK, _NEARLY = 0.3, 0.25
+"""For how many seconds to look at what the cores do, and how busy one may be and still count as idle."""
+
 _LIBRARIES = ("numpy", "scipy", "numba", "llvmlite", "cholespy", "pyarrow", "rerun-sdk", "pyvista", "vtk")
 
 
@@ -59,6 +63,10 @@ def _cpu() -> str:
     fields = (line.partition(":") for line in told.stdout.splitlines())
     names = [value.strip() for name, _, value in fields if name.strip() == "Model name"]
     return names[0] if names else platform.machine()
+
+
+def _usable() -> int:
+    return min(_cores(), int(os.environ.get("NUMBA_NUM_THREADS") or _cores()))
 
 
 def _cores() -> int:
@@ -110,6 +118,31 @@ def code_hash(root: Path = _ROOT) -> str:
     return digest.hexdigest()[:12]
 
 
+@dataclass(frozen=True, slots=True)
+class Threads:
+    """How many threads BLAS and Numba may use, and why, in words, where that was not said but chosen."""
+
+    number: int
+    why: str = ""
+
+
+def threads(asked: int | Literal["auto"]) -> Threads:
+    """The threads that were asked for; for "auto" as many as there are idle cores, the same all the process long."""
+    return _idle() if asked == "auto" else Threads(asked)
+
+
+@cache
+def _idle() -> Threads:
+    """A thread for each core that others leave idle while this process looks on; once, so that runs are alike."""
+    usable = _usable()
+    mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(usable)
+    busy = psutil.cpu_percent(_LOOK, percpu=True)
+    idle = sum(1.0 - busy[core] / 100 for core in mine if core < len(busy))
+    number = min(usable, max(1, int(idle + _NEARLY)))
+    load = os.getloadavg()[0]
+    return Threads(number, f"threads: {number} of {usable}, for {idle:.1f} cores were idle (load average {load:.1f})")
+
+
 @contextmanager
 def pinned_threads(threads: int) -> Iterator[None]:
     """Let BLAS and Numba's parallel kernels use `threads` threads each, and restore their numbers afterwards.
@@ -121,7 +154,7 @@ def pinned_threads(threads: int) -> Iterator[None]:
     import numba
     import scipy.linalg  # noqa: F401
 
-    usable = min(_cores(), int(os.environ.get("NUMBA_NUM_THREADS") or _cores()))
+    usable = _usable()
     if not 1 <= threads <= usable:
         wanted = f"should be from 1 to {usable}, the cores that this process may use, not {threads}"
         raise InputError(Mistake(wanted, key="threads"))

@@ -57,9 +57,9 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
     tick: told the name of the pass after each step; positions: where to store the positions after every step
     (frames, n, 3) [m], float64. Returns the rows. Raises InputError for what the user can mend.
     """
-    shared = common(run)
+    shared, threads = common(run), machine.threads(run.threads)
     try:
-        with machine.pinned_threads(run.threads):
+        with machine.pinned_threads(threads.number):
             found = _passes(run, files, tick, positions)
     except InputError:
         raise
@@ -67,6 +67,9 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
         found = [failure(error)]
         for earlier in (files.recording, files.picture):  # of a time when it did not fail; they would hide this
             earlier.unlink(missing_ok=True)
+    if threads.why:
+        for row in found:
+            row["choice"] = "; ".join(filter(None, [row.get("choice"), threads.why]))
     result = [shared | row for row in found]
     rows.write(files.rows, result)
     return result
@@ -159,7 +162,7 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, measured: Measured) -> R
         "iterations": run.iterations,
         "tolerance": run.tolerance or 0.0,
         "first_guess": run.first_guess,
-        "threads": run.threads,
+        "threads": machine.threads(run.threads).number,
         "milliseconds_per_step": 1e3 * float(np.median(seconds)),
         "cpu": here.cpu,
         "cores": here.cores,
@@ -215,7 +218,7 @@ def common(run: RunSpec) -> dict[str, Any]:
         "first_guess": run.first_guess,
         "max_iterations": run.iterations,
         "tolerance": run.tolerance,
-        "threads": run.threads,
+        "threads": machine.threads(run.threads).number,
         **provenance(),
     }
 

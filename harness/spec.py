@@ -139,6 +139,7 @@ class SceneSpec(SceneFields):
 Iterations = Annotated[int, Field(ge=1, le=100_000)]
 Tolerance = Annotated[float, Field(gt=0, lt=1)] | None
 Threads = Annotated[int, Field(ge=1, le=1024)]
+AUTO: Literal["auto"] = "auto"
 Rounds = Annotated[int, Field(ge=1, le=1000)]
 
 
@@ -155,8 +156,8 @@ class Grid(Model):
     """Time step [s]; null takes the scene's."""
     first_guess: Many[FirstGuess | None] = (None,)
     """Where a step's iteration starts; null is `assignment` for JSON scenes, else `current`."""
-    threads: Many[Threads] = (1,)
-    """Threads of Numba and of BLAS."""
+    threads: Many[Threads | Literal["auto"]] = (1,)
+    """Threads of Numba and of BLAS; auto: as many as there are cores that nobody else uses."""
     frames: Many[Frames | None] = (None,)
     """Number of steps; null takes the scene's."""
     rounds: Many[Rounds] = (2,)
@@ -195,7 +196,7 @@ class Include(Model):
     """Time steps [s]."""
     first_guess: Many[FirstGuess] = ()
     """Where a step's iteration starts."""
-    threads: Many[Threads] = ()
+    threads: Many[Threads | Literal["auto"]] = ()
     """Numbers of threads."""
     frames: Many[Frames] = ()
     """Numbers of steps."""
@@ -257,7 +258,7 @@ class RunSpec:
     integrator: IntegratorName
     time_step: float
     first_guess: FirstGuess
-    threads: int
+    threads: int | Literal["auto"]
     frames: int
     rounds: int
     convergence_frames: tuple[int, ...] | None

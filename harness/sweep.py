@@ -81,7 +81,7 @@ def run_sweep(
     """
     if positions and len(runs) != 1:
         raise InputError(f"--positions stores the positions of one run; this is {len(runs)} runs")
-    for threads in {run.threads for run in runs}:
+    for threads in {machine.threads(run.threads).number for run in runs}:
         with machine.pinned_threads(threads):  # refuses what this machine cannot do before anything starts
             pass
     for part in ("rows", "recordings", "pictures"):

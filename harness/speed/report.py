@@ -39,13 +39,14 @@ def run_speed(
     budget: seconds that a candidate may take at a size, as its smaller sizes predict; say: prints a remark.
     Raises InputError.
     """
-    for threads in {run.threads for run in sweep.runs()}:
+    runs = [replace(run, threads=machine.threads(run.threads).number) for run in sweep.runs()]
+    for threads in {machine.threads(run.threads).number for run in runs}:
         with machine.pinned_threads(threads):  # refuses what this machine cannot do before anything starts
             pass
     (folder / "rows").mkdir(parents=True, exist_ok=True)
     files: list[Path] = []
     past: dict[str, list[Past]] = {}
-    for group in _groups(sweep.runs()):
+    for group in _groups(runs):
         runs = [*group, *_beside(group)]
         paths = [Files.of(run, folder).rows for run in runs]
         if again or not all(path.exists() for path in paths):

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from harness import machine
 from harness.errors import RunFailed
-from harness.machine import pinned_threads
 from harness.measure import digest
 from harness.run import common, failure
 from harness.spec import RunSpec
@@ -102,7 +102,7 @@ def predicted(past: Sequence[Past], vertices: int, run: RunSpec) -> float:
 def _guarded(candidate: Candidate, rows: list[Row], alive: list[Candidate]) -> Iterator[None]:
     """With the candidate's threads; what it raises is its only row, and it is out."""
     try:
-        with pinned_threads(candidate.run.threads):
+        with machine.pinned_threads(machine.threads(candidate.run.threads).number):
             yield
     except Exception as error:  # whatever one of them raises, the others go on
         rows[:] = [failure(error)]

@@ -161,3 +161,40 @@ def test_pinned_threads_are_restored_even_after_a_failure():
 def test_more_threads_than_usable_cores_are_the_users_mistake(threads: int):
     with pytest.raises(InputError, match=rf"from 1 to {CORES}, .* not {threads}"), machine.pinned_threads(threads):
         pass
+
+
+@pytest.fixture
+def looked(monkeypatch: pytest.MonkeyPatch):
+    """Says how busy four cores are [%]; what was found of them is forgotten before and after."""
+
+    def pretend(*busy: float) -> None:
+        monkeypatch.setattr(machine, "_usable", lambda: 4)
+        monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
+        monkeypatch.setattr(machine.psutil, "cpu_percent", lambda _, percpu: list(busy))
+
+    machine._idle.cache_clear()
+    yield pretend
+    machine._idle.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("busy", "number"),
+    [((0, 0, 0, 0), 4), ((2, 1, 5, 3), 4), ((100, 0, 0, 0), 3), ((50, 50, 50, 50), 2), ((100, 100, 100, 90), 1)],
+)
+def test_threads_are_as_many_as_there_are_idle_cores(looked, busy: tuple[float, ...], number: int):
+    looked(*busy)
+    found = machine.threads("auto")
+    assert found.number == number
+    assert f"{number} of 4" in found.why
+
+
+def test_a_number_that_was_given_stays(looked):
+    looked(100, 100, 100, 100)
+    assert machine.threads(3) == machine.Threads(3)
+
+
+def test_the_choice_stays_the_same_all_the_process_long(looked):
+    looked(0, 0, 0, 0)
+    first = machine.threads("auto")
+    looked(100, 100, 100, 100)
+    assert machine.threads("auto") is first
