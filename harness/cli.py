@@ -141,7 +141,7 @@ def accuracy(
     asked = load_accuracy(config)
     folder = results / asked.name
     files = run_accuracy(asked, folder, display(err), _say, again=again)
-    drawn = draw(folder)
+    drawn = draw(folder, files)
     _say(f"rows are in {folder / 'accuracy'}; {len(drawn)} pictures and pages tell of them, {drawn[-1]} of all")
     failed = failures(files)
     for line in failed:

@@ -39,7 +39,9 @@ def run_accuracy(
     *,
     again: bool = False,
 ) -> list[Path]:
-    """Do what is missing (all of it with `again`) and return the files of all units.
+    """Do what is missing (all of it with `again`) and return the files of all units and their frozen steps.
+
+    What an earlier state of the config asked for is left where it is, and not among these.
 
     folder: of the config's results, beside which the truth is kept for all configs; say: prints a remark.
     Raises InputError.
@@ -64,7 +66,8 @@ def run_accuracy(
                 run.work(list(work))
         finally:
             display.end()
-    return [path for unit in units if (path := run.path(unit)).exists()]
+    paths = [*map(run.path, units), *map(run.problem_path, accuracy.curves)]
+    return [path for path in dict.fromkeys(paths) if path.exists()]
 
 
 def references(results: Path) -> Store:
@@ -94,6 +97,10 @@ class _Run:
         """The file of a unit."""
         return self._folder / "accuracy" / f"{unit.label()}.parquet"
 
+    def problem_path(self, unit: CurveUnit) -> Path:
+        """The file of a unit's frozen step."""
+        return self._folder / "accuracy" / f"{unit.problem_label()}.parquet"
+
     def done(self, unit: Unit, problem: str | None = None) -> bool:
         """Whether the rows are there as the config asks for them now, and are of this problem if one is given."""
         path = self.path(unit)
@@ -122,8 +129,9 @@ class _Run:
             if not self.done(unit, digest):
                 measured = partial(curve_rows, unit, graded, self._folder)
                 self._do(unit, graded.moment, len(unit.first_guesses), measured)
-        path = self._folder / "accuracy" / f"{first.problem_label()}.parquet"
-        rows.write(path, [{"sweep": self._name, "unit": digest} | row for row in graded.rows()], SCHEMA)
+        rows.write(
+            self.problem_path(first), [{"sweep": self._name, "unit": digest} | row for row in graded.rows()], SCHEMA
+        )
 
     def work(self, group: Sequence[WorkUnit]) -> None:
         """The simulations of one scene up to one horizon."""

@@ -182,6 +182,18 @@ def test_what_is_asked_otherwise_takes_the_place_of_what_was_there(tmp_path: Pat
     assert {len(row["seconds"]) for row in made.rows("curve")} == {1}
 
 
+def test_what_is_not_asked_for_any_more_stays_and_is_not_counted(tmp_path: Path) -> None:
+    made = Home(tmp_path, CONFIG.partition("work:")[0])
+    made.run()
+    before = set(made.written())
+    made.config.write_text(made.config.read_text().replace("[early, violent]", "early"))
+    files = run_accuracy(load_accuracy(made.config), made.folder, Quiet(), lambda line: None)
+    assert set(made.written()) == before
+    moments = rows.read(files, SCHEMA)["moment"].to_pylist()
+    assert set(moments) == {"early"}
+    assert "problem" in rows.read(files, SCHEMA)["kind"].to_pylist()
+
+
 def test_moments_that_are_one_step_are_measured_once(tmp_path: Path) -> None:
     made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "[2, early, middle]"))
     (tmp_path / "cloth.yaml").write_text(SCENE.replace("frames: 8", "frames: 2"))

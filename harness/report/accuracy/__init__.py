@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import chain
 from pathlib import Path
 
@@ -18,12 +19,13 @@ from harness.report.accuracy.time_plot import draw_times
 from harness.report.accuracy.work_plot import draw_work
 
 
-def draw(folder: Path) -> list[Path]:
+def draw(folder: Path, files: Iterable[Path] | None = None) -> list[Path]:
     """Draw all that the rows under `folder`/accuracy say to `folder`/report; returns the files, the page last.
 
-    folder: of one config's results. Raises InputError where it holds no such rows.
+    folder: of one config's results; files: those of its rows that count, all if left out. Raises InputError where
+    there are no rows.
     """
-    everything = read(folder)
+    everything = read(folder, files)
     table, out = without_short(everything), folder / "report"
     out.mkdir(parents=True, exist_ok=True)
     title, failed, chapters = f"What accuracy costs: {folder.name}", failures(everything), findings(everything)

@@ -26,10 +26,10 @@ _Row = dict[str, Any]
 _Label = Callable[[_Row], str]
 
 
-def read(folder: Path) -> Table:
-    """The rows under `folder`/accuracy. Raises InputError where there are none."""
+def read(folder: Path, files: Iterable[Path] | None = None) -> Table:
+    """The rows in these files, all under `folder`/accuracy if left out. Raises InputError where there are none."""
     tables = []
-    for path in sorted((folder / "accuracy").rglob("*.parquet")):
+    for path in sorted((folder / "accuracy").rglob("*.parquet") if files is None else files):
         try:
             tables.append(pq.read_table(path))
         except (pa.ArrowInvalid, OSError) as error:
