@@ -86,8 +86,8 @@ def recommend(
     size = (size or scene.default_size or 0) if isinstance(scene.mesh, Generator) else 0
     try:
         asked = _grid(path, scene, size, horizon, time_limit)
-    except InputError as error:  # the studies are ours; what is wrong came with an option
-        raise InputError(list(dict.fromkeys(map(_of_option, error.mistakes)))) from error
+    except InputError as refused:  # the studies are ours; what is wrong came with an option
+        raise InputError(list(dict.fromkeys(map(_of_option, refused.mistakes)))) from refused
     ways, reasons = _known(path.stem, scene, size, horizon, results)
     if not any(way.error <= error for way in ways):
         say(f"nothing measured of {path.stem} {size or ''} keeps to an error of {error:g}: measuring")
