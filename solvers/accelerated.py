@@ -158,7 +158,7 @@ class _Compiled:
         window = _window(self._method, self._entries, whole)
         window.trial[4 * self._far] = FAR
         x = aligned(whole, self._plan.squares.dtype)
-        vectors = aligned(whole), x, aligned(whole), np.zeros(1)
+        vectors = aligned(whole), x, aligned(whole), np.zeros(2)
         return accelerate_step.Step(self._plan, self._bundles, self._shares, self._rows, *vectors), window
 
     def begin(self, problem: StepProblem, guess: Positions, *, kept: bool) -> Run:

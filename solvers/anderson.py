@@ -26,7 +26,7 @@ class Anderson:
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
 
-    pairs: int = 8
+    pairs: int = 5
     linear: Linear = "auto"
     precision: Precision = "float64"
 

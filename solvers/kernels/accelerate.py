@@ -8,8 +8,8 @@ A method is nothing but its coefficients (see `accelerate_coefficients`), which 
 window's vectors. An iteration tries p + d, then shorter steps, then the plain correction, shorter and shorter:
 
     g(p + t d) <= g(p) + DECREASE t min(0, grad g(p) d)           Armijo (1966)
-    or, where the two values agree up to round-off, the slope at p + t d is at most 1 - 2 FLATTER of what it was, the
-    other way round                                               approximate Wolfe (Hager and Zhang 2005)
+    grad g(p + t d) d <= (2 FLATTER - 1) grad g(p) d              approximate Wolfe (Hager and Zhang 2005), instead of
+                                                                  it where round-off hides how far g falls
 
 For projective energies Q majorises the Hessian, so that the plain correction passes at full length. Vectors are flat
 and know nothing of what their entries stand for; entries of vertices that do not move are zero.
@@ -35,7 +35,8 @@ _BLOCK = 512
 
 _HALVINGS = 40
 
-# Sums may be reordered, which vectors need; NaN and infinity keep their meaning.
+# Sums may be reordered, which vectors need; NaN and infinity keep their meaning. No loop both adds up and writes:
+# whether that becomes vectors is decided by where the arrays lie, and with it the order of the sum.
 _vectors: Any = njit(**_inner, fastmath={"contract", "reassoc", "nsz"})
 
 NOW = np.dtype(
@@ -112,17 +113,21 @@ def propose(window):
 def judge(window):
     """What to do about a trial whose rise, noise and gradient are known."""
     now = window.now[0]
-    if now.rise <= DECREASE * now.length * min(0.0, now.slope):
-        return ACCEPTED
     even = abs(now.rise) <= now.noise
-    if even and now.slope < 0.0 and -_dot(window.descent_there, window.direction) <= (2.0 * FLATTER - 1.0) * now.slope:
+    if even:
+        there = -_dot(window.direction, window.descent_there)
+        enough = now.slope <= 0.0 and there <= (2.0 * FLATTER - 1.0) * now.slope
+        excess = 0.5 * now.length * (there - now.slope)
+    else:
+        enough = now.rise <= DECREASE * now.length * min(0.0, now.slope)
+        excess = now.rise - now.length * now.slope
+    if enough:
         return ACCEPTED
     now.tries += 1
     if now.plain and (even or now.tries > _HALVINGS):
         return STALLED
-    if now.plain or (now.tries <= now.retries and now.slope < 0.0 and not even):
-        # The minimum of the parabola through both values and the slope, kept from being too short or too long.
-        excess = now.rise - now.slope * now.length
+    if now.plain or (now.tries <= now.retries and now.slope < 0.0):
+        # Where the parabola through what is known is least, kept from being too short or too long.
         least = -0.5 * now.slope * now.length / excess if excess > 0.0 else 0.5
         _try(window, now.length * min(max(least, 0.1), 0.5))
         return AGAIN
@@ -146,7 +151,7 @@ def accept(window, correction):
     size = len(window.direction)
     for begin in range(0, size, _BLOCK):
         end = min(size, begin + _BLOCK)
-        now.squared += _renew(
+        _renew(
             window.steps[new * size + begin : new * size + end],
             window.images[new * size + begin : new * size + end],
             window.position[begin:end],
@@ -157,7 +162,9 @@ def accept(window, correction):
             correction[begin:end],
             window.direction[begin:end],
         )
-        for j in range(now.count):
+        now.squared += _dot(window.descent[begin:end], window.correction[begin:end])
+        for back in range(now.count):
+            j = (new - back + m) % m
             sg, sy, wg, wy = _dots(
                 window.steps[j * size + begin : j * size + end],
                 window.images[j * size + begin : j * size + end],
@@ -168,7 +175,7 @@ def accept(window, correction):
             window.wg[j] -= wg
             window.sy[j, new] += sy
             window.wy[j, new] += wy
-    for j in range(now.count):
+    for j in range(m):
         window.wy[new, j] = window.wy[j, new]
     now.newest = new
 
@@ -183,13 +190,14 @@ def _try(window, length):
 @inner
 def _combine(window):
     """The direction by the coefficients, and its slope."""
-    now, size = window.now[0], len(window.direction)
+    now, size, m = window.now[0], len(window.direction), len(window.a)
     slope = 0.0
     for begin in range(0, size, _BLOCK):
         end = min(size, begin + _BLOCK)
         direction = window.direction[begin:end]
         _set(direction, now.scale, window.correction[begin:end])
-        for j in range(now.count):
+        for back in range(now.count):
+            j = (now.newest - back + m) % m
             _subtract(
                 direction,
                 window.a[j],
@@ -203,16 +211,13 @@ def _combine(window):
 
 @_vectors
 def _renew(step, image, position, trial, descent, there, correction, corrected, y):
-    """A block of s, w and y, and the new p, -grad g and c in the place of the old; returns its share of |c|_Q^2."""
-    squared = 0.0
+    """A block of s, w and y, and the new p, -grad g and c in the place of the old."""
     for k in range(len(y)):
         c = np.float64(corrected[k])
         step[k] = trial[k] - position[k]
         image[k] = correction[k] - c
         y[k] = descent[k] - there[k]
         position[k], descent[k], correction[k] = trial[k], there[k], c
-        squared += there[k] * c
-    return squared
 
 
 @_vectors
@@ -228,6 +233,7 @@ def _dots(s, w, g, y):
 
 @_vectors
 def _dot(a, b):
+    """Over the entries of a, of which b may have more."""
     total = 0.0
     for k in range(len(a)):
         total += a[k] * b[k]

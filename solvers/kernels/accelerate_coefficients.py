@@ -5,9 +5,15 @@ See `solvers.kernels.accelerate` for the letters, and each method's own module f
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from solvers.compiling import inner
+import numpy as np
+from numba import njit
+
+from solvers.compiling import _inner
+
+# At a minimum all products may be zero: then quotients are not numbers, and the trial that they make is rejected.
+inner: Any = njit(**_inner, error_model="numpy")
 
 CHEBYSHEV, ANDERSON, LBFGS = 0, 1, 2
 
@@ -39,13 +45,18 @@ def coefficients(window):
 
 @inner
 def _lbfgs(window, now):
-    """The two loops over the pairs (Nocedal 1980), done with scalar products alone (Byrd, Nocedal, Schnabel 1994)."""
+    """The two loops over the pairs (Nocedal 1980), done with scalar products alone (Byrd, Nocedal, Schnabel 1994).
+
+    H0 = scale Q^-1 has the curvature of the newest pair along Q^-1 y: Q alone is too stiff, its steps short by half.
+    """
     a, b, m = window.a, window.b, len(window.a)
     new = now.newest
     if now.count > 0 and not window.sy[new, new] > _CURVED * window.wy[new, new]:
         now.newest = (new - 1 + m) % m
         now.count -= 1
     first = now.newest - now.count + 1 + m
+    if now.count > 0:
+        now.scale = window.sy[now.newest, now.newest] / window.wy[now.newest, now.newest]
     for back in range(now.count):
         i = (now.newest - back + m) % m
         total = window.sg[i]
@@ -55,14 +66,16 @@ def _lbfgs(window, now):
         b[i] = -total / window.sy[i, i]
     for nth in range(now.count):
         i = (first + nth) % m
-        total = -window.wg[i] - window.sy[i, i] * b[i]
+        total = -now.scale * window.wg[i] - window.sy[i, i] * b[i]
         for other in range(now.count):
             j = (first + other) % m
-            total -= window.wy[i, j] * b[j]
+            total -= now.scale * window.wy[i, j] * b[j]
         for before in range(nth):
             j = (first + before) % m
             total -= window.sy[j, i] * a[j]
         a[i] = total / window.sy[i, i]
+    for j in range(m):
+        b[j] *= now.scale
     return 1 if now.count == 0 else 0
 
 
@@ -92,7 +105,7 @@ def _anderson(window, now):
             j = (now.newest - other + m) % m
             total -= L[j, i] * a[j]
         a[i] = total / L[i, i] if L[i, i] > 0.0 else 0.0
-    for j in range(now.count):
+    for j in range(m):
         window.b[j] = -a[j]
     return 1 if now.count == 0 else 0
 
@@ -100,7 +113,7 @@ def _anderson(window, now):
 @inner
 def _chebyshev(window, now):
     """p_(k+1) - p_k = weight gamma c + (weight - 1) s."""
-    if now.degree > 0:
+    if now.degree > 0 and now.reference > 0.0:
         _estimate(now)
     sigma = now.radius / (2.0 - now.radius)
     if now.degree == 0:

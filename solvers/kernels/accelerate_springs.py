@@ -27,12 +27,13 @@ class Shares(NamedTuple):
     """What the objective needs beside the gradient's arrays.
 
     weight: of each bundled entry, k/4 [N/m], or k/2 where the other end is pinned exactly and so has no entry; rest:
-    its rest length [m]; inverse: 1/h [m/N] of each row, 0 where h is.
+    its rest length [m]; inverse: 1/h [m/N] of each row, 0 where h is; size: the sum of k r^2 [J].
     """
 
     weight: NDArray[np.float64]
     rest: NDArray[np.float64]
     inverse: NDArray[np.float64]
+    size: float
 
     @classmethod
     def of(cls, bundles: Bundles, held: NDArray[np.float64], pinned: NDArray[np.int64]) -> Shares:
@@ -41,7 +42,8 @@ class Shares(NamedTuple):
         weight, rest = aligned(len(k)), aligned(len(k))
         weight[:] = np.where(np.isin(bundles.neighbour, pinned), 0.5, 0.25) * k
         np.divide(pull, k, out=rest, where=k > 0.0)
-        return cls(weight, rest, np.divide(1.0, held, out=np.zeros_like(held), where=held > 0.0))
+        inverse = np.divide(1.0, held, out=np.zeros_like(held), where=held > 0.0)
+        return cls(weight, rest, inverse, 2.0 * float(weight @ rest**2))
 
 
 def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, weight, rest, begin, end, y, held, out):

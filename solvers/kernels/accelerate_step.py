@@ -19,13 +19,18 @@ from solvers.kernels.step import Plan
 from solvers.kernels.step_ends import Rows, fetch, place, state
 from solvers.linear.supernodal_solve import backwards, forwards
 
-NOISE = 64.0 * np.finfo(np.float64).eps
-"""The rounding of thousands of terms of one sign, relative to their sum; measured: 10 eps."""
+NOISE = 4.0 * np.finfo(np.float64).eps
+"""Of the rounding below: what is measured is less by the root of the number of terms."""
 
 
 class Step(NamedTuple):
     """A system's plan, bundles, shares of the objective and rows, with vectors of all rows: y, the solve's (x) in the
-    factor's type, scratch (e, zero but in unknown rows); objective (1,): at the position [J]."""
+    factor's type, scratch (e, zero but in unknown rows); objective (2,): at the position, and the
+    size of what cancels in it [J].
+
+    The objective is a sum of squares a^2/2, where each a is a difference of two numbers of size A and so known to
+    eps A: the sum to eps (sum of a A), at most eps sqrt(2 g size), with size the sum of A^2.
+    """
 
     plan: Plan
     bundles: Bundles
@@ -43,6 +48,9 @@ def start(step: Step, window: Window, target, force, pin_targets, guess):
     state(step.rows, target, force, pin_targets, step.y)
     largest = place(step.rows, guess, pin_targets, window.trial)
     step.objective[0] = _evaluate(step, window)
+    step.objective[1] = step.shares.size
+    for k in range(len(window.direction)):
+        step.objective[1] += step.plan.held[k // 4] * window.trial[k] ** 2
     _solve(step.plan, window.descent_there, len(window.direction), step.x)
     begin(window, step.x)
     return largest
@@ -62,7 +70,8 @@ def run(step: Step, window: Window, iterations, limit, floor, every, out):
         verdict = AGAIN
         while verdict == AGAIN:
             there = _evaluate(step, window)
-            now.rise, now.noise = there - step.objective[0], NOISE * abs(step.objective[0])
+            before, size = abs(step.objective[0]), step.objective[1]
+            now.rise, now.noise = there - step.objective[0], NOISE * (before + np.sqrt(2.0 * before * size))
             verdict = judge(window)
         if verdict == STALLED:
             residual = _residual(step, window)
