@@ -25,6 +25,14 @@ class Diverged(Exception):
     """Positions are not finite any more; the message says since when."""
 
 
+class StepFailed(Exception):
+    """A step, of this frame, ended with an error, the cause of this one."""
+
+    def __init__(self, frame: int) -> None:
+        super().__init__(f"frame {frame} failed")
+        self.frame = frame
+
+
 @dataclass(frozen=True, slots=True)
 class Timing:
     """One measured time: phase, frame (None where it has none), round, wall seconds."""
@@ -57,7 +65,7 @@ class Measured:
 def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[str], None]) -> Measured:
     """Prepare cold and warm, then time phases and steps; `tick` is told each pass's name after each step.
 
-    Raises Unsupported, NotPositiveDefinite, Diverged.
+    Raises Unsupported, NotPositiveDefinite, StepFailed.
     """
     timings: list[Timing] = []
     prepared = None
@@ -86,11 +94,15 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
 
 
 def steps(scene: Scene, prepared: Prepared, settings: Settings) -> Iterator[Step]:
-    """The run's steps; raises Diverged as soon as a position is not finite."""
+    """The run's steps; raises StepFailed, from Diverged where a position is not finite."""
     run = simulate(scene, prepared, settings.stop, first_guess=settings.first_guess, frames=settings.frames)
-    for step in run:
-        if not np.isfinite(step.positions).all():
-            raise Diverged(f"positions are not finite from frame {step.index} on")
+    for frame in range(1, settings.frames + 1):
+        try:
+            step = next(run)
+            if not np.isfinite(step.positions).all():
+                raise Diverged(f"positions are not finite from frame {frame} on")
+        except Exception as error:
+            raise StepFailed(frame) from error
         yield step
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.judge import Judge
 from harness.measure import Settings, digest, steps
 from harness.record.base import Frame, Recorder
 from harness.scene import Scene
@@ -31,12 +32,14 @@ def observe(
     recorder: Recorder | None,
     convergence: Collection[int],
     stored: NDArray[np.float64] | None,
+    judge: Judge | None,
     tick: Callable[[], None],
 ) -> dict[int, dict[str, Any]]:
     """Simulate a run's frames and return, by frame, the columns of its rows that tell of the solution.
 
     recorder: takes every frame, and how the solve converged in the frames `convergence`; stored: where to put the
-    positions after each step, (frames, n, 3) [m]; tick: called after each step.
+    positions after each step, (frames, n, 3) [m]; judge: adds what an oracle says of each step; tick: called after
+    each step.
     """
     found: dict[int, dict[str, Any]] = {}
 
@@ -53,6 +56,7 @@ def observe(
             "residual": s.residual,
             "yardstick": s.yardstick,
             "digest": digest(p),
+            **(judge(step) if judge else {}),
         }
         if stored is not None:
             stored[step.index - 1] = p

@@ -57,6 +57,22 @@ COLUMNS = (
         "|Q^-1 grad g|_Q where the step's last iteration began or ended, unpinned vertices",
     ),
     Column("yardstick", _REAL, "J^(1/2)", "the residual at the step's start, which the tolerance refers to"),
+    Column(
+        "stationarity",
+        _REAL,
+        "",
+        "where judged, and the solver minimises: |Q^-1 grad g|_Q after the step, by the oracle, over the larger of "
+        "its value at the current positions and round-off",
+    ),
+    Column("attainable", _REAL, "", "where judged: the least stationarity that round-off lets anyone reach"),
+    Column("minimum", pa.bool_(), "", "where judged: whether the Hessian after the step is positive definite"),
+    Column(
+        "distance",
+        _REAL,
+        "",
+        "where judged: largest distance of a vertex from where a run of Newton's method to round-off has it in that "
+        "frame, over the rest shape's size; null from where that is lost",
+    ),
     Column("energy_springs", _REAL, "J", "elastic energy of the springs after the step"),
     Column("energy_inertia", _REAL, "J", "inertia term of the step's objective"),
     Column("energy_force", _REAL, "J", "external forces' term of the step's objective"),
@@ -67,6 +83,7 @@ COLUMNS = (
     Column("digest", _TEXT, "", "SHA-256 of the positions after the step (float64 bytes)"),
     Column("nnz_system", _INT, "", "stored entries of the system matrix Q"),
     Column("nnz_factor", _INT, "", "stored entries of its triangular factor, null where the library hides it"),
+    Column("nnz_hessian_factor", _INT, "", "stored entries of the triangular factor of Newton's Hessian"),
     Column("panel_bytes", _INT, "", "bytes in which the prepared factor is stored"),
     Column("flops_per_solve", _INT, "", "additions and multiplications of one global step, padding included"),
     Column("choice", _TEXT, "", "what the solver chose by itself, and why"),

@@ -9,24 +9,28 @@ from __future__ import annotations
 import json
 import os
 import traceback
-from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from harness import machine, rows
 from harness.errors import InputError, RunFailed
-from harness.measure import Diverged, Measured, Settings, measure
+from harness.judge import Judge, reference
+from harness.measure import Diverged, Measured, Settings, StepFailed, measure
 from harness.observe import observe
-from harness.record.base import Recorder, RecordingInfo
+from harness.record.base import RecordingInfo
 from harness.record.rerun import RerunRecorder
 from harness.scene import Scene, build
+from harness.simulate import prepare
 from harness.spec import RunSpec
-from solvers.problem import NotPositiveDefinite, StopRule, Unsupported
+from solvers.problem import NotPositiveDefinite, Solver, StopRule, Unsupported
 from solvers.registry import SOLVERS, load
 
 Tick = Callable[[str], None]
@@ -58,15 +62,17 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
     (frames, n, 3) [m], float64. Returns the rows. Raises InputError for what the user can mend.
     """
     shared, threads = common(run), machine.threads(run.threads)
-    try:
-        with machine.pinned_threads(threads.number):
+    with machine.pinned_threads(threads.number):
+        try:
             found = _passes(run, files, tick, positions)
-    except InputError:
-        raise
-    except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
-        found = [failure(error)]
-        for earlier in (files.recording, files.picture):  # of a time when it did not fail; they would hide this
-            earlier.unlink(missing_ok=True)
+        except InputError:
+            raise
+        except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
+            found = [failure(error)]
+            for earlier in (files.recording, files.picture):  # of a time when it did not fail; they would hide this
+                earlier.unlink(missing_ok=True)
+            if run.record and "frame" in found[0]:
+                _record_until(run, files, found[0])
     if threads.why:
         for row in found:
             row["choice"] = "; ".join(filter(None, [row.get("choice"), threads.why]))
@@ -75,15 +81,17 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
     return result
 
 
-_STATUS: dict[type[Exception], str] = {Unsupported: "unsupported", Diverged: "diverged"}
+_STATUS: dict[type[BaseException], str] = {Unsupported: "unsupported", Diverged: "diverged"}
 
 
-def failure(error: Exception) -> dict[str, Any]:
-    """The row of a run that ended with an error, less what all its rows share."""
+def failure(error: BaseException) -> dict[str, Any]:
+    """The row of a run that ended with an error, less what all its rows share; with the frame, where a step failed."""
+    if isinstance(error, StepFailed) and error.__cause__:
+        return failure(error.__cause__) | {"frame": error.frame}
     return {"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error)}
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: BaseException) -> str:
     """An error of ours speaks for itself; of any other the row also says what it was and where it came from."""
     if isinstance(error, (Unsupported, NotPositiveDefinite, Diverged, RunFailed)):
         return str(error)
@@ -94,9 +102,8 @@ def _reason(error: Exception) -> str:
 def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
     scene = build(run.scene, run.size, run.integrator)
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
-    settings = Settings(StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
-    solver = load(SOLVERS[run.solver.name])(**run.solver.parameters)
-    measured = measure(scene, solver, settings, tick)
+    settings = _settings(run)
+    measured = measure(scene, _solver(run), settings, tick)
     by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
     if by_frame[run.frames]["digest"] != measured.digest:
         raise RunFailed("the recorded pass ended at other positions than the timed pass")
@@ -123,8 +130,11 @@ def _second_pass(
     """Simulate again with everything that is looked at: energies, convergence, recording, positions."""
     stored = np.empty((run.frames, len(scene.mesh.rest), 3)) if positions else None
     with ExitStack() as cleanup:
-        recorder = _recorder(run, files, scene, measured)
-        if recorder:
+        recorder = None
+        if run.record:
+            seconds = [t.seconds for t in measured.timings if t.phase == "step"]
+            facts = {"status": "ok", "milliseconds_per_step": 1e3 * float(np.median(seconds))}
+            recorder = _recorder(run, files, scene, facts)
             cleanup.callback(recorder.abandon)
         found = observe(
             scene,
@@ -133,6 +143,7 @@ def _second_pass(
             recorder=recorder,
             convergence=run.convergence_frames or {1, (run.frames + 1) // 2, run.frames},
             stored=stored,
+            judge=_judge(run, scene),
             tick=lambda: tick("second pass"),
         )
         if recorder:
@@ -142,12 +153,59 @@ def _second_pass(
     return found
 
 
-def _recorder(run: RunSpec, files: Files, scene: Scene, measured: Measured) -> Recorder | None:
-    if not run.record:
+def _record_until(run: RunSpec, files: Files, failed: dict[str, Any]) -> None:
+    """Record the frames before the one that failed, marked as what they are; nothing where they fail too."""
+    facts = {"status": failed["status"], "reason": failed["reason"], "failed_frame": failed["frame"]}
+    settings = replace(_settings(run), frames=failed["frame"] - 1)
+    with ExitStack() as cleanup, suppress(Exception):  # what went wrong is told already
+        scene = build(run.scene, run.size, run.integrator)
+        prepared = prepare(scene, _solver(run))
+        recorder = _recorder(run, files, scene, facts)
+        cleanup.callback(recorder.abandon)
+        observe(
+            scene, prepared, settings, recorder=recorder, convergence=(), stored=None, judge=None, tick=lambda: None
+        )
+        recorder.close({})
+
+
+def _settings(run: RunSpec) -> Settings:
+    return Settings(StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
+
+
+def _solver(run: RunSpec) -> Solver:
+    return load(SOLVERS[run.solver.name])(**run.solver.parameters)
+
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """A run's scene and what else determines its motion; two of one key are the same."""
+
+    key: tuple[str | int, ...]
+    run: RunSpec = field(compare=False)
+
+
+def _judge(run: RunSpec, scene: Scene) -> Judge | None:
+    if not run.judge:
         return None
+    key = (run.scene.digest, run.size, run.integrator, run.first_guess, run.frames)
+    return Judge(scene, _reference(_Motion(key, run)), minimises=_solver(run).minimises)
+
+
+@lru_cache(maxsize=1)
+def _reference(motion: _Motion) -> NDArray[np.float64] | None:
+    """The reference motion of a scene, whose runs come one after the other; None where Newton's method cannot do it."""
+    run = motion.run
+    scene = build(run.scene, run.size, run.integrator)
+    try:
+        return reference(scene, load(SOLVERS["newton"])(), first_guess=run.first_guess, frames=run.frames)
+    except (Unsupported, NotPositiveDefinite):
+        return None
+
+
+def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]) -> RerunRecorder:
+    """facts: how the run ended, among the recording's properties."""
     files.recording.parent.mkdir(parents=True, exist_ok=True)
     here = machine.describe()
-    seconds = [t.seconds for t in measured.timings if t.phase == "step"]
     properties = {
         "sweep": run.sweep,
         "scene": run.scene_name,
@@ -163,7 +221,7 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, measured: Measured) -> R
         "tolerance": run.tolerance or 0.0,
         "first_guess": run.first_guess,
         "threads": machine.threads(run.threads).number,
-        "milliseconds_per_step": 1e3 * float(np.median(seconds)),
+        **facts,
         "cpu": here.cpu,
         "cores": here.cores,
         "memory_gib": here.memory_gib,

@@ -175,6 +175,8 @@ class Options(Grid):
     """Whether a Rerun recording is written for each run."""
     pictures: bool = True
     """Whether pictures are drawn from the recordings."""
+    judge: bool = False
+    """Whether an oracle judges each step's answer in the rows: for `springbench report`, on small meshes."""
 
 
 class Include(Model):
@@ -265,6 +267,7 @@ class RunSpec:
     strain_range: float
     record: bool
     pictures: bool
+    judge: bool
 
     def identity(self) -> str:
         """All that determines the run's result and timing on one machine, as canonical JSON."""
