@@ -51,6 +51,11 @@ class Motion(Model):
             raise ValueError("the axis should have a direction; it is zero")
         return self
 
+    @property
+    def times(self) -> tuple[float, ...]:
+        """The times of the keys [s]."""
+        return tuple(key.time for key in self.keys)
+
     def moved(self, points: Positions, time: float) -> Positions:
         """Where points declared at (q, 3) [m] are at a time [s]."""
         *offset, turn = self._at(time)

@@ -80,7 +80,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
     system = System(mass, spec.time_step, energies, pins, INTEGRATORS[integrator].factor)
     _require_determined(system)
     start = spec.start or AT_REST
-    start.positions(mesh.rest)  # refuses what the mesh lacks
+    _check(parts, start.positions(mesh.rest))
     return Scene(
         mesh=mesh,
         system=system,
@@ -103,6 +103,17 @@ def _bound(spec: SceneSpec, i: int, mesh: Mesh, mass: NDArray[np.float64]) -> Co
     if bound.empty:
         _LOG.info("effects[%d] (%s) does nothing with these parameters and is left out", i, spec.effects[i].kind)
     return bound
+
+
+def _check(parts: list[Contribution], start: Positions) -> None:
+    """Raise InputError where an effect does not fit the start (n, 3) [m] or the pins."""
+    pins = [pin for part in parts for pin in part.pins]
+    for i, part in enumerate(parts):
+        try:
+            for check in part.checks:
+                check(start, pins)
+        except InputError as error:
+            raise InputError([replace(mistake, key=f"effects[{i}]") for mistake in error.mistakes]) from error
 
 
 def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:

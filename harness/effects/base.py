@@ -54,6 +54,14 @@ class Pin:
     motion: Motion | None = None
 
 
+class Check(Protocol):
+    """What an effect asks of a scene's other parts."""
+
+    def __call__(self, start: Positions, pins: Sequence[Pin]) -> None:
+        """Raise InputError where the effect does not fit the start (n, 3) [m], or the pins."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Contribution:
     """The places that the step formula has, and no others."""
@@ -63,6 +71,7 @@ class Contribution:
     pins: tuple[Pin, ...] = field(default=())
     filters: tuple[VelocityFilter, ...] = field(default=())
     derived: tuple[Derived, ...] = field(default=())
+    checks: tuple[Check, ...] = field(default=())
 
     @property
     def empty(self) -> bool:

@@ -5,6 +5,7 @@ EFFECTS = {
     "attachments": "harness.effects.attachments:Attachments",
     "bending": "harness.effects.bending:Bending",
     "constant-force": "harness.effects.constant_force:ConstantForce",
+    "contact": "harness.effects.contact:Contact",
     "dashpots": "harness.effects.dashpots:Dashpots",
     "ether-drag": "harness.effects.ether_drag:EtherDrag",
     "gas": "harness.effects.gas:Gas",

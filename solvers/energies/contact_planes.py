@@ -1,0 +1,148 @@
+"""Which half-space keeps each vertex out of a convex obstacle during one step.
+
+An obstacle is a box of its own frame with a radius around it: all points within R of the box. A sphere is a box
+without extent, a capsule one along an axis, a plane the top of one that has no other end. In the obstacle's frame a
+vertex goes from a straight to b, where it would end by its velocity alone. The distance f to the box along that way
+is convex, and so Newton's method for f = R, from a on, never passes the first contact. At each of its iterates the
+plane through the nearest point, R outwards, has the obstacle on the one side and a on the other; the last one touches
+the first contact, or does not cut the way at all. A vertex that ends on the outer side of it has not been inside the
+obstacle on the way, wherever it ends.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from solvers.compiling import inner, kernel
+
+_ITERATIONS = 40
+_CONTACT = 1e-6
+"""Of R: so near to the obstacle a way has reached it."""
+
+
+@kernel
+def near(p, v, dt, frames, low, high, reach, out):
+    """Whether vertices could come near obstacles, by boxes around all of them, to `out` (o,).
+
+    p (n, 3) [m], v (n, 3) [m/s]; frames (o, 2, 4, 3): origin and axes of each obstacle's frame at the step's start and
+    end; low, high (o, 3) and reach (o,) [m] of each. Returns the largest displacement dt |v| [m].
+    """
+    smallest, largest = np.inf, 0.0
+    x0, x1, x2, y0, y1, y2 = smallest, smallest, smallest, -smallest, -smallest, -smallest
+    a0, a1, a2, b0, b1, b2 = x0, x1, x2, y0, y1, y2
+    for i in range(len(p)):
+        p0, p1, p2 = p[i, 0], p[i, 1], p[i, 2]
+        d0, d1, d2 = dt * v[i, 0], dt * v[i, 1], dt * v[i, 2]
+        largest = max(largest, d0 * d0 + d1 * d1 + d2 * d2)
+        x0, x1, x2 = min(x0, p0), min(x1, p1), min(x2, p2)
+        y0, y1, y2 = max(y0, p0), max(y1, p1), max(y2, p2)
+        a0, a1, a2 = min(a0, p0 + d0), min(a1, p1 + d1), min(a2, p2 + d2)
+        b0, b1, b2 = max(b0, p0 + d0), max(b1, p1 + d1), max(b2, p2 + d2)
+    largest = np.sqrt(largest)
+    for k in range(len(out)):
+        inside = True
+        for c in range(3):
+            first, second = frames[k, 0], frames[k, 1]
+            begin, end = _extent(first, c, x0, x1, x2, y0, y1, y2)
+            other, last = _extent(second, c, a0, a1, a2, b0, b1, b2)
+            begin, end = min(begin, other), max(end, last)
+            inside &= begin <= high[k, c] + reach[k] + largest and end >= low[k, c] - reach[k] - largest
+        out[k] = inside
+    return largest
+
+
+@inner
+def _extent(frame, c, x0, x1, x2, y0, y1, y2):
+    """The least and the largest coordinate c in a frame of a box from x to y."""
+    e0, e1, e2, o = frame[1 + c, 0], frame[1 + c, 1], frame[1 + c, 2], frame[0]
+    middle = e0 * (0.5 * (x0 + y0) - o[0]) + e1 * (0.5 * (x1 + y1) - o[1]) + e2 * (0.5 * (x2 + y2) - o[2])
+    half = 0.5 * (abs(e0) * (y0 - x0) + abs(e1) * (y1 - x1) + abs(e2) * (y2 - x2))
+    return middle - half, middle + half
+
+
+@kernel
+def planes(p, v, dt, frames, low, high, radius, margin, vertices, normal, offset, carried, work):
+    """The half-spaces n.x >= d of the vertices that may come near one obstacle; returns how many, k.
+
+    frames (2, 4, 3), low, high (3,) [m] as in `near`; radius: R [m]; margin [m]: a vertex farther away than that and
+    twice its way has none. The first k rows are written of vertices, normal (n, 3), offset d [m], and carried (n, 3)
+    [m]: where the vertex would be had it moved with the obstacle; all in the world, at the step's end. work: (5, 3).
+    """
+    count = 0
+    a, b, x, c, n = work[0], work[1], work[2], work[3], work[4]
+    first, second = frames[0], frames[1]
+    for i in range(len(p)):
+        way = 0.0
+        for k in range(3):
+            a[k] = b[k] = 0.0
+            for j in range(3):
+                a[k] += first[1 + k, j] * (p[i, j] - first[0, j])
+                b[k] += second[1 + k, j] * (p[i, j] + dt * v[i, j] - second[0, j])
+            way += (b[k] - a[k]) ** 2
+        far = _nearest(a, low, high, c, n)
+        if not far <= radius + margin + 2.0 * np.sqrt(way):
+            continue
+        _separate(a, b, low, high, radius, far, x, c, n)
+        vertices[count], offset[count] = i, radius
+        for j in range(3):
+            normal[count, j], carried[count, j] = 0.0, second[0, j]
+            for k in range(3):
+                normal[count, j] += n[k] * second[1 + k, j]
+                carried[count, j] += a[k] * second[1 + k, j]
+        for k in range(3):
+            offset[count] += n[k] * c[k] + normal[count, k] * second[0, k]
+        count += 1
+    return count
+
+
+@inner
+def _separate(a, b, low, high, radius, far, x, c, n):
+    """Newton's method along the way from a to b; c and n, the nearest point and the normal, are those at a, and then
+    those of the half-space; x: scratch."""
+    begin, end, slope = 0.0, np.inf, _slope(a, b, n)
+    for _ in range(_ITERATIONS):
+        if far <= (1.0 + _CONTACT) * radius or slope >= 0.0:
+            break
+        s = begin - (far - radius) / slope
+        if s >= 1.0:
+            break
+        if s >= end:
+            s = 0.5 * (begin + end)
+        for k in range(3):
+            x[k] = a[k] + s * (b[k] - a[k])
+        there = _nearest(x, low, high, c, n)
+        steep = _slope(a, b, n)
+        if steep < 0.0:
+            begin, far, slope = s, there, steep
+        else:  # past the nearest point of the way: the obstacle is not met
+            end = s
+    for k in range(3):
+        x[k] = a[k] + begin * (b[k] - a[k])
+    _nearest(x, low, high, c, n)
+
+
+@inner
+def _slope(a, b, n):
+    return n[0] * (b[0] - a[0]) + n[1] * (b[1] - a[1]) + n[2] * (b[2] - a[2])
+
+
+@inner
+def _nearest(x, low, high, c, n):
+    """The distance from x to a box, negative inside, the nearest point of its surface to c, the normal there to n."""
+    square, least, axis, side = 0.0, np.inf, 0, 1.0
+    for k in range(3):
+        c[k] = min(max(x[k], low[k]), high[k])
+        n[k] = x[k] - c[k]
+        square += n[k] * n[k]
+        if high[k] - x[k] < least:
+            least, axis, side = high[k] - x[k], k, 1.0
+        if x[k] - low[k] < least:
+            least, axis, side = x[k] - low[k], k, -1.0
+    if square > 0.0:
+        far = np.sqrt(square)
+        for k in range(3):
+            n[k] /= far
+        return far
+    n[:] = 0.0
+    n[axis], c[axis] = side, high[axis] if side > 0.0 else low[axis]
+    return -least
