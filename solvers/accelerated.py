@@ -19,9 +19,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiled import _FAR as FAR
-from solvers.compiled import _ORDERS as ORDERS
-from solvers.compiled import PreparedCompiled
+from solvers.compiled import FAR, ORDERS, PreparedCompiled
 from solvers.energies.springs import Springs
 from solvers.kernels import accelerate, accelerate_step
 from solvers.kernels.accelerate import Window

@@ -28,7 +28,7 @@ from solvers.linear.team import Team
 from solvers.local_global import PreparedLocalGlobal, Project, only_springs, prepared
 from solvers.problem import Positions, Solution, StepProblem, StopRule, System
 
-_FAR = 1e100
+FAR = 1e100
 """Where the springs end that fill up bundles: at no vertex, whatever the unit of length."""
 
 
@@ -49,13 +49,13 @@ class CompiledLocalGlobal:
         """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
         springs = only_springs(system, "numba")
         base = prepared(system, [springs], lambda Q: factorise(Q, self.linear, self.precision))
-        for kind, order in _ORDERS.items():
+        for kind, order in ORDERS.items():
             if isinstance(base.factor, kind):
                 return PreparedCompiled.of(base, springs, order(base.factor))
         return replace(base, project=_projection(springs, system.vertices))
 
 
-_ORDERS: dict[type, Callable[[Any], Order]] = {Supernodal: of_supernodal, Inverse: of_inverse}
+ORDERS: dict[type, Callable[[Any], Order]] = {Supernodal: of_supernodal, Inverse: of_inverse}
 """The linear solvers whose panels the kernels go through; the others are called in between."""
 
 
@@ -202,7 +202,7 @@ class PreparedCompiled:
         arrays = vectors(dtype, rows)
         p = None if dtype == np.float64 else kernels.aligned(4 * rows)
         for x in arrays[:3] if p is None else [p]:
-            x[4 * self.far] = _FAR
+            x[4 * self.far] = FAR
         return _Work(arrays, kernels.aligned(4 * rows), p)
 
     def _threads(self) -> int | None:
@@ -222,7 +222,7 @@ def _projection(springs: Springs, n: int) -> Project:
     """The compiled local step for a linear solver that is called from Python."""
     bundles, _ = kernels.Bundles.of(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
     x, b, zero = (kernels.aligned(4 * (n + 2)) for _ in range(3))
-    x[4 * (n + 1)] = _FAR
+    x[4 * (n + 1)] = FAR
 
     def project(p: Positions, y: Positions, out: Positions) -> None:
         kernels.project(bundles, p, y, x, b, zero, out)

@@ -12,8 +12,8 @@ from typing import Any
 from numba import njit
 
 _kept: Any = {"cache": True, "_nrt": False, "nogil": True}
-_inner: Any = {**_kept, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+inner_options: Any = {**_kept, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 kernel: Any = njit(**_kept)
-inner: Any = njit(**_inner)
-inner_in_parallel: Any = njit(**_inner, parallel=True)
+inner: Any = njit(**inner_options)
+inner_in_parallel: Any = njit(**inner_options, parallel=True)

@@ -23,7 +23,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from solvers.compiling import _inner, inner, kernel
+from solvers.compiling import inner, inner_options, kernel
 from solvers.kernels.accelerate_coefficients import coefficients
 
 DECREASE, FLATTER = 1e-4, 0.1
@@ -37,7 +37,7 @@ _HALVINGS = 40
 
 # Sums may be reordered, which vectors need; NaN and infinity keep their meaning. No loop both adds up and writes:
 # whether that becomes vectors is decided by where the arrays lie, and with it the order of the sum.
-_vectors: Any = njit(**_inner, fastmath={"contract", "reassoc", "nsz"})
+_vectors: Any = njit(**inner_options, fastmath={"contract", "reassoc", "nsz"})
 
 NOW = np.dtype(
     [

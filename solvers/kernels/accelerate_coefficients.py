@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from solvers.compiling import _inner
+from solvers.compiling import inner_options
 
 # At a minimum all products may be zero: then quotients are not numbers, and the trial that they make is rejected.
-inner: Any = njit(**_inner, error_model="numpy")
+inner: Any = njit(**inner_options, error_model="numpy")
 
 CHEBYSHEV, ANDERSON, LBFGS = 0, 1, 2
 

@@ -19,8 +19,8 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from solvers.compiling import inner
-from solvers.kernels.springs import _TINY_SQUARED, Bundles, _one_by_one, aligned
-from solvers.kernels.springs_vectors import _F64, _I8, _I64, _LEAST, _MASK, _WIDE, LANES, _constant, _Vectors
+from solvers.kernels.springs import TINY_SQUARED, Bundles, aligned, one_by_one
+from solvers.kernels.springs_vectors import F64, I8, I64, LANES, LEAST, MASK, WIDE, Vectors, constant
 
 
 class Shares(NamedTuple):
@@ -56,24 +56,24 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, weight, rest, 
             else context.cast(builder, value, argument, types.int64)
             for argument, value in zip(signature.args, args, strict=True)
         )
-        v = _Vectors(builder)
-        places = v.places(builder.gep(own, [builder.mul(chunk, _I64(LANES))]))
+        v = Vectors(builder)
+        places = v.places(builder.gep(own, [builder.mul(chunk, I64(LANES))]))
         centre = v.gather(x, places)
-        sums = [cgutils.alloca_once(builder, _WIDE) for _ in range(4)]
+        sums = [cgutils.alloca_once(builder, WIDE) for _ in range(4)]
         for accumulator in sums:
-            builder.store(_constant(0.0), accumulator)
-        short = cgutils.alloca_once(builder, _MASK)
-        builder.store(ir.Constant(_MASK, [0] * LANES), short)
-        with cgutils.for_range_slice(builder, begin, end, _I64(1), _I64) as (entry, _):
-            first = builder.mul(entry, _I64(LANES))
+            builder.store(constant(0.0), accumulator)
+        short = cgutils.alloca_once(builder, MASK)
+        builder.store(ir.Constant(MASK, [0] * LANES), short)
+        with cgutils.for_range_slice(builder, begin, end, I64(1), I64) as (entry, _):
+            first = builder.mul(entry, I64(LANES))
 
             def wide(array, first=first):
-                return v.load(builder.gep(array, [first]), _WIDE)
+                return v.load(builder.gep(array, [first]), WIDE)
 
             others = v.gather(x, v.places(builder.gep(neighbour, [first])))
             arrow = [builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
             squared = v.dot(arrow)
-            tiny = builder.fcmp_ordered("<=", squared, _constant(_LEAST))
+            tiny = builder.fcmp_ordered("<=", squared, constant(LEAST))
             builder.store(builder.or_(builder.load(short), tiny), short)
             root = v.inverse_root(squared)
             scale = builder.fsub(builder.fmul(wide(pull), root), wide(stiffness))
@@ -82,7 +82,7 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, weight, rest, 
             for factor, term, accumulator in zip(scales, [*arrow, longer], sums, strict=True):
                 builder.store(v.multiply_add(factor, term, builder.load(accumulator)), accumulator)
         *total, energy = [builder.load(accumulator) for accumulator in sums]
-        any_short = builder.icmp_unsigned("!=", builder.bitcast(builder.load(short), _I8), _I8(0))
+        any_short = builder.icmp_unsigned("!=", builder.bitcast(builder.load(short), I8), I8(0))
         with builder.if_then(builder.not_(any_short), likely=True):
             for place, row in zip(places, v.rows(*total), strict=True):
                 here = v.load(v.row(x, place), row.type)
@@ -90,7 +90,7 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, weight, rest, 
                 row = builder.fadd(row, v.load(v.row(y, place), row.type))
                 row = v.subtract_product(row, weight_here, here)
                 builder.store(row, builder.bitcast(v.row(out, place), row.type.as_pointer()), align=8)
-        return builder.select(any_short, _F64(-1.0), v.total(energy))
+        return builder.select(any_short, F64(-1.0), v.total(energy))
 
     return types.float64(x, own, chunk, neighbour, pull, stiffness, weight, rest, begin, end, y, held, out), generate
 
@@ -111,7 +111,7 @@ def descend(bundles, shares, p, y, held, rows, out):
             for lane in range(LANES):
                 for c in range(4):
                     out[4 * own[LANES * b + lane] + c] = 0.0
-            _one_by_one(bundles, b, p, y, held, out, 0, True)
+            one_by_one(bundles, b, p, y, held, out, 0, True)
             energy = _short(bundles, shares, b, p)
         total += energy
     for i in range(rows):
@@ -132,6 +132,6 @@ def _short(bundles, shares, b, p):
         squared = 0.0
         for c in range(3):
             squared += (p[4 * i + c] - p[4 * j + c]) ** 2
-        length = 0.0 if squared <= _TINY_SQUARED else np.sqrt(squared)
+        length = 0.0 if squared <= TINY_SQUARED else np.sqrt(squared)
         total += shares.weight[entry] * (length - shares.rest[entry]) ** 2
     return total

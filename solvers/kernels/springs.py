@@ -19,7 +19,7 @@ from solvers.energies.springs import TINY, Springs
 from solvers.kernels import springs_vectors as vectors
 from solvers.kernels.springs_vectors import LANES
 
-_TINY_SQUARED = TINY * TINY
+TINY_SQUARED = TINY * TINY
 WINDOW = 128
 """Neighbouring rows of which those with equally many springs are bundled: longer ones would scatter the reading."""
 
@@ -108,7 +108,7 @@ def add_projection(bundles, begin, end, p, y, held, out, shift):
     own, start, neighbour, pull, stiffness, _spring, _direction = bundles
     for b in range(begin, end):
         if vectors.project(p, own, b, neighbour, pull, stiffness, start[b], start[b + 1], y, held, out, shift):
-            _one_by_one(bundles, b, p, y, held, out, shift, False)
+            one_by_one(bundles, b, p, y, held, out, shift, False)
 
 
 @inner
@@ -117,11 +117,11 @@ def add_descent(bundles, begin, end, p, y, held, out, shift):
     own, start, neighbour, pull, stiffness, _spring, _direction = bundles
     for b in range(begin, end):
         if vectors.correct(p, own, b, neighbour, pull, stiffness, start[b], start[b + 1], y, held, out, shift):
-            _one_by_one(bundles, b, p, y, held, out, shift, True)
+            one_by_one(bundles, b, p, y, held, out, shift, True)
 
 
 @inner
-def _one_by_one(bundles, b, p, y, held, out, shift, correct):
+def one_by_one(bundles, b, p, y, held, out, shift, correct):
     """A bundle in which a spring has no length: that takes the direction of its rest shape."""
     for lane in range(LANES):
         i = bundles.own[LANES * b + lane]
@@ -137,7 +137,7 @@ def _one_by_one(bundles, b, p, y, held, out, shift, correct):
                 k = bundles.stiffness[e]
                 s0, s1, s2 = s0 - k * v0, s1 - k * v1, s2 - k * v2
             scale, squared = bundles.pull[e], v0 * v0 + v1 * v1 + v2 * v2
-            if squared <= _TINY_SQUARED:
+            if squared <= TINY_SQUARED:
                 name = bundles.spring[e]
                 if name < 0:
                     scale, name = -scale, ~name

@@ -19,29 +19,30 @@ from numba.extending import intrinsic
 from solvers.energies.springs import TINY
 
 LANES = 8
-_I32, _I64, _F64 = ir.IntType(32), ir.IntType(64), ir.DoubleType()
-_ROW, _WIDE = ir.VectorType(_F64, 4), ir.VectorType(_F64, LANES)
-_I8, _MASK = ir.IntType(8), ir.VectorType(ir.IntType(1), LANES)
-_BITS = ir.VectorType(_I64, LANES)
+I32, I64, F64 = ir.IntType(32), ir.IntType(64), ir.DoubleType()
+ROW, WIDE = ir.VectorType(F64, 4), ir.VectorType(F64, LANES)
+I8, MASK = ir.IntType(8), ir.VectorType(ir.IntType(1), LANES)
+BITS = ir.VectorType(I64, LANES)
 _GUESS = 0x5FE6EB50C7B537A9
-_LEAST, _MOST = TINY * TINY, 1.7e308
+LEAST, MOST = TINY * TINY, 1.7e308
 """Squared lengths are kept between these, so that no guess is infinite."""
 
 Kind = Literal["project", "correct", "energy"]
 
 
-def _constant(value: float) -> ir.Constant:
-    return ir.Constant(_WIDE, [value] * LANES)
+def constant(value: float) -> ir.Constant:
+    """Eight times one number."""
+    return ir.Constant(WIDE, [value] * LANES)
 
 
-class _Vectors:
+class Vectors:
     """Vectors of eight float64, written with a builder."""
 
     def __init__(self, builder: Any) -> None:
         self.builder = builder
 
     def shuffle(self, a: ir.Value, b: ir.Value, lanes: list[int]) -> Any:
-        return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(lanes)), lanes))
+        return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))
 
     def load(self, pointer: Any, kind: ir.Type, align: int = 8) -> ir.Value:
         return self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()), align=align)
@@ -56,16 +57,16 @@ class _Vectors:
 
     def row(self, array: Any, place: Any) -> Any:
         """Where row `place` of four numbers begins."""
-        return self.builder.gep(array, [self.builder.shl(place, _I64(2))])
+        return self.builder.gep(array, [self.builder.shl(place, I64(2))])
 
     def places(self, indices: Any) -> list[Any]:
         """The eight int32 at a pointer."""
         b = self.builder
-        return [b.zext(b.load(b.gep(indices, [_I64(lane)])), _I64) for lane in range(LANES)]
+        return [b.zext(b.load(b.gep(indices, [I64(lane)])), I64) for lane in range(LANES)]
 
     def gather(self, array: Any, places: list[Any]) -> list[Any]:
         """x, y and z of eight rows."""
-        rows = [self.load(self.row(array, place), _ROW) for place in places]
+        rows = [self.load(self.row(array, place), ROW) for place in places]
         pairs = [self.shuffle(rows[lane], rows[lane + 4], list(range(8))) for lane in range(4)]
         low = [0, 8, 2, 10, 4, 12, 6, 14]
         xz = [self.shuffle(pairs[i], pairs[i + 1], low) for i in (0, 2)]
@@ -78,7 +79,7 @@ class _Vectors:
         out = []
         for lane in range(LANES):
             xy = self.shuffle(x, y, [lane, LANES + lane])
-            z0 = self.shuffle(z, _constant(0.0), [lane, LANES])
+            z0 = self.shuffle(z, constant(0.0), [lane, LANES])
             out.append(self.shuffle(xy, z0, [0, 1, 2, 3]))
         return out
 
@@ -91,43 +92,43 @@ class _Vectors:
 
     def gathered(self, scalars: list[Any]) -> Any:
         """Eight numbers as a vector."""
-        out: Any = _constant(0.0)
+        out: Any = constant(0.0)
         for lane, scalar in enumerate(scalars):
-            out = self.builder.insert_element(out, scalar, _I32(lane))
+            out = self.builder.insert_element(out, scalar, I32(lane))
         return out
 
     def total(self, a: Any) -> Any:
         """The sum of the lanes, taken pairwise."""
-        terms = [self.builder.extract_element(a, _I32(lane)) for lane in range(LANES)]
+        terms = [self.builder.extract_element(a, I32(lane)) for lane in range(LANES)]
         while len(terms) > 1:
             terms = [self.builder.fadd(p, q) for p, q in zip(terms[::2], terms[1::2], strict=True)]
         return terms[0]
 
     def broadcast(self, scalar: Any) -> Any:
         """A row of four times one number."""
-        single = self.builder.insert_element(ir.Constant(_ROW, [0.0] * 4), scalar, _I32(0))
+        single = self.builder.insert_element(ir.Constant(ROW, [0.0] * 4), scalar, I32(0))
         return self.shuffle(single, single, [0] * 4)
 
     def add_to(self, pointer: Any, row: Any) -> None:
         """Add a row to one in memory, rounded to its type first."""
-        if pointer.type.pointee != _F64:
+        if pointer.type.pointee != F64:
             row = self.builder.fptrunc(row, ir.VectorType(pointer.type.pointee, 4))
-        size = 8 if pointer.type.pointee == _F64 else 4
+        size = 8 if pointer.type.pointee == F64 else 4
         total = self.builder.fadd(self.load(pointer, row.type, size), row)
         self.builder.store(total, self.builder.bitcast(pointer, row.type.as_pointer()), align=size)
 
     def inverse_root(self, s: Any) -> Any:
-        """1/sqrt(s), s taken to lie between _LEAST and _MOST."""
+        """1/sqrt(s), s taken to lie between LEAST and MOST."""
         b = self.builder
-        for order, bound in (("<=", _constant(_LEAST)), (">=", _constant(_MOST))):
+        for order, bound in (("<=", constant(LEAST)), (">=", constant(MOST))):
             s = b.select(b.fcmp_ordered(order, s, bound), bound, s)
-        half = b.lshr(b.bitcast(s, _BITS), ir.Constant(_BITS, [1] * LANES))
-        y = b.bitcast(b.sub(ir.Constant(_BITS, [_GUESS] * LANES), half), _WIDE)
+        half = b.lshr(b.bitcast(s, BITS), ir.Constant(BITS, [1] * LANES))
+        y = b.bitcast(b.sub(ir.Constant(BITS, [_GUESS] * LANES), half), WIDE)
         for coefficients in ([35 / 128, 5 / 16, 3 / 8, 1 / 2], [3 / 8, 1 / 2]):
-            e = self.subtract_product(_constant(1.0), b.fmul(s, y), y)
-            series = _constant(coefficients[0])
+            e = self.subtract_product(constant(1.0), b.fmul(s, y), y)
+            series = constant(coefficients[0])
             for c in coefficients[1:]:
-                series = self.multiply_add(series, e, _constant(c))
+                series = self.multiply_add(series, e, constant(c))
             y = self.multiply_add(b.fmul(y, e), series, y)
         return y
 
@@ -143,21 +144,21 @@ def _over_chunk(kind: Kind):
                 else context.cast(builder, value, argument, types.int64)
                 for argument, value in zip(signature.args, args, strict=True)
             )
-            v = _Vectors(builder)
-            places = v.places(builder.gep(own, [builder.mul(chunk, _I64(LANES))]))
+            v = Vectors(builder)
+            places = v.places(builder.gep(own, [builder.mul(chunk, I64(LANES))]))
             centre = v.gather(x, places)
-            sums = [cgutils.alloca_once(builder, _WIDE) for _ in range(3)]
+            sums = [cgutils.alloca_once(builder, WIDE) for _ in range(3)]
             for accumulator in sums:
-                builder.store(_constant(0.0), accumulator)
-            short = cgutils.alloca_once(builder, _MASK)
-            builder.store(ir.Constant(_MASK, [0] * LANES), short)
+                builder.store(constant(0.0), accumulator)
+            short = cgutils.alloca_once(builder, MASK)
+            builder.store(ir.Constant(MASK, [0] * LANES), short)
 
             def read(entry):
                 """What an entry's springs need: k r, k, and the vector from their other ends with its square."""
-                first = builder.mul(entry, _I64(LANES))
+                first = builder.mul(entry, I64(LANES))
                 others = v.gather(x, v.places(builder.gep(neighbour, [first])))
                 arrow = [builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
-                weights = [v.load(builder.gep(array, [first]), _WIDE) for array in weighted]
+                weights = [v.load(builder.gep(array, [first]), WIDE) for array in weighted]
                 return [*weights, v.dot(arrow), *arrow]
 
             def add(values):
@@ -168,7 +169,7 @@ def _over_chunk(kind: Kind):
                 if kind == "energy":
                     added = [squared]
                 else:
-                    tiny = builder.fcmp_ordered("<=", squared, _constant(_LEAST))
+                    tiny = builder.fcmp_ordered("<=", squared, constant(LEAST))
                     builder.store(builder.or_(builder.load(short), tiny), short)
                     scale = builder.fmul(scale, v.inverse_root(squared))
                 if kind == "correct":
@@ -179,8 +180,8 @@ def _over_chunk(kind: Kind):
             # One entry is read while the one before is added: a root waits for its springs no longer than they do.
             weighted = {"project": [pull], "correct": [pull, stiffness], "energy": [stiffness]}[kind]
             waiting = [cgutils.alloca_once_value(builder, value) for value in read(begin)]
-            second = builder.add(begin, _I64(1))
-            with cgutils.for_range_slice(builder, second, end, _I64(1), _I64) as (entry, _):
+            second = builder.add(begin, I64(1))
+            with cgutils.for_range_slice(builder, second, end, I64(1), I64) as (entry, _):
                 following = read(entry)
                 add([builder.load(value) for value in waiting])
                 for value, place in zip(following, waiting, strict=True):
@@ -189,14 +190,14 @@ def _over_chunk(kind: Kind):
             total = [builder.load(accumulator) for accumulator in sums]
             weights = [builder.load(builder.gep(held, [place])) for place in places]
             if kind == "energy":
-                lanes = v.multiply_add(v.dot(centre), v.gathered(weights), builder.fmul(_constant(0.5), total[0]))
+                lanes = v.multiply_add(v.dot(centre), v.gathered(weights), builder.fmul(constant(0.5), total[0]))
                 return v.total(lanes)
-            any_short = builder.icmp_unsigned("!=", builder.bitcast(builder.load(short), _I8), _I8(0))
+            any_short = builder.icmp_unsigned("!=", builder.bitcast(builder.load(short), I8), I8(0))
             with builder.if_then(builder.not_(any_short), likely=True):
                 for place, row, weight in zip(places, v.rows(*total), weights, strict=True):
-                    row = builder.fadd(row, v.load(v.row(y, place), _ROW))
+                    row = builder.fadd(row, v.load(v.row(y, place), ROW))
                     if kind == "correct":
-                        row = v.subtract_product(row, v.broadcast(weight), v.load(v.row(x, place), _ROW))
+                        row = v.subtract_product(row, v.broadcast(weight), v.load(v.row(x, place), ROW))
                     v.add_to(v.row(out, builder.add(place, shift)), row)
             return any_short
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from solvers.compiling import inner, kernel
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.accelerate_springs import descend as objective
-from solvers.kernels.springs import Bundles, _one_by_one
+from solvers.kernels.springs import Bundles, one_by_one
 from solvers.kernels.springs_vectors import LANES
 from solvers.kernels.vbd_vectors import descend
 
@@ -53,7 +53,7 @@ def _sweep(blocks, y, p, work):
             for lane in range(LANES):
                 for k in range(4):
                     work.out[4 * own[LANES * b + lane] + k] = 0.0
-            _one_by_one(blocks.bundles, b, p, y, blocks.held, work.out, 0, True)
+            one_by_one(blocks.bundles, b, p, y, blocks.held, work.out, 0, True)
             for lane in range(LANES):
                 i = own[LANES * b + lane]
                 for k in range(4 * i, 4 * i + 3):

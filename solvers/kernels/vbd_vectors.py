@@ -9,7 +9,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from solvers.kernels.springs_vectors import _I8, _I64, _LEAST, _MASK, _WIDE, LANES, _constant, _Vectors
+from solvers.kernels.springs_vectors import I8, I64, LANES, LEAST, MASK, WIDE, Vectors, constant
 
 NUMBERS = 4
 """What is kept of each spring between the two passes: its vector and its length."""
@@ -17,10 +17,10 @@ NUMBERS = 4
 _ROUND_OFF = 1e-14
 """Pivots up to this share of the diagonal's sum are round-off, of some ten springs."""
 
-_ZERO, _HALF, _ONE = _constant(0.0), _constant(0.5), _constant(1.0)
+_ZERO, _HALF, _ONE = constant(0.0), constant(0.5), constant(1.0)
 
 
-def _newton(v: _Vectors, block: list[Any], g: list[Any]) -> tuple[list[Any], Any]:
+def _newton(v: Vectors, block: list[Any], g: list[Any]) -> tuple[list[Any], Any]:
     """-B^-1 g for B = [[a, b, c], [b, d, e], [c, e, f]] by its factors L D L', and where B is positive definite."""
     builder: Any = v.builder
     a, b, c, d, e, f = block
@@ -37,7 +37,7 @@ def _newton(v: _Vectors, block: list[Any], g: list[Any]) -> tuple[list[Any], Any
     x1 = v.subtract_product(builder.fmul(builder.fsub(_ZERO, y1), by_second), l3, x2)
     x0 = v.subtract_product(builder.fmul(builder.fsub(_ZERO, g[0]), by_a), l1, x1)
     x0 = v.subtract_product(x0, l2, x2)
-    least = builder.fmul(_constant(_ROUND_OFF), builder.fadd(builder.fadd(a, d), f))
+    least = builder.fmul(constant(_ROUND_OFF), builder.fadd(builder.fadd(a, d), f))
     large = [builder.fcmp_ordered(">", pivot, least) for pivot in (a, second, third)]
     return [x0, x1, x2], builder.and_(builder.and_(large[0], large[1]), large[2])
 
@@ -52,34 +52,34 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y,
             else context.cast(builder, value, argument, types.int64)
             for argument, value in zip(signature.args, args, strict=True)
         )
-        v = _Vectors(builder)
-        places = v.places(builder.gep(own, [builder.mul(chunk, _I64(LANES))]))
+        v = Vectors(builder)
+        places = v.places(builder.gep(own, [builder.mul(chunk, I64(LANES))]))
 
         def at_vertices(array):
             return v.gathered([builder.load(builder.gep(array, [place])) for place in places])
 
         def kept(entry):
-            begins = builder.mul(builder.sub(entry, begin), _I64(LANES * NUMBERS))
-            return [builder.gep(near, [builder.add(begins, _I64(LANES * k))]) for k in range(NUMBERS)]
+            begins = builder.mul(builder.sub(entry, begin), I64(LANES * NUMBERS))
+            return [builder.gep(near, [builder.add(begins, I64(LANES * k))]) for k in range(NUMBERS)]
 
         def wide(array, entry):
-            return v.load(builder.gep(array, [builder.mul(entry, _I64(LANES))]), _WIDE)
+            return v.load(builder.gep(array, [builder.mul(entry, I64(LANES))]), WIDE)
 
         centre, weight = v.gather(x, places), at_vertices(held)
         load = [v.subtract_product(here, weight, p) for here, p in zip(v.gather(y, places), centre, strict=True)]
         # Minus the gradient, then the block's upper triangle, row by row.
         first = [*load, weight, _ZERO, _ZERO, weight, _ZERO, weight]
         sums = [cgutils.alloca_once_value(builder, value) for value in first]
-        short = cgutils.alloca_once_value(builder, ir.Constant(_MASK, [0] * LANES))
-        with cgutils.for_range_slice(builder, begin, end, _I64(1), _I64) as (entry, _):
-            others = v.gather(x, v.places(builder.gep(neighbour, [builder.mul(entry, _I64(LANES))])))
+        short = cgutils.alloca_once_value(builder, ir.Constant(MASK, [0] * LANES))
+        with cgutils.for_range_slice(builder, begin, end, I64(1), I64) as (entry, _):
+            others = v.gather(x, v.places(builder.gep(neighbour, [builder.mul(entry, I64(LANES))])))
             arrow = [builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
             squared = v.dot(arrow)
-            tiny = builder.fcmp_ordered("<=", squared, _constant(_LEAST))
+            tiny = builder.fcmp_ordered("<=", squared, constant(LEAST))
             builder.store(builder.or_(builder.load(short), tiny), short)
             root = v.inverse_root(squared)
             for value, pointer in zip([*arrow, builder.fmul(squared, root)], kept(entry), strict=True):
-                builder.store(value, builder.bitcast(pointer, _WIDE.as_pointer()), align=8)
+                builder.store(value, builder.bitcast(pointer, WIDE.as_pointer()), align=8)
             k = wide(stiffness, entry)
             tension = builder.fsub(builder.fmul(wide(pull, entry), root), k)
             compressed = builder.fcmp_ordered(">", tension, _ZERO)
@@ -101,8 +101,8 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y,
         for component, own_force in zip(d, load, strict=True):
             rise = v.subtract_product(rise, component, own_force)
         rises = cgutils.alloca_once_value(builder, rise)
-        with cgutils.for_range_slice(builder, begin, end, _I64(1), _I64) as (entry, _):
-            *arrow, length = [v.load(pointer, _WIDE) for pointer in kept(entry)]
+        with cgutils.for_range_slice(builder, begin, end, I64(1), I64) as (entry, _):
+            *arrow, length = [v.load(pointer, WIDE) for pointer in kept(entry)]
             moved = [builder.fadd(a, b) for a, b in zip(arrow, d, strict=True)]
             squared = v.dot(moved)
             both = v.multiply_add(squared, v.inverse_root(squared), length)
@@ -116,7 +116,7 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y,
         scale = builder.fdiv(_ONE, at_vertices(majorant))
         safe = [builder.fmul(scale, component) for component in force]
         ends = [builder.fadd(p, builder.select(better, a, b)) for p, a, b in zip(centre, d, safe, strict=True)]
-        any_short = builder.icmp_unsigned("!=", builder.bitcast(builder.load(short), _I8), _I8(0))
+        any_short = builder.icmp_unsigned("!=", builder.bitcast(builder.load(short), I8), I8(0))
         with builder.if_then(builder.not_(any_short), likely=True):
             for place, row in zip(places, v.rows(*ends), strict=True):
                 builder.store(row, builder.bitcast(v.row(x, place), row.type.as_pointer()), align=8)
