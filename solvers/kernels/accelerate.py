@@ -113,7 +113,7 @@ def propose(window):
 def judge(window):
     """What to do about a trial whose rise, noise and gradient are known."""
     now = window.now[0]
-    even = abs(now.rise) <= now.noise
+    even = abs(now.rise) <= now.noise < np.inf
     if even:
         there = -_dot(window.direction, window.descent_there)
         enough = now.slope <= 0.0 and there <= (2.0 * FLATTER - 1.0) * now.slope
