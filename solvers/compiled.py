@@ -26,7 +26,8 @@ from solvers.linear.inverse import Inverse
 from solvers.linear.supernodal import Supernodal
 from solvers.linear.team import Team
 from solvers.local_global import PreparedLocalGlobal, Project, only_springs, prepared
-from solvers.problem import Positions, Solution, StepProblem, StopRule, System
+from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System
+from solvers.touching import without_contact
 
 FAR = 1e100
 """Where the springs end that fill up bundles: at no vertex, whatever the unit of length."""
@@ -45,8 +46,12 @@ class CompiledLocalGlobal:
     linear: Linear = "auto"
     precision: Precision = "float64"
 
-    def prepare(self, system: System) -> PreparedLocalGlobal | PreparedCompiled:
-        """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
+    def prepare(self, system: System) -> Prepared:
+        """Raises Unsupported for energies other than springs and contact, NotPositiveDefinite."""
+        if without_contact(system) is not system:
+            from solvers.contact import local_global  # for those who need it
+
+            return local_global(self, system)
         springs = only_springs(system, "numba")
         base = prepared(system, [springs], lambda Q: factorise(Q, self.linear, self.precision))
         for kind, order in ORDERS.items():

@@ -28,6 +28,7 @@ from solvers.problem import (
     Energy,
     LaggedEnergy,
     Positions,
+    Prepared,
     ProjectiveEnergy,
     Solution,
     StepProblem,
@@ -35,6 +36,7 @@ from solvers.problem import (
     System,
     Unsupported,
 )
+from solvers.touching import without_contact
 
 Project = Callable[[Positions, Positions, Positions], None]
 """(p, y, out): write y + A'K d(p) to `out`."""
@@ -188,8 +190,12 @@ class SparseLocalGlobal:
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
 
-    def prepare(self, system: System) -> PreparedLocalGlobal:
+    def prepare(self, system: System) -> Prepared:
         """Raises Unsupported for energies that are not projective, NotPositiveDefinite."""
+        if without_contact(system) is not system:
+            from solvers.contact import local_global  # which builds on this module, and is not for everyone
+
+            return local_global(self, system)
         energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
         if len(energies) < len(system.energies):
             others = {type(e).__name__ for e in system.energies if not isinstance(e, ProjectiveEnergy)}

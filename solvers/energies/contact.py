@@ -25,6 +25,7 @@ from scipy.sparse import bsr_array, csr_array
 
 from solvers.energies import contact_planes
 from solvers.problem import Positions, Start
+from solvers.touching import Rows
 
 Array = NDArray[np.float64]
 
@@ -60,19 +61,8 @@ class Planes(NamedTuple):
     grip: Array
 
 
-class Rows(NamedTuple):
-    """Stiffnesses that majorise a contact energy: w/2 (direction.x_v + gap)^2, of vertices (r,).
-
-    direction: (r, 3), unit vectors; weight: w (r,) [N/m]; gap (r,) [m]: zero where the force of today is part of it.
-    """
-
-    vertices: NDArray[np.int64]
-    direction: Positions
-    weight: Array
-    gap: Array
-
-
-_NONE = Planes(np.empty(0, np.int64), *np.empty((1, 0, 3)), np.empty(0), *np.empty((1, 0, 3)), *np.empty((2, 0)))
+_VECTORS, _NUMBERS = np.empty((0, 3)), np.empty(0)
+_NONE = Planes(np.empty(0, np.int64), _VECTORS, _NUMBERS, _VECTORS, _NUMBERS, _NUMBERS)
 
 
 @dataclass(frozen=True, eq=False)
