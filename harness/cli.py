@@ -178,6 +178,23 @@ def recommend(
     out.print(table)
 
 
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(help="The results of a sweep with `judge: true`, such as results/hard.")],
+) -> None:
+    """Draw the map of robustness: solvers x cases, coloured by what became of each run."""
+    from harness.report.robustness import read_cells, summary
+    from harness.report.robustness_map import draw_map, write_page
+
+    cells = read_cells(folder)
+    picture, page = folder / "pictures" / "robustness.png", folder / "robustness.html"
+    picture.parent.mkdir(exist_ok=True)
+    draw_map(cells, picture, f"Robustness: {folder.resolve().name}")
+    write_page(cells, page, f"Robustness: {folder.resolve().name}")
+    out.print(summary(cells))
+    _say(f"the map is {picture}, with reasons and recordings {page}")
+
+
 @app.command("list")
 def list_runs(config: Config, results: Results = Path("results")) -> None:
     """Check a config, and show what would run and what is there already."""

@@ -1,0 +1,158 @@
+"""How robust each solver is: the outcome of each run of a sweep that was judged, from its rows alone.
+
+A run that means to minimise is right where every step's answer is stationary to the tolerance that was asked for, or
+to round-off, and a certified minimum, and the motion is that of the reference. One that does not minimise is graded by
+the motion alone.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.table import Table
+
+from harness import rows
+from harness.errors import InputError
+from solvers.registry import SOLVERS
+
+SLACK = 1.1
+"""On the tolerance: the oracle and a solver factorise the same matrix by different ways."""
+ASKED = 1e-6
+"""The tolerance by which a run is graded that was asked for none."""
+SAME = 1e-2
+"""Of the rest shape's size: a motion within this of the reference is the same; steps are solved to 1e-6 of what they
+move by, and what is unstable multiplies that."""
+CLOSE = 0.05
+"""Of the rest shape's size: how near a method that does not minimise has to come, about what an eye would notice."""
+
+
+class Outcome(NamedTuple):
+    """What became of a run: words for it and a colour."""
+
+    words: str
+    color: str
+    meaning: str
+
+
+RIGHT = Outcome("right", "#3a9e72", "stationary to the tolerance, a certified minimum, and the motion of the reference")
+OTHER = Outcome(
+    "another minimum", "#8fcbad", "a certified minimum in every step, and another motion than the reference"
+)
+SADDLE = Outcome("no minimum", "#b9a3d6", "stationary, but where the Hessian is not positive definite: a saddle")
+SHORT = Outcome("not converged", "#f2c45f", "finite, and not yet stationary, or not close to the reference")
+DIVERGED = Outcome("diverged", "#d1495b", "positions are not finite any more")
+FAILED = Outcome("failed", "#23262b", "ended with an error")
+REFUSED = Outcome("refused", "#d9d9d6", "refused before it began, with a reason")
+OUTCOMES = (RIGHT, OTHER, SADDLE, SHORT, DIVERGED, FAILED, REFUSED)
+
+_ENDED = {"unsupported": REFUSED, "diverged": DIVERGED, "failed": FAILED}
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One run: its case, its solver, what became of it and why; worst: the largest stationarity of a step, or where
+    `graded` is "distance" the largest distance from the reference, None where there is none; recording: where it is."""
+
+    case: str
+    solver: str
+    outcome: Outcome
+    worst: float | None
+    graded: str
+    reason: str
+    recording: Path | None
+
+    @property
+    def figure(self) -> str:
+        """The worst residual in few characters: the exponent of ten, or per cent of the size."""
+        if self.worst is None:
+            return ""
+        if self.graded == "distance":
+            return f"{100 * self.worst:.0f} %" if self.worst < 9.99 else ">999 %"
+        return "0" if self.worst == 0.0 else str(round(math.log10(self.worst)))
+
+
+def read_cells(folder: Path) -> list[Cell]:
+    """The outcomes of the runs in a sweep's folder, the newest where one was repeated; by case, then by solver.
+
+    Raises InputError where no run was judged.
+    """
+    files = sorted((folder / "rows").glob("*.parquet"))
+    table = rows.read(files).to_pylist()
+    runs: dict[str, list[dict[str, Any]]] = {}
+    for row in table:
+        if row["phase"] == "run" or (row["phase"] == "step" and row["round"] == 0):
+            runs.setdefault(row["run_id"], []).append(row)
+    if not any(row["stationarity"] is not None or row["distance"] is not None for row in table):
+        raise InputError(f"{folder}: holds no runs that were judged; run a sweep with `judge: true`")
+    firsts = [run[0] for run in runs.values()]
+    cells = {}
+    for run in sorted(runs.values(), key=lambda run: run[0]["started"]):
+        case, solver = _case(run[0], firsts), _solver(run[0], firsts)
+        outcome, worst, graded, reason = judged(run)
+        recording = next((folder / "recordings").glob(f"*-{run[0]['run_id']}.rrd"), None)
+        cells[case, solver] = Cell(case, solver, outcome, worst, graded, reason, recording)
+    order = [*SOLVERS, *(first["solver"] for first in firsts)]
+    return sorted(cells.values(), key=lambda cell: (cell.case, order.index(cell.solver.split()[0]), cell.solver))
+
+
+def judged(run: Sequence[dict[str, Any]]) -> tuple[Outcome, float | None, str, str]:
+    """The outcome of a run from its rows, one a step; its worst figure, what that is, and why it is not right."""
+    first = run[0]
+    if first["status"] != "ok":
+        where = f"frame {first['frame']}: " if first["frame"] else ""
+        return _ENDED[first["status"]], None, "", where + first["reason"]
+    away = [row["distance"] for row in run if row["distance"] is not None]
+    farthest = max(away, default=None)
+    if all(row["stationarity"] is None for row in run):
+        near = farthest is not None and farthest <= CLOSE
+        why = "" if near else "there is no reference" if farthest is None else "away from the reference"
+        return (RIGHT if near else SHORT), farthest, "distance", why
+    worst = max(row["stationarity"] for row in run)
+    missed = [row["frame"] for row in run if not row["stationarity"] <= _asked(row)]
+    if missed:
+        return SHORT, worst, "stationarity", f"{len(missed)} of {len(run)} steps missed the tolerance"
+    if not all(row["minimum"] for row in run):
+        return SADDLE, worst, "stationarity", "the Hessian is not positive definite"
+    if farthest is not None and farthest > SAME:
+        return OTHER, worst, "stationarity", f"up to {100 * farthest:.2g} % of the size from the reference"
+    return RIGHT, worst, "stationarity", ""
+
+
+def _asked(row: dict[str, Any]) -> float:
+    return SLACK * max(row["tolerance"] or ASKED, row["attainable"])
+
+
+_OPTIONS = ("size", "integrator", "time_step", "first_guess", "max_iterations", "tolerance", "threads")
+
+
+def _case(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
+    """The scene, with the options that the runs of that scene differ in."""
+    own = [other for other in runs if other["scene"] == row["scene"]]
+    varied = [str(row[key]) for key in _OPTIONS if any(other[key] != row[key] for other in own)]
+    return " ".join([row["scene"], *varied])
+
+
+def _solver(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
+    """The solver's name, with the parameters in which the runs of that name differ."""
+    others = [json.loads(text) for text in {run["parameters"] for run in runs if run["solver"] == row["solver"]}]
+    own = json.loads(row["parameters"])
+    return " ".join([row["solver"], *(str(v) for key, v in own.items() if any(other[key] != v for other in others))])
+
+
+def summary(cells: Sequence[Cell]) -> Table:
+    """A row for each solver: how many cases ended how, the shares of those it did not refuse, the worst residual."""
+    table = Table("solver", *(outcome.words for outcome in OUTCOMES), "right", "finite", "worst")
+    for solver in dict.fromkeys(cell.solver for cell in cells):
+        own = [cell for cell in cells if cell.solver == solver]
+        counts = [sum(cell.outcome == outcome for cell in own) for outcome in OUTCOMES]
+        claimed = len(own) - counts[OUTCOMES.index(REFUSED)]
+        broken = sum(cell.outcome in (DIVERGED, FAILED) for cell in own)
+        worst = max((cell.worst for cell in own if cell.worst is not None), default=float("nan"))
+        shares = [f"{100 * part / claimed:.0f} %" if claimed else "" for part in (counts[0], claimed - broken)]
+        table.add_row(solver, *map(str, counts), *shares, f"{worst:.1e}")
+    return table

@@ -1,0 +1,110 @@
+"""The robustness map: solvers x cases, coloured by outcome, the worst residual in each cell; a picture and a page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from harness.report.robustness import OUTCOMES, Cell, Outcome
+from harness.report.style import DPI, INK, MUTED, PAGE
+
+_ROW, _COLUMN, _LEFT, _TOP, _BOTTOM = 0.21, 0.78, 3.3, 1.75, 1.25
+"""Inches: a cell's height and width, room for the cases' names, for the solvers' names, and for the legend."""
+
+NOTE = (
+    "Figures: log10 of the largest residual |Q^-1 grad g|_Q of a step, over its value at the step's start (or "
+    "round-off);\nof methods that do not minimise, the largest distance from a converged run, in per cent of the size."
+)
+
+
+def draw_map(cells: Sequence[Cell], path: Path, title: str) -> None:
+    """Draw the map to a PNG."""
+    cases, solvers = (list(dict.fromkeys(getattr(cell, key) for cell in cells)) for key in ("case", "solver"))
+    width, height = _LEFT + _COLUMN * len(solvers) + 0.9, _TOP + _ROW * len(cases) + _BOTTOM
+    figure = Figure((width, height), DPI, facecolor=PAGE)
+    ax = figure.add_axes((_LEFT / width, _BOTTOM / height, _COLUMN * len(solvers) / width, _ROW * len(cases) / height))
+    ax.set_xlim(0, len(solvers))
+    ax.set_ylim(len(cases), 0)
+    ax.set_axis_off()
+    for cell in cells:
+        x, y = solvers.index(cell.solver), cases.index(cell.case)
+        ax.add_patch(Rectangle((x + 0.02, y + 0.05), 0.96, 0.9, facecolor=cell.outcome.color, linewidth=0))
+        ax.text(x + 0.5, y + 0.53, cell.figure, ha="center", va="center", fontsize=7.5, color=_ink(cell.outcome))
+    for y, case in enumerate(cases):
+        ax.text(-0.1, y + 0.53, case, ha="right", va="center", fontsize=8.5, color=INK)
+        if y and _family(case) != _family(cases[y - 1]):
+            ax.plot([-4.2, len(solvers)], [y, y], color=MUTED, linewidth=0.6, clip_on=False)
+    for x, solver in enumerate(solvers):
+        ax.text(x + 0.45, -0.25, solver, ha="left", va="bottom", rotation=40, fontsize=9, color=INK)
+    figure.text(0.15 / width, 1 - 0.32 / height, title, fontsize=14, color=INK, weight="bold")
+    _legend(figure, cells)
+    figure.savefig(path, facecolor=PAGE)
+
+
+def _legend(figure: Figure, cells: Sequence[Cell]) -> None:
+    width, height = figure.get_size_inches()
+    x = 0.15
+    for outcome in OUTCOMES:
+        words = f"{outcome.words} ({sum(cell.outcome == outcome for cell in cells)})"
+        box = Rectangle((x / width, 0.8 / height), 0.2 / width, 0.16 / height, facecolor=outcome.color)
+        figure.add_artist(box)
+        figure.text((x + 0.27) / width, 0.88 / height, words, fontsize=9, va="center", color=INK)
+        x += 0.55 + 0.078 * len(words)
+    figure.text(0.15 / width, 0.2 / height, NOTE, fontsize=8, color=MUTED, linespacing=1.5)
+
+
+def _family(case: str) -> str:
+    return case.partition("-")[0]
+
+
+def _ink(outcome: Outcome) -> str:
+    red, green, blue = (int(outcome.color[k : k + 2], 16) for k in (1, 3, 5))
+    return INK if 0.3 * red + 0.6 * green + 0.1 * blue > 120 else PAGE
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>{title}</title>
+<style>
+body {{ font: 14px/1.45 system-ui, sans-serif; color: {ink}; background: {page}; margin: 2rem; max-width: 110rem }}
+table {{ border-collapse: separate; border-spacing: 2px }}
+th {{ font-weight: normal; text-align: left; white-space: nowrap; padding-right: .6rem }}
+thead th {{ writing-mode: vertical-rl; transform: rotate(180deg); padding: .4rem 0 }}
+td {{ text-align: center; min-width: 3.2rem; font-size: 12px; padding: 1px 4px }}
+td a {{ color: inherit }}
+li span {{ display: inline-block; width: 1rem; height: .8rem; margin-right: .5rem }} ul {{ list-style: none; padding: 0 }}
+</style>
+<h1>{title}</h1>
+<p>{note} Point at a cell for its reason; a cell that is underlined leads to the recording of its run.</p>
+<ul>{legend}</ul>
+<table><thead><tr><th></th>{head}</tr></thead><tbody>
+{body}
+</tbody></table></html>
+"""
+
+
+def write_page(cells: Sequence[Cell], path: Path, title: str) -> None:
+    """Write the map as a page of its own, with each cell's reason and a link to its recording, where there is one."""
+    cases, solvers = (list(dict.fromkeys(getattr(cell, key) for cell in cells)) for key in ("case", "solver"))
+    by_place = {(cell.case, cell.solver): _cell(cell, path.parent) for cell in cells}
+    body = "\n".join(
+        f"<tr><th>{escape(case)}</th>{''.join(by_place.get((case, solver), '<td></td>') for solver in solvers)}</tr>"
+        for case in cases
+    )
+    legend = "".join(f'<li><span style="background:{o.color}"></span>{o.words}: {o.meaning}</li>' for o in OUTCOMES)
+    head = "".join(f"<th>{escape(solver)}</th>" for solver in solvers)
+    page = _PAGE.format(title=escape(title), note=NOTE, legend=legend, head=head, body=body, ink=INK, page=PAGE)
+    path.write_text(page, encoding="utf-8")
+
+
+def _cell(cell: Cell, folder: Path) -> str:
+    figure = cell.figure or "&nbsp;"
+    if cell.recording:
+        figure = f'<a href="{escape(cell.recording.relative_to(folder).as_posix())}">{figure}</a>'
+    worst = "" if cell.worst is None else f" ({cell.graded} {cell.worst:.1e})"
+    words = escape(f"{cell.case}, {cell.solver}: {cell.outcome.words}{worst}. {cell.reason}", quote=True)
+    style = f"background:{cell.outcome.color};color:{_ink(cell.outcome)}"
+    return f'<td style="{style}" title="{words}">{figure}</td>'
