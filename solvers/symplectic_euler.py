@@ -74,7 +74,7 @@ def frequency_bound(system: System, springs: Springs) -> float:
     edges = springs.edges[springs.edges[:, 0] != springs.edges[:, 1]]
     k = springs.stiffness[springs.edges[:, 0] != springs.edges[:, 1]]
     stiffness = np.bincount(edges.ravel(), np.repeat(k, 2), system.vertices)
-    rate = np.divide(stiffness, system.mass, out=np.zeros_like(stiffness), where=system.unpinned)
+    rate = np.divide(stiffness, system.mass, out=np.zeros(system.vertices), where=system.unpinned)
     return float(np.sqrt(rate[edges].sum(axis=1).max(initial=0.0)))
 
 
