@@ -73,6 +73,7 @@ class Matrix:
     def __init__(self, system: System, edges: NDArray[np.int64], graph: csr_array) -> None:
         """graph: its pattern of blocks (f, f), sorted, with a diagonal."""
         self.graph, self._size = graph, len(system.free)
+        self.values = np.empty((graph.nnz, 3, 3))
         self.factor = BlockCholesky(graph)
         self.places = hessian.Places.of(system, edges, graph)
         rows = np.repeat(np.arange(len(graph.indptr) - 1), np.diff(graph.indptr))
@@ -128,6 +129,12 @@ class StepObjective:
             noise += _ROUND_OFF * (abs(before) + abs(after))
         return change, noise
 
+    def tensions(self, p: Positions, d: Positions) -> NDArray[np.float64]:
+        """The springs' tensions [N], (m,), at p, linearised for a step d."""
+        out = np.empty(len(self.whole.terms.stiffness))
+        hessian.tensions(self.whole.terms, p, d, out)
+        return out
+
     def hessian(self, p: Positions) -> Hessian:
         """The Hessian at p, to be factorised."""
         return Hessian(self, p)
@@ -137,7 +144,7 @@ class Hessian:
     """The Hessian [N/m] at a point, over the coordinates of free vertices."""
 
     def __init__(self, step: StepObjective, p: Positions) -> None:
-        whole = step.whole
+        self.step, whole = step, step.whole
         self._terms, self._p, self._free = whole.terms, p, whole.system.free
         self._others: csr_array | None = None
         self._matrix = whole.matrix
@@ -149,18 +156,23 @@ class Hessian:
             rows, columns = rows[inside], columns[inside]
             self._matrix = whole.matrix_for(rows, columns)
             self._added = self._matrix.entries(rows, columns), total.data[inside]
-        self._values = np.empty((self._matrix.graph.nnz, 3, 3))
 
-    def factorise(self, keep: float = 1.0, shift: NDArray[np.float64] | float = 0.0) -> bool:
-        """Whether it is positive definite, and then ready for `solve`.
+    def factorise(
+        self,
+        keep: float = 1.0,
+        shift: NDArray[np.float64] | float = 0.0,
+        tension: NDArray[np.float64] | None = None,
+    ) -> bool:
+        """Whether it is positive definite, and then ready for `solve`; without arguments it is the exact Hessian.
 
-        keep: of the negative lateral part of springs, 1 for the exact Hessian; shift: added to the diagonal [N/m].
+        keep: of the negative lateral part of springs; shift: added to the diagonal [N/m]; tension (m,): of springs [N].
         """
-        hessian.assemble(self._terms, self._matrix.places, self._p, keep, self._values)
+        tension = self._tension if tension is None else tension
+        hessian.assemble(self._terms, self._matrix.places, self._p, tension, keep, self._matrix.values)
         if self._others is not None:
-            np.add.at(self._values.reshape(-1), *self._added)
-        self._values.reshape(-1)[self._matrix.diagonal] += shift
-        return self._matrix.factor.factorise(self._values)
+            np.add.at(self._matrix.values.reshape(-1), *self._added)
+        self._matrix.values.reshape(-1)[self._matrix.diagonal] += shift
+        return self._matrix.factor.factorise(self._matrix.values)
 
     def solve(self, b: Positions) -> Positions:
         """Its inverse, as it was factorised last, times b (n, 3); zero at vertices that are not free."""
@@ -169,8 +181,12 @@ class Hessian:
         return out
 
     @cached_property
+    def _tension(self) -> NDArray[np.float64]:
+        return self.step.tensions(self._p, np.zeros_like(self._p))
+
+    @cached_property
     def _linear(self) -> NDArray[np.float64]:
-        linear = np.empty((len(self._terms.stiffness), 5))
+        linear = np.empty((len(self._terms.stiffness), 4))
         hessian.linearise(self._terms, self._p, linear)
         return linear
 

@@ -1,9 +1,10 @@
 """The Hessian of springs, written straight into the entries of a matrix of 3 x 3 blocks, and its products.
 
-    H_e = k (nn' + lateral (I - nn')),   lateral = 1 - r/l,   n the direction of a spring, l its length
+    H_e = k nn' + t/l (I - nn'),   t = k (l - r),   n the direction of a spring, l its length, t its tension
 
-A compressed spring (l < r) has a negative lateral part. It is scaled by `keep`: 1 leaves the Hessian exact, 0 makes it
-positive semidefinite spring by spring (Teran et al. 2005).
+A compressed spring (t < 0) has a negative lateral part. It is scaled by `keep`: 1 leaves the Hessian exact, 0 makes it
+positive semidefinite spring by spring (Teran et al. 2005). The tensions are given apart from the positions, for methods
+that have a better guess at what they will be (see `solvers.hybrid`).
 """
 
 from __future__ import annotations
@@ -47,14 +48,25 @@ class Places(NamedTuple):
         return cls(system.free, diagonal, across)
 
 
+@kernel
+def tensions(terms, p, d, out):
+    """Write the springs' tensions [N] at p, linearised for a step d (both (n, 3)), to out (m,)."""
+    for e in range(len(terms.stiffness)):
+        i, j = terms.edges[e, 0], terms.edges[e, 1]
+        n0, n1, n2, length = along(terms, e, p)
+        stretch = n0 * (d[i, 0] - d[j, 0]) + n1 * (d[i, 1] - d[j, 1]) + n2 * (d[i, 2] - d[j, 2])
+        out[e] = terms.stiffness[e] * (length - terms.rest_length[e] + stretch)
+
+
 @inner
-def _curvature(terms, e, length, keep):
-    """k and the lateral stiffness [N/m] of spring e; one of zero length and positive rest length has none."""
-    k, r = terms.stiffness[e], terms.rest_length[e]
-    if length > 0.0:
-        lateral = 1.0 - r / length
-        return k, k * (lateral * keep if lateral < 0.0 else lateral)
-    return k, k if r == 0.0 else 0.0
+def _lateral(terms, e, length, tension, keep):
+    """The lateral stiffness [N/m] of spring e, at most its own. One of zero length that has a rest length has none."""
+    if terms.rest_length[e] == 0.0:
+        return terms.stiffness[e]
+    if length <= 0.0:
+        return 0.0
+    lateral = min(tension / length, terms.stiffness[e])
+    return lateral * keep if lateral < 0.0 else lateral
 
 
 @inner
@@ -72,8 +84,11 @@ def _add(values, block, sign, xx, xy, xz, yy, yz, zz):
 
 
 @kernel
-def assemble(terms, places, p, keep, values):
-    """Write the Hessian [N/m] of springs, inertia and penalty pins at p (n, 3) to the blocks `values`, (b, 3, 3)."""
+def assemble(terms, places, p, tension, keep, values):
+    """Write the Hessian [N/m] of springs, inertia and penalty pins at p (n, 3) to the blocks `values`, (b, 3, 3).
+
+    tension (m,): of each spring [N].
+    """
     values[:] = 0.0
     for v in places.free:
         h = terms.inertia[v]
@@ -86,8 +101,8 @@ def assemble(terms, places, p, keep, values):
         if i == j:
             continue
         n0, n1, n2, length = along(terms, e, p)
-        k, lateral = _curvature(terms, e, length, keep)
-        a = k - lateral
+        lateral = _lateral(terms, e, length, tension[e], keep)
+        a = terms.stiffness[e] - lateral
         xx, xy, xz = a * n0 * n0 + lateral, a * n0 * n1, a * n0 * n2
         yy, yz, zz = a * n1 * n1 + lateral, a * n1 * n2, a * n2 * n2 + lateral
         if places.diagonal[i] >= 0:
@@ -101,14 +116,13 @@ def assemble(terms, places, p, keep, values):
 
 @kernel
 def linearise(terms, p, out):
-    """Write to out (m, 5) what `multiply` needs of each spring at p (n, 3): sqrt(k - lateral) n, its sign, lateral."""
+    """Write to out (m, 4) what `multiply` needs of each spring at p (n, 3): sqrt(k - lateral) n and lateral."""
     for e in range(len(terms.stiffness)):
         n0, n1, n2, length = along(terms, e, p)
-        k, lateral = _curvature(terms, e, length, 1.0)
-        a = k - lateral
-        root = np.sqrt(abs(a))
-        out[e, 0], out[e, 1], out[e, 2] = root * n0, root * n1, root * n2
-        out[e, 3], out[e, 4] = (1.0 if a >= 0.0 else -1.0), lateral
+        k = terms.stiffness[e]
+        lateral = _lateral(terms, e, length, k * (length - terms.rest_length[e]), 1.0)
+        root = np.sqrt(k - lateral)
+        out[e, 0], out[e, 1], out[e, 2], out[e, 3] = root * n0, root * n1, root * n2, lateral
 
 
 @kernel
@@ -124,10 +138,10 @@ def multiply(terms, linear, x, out):
     for e in range(len(terms.stiffness)):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
         s0, s1, s2 = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
-        along_it = linear[e, 3] * (linear[e, 0] * s0 + linear[e, 1] * s1 + linear[e, 2] * s2)
-        f0 = linear[e, 4] * s0 + along_it * linear[e, 0]
-        f1 = linear[e, 4] * s1 + along_it * linear[e, 1]
-        f2 = linear[e, 4] * s2 + along_it * linear[e, 2]
+        stretch = linear[e, 0] * s0 + linear[e, 1] * s1 + linear[e, 2] * s2
+        f0 = linear[e, 3] * s0 + stretch * linear[e, 0]
+        f1 = linear[e, 3] * s1 + stretch * linear[e, 1]
+        f2 = linear[e, 3] * s2 + stretch * linear[e, 2]
         out[i, 0] += f0
         out[i, 1] += f1
         out[i, 2] += f2

@@ -21,7 +21,8 @@ from solvers.linear.symbolic import Symbolic, analyse
 class BlockCholesky:
     """The factorisation of H for one pattern of blocks.
 
-    nonzeros: entries of L, the diagonal's included. Factorisations and solves share their arrays: one at a time.
+    nonzeros: entries of L, the diagonal's included; flops: multiplications and additions of a factorisation, padding
+    left out. Factorisations and solves share their arrays: one at a time.
     """
 
     def __init__(self, graph: csr_array) -> None:
@@ -32,9 +33,16 @@ class BlockCholesky:
         self._fronts = _fronts(pointers, neighbours, symbolic)
         f = self._fronts
         below = np.diff(f.start) - f.own
+        w, h = 3.0 * f.own, 3.0 * below
+        self.flops = float((w * (w * w / 3.0 + w * h + h * h)).sum())
         room = _room(f, 3 * below * whole(3 * below))
         self._panels, n = np.zeros(f.panel[-1] + ROWS), len(pointers) - 1
-        self._scratch = np.zeros((2, room)), np.zeros((2, len(f.own)), np.int64), *np.zeros((2, n), np.int64)
+        self._scratch = (
+            np.zeros((2, room)),
+            np.zeros((2, len(f.own)), np.int64),
+            np.zeros(n, np.int64),
+            np.zeros((2, n + 1), np.int64),
+        )
         self._front = np.zeros(int((whole(3 * f.own) + whole(3 * below)).max(initial=0)) + ROWS)
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
@@ -62,7 +70,7 @@ def _fronts(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], symbolic
         for k in sequence.tolist()
     ]
     start = np.concatenate([[0], np.cumsum([len(x) for x in lists])]).astype(np.int64)
-    members = np.concatenate(lists).astype(np.int64)
+    members = np.concatenate([s.vertex[:0], *lists]).astype(np.int64)
     within = np.full(len(members), -1)
     stack = np.zeros(len(own), np.int64)
     place = np.empty(len(pointers) - 1, np.int64)

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from solvers.linear.block_vectors import ROWS, TILE, divide, subtract_columns, subtract_product, subtract_rows
+from solvers.linear.block_vectors import ROWS, TILE, add, divide, subtract_columns, subtract_product, subtract_rows
 
 _NO_DIGITS = 4.0 * np.finfo(np.float64).eps
 """A pivot this small beside its entry of the matrix is round-off."""
@@ -51,10 +51,10 @@ def whole(rows):
 
 
 @njit(cache=True)
-def factorise(fronts, values, panels, stacks, waiting, place, offset):
+def factorise(fronts, values, panels, stacks, waiting, place, runs):
     """Write L to `panels` from the blocks of the matrix, values (b, 3, 3); returns whether it is positive definite.
 
-    stacks (2, room): of updates; waiting (2, s), place (n,), offset (n,): scratch.
+    stacks (2, room): of updates; waiting (2, s), place (n,), runs (2, n + 1): scratch.
     """
     triangle = np.empty((TILE, TILE))
     depth = np.zeros(2, np.int64)  # supernodes that wait
@@ -73,7 +73,7 @@ def factorise(fronts, values, panels, stacks, waiting, place, offset):
             rows = fronts.start[c + 1] - fronts.start[c] - fronts.own[c]
             top[1 - side] -= 3 * rows * whole(3 * rows)
             _extend(fronts, c, rows, stacks[1 - side], top[1 - side], own, head, stride, panels, base, update, begin,
-                    size, offset)  # fmt: skip
+                    size, runs)  # fmt: skip
         if not _eliminate(fronts, s, values, panels, head, stride, triangle):
             return False
         _update(panels, base, 3 * own, head, stride, update, begin, 3 * below, size)
@@ -105,30 +105,38 @@ def _enter(fronts, s, values, panels, head, stride, place):
 
 
 @njit(cache=True)
-def _extend(fronts, c, rows, source, at, own, head, stride, panels, base, update, begin, size, offset):
-    """Add the update of a child c to its parent's front."""
+def _extend(fronts, c, rows, source, at, own, head, stride, panels, base, update, begin, size, runs):
+    """Add the update of a child c to its parent's front, in runs of members that are neighbours in both."""
     first = fronts.start[c] + fronts.own[c]
     height = whole(3 * rows)
-    inside = 0
-    while inside < rows and fronts.within[first + inside] < own:
-        inside += 1
+    count = 0
     for k in range(rows):
         q = fronts.within[first + k]
-        offset[k] = 3 * q if q < own else head + 3 * (q - own)
-    for b in range(inside):
+        if k == 0 or q != fronts.within[first + k - 1] + 1 or q == own:
+            runs[0, count] = k
+            runs[1, count] = 3 * q if q < own else head + 3 * (q - own)
+            count += 1
+    runs[0, count] = rows
+    run = 0
+    for b in range(rows):
+        if runs[0, run + 1] == b:
+            run += 1
+        q = fronts.within[first + b]
         for j in range(3):
-            column = base + (3 * fronts.within[first + b] + j) * stride
             start = at + (3 * b + j) * height
-            for a in range(b, rows):
-                for i in range(3):
-                    panels[column + offset[a] + i] += source[start + 3 * a + i]
-    for b in range(inside, rows):
-        for j in range(3):
-            column = begin + (3 * (fronts.within[first + b] - own) + j) * size - head
-            start = at + (3 * b + j) * height
-            for a in range(b, rows):
-                for i in range(3):
-                    update[column + offset[a] + i] += source[start + 3 * a + i]
+            if q < own:
+                _add_runs(runs, run, count, b, source, start, panels, base + (3 * q + j) * stride)
+            else:
+                _add_runs(runs, run, count, b, source, start, update, begin + (3 * (q - own) + j) * size - head)
+
+
+@njit(cache=True)
+def _add_runs(runs, run, count, b, source, start, target, column):
+    """Add the rows from member b on of a column."""
+    for k in range(run, count):
+        a = max(b, runs[0, k])
+        to = column + runs[1, k] + 3 * (a - runs[0, k])
+        add(source, start + 3 * a, target, to, 3 * (runs[0, k + 1] - a))
 
 
 @njit(cache=True)

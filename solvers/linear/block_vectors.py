@@ -41,14 +41,16 @@ def _minus_product(builder: Any, c: Any, a: Any, b: Any) -> Any:
 
 
 def _arguments(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
-    """The arrays' data pointers, the integers as int64, and the last, a literal, as Python's int."""
+    """The arrays' data pointers, the integers as int64, and a literal as Python's int."""
     out: list[Any] = []
-    for kind, value in zip(signature.args[:-1], args, strict=False):
+    for kind, value in zip(signature.args, args, strict=True):
         if isinstance(kind, types.Array):
             out.append(context.make_array(kind)(context, builder, value).data)
+        elif isinstance(kind, types.IntegerLiteral):
+            out.append(kind.literal_value)
         else:
             out.append(context.cast(builder, value, kind, types.int64))
-    return [*out, signature.args[-1].literal_value]
+    return out
 
 
 def _signature(*kinds: Any) -> Any:
@@ -156,8 +158,29 @@ def _subtract_rows(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any
     return signature, generate
 
 
+def _add(typingctx: Any, source: Any, at: Any, target: Any, to: Any, count: Any) -> Any:
+    """target[to + r] += source[at + r] for r < count, a multiple of three."""
+    signature = types.void(source, at, target, to, count)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        source, at, target, to, count = _arguments(context, builder, signature, args)
+        source, target = builder.gep(source, [at]), builder.gep(target, [to])
+        with cgutils.for_range(builder, builder.udiv(count, _I64(ROWS))) as loop:
+            row = builder.mul(loop.index, _I64(ROWS))
+            place = builder.gep(target, [row])
+            _store(builder, builder.fadd(_load(builder, place), _load(builder, builder.gep(source, [row]))), place)
+        done = builder.sub(count, builder.urem(count, _I64(ROWS)))
+        with cgutils.for_range_slice(builder, done, count, _I64(1), _I64) as (row, _):
+            place = builder.gep(target, [row])
+            builder.store(builder.fadd(builder.load(place), builder.load(builder.gep(source, [row]))), place)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
 # Numba passes the first argument itself, which type checkers do not know.
 subtract_product: Any = intrinsic(_subtract_product)
+add: Any = intrinsic(_add)
 divide: Any = intrinsic(_divide)
 subtract_columns: Any = intrinsic(_subtract_columns)
 subtract_rows: Any = intrinsic(_subtract_rows)

@@ -1,0 +1,178 @@
+"""A hybrid: L-BFGS and Newton's method with predicted tensions in turns, Newton's method in the end.
+
+    H(t) = M/dt^2 + sum_e k nn' + t_e/l_e (I - nn'),   d = -H(t)^-1 grad g(p),   t_e <- k_e (l_e + n (A d)_e - r_e)
+
+Stiff springs hardly change their lengths, but on the way to the minimum they do, and their tensions k (l - r) then are
+larger than the true ones by orders of magnitude. In the exact Hessian they make springs stiff against bending, or
+unstable, where they are neither. Here tensions are unknowns of their own. Newton's method on the optimality conditions
+of both (primal-dual, as in interior point methods: Nocedal and Wright 2006, chapter 19; tensions that outlive an
+iteration stabilise stiff springs in Tournier et al. 2015, "Stable Constrained Dynamics") comes down to a Hessian with
+predicted tensions, and its steps are longer by as much. What such a step stretches at second order is local: a round of
+L-BFGS takes it back. The first one starts where the step before ended, from smooth positions.
+
+L-BFGS comes first. Once it gets slow, whichever brought the greater descent for its cost the last time goes on. The
+exact method takes over when the Hessian is positive definite as it is and the slope falls as it does where Newton's
+method converges quadratically. The start is the lower one of first guess and free fall.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from solvers.accelerated import PreparedAccelerated
+from solvers.descent import DECREASE, Metric, Point, PreparedDescent, dot, search
+from solvers.lbfgs import Lbfgs
+from solvers.newton import NewtonMethod
+from solvers.objective import Hessian, Objective, StepObjective
+from solvers.problem import Positions, System
+
+_ROUND = 10
+"""Iterations of L-BFGS in a round."""
+
+_QUICK = 0.5
+"""What the first round leaves of the residual where L-BFGS suits a problem."""
+
+_SLOW = 0.8
+"""What a round brings beside the one before it where L-BFGS gets slow."""
+
+_KEPT = 0.25
+"""Of the decrease that the slope promises, what shows that the quadratic model holds; one that is right keeps .5."""
+
+_QUADRATIC = 0.1
+"""What a step leaves of the slope near a minimum, at most."""
+
+_LEVELS = ((1.0, 0.0), (1.0, 0.1), (1.0, 1.0), (1.0, 10.0), (0.0, 0.0))
+"""What is kept of negative lateral parts, and what multiple of inertia is added. The last one is positive definite."""
+
+_FLOPS_PER_ENTRY = 270.0
+"""Of a factorisation, what takes as long as an entry of Q's factor does in a round, with all that belongs to either."""
+
+
+@dataclass(frozen=True)
+class Hybrid:
+    """L-BFGS far from the minimum, Newton's method with predicted tensions nearer to it, Newton's method in the end."""
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+
+    def prepare(self, system: System) -> PreparedDescent:
+        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
+        metric, objective = Metric(system), Objective(system)
+        method = HybridMethod(objective, NewtonMethod(metric), Lbfgs().prepare(system))
+        factor = objective.matrix.factor
+        facts = metric.facts | {"nnz_hessian_factor": float(factor.nonzeros)}
+        choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {metric.choice}"
+        return PreparedDescent(objective, metric, method, choice, facts)
+
+
+class HybridMethod:
+    """The iteration for one system: a round of L-BFGS, or a step of one of Newton's methods."""
+
+    def __init__(self, objective: Objective, newton: NewtonMethod, lbfgs: PreparedAccelerated) -> None:
+        self._newton, self._lbfgs = newton, lbfgs
+        self.inertia = np.repeat(objective.system.inertia[objective.system.free], 3)
+        factor = objective.matrix.factor
+        self._cost = 9.0 * factor.flops / (_FLOPS_PER_ENTRY * max(1, factor.nonzeros))
+
+    def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
+        """The points after `start`."""
+        origin = point = _lower(step, start)
+        predicting = _Predicting(self, step, origin)
+        run = self._lbfgs.engine.begin(step.problem, point.positions, kept=False)
+        _, before, _ = run.advance(0, 0.0, 0.0, False)
+        gain, newton_gain, ended = np.inf, 0.0, False
+        while not ended:
+            if gain > newton_gain:
+                _, residual, ended = run.advance(_ROUND, 0.0, 0.0, False)
+                following = _at(step, run.positions)
+                last, gain = gain, -step.rise(point.positions, following.positions)[0]
+                if last == np.inf and residual > _QUICK * before:
+                    gain = 0.0  # of no use yet
+                if newton_gain == 0.0 and (gain == 0.0 or gain > _SLOW * last):
+                    newton_gain = np.inf
+            else:
+                following, ended = predicting.next(point)
+                newton_gain = -step.rise(point.positions, following.positions)[0] / self._cost
+                gain = gain or newton_gain  # until it is known
+                run = self._lbfgs.engine.begin(step.problem, following.positions, kept=False)
+            point = following
+            yield point
+        yield from self._newton.points(step, point)
+
+    def relaxed(self, step: StepObjective, p: Positions) -> Point:
+        """Where a round of L-BFGS leads from p."""
+        run = self._lbfgs.engine.begin(step.problem, p, kept=True)
+        run.advance(_ROUND, float("nan"), 0.0, False)
+        return _at(step, run.positions)
+
+
+class _Predicting:
+    """Newton's method with predicted tensions, in one solve."""
+
+    def __init__(self, method: HybridMethod, step: StepObjective, origin: Point) -> None:
+        """origin: where the first step starts."""
+        self._method, self._step = method, step
+        self._origin: Point | None = origin
+        self._tension = np.zeros(len(step.whole.springs.stiffness))
+        self._level, self._slope = len(_LEVELS), -np.inf
+
+    def next(self, point: Point) -> tuple[Point, bool]:
+        """A lower point, or the same one; whether the exact method does better from there."""
+        step, at = self._step, self._origin or point
+        self._origin = None
+        hessian = step.hessian(at.positions)
+        if not self._factorise(hessian):
+            return point, True
+        direction = -hessian.solve(at.gradient)
+        slope, before = dot(at.gradient, direction), self._slope
+        self._slope = slope
+        if not slope < 0.0:
+            return point, True
+        predicted = step.tensions(at.positions, direction)
+        length, following, kept = self._along(at, direction, slope)
+        if following is None:
+            return point, True
+        self._tension += length * (predicted - self._tension)
+        lower = following if step.rise(point.positions, following.positions)[0] < 0.0 else point
+        return lower, self._level == 0 and kept and slope >= _QUADRATIC * before
+
+    def _factorise(self, hessian: Hessian) -> bool:
+        """Whether some level gives a factor: the first one does from that before the last one's on."""
+        for level in range(max(0, self._level - 1), len(_LEVELS)):
+            keep, by = _LEVELS[level]
+            if hessian.factorise(keep, by * self._method.inertia, self._tension):
+                self._level = level
+                return True
+        return False
+
+    def _along(self, at: Point, direction: Positions, slope: float) -> tuple[float, Point | None, bool]:
+        """How much of the direction is gone, to where, and whether the objective falls as its model promises."""
+        step = self._step
+        p = step.placed(at.positions + direction)
+        if step.rise(at.positions, p)[0] <= _KEPT * slope:
+            return 1.0, Point(p, step.gradient(p)), True
+        relaxed = self._method.relaxed(step, p)
+        if step.rise(at.positions, relaxed.positions)[0] <= DECREASE * slope:
+            return 1.0, relaxed, False
+        found = search(step, at, direction)
+        if found is None:
+            return 0.0, None, False
+        length = dot(found.positions - at.positions, direction) / dot(direction, direction)
+        return length, self._method.relaxed(step, found.positions), False
+
+
+def _lower(step: StepObjective, start: Point) -> Point:
+    """The lower one of a point and of free fall, where inertia and forces alone would lead."""
+    problem, h = step.problem, step.problem.system.inertia[:, None]
+    fall = problem.target + np.divide(problem.force, h, out=np.zeros_like(problem.force), where=h > 0.0)
+    fall[problem.system.pins.vertices] = problem.pin_targets
+    return _at(step, fall) if step.rise(start.positions, fall)[0] < 0.0 else start
+
+
+def _at(step: StepObjective, p: Positions) -> Point:
+    placed = step.placed(p)
+    return Point(placed, step.gradient(placed))
