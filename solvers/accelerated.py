@@ -29,6 +29,7 @@ from solvers.linear.choice import Linear, Precision, factorise
 from solvers.local_global import PreparedLocalGlobal, only_springs, prepared
 from solvers.objective import Objective, StepObjective
 from solvers.problem import Positions, ProjectiveEnergy, Solution, StepProblem, StopRule, System, Unsupported
+from solvers.touching import without_contact
 
 
 @dataclass(frozen=True)
@@ -60,14 +61,23 @@ def prepare(system: System, method: Method, linear: Linear, precision: Precision
     others = {type(e).__name__ for e in system.energies if not isinstance(e, ProjectiveEnergy)}
     if method.projective and others:
         raise Unsupported(f"{method.name}: needs projective energies; not so: {', '.join(sorted(others))}")
-    base = prepared(system, projective, lambda Q: factorise(Q, linear, precision))
+    bare = without_contact(system)
+    base = prepared(bare, projective, lambda Q: factorise(Q, linear, precision))
+    engine = _engine(bare, method, base)
+    if bare is not system:
+        from solvers.accelerated_contact import Touching  # for those who need it
+
+        engine = Touching(method, base, engine)
+    return PreparedAccelerated(base, engine)
+
+
+def _engine(system: System, method: Method, base: PreparedLocalGlobal) -> Engine:
     if all(isinstance(energy, Springs) for energy in system.energies):
         for kind, order in ORDERS.items():
             if isinstance(base.factor, kind):
                 springs = only_springs(system, method.name)
-                compiled = PreparedCompiled.of(base, springs, order(base.factor))
-                return PreparedAccelerated(base, _Compiled(method, compiled))
-    return PreparedAccelerated(base, _Interpreted(method, base))
+                return _Compiled(method, PreparedCompiled.of(base, springs, order(base.factor)))
+    return _Interpreted(method, base)
 
 
 class Engine(Protocol):
@@ -123,7 +133,7 @@ class PreparedAccelerated:
         return {}
 
 
-def _window(method: Method, entries: int, whole: int) -> Window:
+def window_for(method: Method, entries: int, whole: int) -> Window:
     """Memory for the unknowns' entries, in vectors that have `whole` of them."""
     m = method.pairs
     now = np.zeros(1, accelerate.NOW)
@@ -153,7 +163,7 @@ class _Compiled:
 
     def _new(self) -> tuple[accelerate_step.Step, Window]:
         whole = 4 * len(self._plan.held)
-        window = _window(self._method, self._entries, whole)
+        window = window_for(self._method, self._entries, whole)
         window.trial[4 * self._far] = FAR
         x = aligned(whole, self._plan.squares.dtype)
         vectors = aligned(whole), x, aligned(whole), np.zeros(2)
@@ -187,11 +197,11 @@ class _Interpreted:
 
     def begin(self, problem: StepProblem, guess: Positions, *, kept: bool) -> Run:
         """See Engine."""
-        window = _window(self._method, guess.size, guess.size)
-        return _InterpretedRun(self._base, window, StepObjective(self._objective, problem), guess)
+        window = window_for(self._method, guess.size, guess.size)
+        return InterpretedRun(self._base, window, StepObjective(self._objective, problem), guess)
 
 
-class _InterpretedRun:
+class InterpretedRun:
     """See Run."""
 
     def __init__(self, base: PreparedLocalGlobal, window: Window, objective: StepObjective, guess: Positions) -> None:
@@ -211,6 +221,9 @@ class _InterpretedRun:
     def _solved(self) -> NDArray[np.float64]:
         self._base._global(self._there, self._image)
         return self._image.ravel()
+
+    def _accept(self) -> None:
+        accelerate.accept(self._window, self._solved())
 
     def _residual(self) -> float:
         e = self._window.correction.reshape(-1, 3).copy()
@@ -233,7 +246,7 @@ class _InterpretedRun:
             if verdict == accelerate.STALLED:
                 return count, self._residual(), True
             count += 1
-            accelerate.accept(window, self._solved())
+            self._accept()
             if every or count == iterations:
                 residual = self._residual()
         return count, residual, False
