@@ -45,6 +45,10 @@ class Method(Protocol):
         """The points after `start`."""
         ...
 
+    def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
+        """What its iterations are made of, by name, at a point."""
+        ...
+
 
 def search(
     step: StepObjective, at: Point, direction: Positions, *, first: float = 1.0, curvature: float = 0.0
@@ -92,6 +96,10 @@ class Metric:
         self.trace = float(self._Q.diagonal()[system.unpinned].sum())
         factor = {} if self._factor.nonzeros is None else {"nnz_factor": float(self._factor.nonzeros)}
         self.facts = {"nnz_system": float(self._Q.nnz)} | factor
+
+    def round_off(self, p: Positions) -> float:
+        """g H^-1 g [J] of a gradient that is round-off of the positions p (n, 3), at most."""
+        return float(np.finfo(np.float64).eps * np.abs(p).max(initial=0.0)) ** 2 * self.trace
 
     def solve(self, b: Positions) -> Positions:
         """Q^-1 b, (n, 3), zero at exactly pinned vertices."""
@@ -152,15 +160,8 @@ class PreparedDescent:
         return Solution(point.positions.copy(), iteration, residual, yardstick, stopped)
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The gradient, the Hessian with its factorisation, and a solve with it, at the first guess."""
-        step, start = self._begin(problem)
-        hessian = step.hessian(start.positions)
-        hessian.factorise(0.0, 1.0)
-        return {
-            "gradient": lambda: step.gradient(start.positions),
-            "factor": lambda: hessian.factorise(0.0, 1.0),
-            "solve": lambda: hessian.solve(start.gradient),
-        }
+        """What iterations are made of, at the first guess."""
+        return self.method.phases(*self._begin(problem))
 
     def _begin(self, problem: StepProblem) -> tuple[StepObjective, Point]:
         step = StepObjective(self.objective, problem)

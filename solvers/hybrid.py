@@ -17,7 +17,7 @@ method converges quadratically. The start is the lower one of first guess and fr
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -102,6 +102,10 @@ class HybridMethod:
             point = following
             yield point
         yield from self._newton.points(step, point)
+
+    def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
+        """Those of Newton's method, and a round of L-BFGS."""
+        return self._newton.phases(step, at) | {"lbfgs": lambda: self.relaxed(step, at.positions)}
 
     def relaxed(self, step: StepObjective, p: Positions) -> Point:
         """Where a round of L-BFGS leads from p."""

@@ -11,7 +11,7 @@ direction of negative curvature (More and Sorensen 1979), found by power iterati
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -49,7 +49,7 @@ class NewtonMethod:
     """The iteration of Newton's method for one system."""
 
     def __init__(self, metric: Metric) -> None:
-        self._round_off = np.finfo(np.float64).eps * metric.trace**0.5
+        self._metric = metric
         self._diagonal: NDArray[np.float64] = np.repeat(metric.diagonal, 3)
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
@@ -59,15 +59,24 @@ class NewtonMethod:
             point = self._next(step, point)
             yield point
 
+    def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
+        """The gradient, the Hessian with its factorisation, and a solve with it."""
+        hessian = step.hessian(at.positions)
+        hessian.factorise(0.0)
+        return {
+            "gradient": lambda: step.gradient(at.positions),
+            "factor": lambda: hessian.factorise(0.0),
+            "solve": lambda: hessian.solve(at.gradient),
+        }
+
     def _next(self, step: StepObjective, at: Point) -> Point:
         hessian = step.hessian(at.positions)
         level = next((k for k, (keep, by) in enumerate(_LEVELS) if hessian.factorise(keep, by * self._diagonal)), None)
         if level is None:
             return at._replace(stalled=True)
         direction = -hessian.solve(at.gradient)
-        # A step of this length, or a shorter one, is what rounding the positions takes away again.
-        least = (self._round_off * float(np.abs(at.positions).max(initial=0.0))) ** 2
-        found = search(step, at, direction) if -dot(at.gradient, direction) > least else None
+        known = -dot(at.gradient, direction) > self._metric.round_off(at.positions)
+        found = search(step, at, direction) if known else None
         if found is None and level > 0:
             found = _leave_saddle(step, at, hessian)
         return found or at._replace(stalled=True)

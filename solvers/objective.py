@@ -144,18 +144,23 @@ class Hessian:
     """The Hessian [N/m] at a point, over the coordinates of free vertices."""
 
     def __init__(self, step: StepObjective, p: Positions) -> None:
-        self.step, whole = step, step.whole
-        self._terms, self._p, self._free = whole.terms, p, whole.system.free
-        self._others: csr_array | None = None
-        self._matrix = whole.matrix
-        if step.others:
-            total = reduce(lambda a, b: a + b, (csr_array(e.hessian(p)) for e in step.others)).tocoo()
-            self._others = csr_array(total)
-            rows, columns = (3 * whole.number[x // 3] + x % 3 for x in total.coords)
-            inside = (rows >= 0) & (columns >= 0)
-            rows, columns = rows[inside], columns[inside]
-            self._matrix = whole.matrix_for(rows, columns)
-            self._added = self._matrix.entries(rows, columns), total.data[inside]
+        self._step, self._p = step, p
+        self._terms, self._free = step.whole.terms, step.whole.system.free
+        parts = [csr_array(energy.hessian(p)) for energy in step.others]
+        self._others = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
+
+    @cached_property
+    def _placed(self) -> tuple[Matrix, NDArray[np.int64], NDArray[np.float64]]:
+        """The matrix, and where in it which entries of the energies that are not springs go."""
+        whole = self._step.whole
+        if self._others is None:
+            return whole.matrix, np.empty(0, np.int64), np.empty(0)
+        total = self._others.tocoo()
+        rows, columns = (3 * whole.number[x // 3] + x % 3 for x in total.coords)
+        inside = (rows >= 0) & (columns >= 0)
+        rows, columns = rows[inside], columns[inside]
+        matrix = whole.matrix_for(rows, columns)
+        return matrix, matrix.entries(rows, columns), np.asarray(total.data[inside], np.float64)
 
     def factorise(
         self,
@@ -167,22 +172,23 @@ class Hessian:
 
         keep: of the negative lateral part of springs; shift: added to the diagonal [N/m]; tension (m,): of springs [N].
         """
+        matrix, places, entries = self._placed
         tension = self._tension if tension is None else tension
-        hessian.assemble(self._terms, self._matrix.places, self._p, tension, keep, self._matrix.values)
-        if self._others is not None:
-            np.add.at(self._matrix.values.reshape(-1), *self._added)
-        self._matrix.values.reshape(-1)[self._matrix.diagonal] += shift
-        return self._matrix.factor.factorise(self._matrix.values)
+        hessian.assemble(self._terms, matrix.places, self._p, tension, keep, matrix.values)
+        values = matrix.values.reshape(-1)
+        values[places] += entries
+        values[matrix.diagonal] += shift
+        return matrix.factor.factorise(matrix.values)
 
     def solve(self, b: Positions) -> Positions:
         """Its inverse, as it was factorised last, times b (n, 3); zero at vertices that are not free."""
         out = np.zeros_like(b)
-        out[self._free] = self._matrix.factor.solve(b[self._free])
+        out[self._free] = self._placed[0].factor.solve(b[self._free])
         return out
 
     @cached_property
     def _tension(self) -> NDArray[np.float64]:
-        return self.step.tensions(self._p, np.zeros_like(self._p))
+        return self._step.tensions(self._p, np.zeros_like(self._p))
 
     @cached_property
     def _linear(self) -> NDArray[np.float64]:

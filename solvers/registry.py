@@ -13,6 +13,7 @@ SOLVERS = {
     "chebyshev": "solvers.chebyshev:Chebyshev",
     "lbfgs": "solvers.lbfgs:Lbfgs",
     "newton": "solvers.newton:Newton",
+    "newton-cg": "solvers.newton_cg:NewtonCG",
     "hybrid": "solvers.hybrid:Hybrid",
     "xpbd": "solvers.xpbd:Xpbd",
     "xpbd-small-steps": "solvers.xpbd:XpbdSmallSteps",

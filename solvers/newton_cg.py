@@ -1,0 +1,95 @@
+"""Inexact Newton's method: conjugate gradients, preconditioned by Q^-1, on the exact Hessian (Dembo and Steihaug 1983).
+
+    H d = -g to |H d + g| <= eta |g|,   |r|^2 = r' Q^-1 r,   eta = .9 (|g| / |g before|)^2    Eisenstat and Walker 1996
+
+For springs Q majorises H, so that the eigenvalues of Q^-1 H are at most 1. Conjugate gradients end where they meet
+negative curvature, with what they have: from the first direction of all that is -Q^-1 g, a local-global iteration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from solvers.descent import Metric, Point, PreparedDescent, dot, search
+from solvers.objective import Objective, StepObjective
+from solvers.problem import Positions, System
+
+_LOOSE, _TIGHT = 0.5, 1e-10
+"""The bounds of eta."""
+
+_MOST = 1000
+"""Iterations of conjugate gradients: as many as the stiffest springs need for a few digits."""
+
+
+@dataclass(frozen=True)
+class NewtonCG:
+    """Newton's method without a factor of the Hessian: it needs the memory of local-global."""
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+
+    def prepare(self, system: System) -> PreparedDescent:
+        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
+        metric = Metric(system)
+        return PreparedDescent(Objective(system), metric, _Method(metric), metric.choice, metric.facts)
+
+
+class _Method:
+    """The iteration for one system."""
+
+    def __init__(self, metric: Metric) -> None:
+        self._metric = metric
+
+    def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
+        """The points after `start`."""
+        point, eta = start, _LOOSE
+        descent = self._metric.solve(point.gradient)
+        while not point.stalled:
+            found = None
+            if dot(point.gradient, descent) > self._metric.round_off(point.positions):
+                direction = self._direction(step, point, descent, eta)
+                found = search(step, point, direction) or search(step, point, -descent)
+            if found is None:
+                yield point._replace(stalled=True)
+                return
+            before, descent = dot(point.gradient, descent), self._metric.solve(found.gradient)
+            # The safeguard of Eisenstat and Walker: eta falls no faster than its own square.
+            following = 0.9 * dot(found.gradient, descent) / before
+            eta = min(_LOOSE, max(_TIGHT, following, 0.9 * eta**2 if 0.9 * eta**2 > 0.1 else 0.0))
+            point = found
+            yield point
+
+    def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
+        """The gradient, a product with the Hessian, and a solve with Q."""
+        hessian = step.hessian(at.positions)
+        return {
+            "gradient": lambda: step.gradient(at.positions),
+            "product": lambda: hessian.multiply(at.gradient),
+            "solve": lambda: self._metric.solve(at.gradient),
+        }
+
+    def _direction(self, step: StepObjective, at: Point, descent: Positions, eta: float) -> Positions:
+        """What conjugate gradients make of -H^-1 g; descent: Q^-1 g."""
+        hessian = step.hessian(at.positions)
+        d, r, s = np.zeros_like(descent), at.gradient.copy(), -descent
+        norm = dot(at.gradient, descent)
+        limit = eta**2 * norm
+        for k in range(_MOST):
+            product = hessian.multiply(s)
+            curvature = dot(s, product)
+            if curvature <= 0.0:
+                return s if k == 0 else d
+            length = norm / curvature
+            d += length * s
+            r += length * product
+            z = self._metric.solve(r)
+            norm, before = dot(r, z), norm
+            if norm <= limit:
+                break
+            s *= norm / before
+            s -= z
+        return d
