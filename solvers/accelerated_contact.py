@@ -59,7 +59,7 @@ class _ContactRun(InterpretedRun):
         super()._solved()
         self._plain = -self._image
         gradient, at = -self._there, (self._contacts, self._trial)
-        x, rows = self._corrections.around(*at, gradient, self._plain, cautious=False)
+        x, rows = self._corrections.around(*at, gradient, self._plain, cautious=True)
         self._begun = self._rows is None or not _alike(self._rows, rows)
         if self._begun or self._rows is None:
             self._rows = rows
