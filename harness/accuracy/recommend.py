@@ -32,7 +32,7 @@ from solvers.integrators import INTEGRATORS
 REFINEMENTS = (0.5, 1, 2, 4, 8)
 """Steps in the horizon, relative to those of the scene's own time step."""
 
-IMPLICIT, EXPLICIT = ["numba", "lbfgs", "newton"], ["symplectic-euler", "xpbd-small-steps"]
+IMPLICIT, EXPLICIT = ["numba", "lbfgs", "newton", "hybrid"], ["symplectic-euler", "xpbd-small-steps"]
 WAYS: list[dict[str, Any]] = [
     {"solver": IMPLICIT, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": list(INTEGRATORS)},
     {"solver": ["numba", *EXPLICIT], "iterations": 50},
