@@ -1,0 +1,157 @@
+"""Starts other than rest: where the vertices are, how they move, and what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter
+
+from harness.effects.pins import Pins
+from harness.errors import InputError
+from harness.load import load_any, load_scene
+from harness.mesh.grid import Grid
+from harness.mesh.network import Network
+from harness.mesh.star import Star
+from harness.scene import build
+from harness.simulate import start
+from harness.start import AnyStart
+
+REST = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 4.0, 0.0], [0.0, 4.0, 8.0]])
+MEAN = [1.0, 2.0, 2.0]
+
+
+def positions(**keys) -> np.ndarray:
+    made = TypeAdapter(AnyStart).validate_python(keys)
+    before = REST.copy()
+    p = made.positions(REST)
+    np.testing.assert_array_equal(REST, before)
+    return p
+
+
+@pytest.mark.parametrize(
+    ("keys", "wanted"),
+    [
+        ({"kind": "rest"}, REST),
+        ({"kind": "collapsed"}, [MEAN] * 4),
+        ({"kind": "flattened", "along": "y"}, REST * [1, 0, 1] + [0, 2, 0]),
+        ({"kind": "flattened", "along": ["y", "z"]}, REST * [1, 0, 0] + [0, 2, 2]),
+        ({"kind": "scaled", "factors": [-1, 1, 1]}, REST * [-1, 1, 1] + [2, 0, 0]),
+        ({"kind": "scaled", "factors": [3, 3, 3]}, 3 * REST - 2 * np.array(MEAN)),
+        ({"kind": "merged", "vertices": [1, 3]}, [REST[0], REST[1], REST[2], REST[1]]),
+    ],
+    ids=lambda value: value["kind"] if isinstance(value, dict) else "",
+)
+def test_a_start_is_where_its_kind_says(keys, wanted):
+    np.testing.assert_array_equal(positions(**keys), wanted)
+
+
+def test_random_starts_fill_their_cube_and_follow_their_seed():
+    p = positions(kind="random", side=0.5)
+    assert np.abs(p - MEAN).max() <= 0.25
+    np.testing.assert_array_equal(p, positions(kind="random", side=0.5))
+    assert np.abs(p - positions(kind="random", side=0.5, seed=1)).max() > 0.01
+
+
+def test_perturbed_starts_lie_about_as_far_off_as_they_say():
+    away = positions(kind="perturbed", deviation=1e-3, seed=2) - REST
+    assert 2e-4 < away.std() < 5e-3  # twelve normal numbers of deviation 1e-3
+
+
+def test_a_spin_turns_about_the_mean_and_carries_no_momentum():
+    made = TypeAdapter(AnyStart).validate_python({"kind": "rest", "spin": [0, 0, 2]})
+    v = made.velocity(REST)
+    np.testing.assert_allclose(v.sum(axis=0), 0.0, atol=1e-15)
+    np.testing.assert_array_equal(v[0], np.cross([0, 0, 2], REST[0] - MEAN))
+
+
+SCENE = "mesh: {{kind: grid}}\nmass: 1\ntime_step: 0.1\nframes: 2\ndefault_size: 3\nvelocity: [1, 0, 0]\nstart: {}\n"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "scene.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_a_scene_starts_as_it_says_and_its_digest_tells(tmp_path: Path):
+    spec = load_scene(written(tmp_path, SCENE.format("{kind: collapsed, spin: [0, 5, 0]}")))
+    begun = start(build(spec, 3)).now
+    np.testing.assert_allclose(begun.positions, np.tile(Grid().build(3).rest.mean(axis=0), (9, 1)), atol=1e-15)
+    np.testing.assert_allclose(begun.velocity, np.tile([1.0, 0.0, 0.0], (9, 1)), atol=1e-14)  # no arm, no spin
+    other = load_scene(written(tmp_path, SCENE.format("{kind: rest}")))
+    plain = load_scene(written(tmp_path, SCENE.format("null")))
+    assert len({spec.digest, other.digest, plain.digest}) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "needle"),
+    [
+        (SCENE.format("{kind: colapsed}"), "start"),
+        (SCENE.format("{kind: scaled, factors: [1, .nan, 1]}"), "start.factors[1]"),
+        (SCENE.format("{kind: random, side: -1}"), "start.side"),
+        (SCENE.format("{kind: merged, vertices: [1, 1]}"), "twice"),
+        (SCENE.format("{kind: merged, vertices: [1, 9]}"), "the mesh has the vertices 0 to 8"),
+    ],
+)
+def test_a_start_that_means_nothing_is_refused(tmp_path: Path, text: str, needle: str):
+    with pytest.raises(InputError) as caught:
+        load_any(written(tmp_path, text))
+    assert needle in str(caught.value)
+    assert str(tmp_path / "scene.yaml:7: ") in str(caught.value)
+
+
+NETWORK = "mesh: {}\n{}time_step: 0.1\nframes: 1\neffects: [{{kind: springs, rule: fixed, stretch: 1}}]\n"
+PAIR = "positions: [[0, 0, 0], [1, 0, 0]]"
+
+
+@pytest.mark.parametrize(
+    ("mesh", "mass", "needles"),
+    [
+        ("{kind: network, positions: []}", "mass: 1\n", ["mesh.positions"]),
+        ("{kind: network, positions: [[0, .nan, 0]]}", "mass: 1\n", ["mesh.positions[0][1]"]),
+        ("{kind: network, positions: [[0, .inf, 0]]}", "mass: 1\n", ["mesh.positions[0][1]"]),
+        ("{kind: network, positions: [[0, 0]]}", "mass: 1\n", ["mesh.positions[0]"]),
+        (f"{{kind: network, {PAIR}, springs: [[0, 1], [1, 1]]}}", "mass: 1\n", ["mesh.springs", "1 to itself"]),
+        (f"{{kind: network, {PAIR}, shear: [[0, 2]]}}", "mass: 1\n", ["mesh.shear", "vertex 2", "0 to 1"]),
+        (f"{{kind: network, {PAIR}, springs: [[0, -1]]}}", "mass: 1\n", ["mesh.springs[0][1]"]),
+        (f"{{kind: network, {PAIR}, mass: [1]}}", "", ["mesh.mass", "1 masses for 2 vertices"]),
+        (f"{{kind: network, {PAIR}, mass: [1, -1]}}", "", ["mesh.mass[1]"]),
+        (f"{{kind: network, {PAIR}, mass: [0, 0]}}", "", ["mesh.mass", "zero at every vertex"]),
+        (f"{{kind: network, {PAIR}, mass: [1, 0]}}", "", ["mesh", "some vertices, 1 in all (1)", "give them mass"]),
+        (f"{{kind: network, {PAIR}}}", "", ["mass", "is missing"]),
+    ],
+)
+def test_a_network_that_cannot_be_simulated_is_refused_with_its_place_and_a_remedy(
+    tmp_path: Path, mesh: str, mass: str, needles: list[str]
+):
+    with pytest.raises(InputError) as caught:
+        load_any(written(tmp_path, NETWORK.format(mesh, mass)))
+    assert len(caught.value.mistakes) == 1
+    assert str(tmp_path / "scene.yaml:") in str(caught.value)
+    for needle in needles:
+        assert needle in str(caught.value)
+
+
+def test_a_massless_vertex_that_a_pin_holds_is_welcome(tmp_path: Path):
+    text = NETWORK.format(f"{{kind: network, {PAIR}, mass: [1, 0]}}", "")
+    pinned = text.replace("stretch: 1}]", "stretch: 1}, {kind: pins, indices: [1]}]")
+    assert len(load_any(written(tmp_path, pinned)).runs()) == 1
+
+
+def test_a_network_is_what_it_was_written_as():
+    mesh = Network(
+        positions=((0, 0, 0), (3, 0, 0), (3, 4, 0)), springs=((0, 1), (1, 0)), bend=((0, 2),), mass=(1.0, 0.0, 3.0)
+    ).build()
+    np.testing.assert_array_equal(mesh.springs, [[0, 1], [1, 0], [0, 2]])
+    np.testing.assert_array_equal(mesh.rest_lengths, [3, 3, 5])
+    assert {name: list(part) for name, part in mesh.families.items()} == {"stretch": [0, 1], "shear": [], "bend": [2]}
+    np.testing.assert_array_equal(mesh.mass, [1, 0, 3])
+    assert mesh.spacing == 3.0
+
+
+def test_a_star_has_a_hub_of_as_many_springs_as_its_size():
+    mesh = Star(radius=2.0).build(1000)
+    assert np.bincount(mesh.springs.ravel())[0] == 1000
+    np.testing.assert_allclose(mesh.rest_lengths, 2.0, rtol=1e-15)
+    np.testing.assert_allclose(mesh.shares[0], 0.5, rtol=1e-12)
+    assert Pins(at=("hub",)).chosen(mesh, "pins").tolist() == [0]
