@@ -26,6 +26,10 @@ STATIONARY, GAP = 1e-10, 1e-9
 AT_REST = 1e-8
 """Stationarity at which iterates that do not change any more count as converged: round-off holds them there."""
 
+STILL = 5
+"""Iterates in a row that do not differ before a solver counts as standing still: one that refuses its own step may
+go another way in the next."""
+
 PROGRESS = 1e-3
 """The share of its gap by which a solver has to come nearer in the second half of its iterations."""
 
@@ -81,7 +85,7 @@ def measure(
     Raises RunFailed where a timed pass ends at other positions.
     """
     grading = _Grading(oracle, lowest, iterations, time_limit)
-    p, spent, number = problem.first_guess.copy(), 0.0, 0
+    p, spent, number, still = problem.first_guess.copy(), 0.0, 0, 0
     grading.add(0, p)
     iterates = prepared.iterates(problem)
     while not grading.status:
@@ -89,8 +93,9 @@ def measure(
         following = next(iterates)
         if number >= WARM_UP:
             spent += perf_counter() - began
-        number, fixed = number + 1, np.array_equal(following, p)
+        number, still = number + 1, still + 1 if np.array_equal(following, p) else 0
         np.copyto(p, following)
+        fixed = still == STILL
         if kept(number) or fixed or spent > time_limit or number == iterations:
             grading.add(number, p)
             grading.judge(fixed, spent)

@@ -80,6 +80,7 @@ ENDS = {
     "it converges": (towards(lambda n: 0.5**n), "ok", ""),
     "it converges too slowly": (towards(lambda n: 1 / (1 + n)), "ok", "limit of iterations"),
     "it stands still far off": (towards(lambda n: max(0.5**n, 0.01)), "no-progress", "do not change"),
+    "it pauses": (towards(lambda n: 0.5 ** (n // curves.STILL)), "ok", ""),
     "it goes to and fro": (towards(lambda n: 0.5 + 0.1 * (n % 2)), "no-progress", "limit of iterations"),
     "it explodes": (towards(lambda n: 10.0**n), "diverged", "exploded"),
     "it is not a number": (towards(lambda n: np.nan if n == 3 else 0.5 / n), "diverged", "after 3 iterations"),
