@@ -1,0 +1,168 @@
+"""The judge: what is stationary, what is a minimum, how far a motion is from the reference; and failures kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness import rows
+from harness.errors import InputError
+from harness.judge import Judge, Oracle, is_minimum, reference
+from harness.load import load_any
+from harness.record.reader import read_replay
+from harness.report.robustness import DIVERGED, OTHER, REFUSED, RIGHT, SADDLE, SHORT, judged, read_cells, summary
+from harness.report.robustness_map import draw_map, write_page
+from harness.run import Files, execute
+from harness.scene import Scene
+from harness.simulate import simulate
+from solvers.local_global import SparseLocalGlobal
+from solvers.newton import Newton
+from solvers.problem import Positions, StepProblem, StopRule
+from tests.scenes import cloth, first_problem, random_problem
+
+
+def stated() -> StepProblem:
+    return random_problem(3)
+
+
+def solved(problem: StepProblem, iterations: int = 200) -> Positions:
+    return Newton().prepare(problem.system).solve(problem, StopRule(iterations)).positions
+
+
+def test_the_residual_is_the_length_of_a_local_global_step():
+    problem = stated()
+    p = problem.first_guess.copy()
+    exact = problem.system.pins.vertices[problem.system.pins.exact]
+    p[exact] = problem.pin_targets[problem.system.pins.exact]
+    step = SparseLocalGlobal().prepare(problem.system).solve(replace(problem, first_guess=p), StopRule(1, 1e-30))
+    # Both are |p - LG(p)|_Q, of two factors of one matrix of condition below 1e5.
+    np.testing.assert_allclose(Oracle(problem.system).residual(problem, p), step.residual, rtol=1e-10)
+
+
+def test_a_heavy_pin_does_not_blind_the_stationarity():
+    problem = first_problem(cloth(5, 1e16))
+    oracle = Oracle(problem.system)
+    assert oracle.stationarity(problem, problem.current)[0] == 1.0
+    assert oracle.stationarity(problem, solved(problem))[0] < 1e-6
+    moved = solved(problem)
+    moved[12] += 1e-3  # a millimetre at a free vertex
+    assert oracle.stationarity(problem, moved)[0] > 1e-3
+
+
+def test_a_stretched_spring_is_a_minimum_and_a_compressed_one_is_not():
+    made = cloth(3)
+    problem = replace(first_problem(made), system=replace(made.system, time_step=10.0))
+    assert is_minimum(problem, 1.1 * made.mesh.rest)
+    assert not is_minimum(problem, 0.5 * made.mesh.rest)  # each spring would rather turn aside
+
+
+def walked(made: Scene, judge: Judge, tolerance: float) -> list[dict]:
+    prepared = Newton().prepare(made.system)
+    steps = simulate(made, prepared, StopRule(200, tolerance), first_guess="current", frames=4)
+    return [judge(step) for step in steps]
+
+
+def test_a_converged_run_is_stationary_and_where_the_reference_is():
+    made = cloth(4)
+    known = reference(made, Newton(), first_guess="current", frames=4)
+    assert np.isfinite(known).all()
+    for row in walked(made, Judge(made, known, minimises=True), 1e-8):
+        assert row["stationarity"] <= 1.1e-8
+        assert row["minimum"]
+        assert row["distance"] < 1e-6  # errors of 1e-8 of a step's motion, and what four steps make of them
+    assert {"distance"} == set(walked(made, Judge(made, known, minimises=False), 1e-2)[0])
+
+
+def test_a_reference_that_is_lost_is_no_reference():
+    made = cloth(4)
+    known = np.full((4, 16, 3), np.nan)
+    assert walked(made, Judge(made, known, minimises=True), 1e-8)[2]["distance"] is None
+
+
+OK = {"status": "ok", "frame": 1, "stationarity": 1e-7, "attainable": 1e-12, "tolerance": 1e-6, "minimum": True}
+OK |= {"distance": 1e-5, "reason": None}
+GRADES = {
+    "right": ([OK, OK], RIGHT),
+    "at round-off": ([OK | {"stationarity": 1e-3, "attainable": 1e-3}], RIGHT),
+    "no reference": ([OK | {"distance": None}], RIGHT),
+    "one step short": ([OK, OK | {"stationarity": 2e-6}], SHORT),
+    "not a number": ([OK | {"stationarity": float("nan")}], SHORT),
+    "no tolerance asked": ([OK | {"tolerance": None}], RIGHT),
+    "elsewhere": ([OK, OK | {"distance": 0.5}], OTHER),
+    "a saddle": ([OK | {"minimum": False}], SADDLE),
+    "a motion that is close": ([OK | {"stationarity": None, "distance": 0.04}], RIGHT),
+    "a motion that is not": ([OK | {"stationarity": None, "distance": 0.06}], SHORT),
+    "a motion without a reference": ([OK | {"stationarity": None, "distance": None}], SHORT),
+    "diverged": ([OK | {"status": "diverged", "reason": "not finite"}], DIVERGED),
+    "refused": ([OK | {"status": "unsupported", "frame": None, "reason": "no mass"}], REFUSED),
+}
+
+
+@pytest.mark.parametrize("name", GRADES)
+def test_a_run_is_graded_by_its_rows(name: str):
+    run, outcome = GRADES[name]
+    assert judged(run)[0] is outcome
+
+
+SCENE = "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 3\ndefault_size: 3\n"
+SCENE += "effects: [{kind: gravity}, {kind: springs, stretch: 10}, {kind: pins, at: [first]}]\n"
+SWEEP = "scenes: [scene.yaml]\nsolvers: [newton, xpbd, {name: numba, precision: float32}, numba]\n"
+SWEEP += "options: {tolerance: 1e-6, rounds: 1, judge: true, pictures: false, record: %s}\n"
+
+
+def test_a_judged_sweep_becomes_a_map_with_links(tmp_path: Path):
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    (tmp_path / "sweep.yaml").write_text(SWEEP % "true")
+    for spec in load_any(tmp_path / "sweep.yaml").runs():
+        files = Files.of(spec, tmp_path)
+        files.rows.parent.mkdir(exist_ok=True)
+        execute(spec, files, lambda phase: None)
+    cells = read_cells(tmp_path)
+    assert [cell.solver for cell in cells] == ["numba float32", "numba float64", "newton", "xpbd"]
+    newton = next(cell for cell in cells if cell.solver == "newton")
+    assert newton.outcome is RIGHT
+    assert newton.worst is not None
+    assert newton.worst < 1.1e-6
+    assert summary(cells).row_count == 4
+    write_page(cells, tmp_path / "map.html", "a <map>")
+    page = (tmp_path / "map.html").read_text()
+    assert "a &lt;map&gt;" in page
+    assert newton.recording
+    assert f'href="recordings/{newton.recording.name}"' in page
+    draw_map(cells, tmp_path / "map.png", "a map")
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_results_that_were_not_judged_are_refused(tmp_path: Path):
+    (tmp_path / "rows").mkdir()
+    rows.write(tmp_path / "rows" / "x.parquet", [{"run_id": "x", "phase": "step", "round": 0, "status": "ok"}])
+    with pytest.raises(InputError, match="judge: true"):
+        read_cells(tmp_path)
+
+
+def test_a_run_that_fails_keeps_and_marks_its_recording_up_to_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    (spec,) = load_any(tmp_path / "scene.yaml", solvers=["sparse"]).runs()
+    files = Files.of(spec, tmp_path)
+    files.rows.parent.mkdir()
+    before = execute(spec, files, lambda phase: None)
+    assert before[0]["status"] == "ok"
+    assert read_replay(files.recording).properties["status"] == "ok"
+
+    def burst(scene, prepared, stop, *, first_guess, frames):
+        for step in simulate(scene, prepared, stop, first_guess=first_guess, frames=frames):
+            if step.index == 3:
+                step.positions[1] = np.inf
+            yield step
+
+    monkeypatch.setattr("harness.measure.simulate", burst)
+    (row,) = execute(spec, files, lambda phase: None)
+    assert (row["status"], row["frame"]) == ("diverged", 3)
+    assert "not finite" in row["reason"]
+    replay = read_replay(files.recording)
+    assert replay.frames.tolist() == [0, 1, 2]
+    assert replay.properties["status"] == "diverged"
+    assert replay.properties["failed_frame"] == 3
