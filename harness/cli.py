@@ -11,22 +11,20 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 from typer.core import TyperGroup
 
+from harness.ablate.command import ablate
+from harness.console import err, out, show_log
+from harness.console import say as _say
 from harness.errors import InputError, SpringbenchError
-
-out, err = Console(), Console(stderr=True)
-if not out.is_terminal:
-    out.width = 240  # a pipe or a file has no width of its own, and no cell should be cut there
 
 
 class _Commands(TyperGroup):
     """Answers our own errors and Ctrl-C with a message and an exit code instead of a traceback."""
 
     def invoke(self, ctx: Any) -> Any:
+        show_log()
         try:
             return super().invoke(ctx)
         except SpringbenchError as error:
@@ -195,6 +193,9 @@ def report(
     _say(f"the map is {picture}, with reasons and recordings {page}")
 
 
+app.command()(ablate)
+
+
 @app.command("list")
 def list_runs(config: Config, results: Results = Path("results")) -> None:
     """Check a config, and show what would run and what is there already."""
@@ -274,10 +275,6 @@ def gate(
     from harness.report.gate import compare
 
     raise typer.Exit(compare(base, new, out))
-
-
-def _say(line: str) -> None:
-    err.print(escape(line), highlight=False, soft_wrap=True)
 
 
 def _check_positions(path: Path | None) -> None:

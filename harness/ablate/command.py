@@ -1,0 +1,45 @@
+"""The command `springbench ablate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from harness.console import out, say
+
+
+def ablate(
+    scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
+    results: Annotated[Path, typer.Option(help="The folder that holds a folder for each scene.")] = Path("results"),
+    solver: Annotated[str | None, typer.Option(help="The first that takes all of the scene, if left out.")] = None,
+    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
+    frames: Annotated[int | None, typer.Option(help="How many steps; the scene's if left out.")] = None,
+    iterations: Annotated[int, typer.Option(help="Iteration limit of a step.")] = 50,
+    tolerance: Annotated[float | None, typer.Option(help="Relative tolerance of a step.")] = None,
+    rounds: Annotated[int, typer.Option(help="How often each step is timed.")] = 5,
+    pairs: Annotated[bool, typer.Option("--pairs", help="Leave out each pair of effects too.")] = False,
+) -> None:
+    """Leave out each effect of a scene: what it costs, what it changes, and which effects the motion calls for."""
+    from harness.ablate.run import ablate as run_ablation
+    from harness.ablate.run import fitting
+    from harness.load import load_any
+    from harness.report.ablation import ablation_table, read, sentences
+    from harness.report.ablation_plot import draw_ablation
+
+    options = {"frames": frames, "iterations": iterations, "tolerance": tolerance, "rounds": rounds, "threads": 1}
+    sizes = [size] if size else []
+    sweep = load_any(scene, solvers=[solver] if solver else [], sizes=sizes, **options)
+    (first,) = sweep.runs()
+    if not solver:
+        sweep = load_any(scene, solvers=[fitting(first.scene, first.size)], sizes=sizes, **options)
+    folder = results / sweep.name
+    path = run_ablation(sweep, folder, pairs=pairs, tick=lambda phase: None)
+    rows, picture = read(path), folder / "pictures" / f"ablation-{path.stem}.png"
+    out.print(ablation_table(rows))
+    for line in sentences(rows):
+        say(line)
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    draw_ablation(rows, picture)
+    say(f"rows are in {path}, the picture is {picture}")

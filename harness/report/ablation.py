@@ -1,0 +1,123 @@
+"""What an ablation found, in words: the verdict on each effect follows from the numbers of its rows.
+
+An effect is called for where leaving it out moves some vertex further than the scene's solver and its time step are
+wrong by anyway. Its price is a difference of times; where the interval holds zero, none was measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
+from rich.table import Table
+
+Row = Mapping[str, Any]
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """The rows of an ablation."""
+    return pq.read_table(path).to_pylist()
+
+
+def of_kind(rows: Sequence[Row], kind: str) -> list[Row]:
+    """The rows of a kind, in their order."""
+    return [row for row in rows if row["kind"] == kind]
+
+
+def known_error(rows: Sequence[Row]) -> tuple[float, str]:
+    """The largest displacement that the scene is wrong by anyway [mean rest lengths], and whose error that is.
+
+    nan where no error is known.
+    """
+    known = [(row["largest"], row["name"]) for row in of_kind(rows, "error") if row["status"] == "ok"]
+    size, name = max(known, default=(float("nan"), ""))
+    return size, {"solver": "the solver's own error", "time-step": "the time step's error", "": ""}[name]
+
+
+def verdict(row: Row, rows: Sequence[Row]) -> str:
+    """What the numbers of one effect say, as a sentence."""
+    if row["status"] == "impossible":
+        return f"the scene is impossible without it ({row['reason']})"
+    (whole,) = of_kind(rows, "whole")
+    price, moved = _price(row, whole["seconds"]), row["largest"]
+    if not moved:
+        return f"{price}, changes nothing at all: leave it out"
+    moves = f"{price}, moves vertices by {_figure(moved)} rest lengths"
+    if moved > row["extent"]:
+        return f"{moves}, further than the mesh is large: without it this is another scene"
+    error, whose = known_error(rows)
+    if not whose:
+        return f"{moves}; by how much the scene is wrong anyway is not known"
+    if moved <= error:
+        return f"{moves}, less than {whose} of {_figure(error)}: this scene does not call for it at this accuracy"
+    return f"{moves}, more than {whose} of {_figure(error)}: this scene calls for it"
+
+
+def _price(row: Row, whole: float) -> str:
+    share, low, high = (row[key] / whole for key in ("cost", "cost_low", "cost_high"))
+    if low <= 0.0 <= high:
+        return f"no time that could be measured ({100 * low:+.1f} to {100 * high:+.1f} %)"
+    if share < 0.0:
+        return f"saves {-share:.0%} of the time" if share < -0.005 else "hardly any time"
+    return f"{share:.0%} of the time" if share >= 0.095 else f"{100 * share:.1f} % of the time"
+
+
+def _figure(value: float) -> str:
+    """Two digits, and no exponent where people would not write one."""
+    return f"{value:.2g}" if value < 100 else f"{value:.0f}"
+
+
+def _relative(value: float) -> str:
+    return f"{value:.1%}" if value < 10.0 else f"{value:.2g} x"
+
+
+def ablation_table(rows: Sequence[Row]) -> Table:
+    """A row an effect: its price, and what leaving it out changes."""
+    (whole,) = of_kind(rows, "whole")
+    headings = ("without", "ms a step", "% of the step", "95 %", "KiB", "nnz(L)", "largest", "RMS", "energy", "centre")
+    table = Table(box=SIMPLE_HEAD, caption="displacements in mean rest lengths, energy of the largest")
+    for i, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if i else "left")
+    size = f"{whole['bytes'] / 1024:,.0f}"
+    table.add_row("nothing", f"{1e3 * whole['seconds']:.3g}", "100", "", size, _count(whole["nnz_factor"], ""))
+    for row in of_kind(rows, "without"):
+        if row["status"] != "ok":
+            table.add_row(escape(row["name"]), row["status"])
+            continue
+        share = [100 * row[key] / whole["seconds"] for key in ("cost", "cost_low", "cost_high")]
+        fill = "" if row["nnz_factor"] is None else _count(whole["nnz_factor"] - row["nnz_factor"], "+")
+        table.add_row(
+            escape(row["name"]),
+            f"{1e3 * row['cost']:.3g}",
+            f"{share[0]:.1f}",
+            f"{share[1]:.1f} to {share[2]:.1f}",
+            f"{(whole['bytes'] - row['bytes']) / 1024:+,.0f}",
+            fill,
+            _figure(row["largest"]),
+            _figure(row["rms"]),
+            _relative(row["energy"]),
+            _figure(row["centre"]),
+        )
+    for row in of_kind(rows, "error"):
+        ok = row["status"] == "ok"
+        found = (_figure(row["largest"]), _figure(row["rms"]), _relative(row["energy"]), _figure(row["centre"]))
+        table.add_row(f"error of the {row['name']}", *[""] * 5, *found) if ok else table.add_row(
+            f"error of the {row['name']}", row["status"]
+        )
+    return table
+
+
+def sentences(rows: Sequence[Row]) -> list[str]:
+    """The verdicts, the suggestions, and what could not be found out."""
+    said = [f"{row['name']}: {verdict(row, rows)}" for row in of_kind(rows, "without")]
+    said += [f"not listed: {row['name']}: {row['reason']}" for row in of_kind(rows, "suggestion")]
+    unknown = [row for row in of_kind(rows, "error") if row["status"] != "ok"]
+    return said + [f"error of the {row['name']}: unknown ({row['reason']})" for row in unknown]
+
+
+def _count(number: int | None, sign: str) -> str:
+    return "" if number is None else f"{number:{sign},}"

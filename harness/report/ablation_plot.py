@@ -1,0 +1,90 @@
+"""The picture of an ablation: what an effect costs to the right, what it changes upwards, one point an effect.
+
+What lies below the lines of the errors changes less than the scene is wrong by anyway.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter
+
+from harness.report.ablation import Row, known_error, of_kind
+from harness.report.page import axes, header, new_page, quantity, save, text
+from harness.report.style import INK, MUTED, RC, RULE, WARNING, mark
+
+_ERRORS = {"solver": "error of the solver", "time-step": "error of the time step"}
+_NOTHING = 1e-6
+"""Displacements below this, in mean rest lengths, are drawn at it."""
+_APART = 15
+"""Pixels between two names."""
+
+
+def draw_ablation(rows: Sequence[Row], path: Path) -> None:
+    """Draw an ablation's picture to `path`, PNG."""
+    (whole,) = of_kind(rows, "whole")
+    points = [row for row in of_kind(rows, "without") if row["status"] == "ok"]
+    with matplotlib.rc_context(RC):
+        page = new_page()
+        facts = [
+            f"{whole['solver']}, {quantity(1e3 * whole['seconds'])} ms a step",
+            f"{whole['vertices']} vertices",
+            f"{whole['frames']} steps of {quantity(1e3 * whole['time_step'])} ms, {whole['rounds']} rounds",
+        ]
+        header(page, f"{whole['scene']}: what its effects cost and change", facts)
+        ax = axes(page, 130, 130, 1380, 640)
+        _errors(ax, rows, points)
+        _effects(ax, points, whole["seconds"])
+        gone = [row["name"] for row in of_kind(rows, "without") if row["status"] != "ok"]
+        called = [row["name"] for row in of_kind(rows, "suggestion")]
+        below = [f"impossible without {', '.join(gone)}"] if gone else []
+        below += [f"not listed, but called for by the motion: {', '.join(called)}"] if called else []
+        text(page, 130, 866, "   ·   ".join(below), size=10.5, color=WARNING if called else MUTED)
+        save(page, path)
+
+
+def _errors(ax: Axes, rows: Sequence[Row], points: Sequence[Row]) -> None:
+    """Lines of the errors, a scale that holds them and the points, and a shade over what lies below both."""
+    known = [row for row in of_kind(rows, "error") if row["status"] == "ok"]
+    values = [max(row["largest"], _NOTHING) for row in (*known, *points)]
+    low, high = min(values, default=1e-3) / 4.0, max(values, default=1.0) * 4.0
+    ax.set_yscale("log")
+    ax.set_ylim(low, high)
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+    ax.set_ylabel("largest displacement where it is left out [mean rest lengths]")
+    ax.set_xlabel("cost [% of a step, with the 95 % interval]")
+    ax.grid(axis="y", which="major")
+    error, _ = known_error(rows)
+    if np.isfinite(error):
+        ax.axhspan(low, max(error, low), color=RULE, alpha=0.45, linewidth=0)
+    for row in known:
+        y = max(row["largest"], _NOTHING)
+        ax.axhline(y, color=MUTED, linewidth=1.0, linestyle=(0, (5, 3)))
+        place = {"xycoords": ("axes fraction", "data"), "xytext": (-4, 3), "textcoords": "offset points"}
+        ax.annotate(_ERRORS[row["name"]], (1.0, y), ha="right", fontsize=9.5, color=MUTED, **place)
+
+
+def _effects(ax: Axes, points: Sequence[Row], whole: float) -> None:
+    """One point an effect with its interval and its name; names that would meet are moved apart."""
+    taken: list[tuple[float, float]] = []
+    for i, row in enumerate(sorted(points, key=lambda row: -row["largest"])):
+        look, y = mark(i), max(row["largest"], _NOTHING)
+        x, low, high = (100.0 * row[key] / whole for key in ("cost", "cost_low", "cost_high"))
+        ax.plot([low, high], [y, y], color=look.color, linewidth=1.6, alpha=0.6, solid_capstyle="butt")
+        ax.plot([x], [y], marker=look.marker, color=look.color, markersize=9, linestyle="none")
+        taken.append((x, y))
+    ax.axvline(0.0, color=MUTED, linewidth=0.8)
+    ax.margins(x=0.12)
+    ax.figure.canvas.draw()
+    used: list[tuple[float, float]] = []
+    for (x, y), row in zip(taken, sorted(points, key=lambda row: -row["largest"]), strict=True):
+        across, up = ax.transData.transform((x, y))
+        lift = 9.0
+        while any(abs(across - a) < 130 and abs(up + lift - b) < _APART for a, b in used):
+            lift += _APART
+        used.append((across, up + lift))
+        ax.annotate(row["name"], (x, y), (9, lift * 0.72), textcoords="offset points", fontsize=10.5, color=INK)
