@@ -62,7 +62,7 @@ class Hybrid:
     def prepare(self, system: System) -> PreparedDescent:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
         metric, objective = Metric(system), Objective(system)
-        method = HybridMethod(objective, NewtonMethod(metric), Lbfgs().prepare(system))
+        method = HybridMethod(objective, metric, Lbfgs().prepare(system))
         factor = objective.matrix.factor
         facts = metric.facts | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {metric.choice}"
@@ -72,11 +72,11 @@ class Hybrid:
 class HybridMethod:
     """The iteration for one system: a round of L-BFGS, or a step of one of Newton's methods."""
 
-    def __init__(self, objective: Objective, newton: NewtonMethod, lbfgs: PreparedAccelerated) -> None:
-        self._newton, self._lbfgs = newton, lbfgs
+    def __init__(self, objective: Objective, metric: Metric, lbfgs: PreparedAccelerated) -> None:
+        self.metric, self._newton, self._lbfgs = metric, NewtonMethod(metric), lbfgs
         self.inertia = np.repeat(objective.system.inertia[objective.system.free], 3)
         factor = objective.matrix.factor
-        self._cost = 9.0 * factor.flops / (_FLOPS_PER_ENTRY * max(1, factor.nonzeros))
+        self._cost = 9.0 * max(1.0, factor.flops) / (_FLOPS_PER_ENTRY * max(1, factor.nonzeros))
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
         """The points after `start`."""
@@ -89,6 +89,7 @@ class HybridMethod:
             if gain > newton_gain:
                 _, residual, ended = run.advance(_ROUND, 0.0, 0.0, False)
                 following = _at(step, run.positions)
+                ended |= residual**2 <= self.metric.round_off(following.positions)
                 last, gain = gain, -step.rise(point.positions, following.positions)[0]
                 if last == np.inf and residual > _QUICK * before:
                     gain = 0.0  # of no use yet
@@ -122,7 +123,7 @@ class _Predicting:
         self._method, self._step = method, step
         self._origin: Point | None = origin
         self._tension = np.zeros(len(step.whole.springs.stiffness))
-        self._level, self._slope = len(_LEVELS), -np.inf
+        self._level, self._slope, self._bold = len(_LEVELS), -np.inf, True
 
     def next(self, point: Point) -> tuple[Point, bool]:
         """A lower point, or the same one; whether the exact method does better from there."""
@@ -134,19 +135,20 @@ class _Predicting:
         direction = -hessian.solve(at.gradient)
         slope, before = dot(at.gradient, direction), self._slope
         self._slope = slope
-        if not slope < 0.0:
+        if not -slope > self._method.metric.round_off(at.positions):
             return point, True
         predicted = step.tensions(at.positions, direction)
         length, following, kept = self._along(at, direction, slope)
         if following is None:
             return point, True
+        self._bold = kept
         self._tension += length * (predicted - self._tension)
         lower = following if step.rise(point.positions, following.positions)[0] < 0.0 else point
         return lower, self._level == 0 and kept and slope >= _QUADRATIC * before
 
     def _factorise(self, hessian: Hessian) -> bool:
         """Whether some level gives a factor: the first one does from that before the last one's on."""
-        for level in range(max(0, self._level - 1), len(_LEVELS)):
+        for level in range(max(0, self._level - self._bold), len(_LEVELS)):
             keep, by = _LEVELS[level]
             if hessian.factorise(keep, by * self._method.inertia, self._tension):
                 self._level = level
