@@ -16,7 +16,8 @@ import numpy as np
 
 from solvers.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.objective import Objective, StepObjective
-from solvers.problem import Positions, System
+from solvers.problem import Positions, System, Unsupported
+from solvers.touching import without_contact
 
 _LOOSE, _TIGHT = 0.5, 1e-10
 """The bounds of eta."""
@@ -33,7 +34,10 @@ class NewtonCG:
     descends: ClassVar[bool] = True
 
     def prepare(self, system: System) -> PreparedDescent:
-        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
+        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported for contact, and where Q fits
+        nowhere."""
+        if without_contact(system) is not system:
+            raise Unsupported("newton-cg: Q preconditions no Contact, which is far stiffer; take newton or lbfgs")
         metric = Metric(system)
         return PreparedDescent(Objective(system), metric, _Method(metric), metric.choice, metric.facts)
 

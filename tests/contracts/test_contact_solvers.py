@@ -1,0 +1,117 @@
+"""Contact with every solver: those that take it agree and descend, others refuse it by name; idle, it costs no bit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from harness.effects.pins import Pins
+from harness.scene import Scene
+from harness.simulate import prepare, simulate
+from solvers import contact as method
+from solvers.problem import Positions, Solver, StepProblem, StopRule, Unsupported
+from solvers.registry import SOLVERS, load
+from tests.contacts import OBSTACLES, contact, sheet, steps
+
+SOLVED: dict[str, Solver] = {name: load(target)() for name, target in SOLVERS.items()}
+TAKE = ("sparse", "numba", "lbfgs", "hybrid", "newton")
+PREFACTORED = ("sparse", "numba", "lbfgs")
+FLOOR = contact(OBSTACLES["plane"], friction=0.4)
+FALL = (0.5, -6.0, 0.0)
+
+
+def held(weight: float | str) -> Scene:
+    return sheet(FLOOR, Pins.model_validate({"at": ["top_corners"], "weight": weight}), velocity=FALL)
+
+
+SCENES = {
+    "frictionless": lambda: sheet(contact(OBSTACLES["plane"]), velocity=FALL),
+    "friction": lambda: sheet(FLOOR, velocity=FALL),
+    "two obstacles": lambda: sheet(contact(OBSTACLES["sphere"], OBSTACLES["capsule"], friction=0.2), velocity=FALL),
+    "held by penalty": lambda: held(1e10),
+    "held exactly": lambda: held("exact"),
+}
+
+
+@cache
+def landed(scene: str) -> tuple[StepProblem, Positions]:
+    """The step at which most presses and something grips, and its minimum by Newton's method."""
+    step = steps(SCENES[scene](), 4, stop=StopRule(100, 1e-12))[-1]
+    energy = step.problem.energies[-1]
+    assert len(energy.rows(step.problem.current, step.solution.positions, cautious=False).vertices) > 3  # pyright: ignore[reportAttributeAccessIssue]
+    return step.problem, step.solution.positions
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("solver", TAKE)
+def test_solvers_agree_at_convergence(solver, scene):
+    problem, wanted = landed(scene)
+    found = SOLVED[solver].prepare(problem.system).solve(problem, StopRule(1500, 1e-9))
+    # Local-global converges linearly: what is left is some hundred times the last step, 1e-9 of the first.
+    np.testing.assert_allclose(found.positions, wanted, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("solver", sorted(set(SOLVED) - set(TAKE)))
+def test_others_refuse_contact_by_name(solver):
+    with pytest.raises(Unsupported, match="Contact"):
+        SOLVED[solver].prepare(SCENES["friction"]().system)
+
+
+@pytest.mark.parametrize("few", [method._FEW, 0], ids=["Woodbury", "conjugate gradients"])
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("solver", PREFACTORED)
+def test_no_iteration_raises_the_objective(solver, scene, few, monkeypatch):
+    monkeypatch.setattr(method, "_FEW", few)
+    problem, wanted = landed(scene)
+    problem = replace(problem, first_guess=problem.target)  # deep inside
+    values = [problem.value(problem.first_guess)]
+    for p in islice(SOLVED[solver].prepare(problem.system).iterates(problem), 30):
+        values.append(problem.value(p))
+        assert values[-1] <= values[-2] + 1e-12 * problem.magnitude(p)  # sums of some hundred terms
+    scale = values[0] - problem.value(wanted)
+    assert values[-1] - problem.value(wanted) <= 1e-2 * scale
+
+
+@pytest.mark.parametrize("scene", ["friction", "held exactly"])
+def test_conjugate_gradients_correct_as_woodburys_formula_does(scene, monkeypatch):
+    problem, _ = landed(scene)
+    rng = np.random.default_rng(0)
+    prepared = method.local_global(SOLVED["sparse"], problem.system)
+    corrections, (energy,) = prepared.corrections, method.touching(problem)
+    p = problem.current
+    gradient = rng.normal(size=p.shape)
+    gradient[problem.system.pins.vertices[problem.system.pins.exact]] = 0.0
+    plain = corrections.plain(gradient)
+    exact, rows = corrections.around([energy], p, gradient, plain, cautious=True)
+    monkeypatch.setattr(method, "_FEW", 0)
+    monkeypatch.setattr(method, "_ITERATIONS", 2000)
+    monkeypatch.setattr(method, "_TOLERANCE", 1e-12)
+    found = corrections.displacement(rows, gradient, plain)
+    # Weights lie six orders above Q: so many digits of sixteen are lost, on both ways.
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-6 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("solver", PREFACTORED)
+def test_contact_that_is_idle_changes_no_bit(solver):
+    far = contact({"kind": "plane", "point": (0, -50, 0)}, friction=0.5)
+    runs = [
+        [
+            step.positions
+            for step in simulate(made, prepare(made, SOLVED[solver]), StopRule(10), first_guess="current", frames=4)
+        ]
+        for made in (sheet(), sheet(far))
+    ]
+    np.testing.assert_array_equal(*runs)
+
+
+@pytest.mark.parametrize("solver", TAKE)
+def test_a_solve_ends_at_exactly_the_iterate_of_its_number(solver):
+    problem, _ = landed("friction")
+    prepared = SOLVED[solver].prepare(problem.system)
+    for count in (1, 3):
+        wanted = [p.copy() for p in islice(prepared.iterates(problem), count)][-1]
+        np.testing.assert_array_equal(prepared.solve(problem, StopRule(count)).positions, wanted)
