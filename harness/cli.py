@@ -18,6 +18,7 @@ from harness.ablate.command import ablate
 from harness.console import err, out, show_log
 from harness.console import say as _say
 from harness.errors import InputError, SpringbenchError
+from harness.gallery import gallery
 
 
 class _Commands(TyperGroup):
@@ -194,6 +195,7 @@ def report(
 
 
 app.command()(ablate)
+app.command()(gallery)
 
 
 @app.command("list")

@@ -5,6 +5,7 @@ All frames of a run share one camera, so that what moves in the pictures is the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, cast
@@ -25,6 +26,7 @@ _TUBES = 20_000  # springs; beyond that they are drawn as lines
 _MESH_LINES = 350  # pixels of the view for each vertex; with fewer, lines would hide the colours
 _SUPERSAMPLING = 3  # a pixel is the mean of 3 x 3: faster than VTK's own anti-aliasing in software
 _JOINT = "#8a8d92"  # vertices of a network without triangles
+_SOLID = "#c9c3b8"  # obstacles
 _SHADE = "#d3d0ca"  # where the ground is fully in shadow
 _MATERIAL: dict[str, Any] = {"ambient": 0.62, "diffuse": 0.44, "specular": 0.06, "specular_power": 18.0}
 _BLOWN_UP = 1e4  # coordinates this many times larger than the start's are drawn as if not finite
@@ -156,11 +158,13 @@ def _balls(at: Points, radius: float) -> pv.PolyData:
 class Studio:
     """One off-screen window of `width` x `height` pixels, reused for all frames; a context manager.
 
+    mesh_lines: how many pixels each vertex needs for the mesh's lines to be drawn.
     Raises RunFailed where the system cannot draw.
     """
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self, width: int, height: int, *, mesh_lines: int = _MESH_LINES) -> None:
         opengl.require()
+        self._mesh_lines = mesh_lines
         self._pixels, self._height = width * height, height
         size = [_SUPERSAMPLING * width, _SUPERSAMPLING * height]
         self._plotter = pv.Plotter(off_screen=True, window_size=size, lighting="none")
@@ -179,8 +183,8 @@ class Studio:
     ) -> None:
         self._plotter.close()
 
-    def draw(self, replay: Replay, frame: int, view: View) -> NDArray[np.uint8]:
-        """A recorded frame as pixels (height, width, 3); its positions must be finite."""
+    def draw(self, replay: Replay, frame: int, view: View, solids: Sequence[pv.PolyData] = ()) -> NDArray[np.uint8]:
+        """A recorded frame as pixels (height, width, 3), with solids beside it; its positions must be finite."""
         plotter = self._plotter
         plotter.clear_actors()
         plotter.camera.position = tuple(view.position)
@@ -194,6 +198,8 @@ class Studio:
         else:
             self._springs(replay, frame, p)
         self._pins(replay, p)
+        for solid in solids:
+            plotter.add_mesh(solid, color=_SOLID, smooth_shading=solid.n_cells > 6, **_MATERIAL)
         plotter.reset_camera_clipping_range()
         plotter.render()
         pixels = Image.fromarray(np.asarray(plotter.screenshot(None, return_img=True))[..., :3])
@@ -212,7 +218,7 @@ class Studio:
             split_sharp_edges=_is_closed(replay.triangles),
             feature_angle=50.0,
             **_MATERIAL,
-            show_edges=len(p) * _MESH_LINES <= self._pixels,
+            show_edges=len(p) * self._mesh_lines <= self._pixels,
             edge_color=INK,
             edge_opacity=0.14,
             line_width=1.5,

@@ -1,0 +1,74 @@
+"""`springbench gallery`: scenes simulated and drawn side by side on one sheet, as they are at their last frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from harness.console import say
+
+
+def gallery(
+    scenes: Annotated[list[Path], typer.Argument(help="Scenes (YAML), in the order of the sheet.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The picture to write (.png).")] = Path("scenes.png"),
+) -> None:
+    """Draw a sheet of scenes, each simulated at its default size up to its last frame."""
+    from harness.report.contact_sheet import draw_sheet
+
+    tiles = []
+    for path in scenes:
+        tiles.append(_tile(path))
+        say(f"[{len(tiles)}/{len(scenes)}] {tiles[-1].name}")
+    draw_sheet(tiles, output)
+    say(f"the sheet is {output}")
+
+
+def _tile(path: Path) -> Any:
+    """A scene's tile."""
+    from harness.ablate.run import fitting
+    from harness.load import load_any
+    from harness.machine import pinned_threads
+    from harness.measure import Settings, steps
+    from harness.record.base import Replay
+    from harness.report.contact_sheet import Tile
+    from harness.scene import build
+    from harness.simulate import prepare
+    from solvers.problem import StopRule
+    from solvers.registry import SOLVERS, load
+
+    (run,) = load_any(path).runs()
+    scene = build(run.scene, run.size)
+    solver = load(SOLVERS[fitting(run.scene, run.size)])()
+    p = scene.mesh.rest
+    with pinned_threads(1):
+        settings = Settings(StopRule(200, 1e-4), run.first_guess, run.frames, 1)
+        for step in steps(scene, prepare(scene, solver), settings):
+            p = step.positions
+    replay = Replay(
+        title=run.scene_name,
+        run_id="",
+        frames=np.array([run.frames]),
+        times=np.array([run.frames * run.time_step]),
+        positions=p[None].astype(np.float32),
+        triangles=scene.mesh.triangles,
+        springs=scene.springs.edges,
+        rest_lengths=scene.springs.rest_length,
+        pinned=scene.system.pins.vertices,
+        strain_range=run.strain_range,
+        scalars={},
+        properties={},
+    )
+    kinds = dict.fromkeys(effect.kind for effect in run.scene.effects if effect.kind not in ("springs", "gravity"))
+    obstacles: list[Any] = [one for effect in run.scene.effects for one in getattr(effect, "obstacles", ())]
+    camera = run.scene.camera
+    return Tile(
+        replay=replay,
+        mass=scene.system.mass,
+        name=run.scene_name.replace("-", " "),
+        effects=", ".join(kinds).replace("-", " "),
+        obstacles=obstacles,
+        angles=(camera.azimuth, camera.elevation) if camera else None,
+    )

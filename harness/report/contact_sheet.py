@@ -1,0 +1,75 @@
+"""A sheet of scenes: each in a tile with its name, its effects and its time, all type of one size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pyvista as pv
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from harness.obstacles import AnyObstacle
+from harness.record.base import Replay
+from harness.report.page import save
+from harness.report.render import Studio, area_vectors, frame_all, natural_angles
+from harness.report.solids import solid
+from harness.report.style import DPI, INK, MUTED, PAGE, RC, WIDTH
+
+COLUMNS = 4
+_LINES = 70
+"""Pixels for each vertex from which on the mesh's lines are drawn: the mesh is to be seen, if only as a texture."""
+_BOB, _HEAVY = 0.03, 20.0
+"""Vertices so many times heavier than most are drawn as balls, of this radius in the scene's size."""
+_MARGIN, _GAP, _TILE, _CAPTION = 28, 20, 290, 62
+"""Pixels: around the sheet, between tiles, a tile's height, the type below it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tile:
+    """A scene at one moment.
+
+    replay: of the frame to be drawn alone; mass: of its vertices (n,) [kg]; name and effects: in words; obstacles: what
+    it touches; angles: azimuth and elevation [degrees], chosen by the mesh's shape where None.
+    """
+
+    replay: Replay
+    mass: NDArray[np.float64]
+    name: str
+    effects: str
+    obstacles: Sequence[AnyObstacle]
+    angles: tuple[float, float] | None
+
+
+def draw_sheet(tiles: Sequence[Tile], path: Path) -> None:
+    """Draw the tiles row by row, PNG. Raises RunFailed where the system cannot draw."""
+    width = (WIDTH - 2 * _MARGIN - (COLUMNS - 1) * _GAP) // COLUMNS
+    step = _TILE + _CAPTION
+    height = 2 * _MARGIN + -(-len(tiles) // COLUMNS) * step - _GAP // 2
+    with matplotlib.rc_context(RC), Studio(width, _TILE, mesh_lines=_LINES) as studio:
+        page = Figure(figsize=(WIDTH / DPI, height / DPI), dpi=DPI, facecolor=PAGE)
+        FigureCanvasAgg(page)
+        for k, tile in enumerate(tiles):
+            row, column = divmod(k, COLUMNS)
+            left, top = _MARGIN + column * (width + _GAP), _MARGIN + row * step
+            page.figimage(_drawn(studio, tile, width / _TILE), xo=left, yo=height - top - _TILE, origin="upper")
+            for words, below, size, color in ((tile.name, 20, 15.0, INK), (tile.effects, 41, 10.5, MUTED)):
+                page.text(left / WIDTH, 1 - (top + _TILE + below) / height, words, size=size, color=color)
+        save(page, path)
+
+
+def _drawn(studio: Studio, tile: Tile, aspect: float) -> np.ndarray:
+    replay, time = tile.replay, float(tile.replay.times[-1])
+    points = replay.positions[-1]
+    touched = [(one.kind, solid(one, time, points)) for one in tile.obstacles]
+    solids = [made for _, made in touched if made is not None]
+    radius = _BOB * float(np.linalg.norm(np.ptp(points, axis=0)))
+    solids += [pv.Sphere(radius=radius, center=p) for p in points[tile.mass > _HEAVY * np.median(tile.mass)]]
+    # A plane has no end; what is framed is what lies on it.
+    framed = np.concatenate([points, *(made.points for kind, made in touched if made and kind != "plane")])
+    angles = tile.angles or natural_angles(points, area_vectors(replay, -1))
+    return studio.draw(replay, -1, frame_all(framed, aspect=aspect, angles=angles), solids)

@@ -1,0 +1,58 @@
+"""Obstacles as meshes that can be drawn, where they are at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import NDArray
+
+from harness.obstacles import AnyObstacle, Box, Capsule, Plane, Sphere
+
+_LEVEL = 0.999
+"""Planes whose normal is as upright as this are the ground, which pictures show by the shadow on it."""
+
+
+def solid(obstacle: AnyObstacle, time: float, seen: NDArray[np.floating]) -> pv.PolyData | None:
+    """The obstacle at a time [s]; of a plane the part below the points `seen` (q, 3) [m]; None for the level ground."""
+    made = _MADE[obstacle.kind](obstacle, seen)
+    if made is not None and obstacle.motion is not None:
+        made.points = obstacle.motion.moved(np.asarray(made.points, np.float64), time)
+    return made
+
+
+def _sphere(one: Sphere, seen: NDArray[np.floating]) -> pv.PolyData:
+    return pv.Sphere(radius=one.radius, center=one.center, theta_resolution=48, phi_resolution=32)
+
+
+def _capsule(one: Capsule, seen: NDArray[np.floating]) -> pv.PolyData:
+    a, b = (np.array(end) for end in one.ends)
+    bar = pv.Line(a, b).tube(radius=one.radius, n_sides=32, capping=False)
+    balls = [pv.Sphere(radius=one.radius, center=end, theta_resolution=32, phi_resolution=24) for end in one.ends]
+    return cast(pv.PolyData, bar.merge(balls).extract_surface(algorithm=None))
+
+
+def _box(one: Box, seen: NDArray[np.floating]) -> pv.PolyData:
+    (a, b, c), (d, e, f) = one.low, one.high
+    return pv.Box(bounds=(a, d, b, e, c, f))
+
+
+def _plane(one: Plane, seen: NDArray[np.floating]) -> pv.PolyData | None:
+    normal = np.array(one.normal) / np.linalg.norm(one.normal)
+    if normal[1] > _LEVEL and one.motion is None:
+        return None
+    away = seen - np.array(one.point)
+    foot = seen - (away @ normal)[:, None] * normal
+    side = 1.3 * float(np.linalg.norm(np.ptp(foot, axis=0)))
+    middle = (foot.min(axis=0) + foot.max(axis=0)) / 2.0
+    return pv.Plane(center=middle, direction=normal, i_size=side, j_size=side)
+
+
+_MADE: dict[str, Callable[[Any, NDArray[np.floating]], pv.PolyData | None]] = {
+    "sphere": _sphere,
+    "capsule": _capsule,
+    "box": _box,
+    "plane": _plane,
+}
