@@ -1,0 +1,60 @@
+"""Runs of 100,000 steps (`pytest -m long`): nothing drifts away, and what should come to rest has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.load import load_scene
+from harness.scene import Scene, build
+from harness.simulate import prepare, simulate, start
+from solvers.compiled import CompiledLocalGlobal
+from solvers.integrators import Motion
+from solvers.lbfgs import Lbfgs
+from solvers.problem import Solver, StopRule
+
+pytestmark = pytest.mark.long
+
+SCENES = Path(__file__).resolve().parents[2] / "configs" / "hard-long"
+STOP = StopRule(50, 1e-6)
+
+
+def hangs(made: Scene, now: Motion) -> None:
+    # Drag-free implicit Euler has damped every swing to the floor of the stop rule, 1e-12 of the positions a step.
+    assert np.abs(now.velocity).max() <= 1e-8 * made.mesh.size / made.system.time_step
+
+
+def keeps_its_momentum(made: Scene, now: Motion) -> None:
+    mass = made.system.mass[:, None]
+    centre = (mass * now.positions).sum(axis=0) / mass.sum()
+    begun = (mass * start(made).now.positions).sum(axis=0) / mass.sum()
+    # Each step's round-off, 1e-16 of the size, adds to the centre's velocity and so, as t^2 at worst, to its place.
+    assert np.abs(centre - begun).max() <= 1e-6 * made.mesh.size
+
+
+def stays_near_its_hand(made: Scene, now: Motion) -> None:
+    # The driving circle is 0.2 m wide; a chain of 1 m stretches by less than its own length under 1 N.
+    assert np.abs(now.positions).max() <= 3.0
+
+
+CHECKS: dict[str, Callable[[Scene, Motion], None]] = {
+    "long-hanging-cloth": hangs,
+    "long-spinning-net": keeps_its_momentum,
+    "long-driven-chain": stays_near_its_hand,
+}
+
+
+@pytest.mark.parametrize("solver", [CompiledLocalGlobal(), Lbfgs()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("name", CHECKS)
+def test_a_hundred_thousand_steps_drift_nowhere(name: str, solver: Solver):
+    spec = load_scene(SCENES / f"{name}.yaml")
+    assert spec.frames == 100_000
+    made = build(spec, spec.default_size or 0)
+    now = start(made).now
+    for step in simulate(made, prepare(made, solver), STOP, first_guess="current", frames=spec.frames):
+        now = step.state.now
+        assert np.isfinite(now.positions).all(), f"frame {step.index}"
+    CHECKS[name](made, now)
