@@ -87,6 +87,7 @@ COLUMNS = (
     Column("panel_bytes", _INT, "", "bytes in which the prepared factor is stored"),
     Column("flops_per_solve", _INT, "", "additions and multiplications of one global step, padding included"),
     Column("choice", _TEXT, "", "what the solver chose by itself, and why"),
+    Column("apart", _REAL, "", "how far the precision of the factor moves converged positions, in the scene's size"),
     Column("bytes", _REAL, "", "bytes that the phase touches, vectors and springs included, by count"),
     Column("flops", _REAL, "", "additions and multiplications of the phase, by count"),
     Column("working_set", _REAL, "", "bytes that the phase goes through again and again"),

@@ -12,7 +12,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MultipleLocator, NullLocator
 
 from harness.report.page import axes, count, header, new_page, quantity, save, shorten
-from harness.report.style import HEIGHT, PAGE, RC, WIDTH, mark
+from harness.report.style import DASH_DOTTED, DOTTED, HEIGHT, PAGE, RC, WIDTH, mark
+
+_DASHES = (((0, (4, 2)), "-"), (DOTTED, DASH_DOTTED))
+"""Of a family's other members and of its namesake; the ninth family has the colour of the first, and other dashes."""
 
 _LEFT, _TOP, _NAMES, _BELOW = 110, 130, 400, 70
 
@@ -29,7 +32,8 @@ class Series(NamedTuple):
 def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[Series], *, share: bool) -> None:
     """Draw to `path`, WIDTH x HEIGHT pixels, PNG; `share`: values are parts of a whole, drawn in percent.
 
-    The line of a family's namesake is solid, those of its other members are dashed. A series without values is not
+    The line of a family's namesake is solid, those of its other members are dashed (dash-dotted and dotted from the
+    ninth family on). A series without values is not
     drawn; it keeps its family's colour free, so that pictures of the same candidates have the same colours.
     """
     drawn = [line for line in series if line.values]
@@ -45,7 +49,7 @@ def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[
                 line.vertices,
                 line.values,
                 color=look.color,
-                linestyle="-" if line.name == line.family else (0, (4, 2)),
+                linestyle=_DASHES[list(looks).index(line.family) // 8 % 2][line.name == line.family],
                 linewidth=1.8,
                 marker=look.marker,
                 markersize=6,

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from harness.scene import Scene
 from harness.spec import RunSpec
 from harness.speed import limits, work
+from harness.speed.rest import Rest, apart, precision
 from harness.speed.yardstick import Yardstick
 from solvers.problem import Positions, Prepared, StepProblem, StopRule
 from solvers.registry import SOLVERS, load
@@ -57,8 +58,10 @@ class SolverCandidate:
     into memory side by side.
     """
 
-    def __init__(self, run: RunSpec, scene: Scene, problem: StepProblem, prepared: dict[str, Prepared]) -> None:
-        self.run, self._shared = run, prepared
+    def __init__(
+        self, run: RunSpec, scene: Scene, problem: StepProblem, prepared: dict[str, Prepared], rest: Rest | None = None
+    ) -> None:
+        self.run, self._shared, self._rest = run, prepared, rest
         self.columns: dict[str, Any] = {}
         self._scene, self._problem = scene, problem
         self._solver = load(SOLVERS[run.solver.name])(**run.solver.parameters)
@@ -74,9 +77,11 @@ class SolverCandidate:
         if self._prepared is None:
             self._prepared = prepared = self._shared.setdefault(str(self._solver), prepared)
             counts = self._scene.system.vertices, len(self._scene.springs.edges)
-            self._work = work.count(prepared.facts, *counts, self.run.solver.parameters.get("precision", "float64"))
+            self._work = work.count(prepared.facts, *counts, precision(self.run))
             self.columns = {name: int(value) for name, value in prepared.facts.items()}
             self.columns["choice"] = prepared.choice
+            if self._rest and precision(self.run) != "float64":
+                self.columns["apart"] = apart(self._rest, prepared)
         return seconds
 
     def turn(self) -> list[Reading]:

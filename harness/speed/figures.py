@@ -43,7 +43,7 @@ class Figures(NamedTuple):
     step: of STEP iterations; touched: bytes a second of an iteration, by what the factor's panels hold; binds: the
     limit that binds; reached: the part of it that an iteration reaches by those bytes and flops; least: the part by
     the entries of L alone, without the panels' padding; faster: than the yardstick a step; solves_faster: than
-    cholespy a global step.
+    cholespy a global step; apart: from float64's converged positions, in the scene's size.
     """
 
     scene: str
@@ -68,6 +68,7 @@ class Figures(NamedTuple):
     faster: Interval | None = None
     cheap_faster: Interval | None = None
     solves_faster: Interval | None = None
+    apart: float | None = None
     load: float | None = None
 
 
@@ -155,6 +156,7 @@ def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], m
         faster=_against(group, f"{YARDSTICK} default", "step", times),
         cheap_faster=_against(group, f"{YARDSTICK} cheap", "step", times),
         solves_faster=_against(group, _cholespy(group), "global", times),
+        apart=first["apart"],
         load=max(row["load"] for row in found),
     )
     facts = {name: first[name] for name in ("nnz_factor", "panel_bytes", "flops_per_solve") if first[name] is not None}

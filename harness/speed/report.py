@@ -21,7 +21,13 @@ from harness.scene import build
 from harness.simulate import problem, start
 from harness.spec import RunSpec, SolverSpec
 from harness.speed import yardstick
-from harness.speed.candidates import Candidate, MachineCandidate, SolverCandidate, YardstickCandidate
+from harness.speed.candidates import (
+    Candidate,
+    MachineCandidate,
+    SolverCandidate,
+    YardstickCandidate,
+)
+from harness.speed.rest import precision, rest_of
 from harness.speed.turns import Past, measure, name
 from solvers.problem import Prepared
 
@@ -46,17 +52,18 @@ def run_speed(
     (folder / "rows").mkdir(parents=True, exist_ok=True)
     files: list[Path] = []
     past: dict[str, list[Past]] = {}
-    for group in _groups(runs):
-        runs = [*group, *_beside(group)]
-        paths = [Files.of(run, folder).rows for run in runs]
-        if again or not all(path.exists() for path in paths):
-            say(f"{group[0].scene_name} {group[0].size}: {len(runs)} candidates take turns")
-            for path, found in zip(paths, _measured(runs, folder, past, budget), strict=True):
-                rows.write(path, found)
-        for run, path in zip(runs, paths, strict=True):
-            past.setdefault(name(run), []).extend(_past(rows.read([path]).to_pylist()))
-        files += paths
-    return rows.read(files)
+    with rows.alone(folder):
+        for group in _groups(runs):
+            members = [*group, *_beside(group)]
+            paths = [Files.of(run, folder).rows for run in members]
+            if again or not all(path.exists() for path in paths):
+                say(f"{group[0].scene_name} {group[0].size}: {len(members)} candidates take turns")
+                for path, found in zip(paths, _measured(members, folder, past, budget), strict=True):
+                    rows.write(path, found)
+            for run, path in zip(members, paths, strict=True):
+                past.setdefault(name(run), []).extend(_past(rows.read([path]).to_pylist()))
+            files += paths
+        return rows.read(files)
 
 
 def _groups(runs: Sequence[RunSpec]) -> list[list[RunSpec]]:
@@ -85,13 +92,14 @@ def _measured(
     stated = problem(scene, start(scene), runs[0].first_guess)
     program = partial(yardstick.build, folder / "build")
     prepared: dict[str, Prepared] = {}
+    rest = rest_of(stated) if any(precision(run) != "float64" for run in runs) else None
 
     def candidate(run: RunSpec) -> Candidate:
         if run.solver.name == MACHINE:
             return MachineCandidate(run)
         if run.solver.name == YARDSTICK:
             return YardstickCandidate(run, scene, stated, program, TEMPORARIES[run.solver.parameters["temporaries"]])
-        return SolverCandidate(run, scene, stated, prepared)
+        return SolverCandidate(run, scene, stated, prepared, rest)
 
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
     return measure([candidate(run) for run in runs], counts, past, budget)

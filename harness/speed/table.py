@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import groupby
 
 import numpy as np
@@ -27,6 +27,7 @@ _NUMBERS = (
     "step against eigen\ntimes faster",
     "with cheap\ntemporaries",
     "solve against\ncholespy",
+    "converged, apart\nfrom float64",
     "load",
 )
 
@@ -34,18 +35,26 @@ _NUMBERS = (
 def speed_table(found: Sequence[Figures]) -> Table:
     """A line for each candidate at each size; ratios with their 95 % intervals."""
     table = Table(box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
-    table.add_column("size", justify="right")
+    table.add_column("scene", justify="right")
     table.add_column("candidate", no_wrap=True)
     for words in _NUMBERS:
         table.add_column(words, justify="right", no_wrap=True)
+    where = _places(found)
     for _, group in groupby(found, key=lambda f: (f.scene, f.size)):
         for f in group:
             if f.status == "ok":
-                table.add_row(count(f.size), _named(f), *_cells(f))
+                table.add_row(where(f), _named(f), *_cells(f))
             else:
-                table.add_row(count(f.size), f.label, f"[yellow]{f.status}[/]")
+                table.add_row(where(f), f.label, f"[yellow]{f.status}[/]")
         table.add_section()
     return table
+
+
+def _places(found: Sequence[Figures]) -> Callable[[Figures], str]:
+    """How a scene of a size is called: by its size where there is one scene."""
+    if len({f.scene for f in found}) == 1:
+        return lambda f: count(f.size)
+    return lambda f: f"{f.scene} {count(f.size)}"
 
 
 def _named(f: Figures) -> str:
@@ -61,6 +70,7 @@ def _cells(f: Figures) -> list[str]:
         _share(f.reached),
         _share(f.least),
         *(_ratio(interval) for interval in (f.faster, f.cheap_faster, f.solves_faster)),
+        "–" if f.apart is None else f"{f.apart:.0e}",
         _number(f.load),
     ]
 
@@ -79,23 +89,24 @@ def _ratio(interval: Interval | None) -> str:
 
 def remarks(found: Sequence[Figures]) -> list[str]:
     """What was left out or failed and why, what the solvers chose, and how the cost of a solve grows."""
+    where = _places(found)
     told: dict[str, list[str]] = defaultdict(list)
     for f in sorted(found, key=lambda f: f.status == "ok"):
         if f.status != "ok":
-            told[f"{f.label}: {f.status}: {f.reason}"].append(str(f.size))
+            told[f"{f.label}: {f.status}: {f.reason}"].append(where(f))
         elif f.choice and "auto" in f.label.split():
-            told[f"{f.label} chose {f.choice}"].append(str(f.size))
+            told[f"{f.label} chose {f.choice}"].append(where(f))
     said = [f"{words} (at {', '.join(sizes)})" for words, sizes in told.items()]
-    for label, exponent in exponents(found).items():
-        said.append(f"{label}: from 10,000 vertices on a solve costs n^{exponent:.2f}")
+    for (scene, label), exponent in exponents(found).items():
+        said.append(f"{label}: from 10,000 vertices of {scene} on a solve costs n^{exponent:.2f}")
     return said
 
 
-def exponents(found: Sequence[Figures], least: int = 10_000) -> dict[str, float]:
-    """The power of n by which the global step's time grows, by label, where several sizes have `least` vertices."""
-    by_label: dict[str, list[tuple[int, float]]] = defaultdict(list)
+def exponents(found: Sequence[Figures], least: int = 10_000) -> dict[tuple[str, str], float]:
+    """The power of n by which the global step's time grows, by scene and label, from `least` vertices on."""
+    by_label: dict[tuple[str, str], list[tuple[int, float]]] = defaultdict(list)
     for f in found:
         if f.global_ and f.vertices >= least:
-            by_label[f.label].append((f.vertices, f.global_))
+            by_label[f.scene, f.label].append((f.vertices, f.global_))
     logarithms = {label: np.log(np.array(points)).T for label, points in by_label.items() if len(points) > 1}
     return {label: float(np.polyfit(n, seconds, 1)[0]) for label, (n, seconds) in logarithms.items()}

@@ -26,6 +26,9 @@ from solvers.problem import Positions
 PREPARES = 3
 """How often each is prepared, the first time included."""
 
+LONG = 3.0
+"""Seconds of a preparation that is not repeated: that of a large mesh, which nothing is cold for any more."""
+
 AGREEMENT = {"float64": 1e-9, "float32": 1e-5, "float16": 1e-2}
 """How far final positions may lie apart, in the scene's size: round-off of 50 iterations, that of float64 in 1e10 : 1
 stiffnesses; below float64 the iterates differ by the precision of the factor until they converge."""
@@ -62,6 +65,8 @@ def measure(
                 alive.append(candidate)
         for round in range(PREPARES):
             for candidate in list(alive):
+                if rows[candidate] and rows[candidate][-1]["seconds"] > LONG:
+                    continue
                 with _guarded(candidate, rows[candidate], alive):
                     seconds = candidate.prepare()
                     if seconds is not None:

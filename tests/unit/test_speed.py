@@ -9,16 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
+from harness.errors import InputError
 from harness.load import load_any, load_sweep
+from harness.rows import alone
 from harness.spec import RunSpec, SolverSpec
-from harness.speed import candidates, limits, yardstick
+from harness.speed import candidates, limits, turns, yardstick
 from harness.speed.candidates import Reading, average
 from harness.speed.figures import figures
 from harness.speed.report import run_speed
+from harness.speed.rest import apart, rest_of
 from harness.speed.table import remarks, speed_table
 from harness.speed.turns import PREPARES, Past, measure, name, predicted
 from harness.speed.work import count
+from solvers.compiled import CompiledLocalGlobal
 from solvers.problem import Unsupported
+from tests.scenes import cloth, first_problem
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ROOT / "configs" / "scenes" / "yardstick-cloth.yaml"
@@ -97,6 +102,26 @@ def test_one_that_would_take_too_long_is_left_out_with_a_row_that_says_so():
     assert "budget of each candidate is 10 s" in rows[0]["reason"]
 
 
+def test_a_long_preparation_is_not_repeated(monkeypatch: pytest.MonkeyPatch):
+    calls: list[str] = []
+    slow, quick = Scripted("a", calls), Scripted("b", calls)
+    monkeypatch.setattr(turns, "LONG", 0.7)
+    monkeypatch.setattr(slow, "prepare", lambda: calls.append("prepare a") or 1.0)
+    found, _ = measure([slow, quick], COUNTS, {}, budget=10.0)
+    assert [calls.count(f"prepare {name}") for name in "ab"] == [1, PREPARES]
+    assert [row["round"] for row in found if row["phase"] == "prepare"] == [0]
+
+
+@pytest.mark.parametrize("precision", ["float32", "float16"])
+def test_less_precision_moves_nothing_that_has_converged(precision):
+    problem = first_problem(cloth(8))
+    rest = rest_of(problem)
+    assert rest is not None
+    assert np.abs(problem.gradient(rest.problem.first_guess)).max() < 1e-6  # beside 9.81 N of weight
+    # What was asked of the method; rounding leaves 1e-13.
+    assert apart(rest, CompiledLocalGlobal("supernodal", precision).prepare(problem.system)) <= 1e-9
+
+
 @pytest.mark.parametrize("power", [1.0, 1.5, 3.0])
 def test_a_power_law_is_predicted_exactly(power: float):
     past = [Past(n, prepare=2.0 * n**power, iteration=0.1 * n**power) for n in (10, 40)]
@@ -163,6 +188,12 @@ def sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(limits.probes, "__defaults__", ((1 << 14, 1 << 16),))
     monkeypatch.setattr(candidates.average, "__defaults__", (0.0,))
     return load_sweep(tmp_path / "small.yaml")
+
+
+def test_a_folder_is_for_one_report_at_a_time(sweep, tmp_path: Path):
+    (tmp_path / "out" / "rows").mkdir(parents=True)
+    with alone(tmp_path / "out"), pytest.raises(InputError, match="another springbench"):
+        run_speed(sweep, tmp_path / "out", print)
 
 
 def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path):
