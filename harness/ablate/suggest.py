@@ -67,7 +67,7 @@ def _overstretched(seen: Seen) -> str:
         return ""
     frame = int(strain.max(axis=1).argmax())
     return (
-        f"{ever} of {len(rest)} springs stretch by more than {STRETCH:.0%}, one by {strain.max():.0%} "
+        f"{ever} of {len(rest)} springs stretch by more than {100 * STRETCH:.0f} %, one by {100 * strain.max():.0f} % "
         f"at {seen.time(frame):.2f} s"
     )
 
@@ -103,8 +103,8 @@ def _restless(seen: Seen) -> str:
     if not kinetic.max() or late <= ALIVE * kinetic.max():
         return ""
     return (
-        f"nothing drives the motion or damps it; in the last quarter of {seen.time(len(kinetic) - 1):.2f} s it "
-        f"still has {late / kinetic.max():.0%} of its largest kinetic energy, and only the time integrator's own "
+        f"nothing drives the motion or damps it; in the last quarter of {seen.time(len(kinetic) - 1):.2f} s it still "
+        f"has {100 * late / kinetic.max():.0f} % of its largest kinetic energy, and only the time integrator's own "
         "damping, which depends on the time step, would ever bring it to rest"
     )
 
@@ -121,7 +121,7 @@ def _creased(seen: Seen) -> str:
     if share < 1e-3:
         return ""
     return (
-        f"over the last quarter of the motion {share:.1%} of the edges between triangles are bent by more than "
+        f"over the last quarter of the motion {100 * share:.1f} % of the edges between triangles are bent by more than "
         f"{np.rad2deg(SHARP):.0f} degrees, the sharpest by {np.rad2deg(turned.max()):.0f}: folds as sharp as the mesh"
     )
 

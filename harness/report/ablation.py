@@ -62,8 +62,8 @@ def _price(row: Row, whole: float) -> str:
     if low <= 0.0 <= high:
         return f"no time that could be measured ({100 * low:+.1f} to {100 * high:+.1f} %)"
     if share < 0.0:
-        return f"saves {-share:.0%} of the time" if share < -0.005 else "hardly any time"
-    return f"{share:.0%} of the time" if share >= 0.095 else f"{100 * share:.1f} % of the time"
+        return f"saves {-100 * share:.0f} % of the time" if share < -0.005 else "hardly any time"
+    return f"{100 * share:.0f} % of the time" if share >= 0.095 else f"{100 * share:.1f} % of the time"
 
 
 def _figure(value: float) -> str:
@@ -72,7 +72,7 @@ def _figure(value: float) -> str:
 
 
 def _relative(value: float) -> str:
-    return f"{value:.1%}" if value < 10.0 else f"{value:.2g} x"
+    return f"{100 * value:.1f} %" if value < 10.0 else f"{value:.2g} x"
 
 
 def ablation_table(rows: Sequence[Row]) -> Table:

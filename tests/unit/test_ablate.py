@@ -1,0 +1,269 @@
+"""Ablation: what is compared, what its numbers mean, and the words that follow from them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from harness.ablate.cases import Case, cases
+from harness.ablate.run import ablate, fitting
+from harness.ablate.suggest import Seen, suggestions
+from harness.ablate.turns import Turn, cost
+from harness.cli import app
+from harness.load import load_any, load_scene
+from harness.report.ablation import read, sentences, verdict
+from harness.scene import Scene
+from tests.effects import cloth
+
+CLOTH = """
+mesh: {kind: grid}
+mass: 0.3
+time_step: 1/30
+frames: 8
+default_size: 5
+effects:
+  - {kind: springs, stretch: 300, shear: 60}
+  - {kind: gravity}
+  - {kind: bending, stiffness: 1.0e-3}
+  - {kind: air-drag, coefficient: 0}
+  - {kind: pins, at: [top_corners]}
+"""
+HELD = """
+mesh: {kind: network, positions: [[0, 0, 0], [1, 0, 0], [2, 0, 0]], springs: [[0, 1], [1, 2]], mass: [0, 0, 1]}
+time_step: 1/30
+frames: 3
+effects:
+  - {kind: springs, rule: fixed, stretch: 100}
+  - {kind: gravity}
+  - {kind: pins, indices: [0]}
+"""
+
+
+def rows_of(scene: str, tmp_path: Path, *, pairs: bool = False, **options: Any) -> list[dict[str, Any]]:
+    """The rows of an ablation by the first solver that fits."""
+    path = tmp_path / "scene.yaml"
+    path.write_text(scene)
+    spec = load_scene(path)
+    solver = fitting(spec, spec.default_size or 0)
+    sweep = load_any(path, solvers=[solver], threads=1, rounds=2, **options)
+    return read(ablate(sweep, tmp_path, pairs=pairs, tick=lambda phase: None))
+
+
+def by_name(rows: Sequence[dict[str, Any]], kind: str = "without") -> dict[str, dict[str, Any]]:
+    return {row["name"]: row for row in rows if row["kind"] == kind}
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    return rows_of(CLOTH, tmp_path_factory.mktemp("cloth"), pairs=True, iterations=20)
+
+
+def test_every_effect_is_left_out_once_and_every_pair_on_request(tmp_path: Path):
+    path = tmp_path / "scene.yaml"
+    path.write_text(CLOTH + "  - {kind: pins, at: [bottom]}\n")
+    scene = load_scene(path)
+    alone, both = cases(scene, pairs=False), cases(scene, pairs=True)
+    assert [case.name for case in alone] == ["", "springs", "gravity", "bending", "air-drag", "pins[4]", "pins[5]"]
+    assert len(both) == 1 + 6 + 15
+    assert [e.kind for e in both[7].scene.effects] == ["bending", "air-drag", "pins", "pins"]
+    assert alone[0].scene.effects == scene.effects
+
+
+def test_an_effect_that_does_nothing_costs_no_entry_and_moves_nothing(told):
+    (whole,), row = by_name(told, "whole").values(), by_name(told)["air-drag"]
+    assert (row["largest"], row["rms"], row["energy"], row["centre"]) == (0.0, 0.0, 0.0, 0.0)
+    assert row["nnz_factor"] == whole["nnz_factor"]
+    assert "changes nothing at all" in verdict(row, told)
+
+
+def test_fill_in_and_memory_are_those_that_bending_brings(told):
+    (whole,), row = by_name(told, "whole").values(), by_name(told)["bending"]
+    assert row["nnz_system"] < whole["nnz_system"]
+    assert row["nnz_factor"] < whole["nnz_factor"]
+    assert row["bytes"] < whole["bytes"]
+
+
+def test_without_gravity_the_centre_of_mass_stays_where_it_was(told):
+    row = by_name(told)["gravity"]
+    (whole,) = by_name(told, "whole").values()
+    # It cannot fall further than freely, by g t^2/2 and the first order of implicit Euler: g t dt/2.
+    t, spacing = 8 / 30, 0.25
+    assert 0.0 < row["centre"] <= 9.81 * t * (t + 1 / 30) / 2 / spacing
+    assert row["largest"] <= whole["extent"]
+    assert row["energy"] == pytest.approx(1.0)  # a scene without gravity and at rest has no energy at all
+
+
+def test_pairs_are_told_of_under_both_names(told):
+    assert {"gravity+bending", "springs+pins"} <= set(by_name(told))
+    # Without gravity nothing moves, and so bending has nothing to do.
+    both, one = (by_name(told)[name]["largest"] for name in ("gravity+bending", "gravity"))
+    assert both == pytest.approx(one, rel=1e-9)  # round-off of a step at rest
+
+
+def test_a_scene_that_cannot_be_without_an_effect_says_so(tmp_path: Path):
+    told = rows_of(HELD, tmp_path, iterations=5)
+    assert by_name(told)["springs"]["status"] == "impossible"
+    assert "impossible without it (" in verdict(by_name(told)["springs"], told)
+    assert by_name(told)["gravity"]["status"] == "ok"
+
+
+def test_the_error_of_the_solver_falls_with_its_iterations_and_that_of_the_step_does_not(tmp_path: Path):
+    few, many = (rows_of(CLOTH, tmp_path, iterations=count) for count in (2, 500))
+    before, after = (by_name(told, "error") for told in (few, many))
+    assert after["solver"]["largest"] < 1e-3 * before["solver"]["largest"]
+    assert after["time-step"]["largest"] == pytest.approx(before["time-step"]["largest"], rel=1e-6)  # both of Newton
+    assert after["time-step"]["largest"] > 0.01
+
+
+def test_the_cost_is_the_difference_of_frames_that_were_timed_together():
+    scene: Any = None
+    rng = np.random.default_rng(1)
+    drift = rng.uniform(1.0, 5.0, (5, 40))
+    whole, without = (Turn(Case((), scene), seconds=(drift + more).tolist()) for more in (0.3, 0.0))
+    assert cost(whole, without) == pytest.approx((0.3, 0.3, 0.3))
+    noisy = Turn(Case((), scene), seconds=(drift + 0.3 + 0.05 * rng.standard_normal((5, 40))).tolist())
+    middle, low, high = cost(noisy, without)
+    assert low < middle < high
+    # 40 frames, the median of 5 rounds each: the mean is known to 0.05 / sqrt(40 * 3), 0.005; six of these.
+    assert middle == pytest.approx(0.3, abs=0.03)
+
+
+WHOLE = {"kind": "whole", "name": "", "seconds": 1.0}
+ERRORS = [
+    {"kind": "error", "name": name, "status": "ok", "largest": size}
+    for name, size in (("solver", 0.3), ("time-step", 0.1))
+]
+ROW = {"kind": "without", "name": "bending", "status": "ok", "extent": 100.0, "largest": 0.02}
+ROW |= {"cost": 0.11, "cost_low": 0.1, "cost_high": 0.12}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            {},
+            "11 % of the time, moves vertices by 0.02 rest lengths, less than the solver's own error of 0.3: "
+            "this scene does not call for it at this accuracy",
+        ),
+        (
+            {"largest": 0.5},
+            "11 % of the time, moves vertices by 0.5 rest lengths, more than the solver's own error of 0.3: "
+            "this scene calls for it",
+        ),
+        ({"largest": 0.0}, "11 % of the time, changes nothing at all: leave it out"),
+        (
+            {"largest": 500.0},
+            "11 % of the time, moves vertices by 500 rest lengths, further than the mesh is large: "
+            "without it this is another scene",
+        ),
+        (
+            {"largest": 0.0, "cost": 0.001, "cost_low": -0.002, "cost_high": 0.004},
+            "no time that could be measured (-0.2 to +0.4 %), changes nothing at all: leave it out",
+        ),
+        ({"status": "impossible", "reason": "loose"}, "the scene is impossible without it (loose)"),
+    ],
+)
+def test_the_verdict_follows_from_the_numbers(change: dict, said: str):
+    assert verdict(ROW | change, [WHOLE, *ERRORS]) == said
+
+
+def test_where_no_error_is_known_the_verdict_does_not_judge():
+    unknown = [row | {"status": "unknown", "reason": "lost", "largest": None} for row in ERRORS]
+    assert verdict(ROW, [WHOLE, *unknown]).endswith("by how much the scene is wrong anyway is not known")
+    assert "error of the solver: unknown (lost)" in sentences([WHOLE, *unknown])
+
+
+def seen(made: Scene, kinds: set[str], positions: np.ndarray, speed: float = 0.0) -> Seen:
+    """A motion that passes through positions (n, 3) for 12 frames."""
+    return Seen(made, kinds, np.tile(positions, (12, 1, 1)), np.full((12, *positions.shape), speed))
+
+
+def folded(made: Scene, angle: float) -> np.ndarray:
+    """The level cloth, folded along its middle."""
+    x, y, z = made.mesh.rest.T
+    right = np.maximum(x, 0.0)
+    return np.stack([x - right + right * np.cos(angle), y + right * np.sin(angle), z], axis=1)
+
+
+def still() -> Scene:
+    made = replace(cloth(), forces=(), moving=())
+    assert suggestions(seen(made, set(), made.mesh.rest)) == []
+    return made
+
+
+def test_a_motion_that_asks_for_nothing_gets_no_suggestion():
+    made = still()
+    assert suggestions(seen(made, set(), folded(made, np.deg2rad(20.0)))) == []
+
+
+@pytest.mark.parametrize(
+    ("effect", "listed", "evidence"),
+    [
+        ("strain-limits", "strain-limits", "one by 12 %"),
+        ("bending", "bending", "of the edges"),
+        ("air-drag", "rayleigh", "100 %"),
+    ],
+)
+def test_a_suggestion_comes_with_its_evidence_unless_the_effect_is_listed(effect: str, listed: str, evidence: str):
+    made = still()
+    places = {"strain-limits": 1.12 * made.mesh.rest, "bending": folded(made, 0.8 * np.pi), "air-drag": made.mesh.rest}
+    speed = 1.0 if effect == "air-drag" else 0.0
+    found = {s.effect: s.evidence for s in suggestions(seen(made, set(), places[effect], speed))}
+    assert evidence in found[effect]
+    assert effect not in {s.effect for s in suggestions(seen(made, {listed}, places[effect], speed))}
+
+
+def test_vertices_that_come_close_are_counted():
+    made = still()
+    found = {s.effect: s.evidence for s in suggestions(seen(made, set(), folded(made, np.pi * 0.99)))}
+    # Of 6 columns the inner two are joined by springs; each outer pair lies on each other in all 6 rows.
+    assert found["self-contact"].startswith("12 pairs of vertices without a spring")
+
+
+def test_a_driven_motion_is_not_asked_to_rest():
+    made = replace(still(), forces=(lambda p, v, t: p,))
+    assert suggestions(seen(made, set(), made.mesh.rest, 1.0)) == []
+
+
+def test_the_first_solver_that_takes_all_effects_is_chosen(tmp_path: Path):
+    plain, gas = tmp_path / "plain.yaml", tmp_path / "gas.yaml"
+    plain.write_text(CLOTH.replace("  - {kind: bending, stiffness: 1.0e-3}\n", ""))
+    bent = tmp_path / "bent.yaml"
+    bent.write_text(CLOTH)
+    gas.write_text(
+        "mesh: {kind: balloon}\nmass: 1\ntime_step: 0.1\nframes: 1\ndefault_size: 2\n"
+        "effects: [{kind: springs, stretch: 100}, {kind: gas, pressure: 10}]\n"
+    )
+    assert [fitting(load_scene(path), 3) for path in (plain, bent, gas)] == ["numba", "sparse", "lbfgs"]
+
+
+def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: Path):
+    log = logging.getLogger("springbench")
+    for handler in list(log.handlers):  # of another test's command, which wrote elsewhere
+        log.removeHandler(handler)
+    scene = tmp_path / "cloth.yaml"
+    scene.write_text(CLOTH)
+    asked = ["ablate", str(scene), "--results", str(tmp_path), "--frames", "4", "--rounds", "2", "--iterations", "5"]
+    told = CliRunner().invoke(app, asked)
+    assert told.exit_code == 0, told.output
+    assert "air-drag: " in told.stderr
+    assert "effects[3] (air-drag) does nothing with these parameters and is left out" in " ".join(told.stderr.split())
+    (rows,) = tmp_path.glob("cloth/ablation/*.parquet")
+    (picture,) = tmp_path.glob("cloth/pictures/*.png")
+    assert len(read(rows)) >= 1 + 5 + 2
+    assert Image.open(picture).size == (1600, 900)
+
+
+def test_a_sweep_is_refused(tmp_path: Path):
+    sweep = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
+    told = CliRunner().invoke(app, ["ablate", str(sweep), "--results", str(tmp_path)])
+    assert told.exit_code == 2
+    assert "is a sweep" in told.stderr
