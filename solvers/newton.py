@@ -61,11 +61,11 @@ class NewtonMethod:
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
         """The gradient, the Hessian with its factorisation, and a solve with it."""
-        hessian = step.hessian(at.positions)
-        hessian.factorise(0.0)
+        hessian, (keep, by) = step.hessian(at.positions), _LEVELS[-1]  # any other may have no factor to solve with
+        hessian.factorise(keep, by * self._diagonal)
         return {
             "gradient": lambda: step.gradient(at.positions),
-            "factor": lambda: hessian.factorise(0.0),
+            "factor": lambda: hessian.factorise(keep, by * self._diagonal),
             "solve": lambda: hessian.solve(at.gradient),
         }
 
