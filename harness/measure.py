@@ -21,6 +21,10 @@ PHASE_REPEATS = 3
 """How often the local and the global step are timed in each frame, after one call to warm up."""
 
 
+LARGEST = 1e150
+"""Coordinates [m] from this one on count as not finite: their squares, and so all energies, are infinite."""
+
+
 class Diverged(Exception):
     """Positions are not finite any more; the message says since when."""
 
@@ -99,7 +103,7 @@ def steps(scene: Scene, prepared: Prepared, settings: Settings) -> Iterator[Step
     for frame in range(1, settings.frames + 1):
         try:
             step = next(run)
-            if not np.isfinite(step.positions).all():
+            if not np.abs(step.positions).max(initial=0.0) < LARGEST:  # so that NaN counts too
                 raise Diverged(f"positions are not finite from frame {frame} on")
         except Exception as error:
             raise StepFailed(frame) from error
