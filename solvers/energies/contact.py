@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -82,25 +83,30 @@ class Contact:
     time_step: float
     planes: Planes = field(default=_NONE)
 
-    @property
     def idle(self) -> bool:
         """Whether nothing can be touched in this step."""
         return not len(self.planes.vertices)
+
+    @cached_property
+    def _extents(self) -> tuple[Array, Array, Array, Array]:
+        """The obstacles' low and high corners (o, 3), their radii with the thickness, and with the margin too [m]."""
+        o = self.obstacles
+        reach = np.array([one.radius for one in o]) + self.thickness
+        return np.array([one.low for one in o]), np.array([one.high for one in o]), reach, reach + self.margin
 
     def begin_step(self, start: Start) -> Contact:
         """The energy of a step; idle after one test of boxes while nothing is near."""
         p, v = (x if x.flags.carray else np.array(x, order="C") for x in (start.positions, start.velocity))
         dt, o = self.time_step, self.obstacles
         frames = np.array([[one.frame(start.time), one.frame(start.time + dt)] for one in o])
-        low, high = np.array([one.low for one in o]), np.array([one.high for one in o])
-        reach, touched = np.array([one.radius for one in o]) + self.thickness, np.empty(len(o), np.bool_)
-        way = contact_planes.near(p, v, dt, frames, low, high, reach + self.margin, touched)
-        if not touched.any():
-            return replace(self, planes=_NONE)
-        found = [
-            self._planes(p, v, frames[k], low[k], high[k], reach[k], way, (start.until - start.time) / dt)
-            for k in np.flatnonzero(touched)
-        ]
+        low, high, reach, farther = self._extents
+        touched = np.empty(len(o), np.bool_)
+        way = contact_planes.near(p, v, dt, frames, low, high, farther, touched)
+        near = np.flatnonzero(touched)
+        if not len(near):
+            return self
+        when = (start.until - start.time) / dt
+        found = [self._planes(p, v, frames[k], low[k], high[k], reach[k], way, when) for k in near]
         return replace(self, planes=Planes(*(np.concatenate(part) for part in zip(*found, strict=True))))
 
     def _planes(
@@ -139,7 +145,7 @@ class Contact:
 
     def value(self, p: Positions) -> float:
         """The energy [J] at p, shape (n, 3)."""
-        if self.idle:
+        if self.idle():
             return 0.0
         grips, _, length = self._slipped(p)
         rounded = np.where(length <= self.slip, 0.5 * length**2 / self.slip, length - 0.5 * self.slip)
@@ -148,7 +154,7 @@ class Contact:
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N], shape (n, 3), to `out`."""
-        if self.idle:
+        if self.idle():
             return
         planes, gap = self.planes, self._gap(p)
         np.add.at(out, planes.vertices, (planes.stiffness * np.minimum(0.0, gap))[:, None] * planes.normal)

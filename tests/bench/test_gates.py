@@ -8,6 +8,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from harness.machine import pinned_threads
+from tests.bench.contact import CONTACT
 from tests.bench.gates import GATES, THREADS, Gate
 from tests.bench.ratio import measure_ratio
 from tests.bench.solves import SOLVES
@@ -15,7 +16,7 @@ from tests.bench.solves import SOLVES
 
 @pytest.mark.parametrize(
     "gate",
-    [pytest.param(gate, id=gate.name, marks=pytest.mark.benchmark(timer=gate.clock)) for gate in (*GATES, *SOLVES)],
+    [pytest.param(gate, id=gate.name, marks=pytest.mark.benchmark(timer=gate.clock)) for gate in (*GATES, *SOLVES, *CONTACT)],
 )
 def test_the_gate_holds(gate: Gate, benchmark: BenchmarkFixture):
     with pinned_threads(THREADS):

@@ -105,7 +105,7 @@ def test_contact_that_is_idle_changes_no_bit(solver):
         ]
         for made in (sheet(), sheet(far))
     ]
-    np.testing.assert_array_equal(*runs)
+    np.testing.assert_array_equal(runs[0], runs[1])
 
 
 @pytest.mark.parametrize("solver", TAKE)

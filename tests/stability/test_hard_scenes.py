@@ -94,7 +94,8 @@ def steps(made: Scene, solver: Solver, frames: int, iterations: int) -> list[Pos
     return found
 
 
-NEAR_ORIGIN = [case for case in CASES if case != "numbers-1e6-m-away"]
+NEAR_ORIGIN = [case for case in CASES if case not in ("numbers-1e6-m-away", "contact-pressed-sphere")]
+"""All but one too far away for that many digits, and one that gives way to one side or the other."""
 
 
 @pytest.mark.parametrize("case", NEAR_ORIGIN)

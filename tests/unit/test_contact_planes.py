@@ -93,9 +93,9 @@ def test_nothing_near_is_idle_and_costs_no_half_space():
     step = begun(energy, p, np.zeros_like(p))
     out = np.zeros_like(p)
     step.add_gradient(p, out)
-    assert step.idle
+    assert step.idle()
     assert (step.value(p), float(np.abs(out).max()), step.hessian(p).nnz) == (0.0, 0.0, 0)
-    assert not begun(energy, p, np.full_like(p, -5.0)).idle
+    assert not begun(energy, p, np.full_like(p, -5.0)).idle()
 
 
 @pytest.mark.parametrize("name", OBSTACLES)

@@ -1,0 +1,43 @@
+"""A gate on contact while nothing is near: whole steps with an obstacle far away, and without one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from harness.effects.contact import Contact
+from harness.effects.gravity import Gravity
+from harness.effects.pins import Pins
+from harness.effects.springs import Springs
+from harness.mesh.grid import Grid
+from harness.scene import build
+from harness.simulate import simulate
+from harness.spec import SceneSpec
+from tests.bench.gates import STOP, Gate, Work, last, prepare
+
+FAR = Contact.model_validate(
+    {
+        "obstacles": [{"kind": "plane", "point": (0, -5, 0)}, {"kind": "sphere", "center": (0, -4, 0), "radius": 0.5}],
+        "friction": 0.5,
+    }
+)
+
+
+def fallen(*effects: Contact, size: int, frames: int) -> Work:
+    """Whole steps of the compiled backend; the last positions [m]."""
+    given = Springs(stretch=1000.0), Gravity(), Pins(at=("top_corners",)), *effects
+    spec = SceneSpec(mesh=Grid(), mass=1.0, time_step=1 / 30, frames=1, effects=given, path=Path("sheet.yaml"))
+    scene = build(spec, size)
+    prepared = prepare("numba", scene)
+    return lambda: last(step.solution for step in simulate(scene, prepared, STOP, first_guess="current", frames=frames))
+
+
+CONTACT = (
+    Gate(
+        name="idle-contact-against-none-64",
+        candidate=lambda: fallen(FAR, size=64, frames=10),
+        yardstick=lambda: fallen(size=64, frames=10),
+        limit=1.02,
+        why="a promise: obstacles that are far away cost one test of boxes, at most 2 % of a step; measured 1.01",
+        turns=31,
+    ),
+)
