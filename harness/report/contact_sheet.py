@@ -65,11 +65,9 @@ def draw_sheet(tiles: Sequence[Tile], path: Path) -> None:
 def _drawn(studio: Studio, tile: Tile, aspect: float) -> np.ndarray:
     replay, time = tile.replay, float(tile.replay.times[-1])
     points = replay.positions[-1]
-    touched = [(one.kind, solid(one, time, points)) for one in tile.obstacles]
-    solids = [made for _, made in touched if made is not None]
+    solids = [made for one in tile.obstacles if (made := solid(one, time, points)) is not None]
+    framed = np.concatenate([points, *(made.points for made in solids)])
     radius = _BOB * float(np.linalg.norm(np.ptp(points, axis=0)))
     solids += [pv.Sphere(radius=radius, center=p) for p in points[tile.mass > _HEAVY * np.median(tile.mass)]]
-    # A plane has no end; what is framed is what lies on it.
-    framed = np.concatenate([points, *(made.points for kind, made in touched if made and kind != "plane")])
     angles = tile.angles or natural_angles(points, area_vectors(replay, -1))
     return studio.draw(replay, -1, frame_all(framed, aspect=aspect, angles=angles), solids)
