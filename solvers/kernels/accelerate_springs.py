@@ -56,7 +56,7 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, weight, rest, 
             else context.cast(builder, value, argument, types.int64)
             for argument, value in zip(signature.args, args, strict=True)
         )
-        v = Vectors(builder)
+        v = Vectors(context, builder)
         places = v.places(builder.gep(own, [builder.mul(chunk, I64(LANES))]))
         centre = v.gather(x, places)
         sums = [cgutils.alloca_once(builder, WIDE) for _ in range(4)]

@@ -52,7 +52,7 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y,
             else context.cast(builder, value, argument, types.int64)
             for argument, value in zip(signature.args, args, strict=True)
         )
-        v = Vectors(builder)
+        v = Vectors(context, builder)
         places = v.places(builder.gep(own, [builder.mul(chunk, I64(LANES))]))
 
         def at_vertices(array):

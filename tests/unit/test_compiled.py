@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import islice, pairwise
+from typing import Any
 
 import numba
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import types
+from numba.core.registry import cpu_target
+from numba.extending import intrinsic
 
 from solvers.compiled import CompiledLocalGlobal, PreparedCompiled
 from solvers.energies.springs import Springs
 from solvers.kernels import plan
 from solvers.kernels.springs import Bundles, aligned, project
+from solvers.kernels.springs_vectors import WIDE, Vectors
 from solvers.linear.choice import Linear, Precision
 from solvers.local_global import SparseLocalGlobal
 from solvers.matrices import assemble, energy_norm
@@ -73,14 +78,34 @@ def test_positions_that_are_not_numbers_stay_so_where_they_are_and_at_their_neig
     assert np.isnan(local(springs, rest, np.zeros((4, 3)))).any(axis=1).tolist() == [True, True, False, False]
 
 
-def test_inverse_roots_are_right_to_the_last_digit():
-    lengths = 10.0 ** np.random.default_rng(0).uniform(-130, 130, 8000)
-    springs = Springs.at_rest(np.zeros((8001, 3)), np.array([[i, 8000] for i in range(8000)]), np.ones(8000))
-    springs = replace(springs, rest_length=np.ones(8000))
-    p = np.zeros((8001, 3))
-    p[:8000, 0] = lengths
-    unit = local(springs, p, np.zeros_like(p))[:8000, 0]
-    assert np.abs(unit - 1.0).max() <= 4 * np.finfo(float).eps  # a root, its reciprocal and two products
+def inverse_roots(estimates: bool):
+    """A compiled function (s, out) for eight numbers, from the processor's estimates or without."""
+
+    def declare(typingctx, s, out):
+        def generate(context, builder, signature, args):
+            v = Vectors(context, builder)
+            v.estimates = estimates
+            s, out = (
+                context.make_array(kind)(context, builder, x).data for kind, x in zip(signature.args, args, strict=True)
+            )
+            v.builder.store(v.inverse_root(v.load(s, WIDE)), builder.bitcast(out, WIDE.as_pointer()), align=8)
+            return context.get_dummy_value()
+
+        return types.void(s, out), generate
+
+    root: Any = intrinsic(declare)
+    return numba.njit(lambda s, out: root(s, out))
+
+
+ESTIMATES = Vectors(cpu_target.target_context, None).estimates
+
+
+@pytest.mark.parametrize("estimates", [False, True] if ESTIMATES else [False])
+def test_inverse_roots_are_right_to_the_last_digit(estimates):
+    root, out = inverse_roots(estimates), np.empty(8)
+    for s in 10.0 ** np.random.default_rng(0).uniform(-260, 300, (1000, 8)):
+        root(s, out)
+        assert np.abs(out * np.sqrt(s) - 1.0).max() <= 4 * np.finfo(float).eps  # a root, its reciprocal, a product
 
 
 PROBLEMS = {
