@@ -21,6 +21,7 @@ from harness.simulate import start
 from solvers.compiling import kernel
 from solvers.energies.springs import TINY, Springs
 from solvers.problem import LaggedEnergy, Positions, Start
+from solvers.touching import without_contact
 
 State = NDArray[np.float64]
 """Positions [m] and velocities [m/s] of the free vertices, one after the other, shape (6 f,)."""
@@ -46,6 +47,8 @@ class Field:
             raise Unintegrable("vertices without mass have no acceleration; give them mass or pin them")
         if not system.pins.exact.all():
             raise Unintegrable("pins by penalty vibrate faster than can be followed; make them exact")
+        if without_contact(system) is not system:
+            raise Unintegrable("contact is stiff, and its friction begins anew each step; leave it out")
         springs = scene.springs
         self._springs = springs.edges, springs.stiffness, springs.rest_length, springs.rest_direction
         self._others = tuple(energy for energy in system.energies if not isinstance(energy, Springs))

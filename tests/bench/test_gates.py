@@ -16,7 +16,10 @@ from tests.bench.solves import SOLVES
 
 @pytest.mark.parametrize(
     "gate",
-    [pytest.param(gate, id=gate.name, marks=pytest.mark.benchmark(timer=gate.clock)) for gate in (*GATES, *SOLVES, *CONTACT)],
+    [
+        pytest.param(gate, id=gate.name, marks=pytest.mark.benchmark(timer=gate.clock))
+        for gate in (*GATES, *SOLVES, *CONTACT)
+    ],
 )
 def test_the_gate_holds(gate: Gate, benchmark: BenchmarkFixture):
     with pinned_threads(THREADS):
