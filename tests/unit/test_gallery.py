@@ -1,0 +1,80 @@
+"""The sheet of scenes: a tile for each, and obstacles where they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from harness.cli import app
+from harness.motion import Key, Motion
+from harness.obstacles import Box, Capsule, Plane, Sphere
+from harness.report import opengl
+from harness.report.contact_sheet import COLUMNS
+from harness.report.solids import solid
+
+needs_opengl = pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
+SEEN = np.random.default_rng(0).normal(size=(20, 3))
+
+SCENE = """
+mesh: {kind: chain, length: 1}
+mass: 1
+time_step: 1/30
+frames: 3
+default_size: 4
+effects:
+  - {kind: springs, stretch: 100}
+  - {kind: pins, at: [first]}
+"""
+
+
+@pytest.mark.parametrize(
+    "obstacle",
+    [
+        Sphere(center=(1.0, 2.0, 3.0), radius=0.5),
+        Capsule(ends=((0.0, 0.0, 0.0), (1.0, 1.0, 0.0)), radius=0.2),
+        Box(low=(-1.0, 0.0, 0.0), high=(1.0, 0.5, 2.0)),
+        Plane(point=(0.0, 1.0, 0.0), normal=(1.0, 1.0, 0.0)),
+    ],
+    ids=lambda one: one.kind,
+)
+def test_what_is_drawn_of_an_obstacle_is_its_surface(obstacle):
+    made = solid(obstacle, 0.0, SEEN)
+    assert made is not None
+    points = np.asarray(made.points, np.float64)
+    distance = obstacle.obstacle().distance(points, 0.0)
+    # VTK keeps points in single precision. The balls at a capsule's ends are whole: half of each is hidden inside.
+    assert distance.max() < 1e-5
+    assert np.median(np.abs(distance)) < 1e-5
+
+
+def test_an_obstacle_is_drawn_where_it_has_moved_to():
+    moves = Motion(keys=(Key(time=0.0), Key(time=2.0, offset=(0.0, 4.0, 0.0))))
+    made = solid(Sphere(radius=1.0, motion=moves), 1.0, SEEN)
+    assert made is not None
+    assert np.asarray(made.points).mean(axis=0) == pytest.approx([0.0, 2.0, 0.0], abs=1e-5)  # single precision
+
+
+def test_the_level_ground_is_not_drawn():
+    assert solid(Plane(), 0.0, SEEN) is None
+
+
+@needs_opengl
+def test_the_sheet_has_a_tile_for_each_scene(tmp_path: Path):
+    paths = [tmp_path / f"scene-{k}.yaml" for k in range(COLUMNS + 1)]
+    for path in paths:
+        path.write_text(SCENE)
+    sizes, blank = [], []
+    for count in (COLUMNS, COLUMNS + 1):
+        sheet = tmp_path / "sheet.png"
+        told = CliRunner().invoke(app, ["gallery", *map(str, paths[:count]), "-o", str(sheet)])
+        assert told.exit_code == 0, told.output
+        image = Image.open(sheet).convert("L")
+        sizes.append(image.size)
+        blank.append(np.asarray(image)[-300:, 800:].min() > 200)
+    assert sizes[0][0] == sizes[1][0] == 1600
+    assert sizes[1][1] > sizes[0][1] + 300  # another row
+    assert blank == [False, True]  # of which only the first tile is filled
