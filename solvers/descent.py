@@ -64,7 +64,7 @@ def search(
         rise, noise = step.rise(at.positions, p)
         if rise <= DECREASE * t * (slope + 0.5 * t * curvature):
             return Point(p, step.gradient(p))
-        if 0.0 < noise >= rise:
+        if rise <= noise and 0.0 < noise < np.inf:
             gradient = step.gradient(p)
             if abs(dot(gradient, direction)) <= (1.0 - 2.0 * DECREASE) * -slope:
                 return Point(p, gradient)

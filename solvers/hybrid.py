@@ -100,8 +100,9 @@ class HybridMethod:
                 newton_gain = -step.rise(point.positions, following.positions)[0] / self._cost
                 gain = gain or newton_gain  # until it is known
                 run = self._lbfgs.engine.begin(step.problem, following.positions, kept=False)
-            point = following
-            yield point
+            if following is not point:
+                point = following
+                yield point
         yield from self._newton.points(step, point)
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
@@ -143,8 +144,9 @@ class _Predicting:
             return point, True
         self._bold = kept
         self._tension += length * (predicted - self._tension)
-        lower = following if step.rise(point.positions, following.positions)[0] < 0.0 else point
-        return lower, self._level == 0 and kept and slope >= _QUADRATIC * before
+        if not step.rise(point.positions, following.positions)[0] < 0.0:
+            return point, at is point
+        return following, self._level == 0 and kept and slope >= _QUADRATIC * before
 
     def _factorise(self, hessian: Hessian) -> bool:
         """Whether some level gives a factor: the first one does from that before the last one's on."""

@@ -1,0 +1,186 @@
+"""The fast objective against the oracle, `StepProblem`, and the springs' own Hessian."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array, diags_array
+
+from solvers.energies.springs import Springs
+from solvers.matrices import signed_incidence_matrix_dense
+from solvers.objective import Objective, StepObjective
+from solvers.problem import Positions, StepProblem
+from tests.scenes import cloth, first_problem, random_problem
+
+SUMS = 1e-12
+"""Two orders of adding some hundred terms, relative to the largest."""
+
+
+@dataclass(frozen=True)
+class Links:
+    """Springs of zero rest length between all pairs of vertices that are near enough: its pattern changes with p."""
+
+    reach: float
+    stiffness: float = 50.0
+
+    def _pairs(self, p: Positions):
+        i, j = np.triu_indices(len(p), 1)
+        near = np.linalg.norm(p[i] - p[j], axis=1) < self.reach
+        return i[near], j[near]
+
+    def value(self, p: Positions) -> float:
+        i, j = self._pairs(p)
+        return 0.5 * self.stiffness * float(((p[i] - p[j]) ** 2).sum())
+
+    def add_gradient(self, p: Positions, out: Positions) -> None:
+        i, j = self._pairs(p)
+        np.add.at(out, i, self.stiffness * (p[i] - p[j]))
+        np.add.at(out, j, self.stiffness * (p[j] - p[i]))
+
+    def hessian(self, p: Positions) -> csr_array:
+        i, j = self._pairs(p)
+        A = signed_incidence_matrix_dense(np.stack([i, j], axis=1), len(p))
+        return csr_array(self.stiffness * np.kron(A.T @ A, np.eye(3)))
+
+
+def with_links(problem: StepProblem, reach: float) -> StepProblem:
+    system = replace(problem.system, energies=(*problem.system.energies, Links(reach)))
+    return replace(problem, system=system)
+
+
+PROBLEMS = {
+    "random": random_problem(0),
+    "random, not pinned": random_problem(1, weights=()),
+    "random, all exact": random_problem(2, weights=(np.inf,) * 12),
+    "cloth": first_problem(cloth(7)),
+    "cloth, exact pins": first_problem(cloth(7, "exact")),
+    "links that springs have": with_links(first_problem(cloth(7, "exact")), 0.2),
+    "links that springs lack": with_links(first_problem(cloth(7, "exact")), 0.4),
+    "random with links": with_links(random_problem(3), 2.0),
+}
+problems = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=list(PROBLEMS))
+
+
+def stepped(problem: StepProblem) -> tuple[StepObjective, Positions, Positions]:
+    """The step, and two points of it."""
+    step = StepObjective(Objective(problem.system), problem)
+    rng = np.random.default_rng(0)
+    p, q = (step.placed(problem.first_guess + 0.1 * rng.normal(size=problem.target.shape)) for _ in range(2))
+    return step, p, q
+
+
+def exact_hessian(problem: StepProblem, p: Positions) -> csr_array:
+    """(3f, 3f), from the energies' own Hessians."""
+    s = problem.system
+    _, vertices, weight = s.penalty
+    held = np.repeat(s.inertia + np.bincount(vertices, weight, minlength=s.vertices), 3)
+    H = csr_array(diags_array(held))
+    for energy in problem.energies:
+        H = csr_array(H + energy.hessian(p))
+    free = (3 * s.free[:, None] + np.arange(3)).ravel()
+    return csr_array(H[free][:, free])
+
+
+@problems
+def test_the_gradient_is_the_oracles(problem):
+    step, p, _ = stepped(problem)
+    wanted = problem.gradient(p)
+    np.testing.assert_allclose(step.gradient(p), wanted, rtol=0, atol=SUMS * np.abs(wanted).max(initial=1e4))
+
+
+@problems
+def test_the_rise_is_the_difference_of_the_oracles_values(problem):
+    step, p, q = stepped(problem)
+    wanted = problem.value(q) - problem.value(p)
+    assert step.rise(p, q)[0] == pytest.approx(wanted, rel=1e-9, abs=SUMS * problem.magnitude(p))
+
+
+def test_the_rise_keeps_its_digits_where_values_have_none_left():
+    """A step of 1e-9 along the gradient: the rise is the slope, to as many digits as it is short."""
+    problem = first_problem(cloth(7, "exact", stretch=1e6))
+    step, p, _ = stepped(problem)
+    direction = step.gradient(p)
+    q = p - 1e-9 / np.abs(direction).max() * direction
+    slope = float((step.gradient(p) * (q - p)).sum())
+    curvature = float(((q - p) * step.hessian(p).multiply(q - p)).sum())
+    assert abs(0.5 * curvature) < 1e-3 * abs(slope)
+    # The step itself is rounded to 1e-7 of its length, but the same way in both.
+    assert step.rise(p, q)[0] == pytest.approx(slope + 0.5 * curvature, rel=1e-9)
+
+
+@problems
+def test_a_product_with_the_hessian_is_that_of_the_energies(problem):
+    step, p, _ = stepped(problem)
+    free = problem.system.free
+    x = np.zeros_like(p)
+    x[free] = np.random.default_rng(1).normal(size=(len(free), 3))
+    H = exact_hessian(problem, p)
+    found = step.hessian(p).multiply(x)
+    wanted = np.zeros_like(p)
+    wanted[free] = (H @ x[free].ravel()).reshape(-1, 3)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=SUMS * np.abs(wanted).max(initial=1.0))
+
+
+@problems
+def test_a_solve_undoes_a_product(problem):
+    step, p, _ = stepped(problem)
+    free = problem.system.free
+    hessian = step.hessian(p)
+    shift = 1.1 * float(abs(exact_hessian(problem, p)).sum(axis=1).max()) if len(free) else 0.0
+    assert hessian.factorise(shift=shift)
+    x = np.zeros_like(p)
+    x[free] = np.random.default_rng(1).normal(size=(len(free), 3))
+    found = hessian.solve(hessian.multiply(x) + shift * x)
+    np.testing.assert_allclose(found, x, rtol=0, atol=1e-9)  # a condition of less than 1e5
+
+
+@problems
+def test_the_hessian_has_a_factor_just_where_its_eigenvalues_are_positive(problem):
+    step, p, _ = stepped(problem)
+    dense = exact_hessian(problem, p).toarray()
+    smallest = float(np.linalg.eigvalsh(dense)[0]) if len(dense) else 1.0
+    hessian = step.hessian(p)
+    assert hessian.factorise() == (smallest > 0.0)
+    if smallest < 0.0:
+        assert hessian.factorise(shift=-1.01 * smallest)
+        assert not hessian.factorise(shift=-0.99 * smallest)
+
+
+def test_without_negative_lateral_parts_springs_are_positive_semidefinite():
+    problem = random_problem(4, weights=())
+    step, p, _ = stepped(problem)
+    hessian = step.hessian(0.01 * p)  # nearly all springs compressed
+    assert not hessian.factorise()
+    assert hessian.factorise(0.0)
+
+
+def test_a_pattern_of_the_day_leaves_no_trace():
+    near, far = (with_links(first_problem(cloth(7, "exact")), reach) for reach in (0.4, 0.9))
+    whole = Objective(near.system)
+    fresh = Objective(near.system)
+    p = near.first_guess
+    b = np.random.default_rng(0).normal(size=p.shape)
+    b[near.system.pins.vertices] = 0.0
+
+    def solved(objective: Objective, problem: StepProblem) -> Positions:
+        hessian = StepObjective(objective, problem).hessian(p)
+        assert hessian.factorise(0.0)
+        return hessian.solve(b)
+
+    first = solved(whole, near)
+    solved(whole, replace(near, system=replace(near.system, energies=far.system.energies)))
+    np.testing.assert_array_equal(solved(whole, near), first)
+    np.testing.assert_array_equal(solved(fresh, near), first)
+
+
+def test_springs_of_no_length_have_the_curvature_that_the_energy_says():
+    p = np.zeros((3, 3))
+    springs = Springs.at_rest(np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 0]]), np.array([[0, 1], [1, 2]]), np.ones(2))
+    problem = random_problem(0, n=3, m=1, weights=())
+    problem = replace(problem, system=replace(problem.system, energies=(springs,)))
+    step = StepObjective(Objective(problem.system), problem)
+    H = exact_hessian(problem, p)
+    x = np.random.default_rng(0).normal(size=(3, 3))
+    np.testing.assert_allclose(step.hessian(p).multiply(x).ravel(), H @ x.ravel(), rtol=SUMS)
