@@ -71,9 +71,10 @@ def most_in_a_step(made: Scene, prepared: Prepared) -> int:
     """The most bytes that a step which is not the first allocates at once; the least of some runs, for Python itself
     allocates now and then."""
     most = []
-    for _ in range(4):
+    for _turn in range(4):
         run = simulate(made, prepared, StopRule(5), first_guess="current", frames=3)
-        next(run), next(run)
+        for _ in range(2):
+            next(run)
         gc.collect()
         tracemalloc.start()
         next(run)
