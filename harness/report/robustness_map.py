@@ -75,7 +75,8 @@ th {{ font-weight: normal; text-align: left; white-space: nowrap; padding-right:
 thead th {{ writing-mode: vertical-rl; transform: rotate(180deg); padding: .4rem 0 }}
 td {{ text-align: center; min-width: 3.2rem; font-size: 12px; padding: 1px 4px }}
 td a {{ color: inherit }}
-li span {{ display: inline-block; width: 1rem; height: .8rem; margin-right: .5rem }} ul {{ list-style: none; padding: 0 }}
+li span {{ display: inline-block; width: 1rem; height: .8rem; margin-right: .5rem }}
+ul {{ list-style: none; padding: 0 }}
 </style>
 <h1>{title}</h1>
 <p>{note} Point at a cell for its reason; a cell that is underlined leads to the recording of its run.</p>
