@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers.linear.block_factor import Fronts, factorise, solve, whole
-from solvers.linear.block_vectors import ROWS
+from solvers.linear.block_vectors import ROWS, TILE
 from solvers.linear.ordering import nested_dissection
 from solvers.linear.symbolic import Symbolic, analyse
 
@@ -36,14 +36,12 @@ class BlockCholesky:
         w, h = 3.0 * f.own, 3.0 * below
         self.flops = float((w * (w * w / 3.0 + w * h + h * h)).sum())
         room = _room(f, 3 * below * whole(3 * below))
-        self._panels, n = np.zeros(f.panel[-1] + ROWS), len(pointers) - 1
-        self._scratch = (
-            np.zeros((2, room)),
-            np.zeros((2, len(f.own)), np.int64),
-            np.zeros(n, np.int64),
-            np.zeros((2, n + 1), np.int64),
-        )
-        self._front = np.zeros(int((whole(3 * f.own) + whole(3 * below)).max(initial=0)) + ROWS)
+        n, supernodes = len(pointers) - 1, len(f.own)
+        self._panels = np.zeros(f.panel[-1] + ROWS)
+        waiting, filled, place, runs = (np.zeros(k, np.int64) for k in ((2, supernodes + 1), 2, n, (2, n + 1)))
+        self._scratch = np.zeros((2, room)), waiting, filled, np.zeros((TILE, TILE)), place, runs
+        largest = int((whole(3 * f.own) + whole(3 * below)).max(initial=0))
+        self._vectors = np.zeros(largest + ROWS), np.zeros(TILE)
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
         """Factorise H with these blocks (b, 3, 3), in the order of the graph; False if it is not positive definite."""
@@ -52,7 +50,7 @@ class BlockCholesky:
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """H^-1 b, both (n, 3), by what was factorised last."""
         x = np.array(b, order="C")
-        solve(self._fronts, self._panels, x, self._front)
+        solve(self._fronts, self._panels, x, *self._vectors)
         return x
 
 

@@ -14,9 +14,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from solvers.compiling import inner, kernel
 from solvers.linear.block_vectors import ROWS, TILE, add, divide, subtract_columns, subtract_product, subtract_rows
 
 _NO_DIGITS = 4.0 * np.finfo(np.float64).eps
@@ -44,49 +44,50 @@ class Fronts(NamedTuple):
     panel: NDArray[np.int64]
 
 
-@njit(cache=True)
 def whole(rows):
     """The rows of so many whole vectors as hold these."""
     return (rows + ROWS - 1) // ROWS * ROWS
 
 
-@njit(cache=True)
-def factorise(fronts, values, panels, stacks, waiting, place, runs):
+_whole = inner(whole)
+
+
+@kernel
+def factorise(fronts, values, panels, stacks, waiting, filled, triangle, place, runs):
     """Write L to `panels` from the blocks of the matrix, values (b, 3, 3); returns whether it is positive definite.
 
-    stacks (2, room): of updates; waiting (2, s), place (n,), runs (2, n + 1): scratch.
+    stacks (2, room): of updates, the numbers in use counted in filled (2,); waiting (2, s + 1): supernodes on each,
+    their count first; triangle (TILE, TILE), place (n,), runs (2, n + 1): scratch.
     """
-    triangle = np.empty((TILE, TILE))
-    depth = np.zeros(2, np.int64)  # supernodes that wait
-    top = np.zeros(2, np.int64)  # numbers on each stack
+    filled[:] = 0
+    waiting[:, 0] = 0
     for s in range(len(fronts.own)):
         _, own, below, head, stride = _sizes(fronts, s)
         size = stride - head
         base, side = fronts.panel[s], fronts.stack[s]
-        update, begin = stacks[side], top[side]
+        update, begin = stacks[side], filled[side]
         panels[base : fronts.panel[s + 1]] = 0.0
         update[begin : begin + 3 * below * size] = 0.0
         _enter(fronts, s, values, panels, head, stride, place)
-        while depth[1 - side] > 0 and fronts.parent[waiting[1 - side, depth[1 - side] - 1]] == s:
-            depth[1 - side] -= 1
-            c = waiting[1 - side, depth[1 - side]]
+        other = 1 - side
+        while waiting[other, 0] > 0 and fronts.parent[waiting[other, waiting[other, 0]]] == s:
+            c = waiting[other, waiting[other, 0]]
+            waiting[other, 0] -= 1
             rows = fronts.start[c + 1] - fronts.start[c] - fronts.own[c]
-            top[1 - side] -= 3 * rows * whole(3 * rows)
-            _extend(fronts, c, rows, stacks[1 - side], top[1 - side], own, head, stride, panels, base, update, begin,
+            filled[other] -= 3 * rows * _whole(3 * rows)
+            _extend(fronts, c, rows, stacks[other], filled[other], own, head, stride, panels, base, update, begin,
                     size, runs)  # fmt: skip
         if not _eliminate(fronts, s, values, panels, head, stride, triangle):
             return False
         _update(panels, base, 3 * own, head, stride, update, begin, 3 * below, size)
-        waiting[side, depth[side]] = s
-        depth[side] += 1
-        top[side] += 3 * below * size
-        if fronts.parent[s] < 0:  # nobody takes what a root leaves
-            depth[side] -= 1
-            top[side] -= 3 * below * size
+        if fronts.parent[s] >= 0:
+            waiting[side, 0] += 1
+            waiting[side, waiting[side, 0]] = s
+            filled[side] += 3 * below * size
     return True
 
 
-@njit(cache=True)
+@inner
 def _enter(fronts, s, values, panels, head, stride, place):
     """Put the matrix's blocks below the diagonal into the panel of a supernode."""
     first, own = fronts.start[s], fronts.own[s]
@@ -104,11 +105,11 @@ def _enter(fronts, s, values, panels, head, stride, place):
                         panels[at + j * stride + i] = values[e, j, i]
 
 
-@njit(cache=True)
+@inner
 def _extend(fronts, c, rows, source, at, own, head, stride, panels, base, update, begin, size, runs):
     """Add the update of a child c to its parent's front, in runs of members that are neighbours in both."""
     first = fronts.start[c] + fronts.own[c]
-    height = whole(3 * rows)
+    height = _whole(3 * rows)
     count = 0
     for k in range(rows):
         q = fronts.within[first + k]
@@ -130,7 +131,7 @@ def _extend(fronts, c, rows, source, at, own, head, stride, panels, base, update
                 _add_runs(runs, run, count, b, source, start, update, begin + (3 * (q - own) + j) * size - head)
 
 
-@njit(cache=True)
+@inner
 def _add_runs(runs, run, count, b, source, start, target, column):
     """Add the rows from member b on of a column."""
     for k in range(run, count):
@@ -139,7 +140,7 @@ def _add_runs(runs, run, count, b, source, start, target, column):
         add(source, start + 3 * a, target, to, 3 * (runs[0, k + 1] - a))
 
 
-@njit(cache=True)
+@inner
 def _eliminate(fronts, s, values, panels, head, stride, triangle):
     """Factorise the panel of a supernode; False at a pivot that is not positive."""
     base, width = fronts.panel[s], 3 * fronts.own[s]
@@ -173,7 +174,7 @@ def _eliminate(fronts, s, values, panels, head, stride, triangle):
     return True
 
 
-@njit(cache=True)
+@inner
 def _diagonal(fronts, v):
     """Which block is the diagonal's of vertex v."""
     e = fronts.pointers[v]
@@ -182,7 +183,7 @@ def _diagonal(fronts, v):
     return e
 
 
-@njit(cache=True)
+@inner
 def _update(panels, base, width, head, stride, update, begin, columns, size):
     """Subtract the product of a panel's rows below from the update."""
     for tile in range(0, columns, TILE):
@@ -194,10 +195,9 @@ def _update(panels, base, width, head, stride, update, begin, columns, size):
                 subtract_product(panels, row + r, row + tile, stride, width, update, to + r, size, 3)
 
 
-@njit(cache=True)
-def solve(fronts, panels, x, front):
-    """Overwrite x (n, 3) with H^-1 x; front: scratch, a vector longer than the largest front."""
-    y = np.empty(TILE)
+@kernel
+def solve(fronts, panels, x, front, y):
+    """Overwrite x (n, 3) with H^-1 x; front, a vector longer than the largest front, and y (TILE,): scratch."""
     for s in range(len(fronts.own)):
         first, own, below, head, stride = _sizes(fronts, s)
         front[: stride + ROWS] = 0.0
@@ -243,22 +243,22 @@ def solve(fronts, panels, x, front):
         _scatter(front, 0, x, fronts.members, first, own)
 
 
-@njit(cache=True)
+@inner
 def _sizes(fronts, s):
     """The first member of a supernode, its columns and rows below in vertices, and where those rows begin and end."""
     first, own = fronts.start[s], fronts.own[s]
-    below, head = fronts.start[s + 1] - first - own, whole(3 * own)
-    return first, own, below, head, head + whole(3 * below)
+    below, head = fronts.start[s + 1] - first - own, _whole(3 * own)
+    return first, own, below, head, head + _whole(3 * below)
 
 
-@njit(cache=True)
+@inner
 def _gather(x, members, first, count, front, at):
     for k in range(count):
         for c in range(3):
             front[at + 3 * k + c] = x[members[first + k], c]
 
 
-@njit(cache=True)
+@inner
 def _scatter(front, at, x, members, first, count):
     for k in range(count):
         for c in range(3):
