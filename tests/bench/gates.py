@@ -135,7 +135,7 @@ def record(scene: Scene, prepared: Prepared, frames: int, path: Path) -> Positio
     recorder = RerunRecorder(path, info)
     stored = np.empty((frames, *scene.mesh.rest.shape))
     settings = Settings(STOP, "current", frames, 1)
-    observe(scene, prepared, settings, recorder=recorder, convergence=(), stored=stored, tick=lambda: None)
+    observe(scene, prepared, settings, recorder=recorder, convergence=(), stored=stored, judge=None, tick=lambda: None)
     recorder.close({})
     return stored[-1]
 
