@@ -90,14 +90,14 @@ class HybridMethod:
                 _, residual, ended = run.advance(_ROUND, 0.0, 0.0, False)
                 following = _at(step, run.positions)
                 ended |= residual**2 <= self.metric.round_off(following.positions)
-                last, gain = gain, -step.rise(point.positions, following.positions)[0]
+                last, gain = gain, _gain(step, point, following)
                 if last == np.inf and residual > _QUICK * before:
                     gain = 0.0  # of no use yet
                 if newton_gain == 0.0 and (gain == 0.0 or gain > _SLOW * last):
                     newton_gain = np.inf
             else:
                 following, ended = predicting.next(point)
-                newton_gain = -step.rise(point.positions, following.positions)[0] / self._cost
+                newton_gain = _gain(step, point, following) / self._cost
                 gain = gain or newton_gain  # until it is known
                 run = self._lbfgs.engine.begin(step.problem, following.positions, kept=False)
             if following is not point:
@@ -144,7 +144,7 @@ class _Predicting:
             return point, True
         self._bold = kept
         self._tension += length * (predicted - self._tension)
-        if not step.rise(point.positions, following.positions)[0] < 0.0:
+        if _gain(step, point, following) == 0.0:
             return point, at is point
         return following, self._level == 0 and kept and slope >= _QUADRATIC * before
 
@@ -171,6 +171,12 @@ class _Predicting:
             return 0.0, None, False
         length = dot(found.positions - at.positions, direction) / dot(direction, direction)
         return length, self._method.relaxed(step, found.positions), False
+
+
+def _gain(step: StepObjective, before: Point, after: Point) -> float:
+    """By how much the objective falls [J], 0 where it rises or round-off hides it."""
+    rise, noise = step.rise(before.positions, after.positions)
+    return -rise if -rise > noise else 0.0
 
 
 def _lower(step: StepObjective, start: Point) -> Point:

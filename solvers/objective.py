@@ -23,6 +23,9 @@ from solvers.problem import Energy, Positions, ProjectiveEnergy, StepProblem, Sy
 _ROUND_OFF = 4.0 * np.finfo(np.float64).eps
 """Of an energy's value, beside its size."""
 
+_NEAR = 1e-10
+"""Of that size, the change from which on its values tell less than its slopes do."""
+
 
 class Objective:
     """The objective of a system's steps: what does not change from step to step."""
@@ -121,12 +124,22 @@ class StepObjective:
         return out
 
     def rise(self, p: Positions, q: Positions) -> tuple[float, float]:
-        """g(q) - g(p) [J], and what of it may be round-off of the energies that are not springs."""
+        """g(q) - g(p) [J], and what of it may be round-off of the energies that are not springs.
+
+        Theirs is the difference of their values, or the mean slope where that difference has lost its digits.
+        """
         change, noise = objective.rise(self.whole.terms, self._given, p, q), 0.0
         for energy in self.others:
             before, after = energy.value(p), energy.value(q)
-            change += after - before
-            noise += _ROUND_OFF * (abs(before) + abs(after))
+            slope = np.zeros_like(q)
+            energy.add_gradient(q, slope)
+            scale = abs(before) + abs(after) + float(np.abs(slope * q).sum())
+            if abs(after - before) <= _NEAR * scale < np.inf:
+                energy.add_gradient(p, slope)
+                change += 0.5 * float((slope * (q - p)).sum())
+            else:
+                change += after - before
+                noise += _ROUND_OFF * scale
         return change, noise
 
     def tensions(self, p: Positions, d: Positions) -> NDArray[np.float64]:

@@ -1,0 +1,83 @@
+"""Newton's method by conjugate gradients; and energies that are not springs, by all of Newton's methods."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from harness.effects.gas import Gas
+from harness.effects.gravity import Gravity
+from harness.effects.pins import Pins
+from harness.effects.springs import Springs
+from harness.mesh.surfaces import Balloon
+from solvers.descent import PreparedDescent
+from solvers.hybrid import Hybrid
+from solvers.newton import Newton, certified
+from solvers.newton_cg import NewtonCG
+from solvers.objective import Objective, StepObjective
+from solvers.problem import StopRule
+from tests.scenes import cloth, first_problem, random_problem, scene
+from tests.unit.test_objective import with_links
+
+OTHERS = pytest.mark.parametrize("solver", [Newton(), NewtonCG(), Hybrid()], ids=lambda s: type(s).__name__)
+
+
+def test_it_never_looks_for_the_structure_of_a_hessians_factor():
+    given = first_problem(cloth(8, "exact"))
+    prepared = NewtonCG().prepare(given.system)
+    assert isinstance(prepared, PreparedDescent)
+    prepared.solve(given, StopRule(5))
+    for phase in prepared.phases(given).values():
+        phase()
+    assert "matrix" not in vars(prepared.objective)
+    assert "nnz_hessian_factor" not in prepared.facts
+
+
+def test_it_converges_faster_than_linearly_near_a_minimum():
+    given = first_problem(cloth(8, "exact"))
+    prepared = NewtonCG().prepare(given.system)
+    assert isinstance(prepared, PreparedDescent)
+    step = StepObjective(prepared.objective, given)
+    residuals = [prepared.metric.residual(step.gradient(p.copy())) for p in islice(prepared.iterates(given), 60)]
+    start = prepared.metric.residual(step.gradient(given.current))
+    near = [r / start for r in residuals if 1e-11 * start < r < 1e-3 * start]
+    assert residuals[-1] <= 1e-12 * start
+    # The forcing term squares the residual once it is below a tenth; five halvings of 1e-3 would be a linear method's.
+    assert 1 <= len(near) <= 6
+
+
+def test_negative_curvature_at_the_very_first_is_a_local_global_step():
+    """All springs compressed to a tenth: there is no direction in which the Hessian is positive."""
+    given = random_problem(1, weights=(), m=60)
+    given = replace(given, first_guess=0.1 * given.current, target=0.1 * given.current, force=0.0 * given.force)
+    prepared = NewtonCG().prepare(given.system)
+    assert isinstance(prepared, PreparedDescent)
+    first = next(prepared.iterates(given)).copy()
+    assert given.value(first) < given.value(given.first_guess)
+
+
+@OTHERS
+@pytest.mark.parametrize("reach", [0.2, 0.4], ids="links within {:g} m".format)
+def test_other_energies_are_minimised_whatever_their_pattern(solver, reach):
+    given = with_links(first_problem(cloth(7, "exact")), reach)
+    solution = solver.prepare(given.system).solve(given, StopRule(200))
+    assert solution.stopped in {"stalled", "floor"}
+    step = StepObjective(Objective(given.system), given)
+    assert np.abs(given.gradient(solution.positions)).max() <= 1e-9 * np.abs(given.gradient(given.current)).max()
+    assert certified(step, step.placed(solution.positions))
+
+
+@OTHERS
+def test_gas_in_a_balloon_is_minimised(solver):
+    """Not projective, infinite inside out, and its Hessian is full."""
+    made = scene(
+        Balloon(), Springs(stretch=50.0), Gravity(), Gas(pressure=5.0), Pins(at=("pole_top",), weight="exact"), size=4
+    )
+    given = first_problem(made)
+    solution = solver.prepare(given.system).solve(given, StopRule(200))
+    step = StepObjective(Objective(given.system), given)
+    assert np.abs(given.gradient(solution.positions)).max() <= 1e-9 * np.abs(given.gradient(given.current)).max()
+    assert certified(step, step.placed(solution.positions))
