@@ -129,7 +129,12 @@ class Work:
     def setting(self) -> str:
         """What was chosen, in words."""
         stop = f"{self.iterations} iterations" if self.tolerance is None else f"tolerance {self.tolerance:g}"
-        return f"{self.label}, {self.integrator}, dt {step_words(self.time_step)}, {stop}"
+        steps = "" if self.solver in OWN_STEPS else f"{self.integrator}, "
+        return f"{self.label}, {steps}dt {step_words(self.time_step)}, {stop}"
+
+
+OWN_STEPS = ("xpbd-small-steps", "symplectic-euler")
+"""Methods that integrate time in substeps of their own, whatever the integrator of the frame."""
 
 
 @dataclass(frozen=True, slots=True)
