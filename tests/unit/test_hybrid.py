@@ -26,7 +26,7 @@ def stiff(ratio: float) -> StepProblem:
 
 @pytest.mark.parametrize("ratio", [1e6, 1e8, 1e10], ids="{:g}".format)
 def test_stiff_springs_take_less_than_half_of_newtons_iterations(ratio):
-    """Counted to a gap of 1e-4; at 1e10 they take a sixth."""
+    """Counted to a gap of 1e-4: 9 beside 26, 27 beside 125, 98 beside 573."""
     given = stiff(ratio)
     prepared = {solver: solver.prepare(given.system) for solver in (Newton(), Hybrid())}
     ends = [p.solve(given, StopRule(3000)).positions for p in prepared.values()]
