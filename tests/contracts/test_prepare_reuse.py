@@ -18,8 +18,12 @@ from solvers.registry import SOLVERS, load
 from tests.scenes import cloth, first_problem, frozen, random_problem
 
 FORCED = {
-    f"numba, {linear} in {precision}": CompiledLocalGlobal(linear, precision)
-    for linear, precision in [("supernodal", "float16"), ("inverse", "float32"), ("cg", "float64")]
+    f"numba, {solver.linear} in {solver.precision}": solver
+    for solver in (
+        CompiledLocalGlobal("supernodal", "float16"),
+        CompiledLocalGlobal("inverse", "float32"),
+        CompiledLocalGlobal("cg", "float64"),
+    )
 }
 CHOICES = {name: load(target)() for name, target in SOLVERS.items()} | FORCED
 LARGE = "cloth large enough for threads, exact pins"
