@@ -23,7 +23,7 @@ from solvers.linear.conjugate_gradients import ConjugateGradients
 from solvers.linear.factors import Factor, SimplicialCholesky
 from solvers.linear.inverse import Inverse
 from solvers.linear.ordering import nested_dissection
-from solvers.linear.supernodal import Layout, Supernodal
+from solvers.linear.supernodal import Supernodal, stored
 from solvers.linear.symbolic import Symbolic, analyse
 from solvers.problem import Unsupported
 
@@ -129,10 +129,10 @@ def memory_of_machine() -> float:
 
 def estimate(s: Symbolic, precision: Precision = "float64") -> Estimate:
     """What a supernodal factor of this structure needs: its panels, and fronts and updates while it is made."""
-    layout = Layout.of(s)
+    squares, entered = stored(s)
     half = 2 if precision == "float16" else 4
-    panels = 8 * (layout.squares + layout.panels)
-    kept = panels if precision == "float64" else 4 * layout.squares + half * layout.panels
+    panels = 8 * (squares + entered)
+    kept = panels if precision == "float64" else 4 * squares + half * entered
     fronts, flops = _factorisation(s.parent, s.first, s.row_start, s.sequence)
     memory = panels + max(8 * fronts, _ROUNDING[precision] * panels) + _BYTES_PER_VERTEX * len(s.slot)
     words = f"its factor has {s.nonzeros:,} entries, {_size(kept)} in {precision}, after {flops:.1e} flops"

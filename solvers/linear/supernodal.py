@@ -57,13 +57,7 @@ class Layout(NamedTuple):
     def of(cls, s: Symbolic) -> Layout:
         """The layout of a factor of this structure."""
         width, below = s.width.astype(np.int64), np.diff(s.row_start)
-        many = -(-width // WIDTH)
-        chunk_of = np.concatenate([[0], np.cumsum(many)])
-        node = np.repeat(np.arange(len(width)), many)
-        done = (np.arange(len(node)) - chunk_of[node]) * WIDTH
-        own = np.minimum(WIDTH, width[node] - done)
-        rows = width[node] - done - own + below[node]
-        quads = -(-own // LANES)
+        chunk_of, node, done, own, rows, quads = _chunks(width, below)
         squares, panels = own * quads * LANES, rows * quads * LANES
         base = np.concatenate([[0], np.cumsum(width + below)])
         columns = [
@@ -105,6 +99,22 @@ class Layout(NamedTuple):
             int(panels.sum()),
             rows_of_work,
         )
+
+
+def _chunks(width: NDArray[np.int64], below: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
+    """`chunk_of`, and of each chunk its supernode, the columns before it there, its own, its rows below, its quads."""
+    many = -(-width // WIDTH)
+    chunk_of = np.concatenate([[0], np.cumsum(many)])
+    node = np.repeat(np.arange(len(width)), many)
+    done = (np.arange(len(node)) - chunk_of[node]) * WIDTH
+    own = np.minimum(WIDTH, width[node] - done)
+    return chunk_of, node, done, own, width[node] - done - own + below[node], -(-own // LANES)
+
+
+def stored(s: Symbolic) -> tuple[int, int]:
+    """The entries in all S and in all W of a factor of this structure."""
+    *_, own, rows, quads = _chunks(s.width.astype(np.int64), np.diff(s.row_start))
+    return int(LANES * own @ quads), int(LANES * rows @ quads)
 
 
 class Supernodal:
