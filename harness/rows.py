@@ -105,7 +105,13 @@ COLUMNS = (
     Column("started", _TEXT, "", "when the run started, UTC, ISO 8601"),
 )
 
-SCHEMA = pa.schema([pa.field(c.name, c.type) for c in COLUMNS])
+
+def schema_of(columns: Iterable[Column]) -> pa.Schema:
+    """The Arrow schema of columns, in their order."""
+    return pa.schema([pa.field(c.name, c.type) for c in columns])
+
+
+SCHEMA = schema_of(COLUMNS)
 Row = Mapping[str, Any]
 
 

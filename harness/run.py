@@ -264,9 +264,12 @@ def save_positions(path: Path, positions: np.ndarray) -> None:
 
 def common(run: RunSpec) -> dict[str, Any]:
     """The columns that are the same in all rows of a run."""
+    return {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep} | asked(run) | provenance()
+
+
+def asked(run: RunSpec) -> dict[str, Any]:
+    """The columns that tell what a run was asked to do."""
     return {
-        "run_id": run.run_id(machine.describe().id),
-        "sweep": run.sweep,
         "scene": run.scene_name,
         "size": run.size,
         "solver": run.solver.name,
@@ -277,7 +280,6 @@ def common(run: RunSpec) -> dict[str, Any]:
         "max_iterations": run.iterations,
         "tolerance": run.tolerance,
         "threads": machine.threads(run.threads).number,
-        **provenance(),
     }
 
 

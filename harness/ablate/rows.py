@@ -13,7 +13,7 @@ from __future__ import annotations
 import pyarrow as pa
 
 from harness.rows import COLUMNS as RUN_COLUMNS
-from harness.rows import Column
+from harness.rows import Column, schema_of
 
 _TEXT, _INT, _REAL = pa.string(), pa.int64(), pa.float64()
 _SHARED = {column.name: column for column in RUN_COLUMNS}
@@ -47,4 +47,4 @@ COLUMNS = (
     *_as_in_runs("machine", "cpu", "cores", "memory_gib", "system", "versions", "commit", "code", "started"),
 )
 
-SCHEMA = pa.schema([pa.field(c.name, c.type) for c in COLUMNS])
+SCHEMA = schema_of(COLUMNS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from harness.ablate.turns import Turn, cost, motion, seconds, turns
 from harness.errors import InputError
 from harness.load import Sweep
 from harness.measure import Settings
-from harness.run import failure, provenance
+from harness.run import asked, failure, provenance
 from harness.scene import Scene, build
 from harness.simulate import prepare
 from harness.spec import RunSpec, SceneSpec
@@ -118,19 +117,9 @@ def _errors(run: RunSpec, whole: Turn, settings: Settings, tick: Callable[[str],
 
 def _shared(run: RunSpec, scene: Scene, told: list[Row]) -> list[Row]:
     """The rows with the columns that are the same in all of them."""
-    shared = {
-        "scene": run.scene_name,
-        "size": run.size,
+    shared = asked(run) | {
         "vertices": len(scene.mesh.rest),
         "springs": len(scene.springs.edges),
-        "solver": run.solver.name,
-        "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
-        "time_step": run.scene.time_step,
-        "integrator": run.integrator,
-        "first_guess": run.first_guess,
-        "max_iterations": run.iterations,
-        "tolerance": run.tolerance,
-        "threads": machine.threads(run.threads).number,
         "frames": run.frames,
         "rounds": run.rounds,
         "extent": scene.mesh.size / rest_length(scene),
