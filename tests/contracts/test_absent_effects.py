@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,7 @@ print(json.dumps({{"modules": sorted(sys.modules), "digests": digests}}))
 """
 
 
-def probe(*, hidden: list[str] = [], load: bool = False) -> dict:  # noqa: B006
+def probe(*, hidden: Sequence[str] = (), load: bool = False) -> dict:
     """What a fresh process imports and computes, with modules hidden, or with all effects loaded first."""
     script = PROBE.format(hidden=hidden, load=load, scene=str(SCENE))
     told = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
