@@ -15,7 +15,7 @@ from harness.errors import InputError
 from harness.report.accuracy.findings import failures, findings, summary
 from harness.report.accuracy.growth import growths
 from harness.report.accuracy.paper import FIGURE_2, FIGURE_3, comparisons
-from harness.report.accuracy.profiles import iteration_ratios, least_ratios, share
+from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
 from harness.report.accuracy.reading import read
 from harness.report.accuracy.table import Curve, Table, without_short
 from harness.report.accuracy.times import TARGETS, contested, crossings, duration, power, reach, seconds_to
@@ -146,17 +146,18 @@ def test_what_the_first_guess_has_already_is_not_contested(tmp_path: Path) -> No
     assert contested(race, 0.1)
 
 
-def test_profiles_count_failures_and_what_was_not_tried_as_never(tmp_path: Path) -> None:
+def test_profiles_count_failures_as_never_and_leave_out_who_was_not_tried_everywhere(tmp_path: Path) -> None:
     rows = [*made.problem("net", 10, "early"), *made.problem("net", 20, "early")]
     for size in (10, 20):
         rows += made.curve("net", size, "early", "numba")
         rows += made.curve("net", size, "early", "sparse")
+        rows.append(made.failure("net", size, "early", "newton", "diverged", "not finite"))
     rows += made.curve("net", 10, "early", "lbfgs")  # not tried at 20
-    rows.append(made.failure("net", 20, "early", "newton", "diverged", "not finite"))
     found = table(tmp_path, rows)
     ratios = least_ratios(found, 1e-3)
     # 20 iterations at 1.2e-7 against 96 at 5e-8 and at 4e-7 s a vertex.
-    assert ratios["lbfgs"].tolist() == [1.0, inf]
+    assert "lbfgs" not in ratios
+    assert not_shown(found) == ["Not shown, as not tried on every problem: lbfgs (on 1 of 2)."]
     assert ratios["numba"] == pytest.approx([96 * 5e-8 / (20 * 1.2e-7), 1.0])
     assert ratios["newton"].tolist() == [inf, inf]
     assert share(ratios["numba"], np.array([1.0, 2.1])).tolist() == [0.5, 1.0]

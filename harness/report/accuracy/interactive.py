@@ -18,7 +18,7 @@ from plotly.offline import get_plotlyjs
 
 from harness.report.accuracy.convergence import GUESSES
 from harness.report.accuracy.growth import TARGET, growths
-from harness.report.accuracy.profiles import iteration_ratios, least_ratios, share
+from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
 from harness.report.accuracy.sheet import looks
 from harness.report.accuracy.table import Curve, Table, Work, step_words
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
@@ -223,7 +223,7 @@ def _profiles(table: Table) -> Item:
     return {
         "title": "Performance and data profiles",
         "note": "The share of the problems solved within a multiple of the fastest solver's time, and of the time of "
-        "one plain local-global iteration. What failed or was not tried is never solved.",
+        f"one plain local-global iteration. What failed is never solved. {' '.join(not_shown(table))}",
         "filters": ["gap"],
         "x": [_axis("ratio", "multiple")],
         "y": [_axis("share", "share of the problems solved", _SHARES)],

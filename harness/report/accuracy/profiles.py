@@ -5,11 +5,13 @@ A step from one first guess is a problem of its own. With t the time of a solver
     performance profile  rho(tau)  = share of the problems with t <= tau * (the least t of all solvers)
     data profile         d(kappa)  = share of the problems with t <= kappa * (one iteration of the yardstick)
 
-the yardstick being the plain local-global iteration. What is not reached, failed or was never tried takes for ever.
+the yardstick being the plain local-global iteration. What is not reached, or failed, takes for ever. Only solvers that
+were tried on as many problems as any are compared: the others' shares would tell what was tried.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 from pathlib import Path
@@ -54,16 +56,32 @@ def iteration_ratios(table: Table, target: float) -> dict[str, Values]:
 
 def _ratios(table: Table, found: Sequence[list[Curve]], target: float, units: Sequence[float]) -> dict[str, Values]:
     times = [{curve.label: seconds_to(curve, target) for curve in race} for race in found]
+    missed = partly_tried(table)
     return {
         label: np.array([each.get(label, inf) / unit for each, unit in zip(times, units, strict=True)], float)
         for label in dict.fromkeys(curve.label for curve in table.curves)
+        if label not in missed
     }
 
 
+def partly_tried(table: Table) -> dict[str, int]:
+    """By label on how many problems the solvers were tried that were tried on fewer than others."""
+    tried = Counter(label for race in races(table).values() for label in {curve.label for curve in race})
+    return {label: count for label, count in sorted(tried.items()) if count < max(tried.values())}
+
+
 def yardstick(table: Table) -> str:
-    """The backend of the plain local-global iteration that data profiles count in; "" where none was measured."""
-    solvers = {curve.solver for curve in table.curves}
-    return next((name for name in _YARDSTICKS if name in solvers), "")
+    """The backend of the plain local-global iteration that data profiles count in, one that ran on most problems; ""
+    where none was measured."""
+    tried = Counter(curve.solver for curve in table.curves if curve.solver in _YARDSTICKS)
+    return max(tried, key=lambda name: (tried[name], -_YARDSTICKS.index(name)), default="")
+
+
+def not_shown(table: Table) -> list[str]:
+    """A sentence about the solvers that profiles leave out, if there are any."""
+    count = len(races(table))
+    names = ", ".join(f"{label} (on {tried} of {count})" for label, tried in partly_tried(table).items())
+    return [f"Not shown, as not tried on every problem: {names}."] if names else []
 
 
 def share(values: Values, at: Values) -> Values:
@@ -95,9 +113,10 @@ def draw_profiles(table: Table, stem: Path) -> list[Path]:
     """A row of performance profiles and a row of data profiles, a column for each accuracy; returns the files."""
     if not any(judged(table, target) for target in TARGETS):
         return []
-    marked = looks((curve.label, curve.solver) for curve in table.curves)
-    words = ["The step alone, set-up apart. A solver that failed, or was not tried, on a problem never solves it."]
-    words += left_out(table.problems)
+    missed = partly_tried(table)
+    marked = looks((curve.label, curve.solver) for curve in table.curves if curve.label not in missed)
+    words = ["The step alone, set-up apart. A solver that failed on a problem never solves it."]
+    words += [*not_shown(table), *left_out(table.problems)]
     steps = f"{sum(not problem.doubt for problem in table.problems)} steps, first guesses apart"
     with sheet(stem, "Performance and data profiles", ["share of the problems solved", steps, *table.machine]) as page:
         width = (RIGHT - LEFT - 50) / len(TARGETS) - 16
