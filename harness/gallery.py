@@ -51,7 +51,7 @@ def _tile(path: Path) -> Any:
         title=run.scene_name,
         run_id="",
         frames=np.array([run.frames]),
-        times=np.array([run.frames * run.time_step]),
+        times=np.array([scene.time(run.frames)]),
         positions=p[None].astype(np.float32),
         triangles=scene.mesh.triangles,
         springs=scene.springs.edges,

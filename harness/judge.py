@@ -88,11 +88,11 @@ class Judge:
         return row
 
     def stationarity(self, problem: StepProblem, p: Positions) -> tuple[float, float]:
-        """As `Oracle` has it; an integrator that needs a history has two systems."""
+        """As `Oracle` has it; a scene whose first step or every second one differs has two systems."""
         system = problem.system
-        if system.factor not in self._oracles:
-            self._oracles[system.factor] = Oracle(system)
-        return self._oracles[system.factor].stationarity(problem, p)
+        if system.rate not in self._oracles:
+            self._oracles[system.rate] = Oracle(system)
+        return self._oracles[system.rate].stationarity(problem, p)
 
 
 def reference(scene: Scene, solver: Solver, *, first_guess: str, frames: int) -> NDArray[np.float64]:

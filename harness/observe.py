@@ -61,10 +61,8 @@ def observe(
         if stored is not None:
             stored[step.index - 1] = p
         if recorder:
-            time = step.index * scene.system.time_step
-            recorder.frame(Frame(step.index, time, p, terms, s.residual, s.iterations))
+            recorder.frame(Frame(step.index, scene.time(step.index), p, terms, s.residual, s.iterations))
 
-    norm = EnergyNorm(scene.system) if recorder and convergence else None
     if recorder:
         recorder.frame(Frame(0, 0.0, start(scene).now.positions, {}, float("nan"), 0))
     with ThreadPoolExecutor(1) as beside:
@@ -73,7 +71,8 @@ def observe(
             if looked:
                 looked.result()  # raises here what went wrong there
             looked = beside.submit(look, step)
-            if recorder and norm and step.index in convergence:
+            if recorder and step.index in convergence:
+                norm = EnergyNorm(step.problem.system)
                 curve = trace(prepared, step.problem, norm, step.solution.iterations)
                 looked.result()
                 recorder.convergence(step.index, curve.residuals, curve.objective)

@@ -31,7 +31,8 @@ class Scene:
     mesh: at rest; start: how the start differs from that; system: what is factorised; load: the sum of the forces
     that never change, (n, 3) [N], read-only; forces: those that change; filters: of the velocity;
     pin_targets: (q, 3) [m], in the order of `system.pins`; moving: which of them move, and how;
-    velocity: of every vertex at the start [m/s], less the start's spin; integrator: its factor is the system's.
+    velocity: of every vertex at the start [m/s], less the start's spin; integrator: its factor is the system's;
+    alternate: the same in every second step, where that is of another length.
     """
 
     mesh: Mesh
@@ -44,6 +45,17 @@ class Scene:
     integrator: Integrator = IMPLICIT_EULER
     moving: tuple[tuple[NDArray[np.int64], Motion], ...] = ()
     start: Rest = AT_REST
+    alternate: Scene | None = None
+
+    def at(self, index: int) -> Scene:
+        """The scene in the step that follows step `index`."""
+        return self.alternate if self.alternate and index % 2 else self
+
+    def time(self, index: int) -> float:
+        """When step `index` ends, and the next begins [s]; 0 is the start."""
+        if not self.alternate:
+            return index * self.system.time_step
+        return (index + 1) // 2 * self.system.time_step + index // 2 * self.alternate.system.time_step
 
     def pins_at(self, time: float) -> Positions:
         """Where the pins want their vertices at a time [s], (q, 3) [m]."""
@@ -81,6 +93,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
     _require_determined(system)
     start = spec.start or AT_REST
     _check(parts, start.positions(mesh.rest))
+    other = spec.alternate_time_step
     return Scene(
         mesh=mesh,
         system=system,
@@ -92,6 +105,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
         integrator=INTEGRATORS[integrator],
         moving=moving,
         start=start,
+        alternate=None if other in (None, spec.time_step) else build(spec.stepped(other), size, integrator),
     )
 
 

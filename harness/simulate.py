@@ -9,7 +9,7 @@ from time import perf_counter
 
 from harness.scene import Scene
 from solvers.integrators import IMPLICIT_EULER, Motion
-from solvers.problem import Positions, Prepared, Solution, Solver, Start, StepProblem, StopRule, System
+from solvers.problem import Positions, Prepared, Solution, Solver, Start, StepProblem, StopRule, System, Unsupported
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +50,8 @@ def start(scene: Scene) -> State:
 
 def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
     """The next step's problem from a state; `first_guess` is a key of `FIRST_GUESSES`."""
-    dt, time = scene.system.time_step, state.index * scene.system.time_step
+    scene, time = scene.at(state.index), scene.time(state.index)
+    dt = scene.system.time_step
     # `before` was filtered when it was `now`. Filtered once more it has decayed as long as `now` has (an integrating
     # factor); without that, BDF2 would decay at twice the rate.
     now, before = (_filtered(scene, motion) for motion in (state.now, state.before or state.now))
@@ -72,9 +73,13 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
 
 
 def prepare(scene: Scene, solver: Solver) -> Prepared:
-    """The solver, ready for all of the scene's steps; raises what `solver.prepare` raises."""
-    prepared = solver.prepare(scene.system)
-    return _Starting(solver.prepare(_first(scene)), prepared) if scene.integrator.history else prepared
+    """The solver, ready for all of the scene's steps; raises what `solver.prepare` raises, and Unsupported where steps
+    differ in length and the integrator goes by two of them."""
+    history, alternate = scene.integrator.history, scene.alternate
+    if history and alternate:
+        raise Unsupported("the integrator's formula holds for steps of one length, and the scene alternates two")
+    prepared, other = solver.prepare(scene.system), alternate.system if alternate else _first(scene)
+    return _Turns(prepared, solver.prepare(other), other.rate) if history or alternate else prepared
 
 
 def simulate(
@@ -94,15 +99,16 @@ def simulate(
         yield Step(stated, solution, state, seconds)
 
 
-class _Starting:
-    """Prepared for two systems, of which the first is that of the first step alone."""
+class _Turns:
+    """Prepared for two systems of one scene, which differ in their rate."""
 
-    def __init__(self, first: Prepared, then: Prepared) -> None:
-        self._first, self._then = first, then
-        self.choice, self.facts = then.choice, then.facts
+    def __init__(self, usual: Prepared, other: Prepared, rate: float) -> None:
+        """rate: of the other [1/s]."""
+        self._usual, self._other, self._rate = usual, other, rate
+        self.choice, self.facts = usual.choice, usual.facts
 
     def _of(self, problem: StepProblem) -> Prepared:
-        return self._first if problem.system.factor == IMPLICIT_EULER.factor else self._then
+        return self._other if problem.system.rate == self._rate else self._usual
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         return self._of(problem).iterates(problem)

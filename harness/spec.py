@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, Protocol
 from pydantic import BeforeValidator, ConfigDict, Field, SkipValidation, WithJsonSchema
 
 from harness.effects.base import Effect
+from harness.errors import InputError, Mistake
 from harness.mesh.base import Mesh
 from harness.model import Many, Model
 from harness.start import AnyStart
@@ -72,6 +73,8 @@ class SceneFields(Model):
     """Total mass [kg]; may be left out where the mesh brings masses of its own."""
     time_step: TimeStep
     """Time step [s], a number or a fraction such as "1/30"."""
+    alternate_time_step: TimeStep | None = None
+    """Time step [s] of every second step; that of all others if left out."""
     frames: Frames
     """Number of steps to simulate."""
     velocity: tuple[Speed, Speed, Speed] = (0.0, 0.0, 0.0)
@@ -120,11 +123,17 @@ class SceneSpec(SceneFields):
     """The lines of the keys in that file, for messages."""
 
     def stepped(self, time_step: float) -> SceneSpec:
-        """The same scene with another time step [s]."""
+        """The same scene with another time step [s], the same in all steps."""
         if time_step == self.time_step:
             return self
         values: dict[str, Any] = {key: getattr(self, key) for key in SceneSpec.model_fields}
-        return SceneSpec.model_construct(None, **values | {"time_step": time_step})
+        return SceneSpec.model_construct(None, **values | {"time_step": time_step, "alternate_time_step": None})
+
+    def require_even_steps(self) -> None:
+        """Raise InputError for a scene whose steps differ in length."""
+        if self.alternate_time_step is not None:
+            key, wanted = "alternate_time_step", "what is measured here depends on one time step; leave it out"
+            raise InputError(Mistake(wanted, self.path, self.lines.get(key), key))
 
     @cached_property
     def digest(self) -> str:
@@ -133,6 +142,8 @@ class SceneSpec(SceneFields):
         content["mesh"] = self.mesh_digest or content["mesh"]
         if self.start:
             content["start"] = self.start.model_dump(mode="json")
+        if self.alternate_time_step is not None:
+            content["alternate_time_step"] = self.alternate_time_step
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

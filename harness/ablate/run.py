@@ -53,6 +53,7 @@ def ablate(sweep: Sweep, folder: Path, *, pairs: bool, tick: Callable[[str], Non
     Raises InputError for what the user can mend, Unsupported where the solver cannot do the whole scene.
     """
     (run,) = sweep.runs()
+    run.scene.require_even_steps()
     settings = Settings(StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
     solver: Solver = load(SOLVERS[run.solver.name])(**run.solver.parameters)
     with machine.pinned_threads(machine.threads(run.threads).number):

@@ -40,6 +40,8 @@ def load_accuracy(path: Path) -> Accuracy:
     scenes, solvers = scenes_of(document), solvers_of(document)
     if fields is None or document.mistakes:
         raise document.error()
+    for scene in scenes.values():
+        scene.require_even_steps()
     return expand(document, fields, scenes, solvers)
 
 

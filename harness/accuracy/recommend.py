@@ -83,6 +83,7 @@ def recommend(
         if not 0 < value < math.inf:
             raise InputError(Mistake(f"came {value:g}; wanted a number above 0", key=key))
     scene = load_scene(path)
+    scene.require_even_steps()
     size = (size or scene.default_size or 0) if isinstance(scene.mesh, Generator) else 0
     try:
         asked = _grid(path, scene, size, horizon, time_limit)

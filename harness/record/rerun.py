@@ -49,6 +49,7 @@ class RerunRecorder:
         self._scalars: dict[str, list[tuple[int, float]]] = {}
         self._styled: dict[str, list[str]] = {}
         self._frames = 0
+        self._clock: dict[int, float] = {}  # of each frame [s]
         self._pins: NDArray[np.float32] | None = None
         self._unseen = 1e-6 * info.mesh.size
         self._springs_shown = False
@@ -66,6 +67,7 @@ class RerunRecorder:
         strain, of_vertex = self._shading.strains(frame.positions)
         self._stream.set_time("frame", sequence=frame.index)
         self._stream.set_time("time", duration=frame.time)
+        self._clock[frame.index] = frame.time
         # Of a run at 0, else that timeline would show no scene at all.
         self._stream.set_time("iteration", sequence=frame.index if self._info.iterates else 0)
         self._log_mesh(p, self._shading.colours(of_vertex))
@@ -182,7 +184,7 @@ class RerunRecorder:
             return rr.TimeColumn("frame", sequence=frames), rr.TimeColumn("iteration", sequence=frames)
         return (
             rr.TimeColumn("frame", sequence=frames),
-            rr.TimeColumn("time", duration=frames * self._info.time_step),
+            rr.TimeColumn("time", duration=np.array([self._clock[frame] for frame in frames.tolist()])),
         )
 
     def _style(self, entity: str, label: str) -> None:

@@ -1,0 +1,116 @@
+"""Scenes whose steps differ in length, every second one: each is a step of its length from where the last one ended."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from harness.cli import app
+from harness.effects.gravity import Gravity
+from harness.judge import SLACK, Judge
+from harness.load import load_any, load_scene
+from harness.mesh.chain import Chain
+from harness.record.reader import read_replay, summary
+from harness.run import Files, execute
+from harness.scene import Scene, build
+from harness.simulate import prepare, simulate, start
+from harness.spec import SceneSpec
+from solvers.newton import Newton
+from solvers.problem import StopRule, Unsupported
+from solvers.registry import SOLVERS, load
+from solvers.symplectic_euler import SymplecticEuler
+
+FILE = Path(__file__).resolve().parents[2] / "configs" / "hard" / "motion-alternating-steps.yaml"
+LENGTHS = (1 / 3, 1 / 300)
+FRAMES, STOP = 6, StopRule(30, 1e-6)
+
+
+def made(integrator: str = "implicit-euler") -> Scene:
+    return build(load_scene(FILE), 6, integrator)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_each_step_is_one_of_its_length_from_where_the_last_one_ended(name: str):
+    scene, solver = made(), load(SOLVERS[name])()
+    assert scene.alternate is not None
+    alone = [solver.prepare(part.system) for part in (scene, scene.alternate)]
+    state, time = start(scene), 0.0  # added up here, multiplied there: some eps apart
+    for step in simulate(scene, prepare(scene, solver), STOP, first_guess="current", frames=FRAMES):
+        dt, begun = LENGTHS[state.index % 2], step.problem.start
+        assert (step.problem.system.time_step, begun.time) == (dt, pytest.approx(time, rel=1e-15))
+        np.testing.assert_array_equal(step.problem.target, state.now.positions + dt * state.now.velocity)
+        np.testing.assert_allclose(step.problem.pin_targets, scene.pins_at(time + dt), rtol=0, atol=1e-15)
+        solution = alone[state.index % 2].solve(step.problem, STOP)
+        np.testing.assert_array_equal(step.solution.positions, solution.positions)
+        state, time = step.state, time + dt
+    assert scene.time(FRAMES) == pytest.approx(time, rel=1e-15)
+
+
+def test_midpoint_falls_exactly_as_a_stone_does_whatever_the_steps():
+    given = {"mesh": Chain(), "effects": (Gravity(),), "time_step": 0.1, "alternate_time_step": 0.003}
+    scene = build(SceneSpec(mass=1.0, frames=9, path=Path("scene.yaml"), **given), 3, "midpoint")
+    *_, last = simulate(scene, prepare(scene, Newton()), STOP, first_guess="inertial", frames=9)
+    assert scene.time(9) == pytest.approx(0.512, rel=1e-15)
+    # Nine roundings of a fall of 1.3 m.
+    np.testing.assert_allclose(last.positions[:, 1], -0.5 * 9.81 * 0.512**2, rtol=1e-14)
+
+
+def test_an_integrator_of_two_steps_of_one_length_is_refused():
+    with pytest.raises(Unsupported, match="steps of one length"):
+        prepare(made("bdf2"), Newton())
+
+
+def test_each_step_is_judged_by_the_matrix_of_its_length():
+    scene = made("midpoint")
+    judge = Judge(scene, None, minimises=True)
+    for step in simulate(scene, prepare(scene, Newton()), StopRule(100), first_guess="current", frames=FRAMES):
+        found = judge(step)
+        assert found["stationarity"] <= SLACK * found["attainable"]
+
+
+def test_a_run_is_recorded_by_its_own_clock(tmp_path: Path):
+    (run,) = load_any(FILE, solvers=["sparse"], frames=4, rounds=1).runs()
+    files = Files.of(run, tmp_path)
+    files.rows.parent.mkdir()
+    rows = execute(run, files, lambda phase: None)
+    assert {row["status"] for row in rows} == {"ok"}
+    ends = np.array([0.0, LENGTHS[0], sum(LENGTHS), 2 * LENGTHS[0] + LENGTHS[1], 2 * sum(LENGTHS)])
+    np.testing.assert_allclose(read_replay(files.recording).times, ends, rtol=0, atol=1e-9)  # nanoseconds
+    with_time = [row for row in summary(files.recording).scalars.to_pylist() if row["time"] is not None]
+    assert {row["frame"] for row in with_time} == set(range(5))
+    for row in with_time:
+        assert row["time"] == pytest.approx(ends[row["frame"]], abs=1e-9)
+
+
+def test_a_sweeps_own_time_step_is_that_of_all_steps():
+    (run,) = load_any(FILE, solvers=["sparse"], time_step=0.1).runs()
+    scene = build(run.scene, run.size)
+    assert scene.alternate is None
+    assert scene.time(7) == 7 * 0.1
+
+
+def test_runs_of_other_steps_have_another_name():
+    spec = load_scene(FILE)
+    assert len({spec.digest, spec.stepped(1 / 300).digest, spec.stepped(1 / 300).stepped(1 / 3).digest}) == 3
+
+
+@pytest.mark.parametrize("command", ["ablate", "recommend", "accuracy"])
+def test_what_measures_at_one_time_step_refuses_two_by_the_key(command: str, tmp_path: Path):
+    config, options = FILE, ["--error", "0.1"] if command == "recommend" else []
+    if command == "accuracy":
+        config = tmp_path / "config.yaml"
+        config.write_text(f"scenes: [{FILE}]\nsolvers: [newton]\nwork: [{{horizon: 1, time_step: [0.1]}}]\n")
+    answer = CliRunner().invoke(app, [command, str(config), "--results", str(tmp_path / "results"), *options])
+    assert answer.exit_code == 2, (answer.output, answer.exception)
+    assert f"{FILE}:7: alternate_time_step: " in answer.output.replace("\n", "")
+
+
+def test_symplectic_euler_takes_the_substeps_that_each_length_asks_for():
+    scene = made()
+    assert scene.alternate is not None
+    counts = [SymplecticEuler().prepare(part.system).substeps for part in (scene, scene.alternate)]
+    assert counts[0] == pytest.approx(100 * counts[1], rel=0.5)
+    assert counts[1] >= 1
