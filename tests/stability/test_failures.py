@@ -1,0 +1,133 @@
+"""What goes wrong while a run runs is a row with a status, the frame and the reason, and the sweep goes on.
+
+The frames before it are recorded, and the recording is marked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from harness.cli import app
+from harness.record.reader import read_replay
+from solvers.linear.factors import DenseCholesky
+from solvers.local_global import SparseLocalGlobal
+from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System
+from solvers.registry import SOLVERS
+from solvers.symplectic_euler import PreparedSymplecticEuler, SymplecticEuler
+
+FRAMES, BROKEN = 20, 4
+"""Frames of the run, and the one in which what is made to break does."""
+
+SCENE = f"""
+mesh: {{kind: chain}}
+mass: 1
+time_step: 0.1
+frames: {FRAMES}
+default_size: 4
+effects: [{{kind: springs, stretch: 1.0e+12}}, {{kind: gravity}}, {{kind: pins, at: [first]}}]
+"""
+SWEEP = """
+scenes: [scene.yaml]
+solvers: [broken, sparse]
+options: {pictures: false, rounds: 1, iterations: 5}
+"""
+
+
+@dataclass(frozen=True)
+class _Breaking:
+    """Local-global, until a frame in which something else happens instead."""
+
+    sound: Prepared
+    happens: Callable[[], object]
+
+    @property
+    def choice(self) -> str:
+        return ""
+
+    @property
+    def facts(self) -> dict[str, float]:
+        return self.sound.facts
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        return self.sound.iterates(problem)
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        if round(problem.start.time / problem.system.time_step) == BROKEN - 1:
+            self.happens()
+        return self.sound.solve(problem, stop)
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        return {}
+
+
+@dataclass(frozen=True)
+class Indefinite:
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+
+    def prepare(self, system: System) -> Prepared:
+        return _Breaking(SparseLocalGlobal().prepare(system), lambda: DenseCholesky(-np.eye(3)))
+
+
+@dataclass(frozen=True)
+class OutOfMemory:
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+
+    def prepare(self, system: System) -> Prepared:
+        return _Breaking(SparseLocalGlobal().prepare(system), lambda: np.empty(2**55))
+
+
+@dataclass(frozen=True)
+class PastItsLimit:
+    """Symplectic Euler in one substep, where stability asks for a million: each step multiplies what it begins with."""
+
+    minimises: ClassVar[bool] = False
+    descends: ClassVar[bool] = False
+
+    def prepare(self, system: System) -> PreparedSymplecticEuler:
+        slow = SymplecticEuler().prepare(replace(system, time_step=1e-9))
+        return replace(slow, system=system, substeps=1)
+
+
+FAILURES = {
+    "a factorisation fails": (Indefinite, "failed", "positive definite"),
+    "memory runs out": (OutOfMemory, "failed", "Unable to allocate"),
+    "a solver diverges": (PastItsLimit, "diverged", "not finite from frame"),
+}
+
+
+@pytest.mark.parametrize("case", FAILURES)
+def test_what_fails_in_a_frame_is_told_and_recorded_up_to_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
+):
+    solver, status, reason = FAILURES[case]
+    monkeypatch.setitem(SOLVERS, "broken", f"{__name__}:{solver.__name__}")
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    (tmp_path / "sweep.yaml").write_text(SWEEP)
+    results = tmp_path / "results"
+    answer = CliRunner().invoke(app, ["run", str(tmp_path / "sweep.yaml"), "--results", str(results)])
+    assert answer.exit_code == 1, (answer.output, answer.exception)
+    assert reason in answer.output.replace("\n", " ")
+    rows = [row for path in (results / "sweep" / "rows").iterdir() for row in pq.read_table(path).to_pylist()]
+    (broken,) = [row for row in rows if row["solver"] == "broken"]
+    assert (broken["phase"], broken["status"]) == ("run", status)
+    assert reason in broken["reason"]
+    assert broken["frame"] == BROKEN or (status == "diverged" and BROKEN < broken["frame"] < FRAMES)
+    others = [row for row in rows if row["solver"] == "sparse"]
+    assert {row["status"] for row in others} == {"ok"}
+    assert {row["frame"] for row in others if row["phase"] == "step"} == set(range(1, FRAMES + 1))
+    (recording,) = (results / "sweep" / "recordings").glob("*-broken-*.rrd")
+    replay = read_replay(recording)
+    assert replay.frames.tolist() == list(range(broken["frame"]))
+    assert np.isfinite(replay.positions[:BROKEN]).all()
+    assert (replay.properties["status"], replay.properties["failed_frame"]) == (status, broken["frame"])
+    assert reason in str(replay.properties["reason"])
