@@ -227,7 +227,7 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], key: Key) -> str:
     if kind == "missing":
         return "is missing" if isinstance(detail["loc"][-1], str) else "has too few items"
     if kind == "extra_forbidden":
-        owner = _model_at(model, key[:-1])
+        owner = _model_at(model, detail["loc"][:-1])
         allowed = owner.model_fields if owner else ()
         return "unknown key; " + (f"expected {did_you_mean(key[-1], allowed)}" if allowed else "remove it")
     if kind == "value_error":
@@ -236,16 +236,20 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], key: Key) -> str:
     return f"came {quote(detail['input'])}{_CAME}{wanted}"
 
 
-def _model_at(model: type[BaseModel], key: Key) -> type[BaseModel] | None:
-    """The model of the mapping at `key` inside a `model`."""
-    for step in key:
-        if isinstance(step, str):
-            given = model.model_fields.get(step)
-            inner = next(_models(given.annotation), None) if given else None
-            if inner is None:
-                return None
-            model = inner
-    return model
+def _model_at(model: type[BaseModel], location: Key) -> type[BaseModel] | None:
+    """The model of the mapping at an error's location, which names the member of a union by its kind."""
+    members = [model]
+    for step in location:
+        if isinstance(step, int):
+            continue
+        if len(members) > 1:
+            members = [one for one in members if one.model_fields["kind"].default == step]
+        else:
+            given = members[0].model_fields.get(step)
+            members = list(_models(given.annotation)) if given else []
+        if not members:
+            return None
+    return members[0]
 
 
 def _models(annotation: Any) -> Iterator[type[BaseModel]]:

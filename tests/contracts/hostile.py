@@ -65,6 +65,11 @@ SCENES: dict[str, tuple[str | bytes, str, int | None]] = {
     "list as key": (scene() + "? [a, b]\n: 1\n", "plain words", None),
     "unknown key": (scene(masss="1"), "did you mean 'mass'", 7),
     "unknown key in an effect": (scene(effects="[{kind: springs, stretch: 1, bnd: 1}]"), "'bend'", 6),
+    "unknown key in an obstacle": (
+        scene(effects="[{kind: contact, obstacles: [{kind: sphere, radius: 1, centre: [0, 1, 0]}]}]"),
+        "expected one of center, kind, motion, radius; did you mean 'center'",
+        6,
+    ),
     "unknown key in the camera": (scene(camera="{azimut: 3}"), "camera.azimut", 7),
     "unknown mesh": (scene(mesh="{kind: gird}"), "did you mean 'grid'", 1),
     "unknown effect": (scene(effects="[{kind: springs, stretch: 1}, {kind: pin}]"), "effects[1].kind", 6),

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pytest
+from pydantic import Field
 
 from harness.config import Document, Key, key_text, quote, read_yaml
 from harness.errors import InputError
@@ -81,8 +82,19 @@ class Inner(Model):
     width: float = 1.0
 
 
+class Ball(Model):
+    kind: Literal["ball"] = "ball"
+    radius: float = 1.0
+
+
+class Brick(Model):
+    kind: Literal["brick"] = "brick"
+    sides: Vector = (1.0, 1.0, 1.0)
+
+
 class Outer(Model):
     count: int
+    toy: tuple[Annotated[Ball | Brick, Field(discriminator="kind")], ...] = ()
     place: Vector = (0.0, 0.0, 0.0)
     weight: float | Literal["exact"] = 1.0
     inner: Inner | None = None
@@ -101,11 +113,18 @@ CHECKS: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "unknown key": (
         {"count": 1, "wight": 2},
-        ["c.yaml:4: part.wight: unknown key; expected one of count, inner, place, weight; did you mean 'weight'?"],
+        ["c.yaml:4: part.wight: unknown key; expected one of count, inner, place, toy, weight; did you mean 'weight'?"],
     ),
     "unknown key further in": (
         {"count": 1, "inner": {"x": 2}},
         ["c.yaml:4: part.inner.x: unknown key; expected one of width"],
+    ),
+    "unknown key of one kind of several": (
+        {"count": 1, "toy": [{"kind": "ball", "radus": 1}, {"kind": "brick", "side": 1}]},
+        [
+            "c.yaml:4: part.toy[0].radus: unknown key; expected one of kind, radius; did you mean 'radius'?",
+            "c.yaml:4: part.toy[1].side: unknown key; expected one of kind, sides; did you mean 'sides'?",
+        ],
     ),
     "two mistakes": (
         {"count": 0.5, "inner": 3},
