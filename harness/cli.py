@@ -183,13 +183,14 @@ def report(
 ) -> None:
     """Draw the map of robustness: solvers x cases, coloured by what became of each run."""
     from harness.report.robustness import read_cells, summary
-    from harness.report.robustness_map import draw_map, write_page
+    from harness.report.robustness_map import draw_map, headline, write_page
 
     cells = read_cells(folder)
+    title = headline(cells, folder.resolve().name)
     picture, page = folder / "pictures" / "robustness.png", folder / "robustness.html"
     picture.parent.mkdir(exist_ok=True)
-    draw_map(cells, picture, f"Robustness: {folder.resolve().name}")
-    write_page(cells, page, f"Robustness: {folder.resolve().name}")
+    draw_map(cells, picture, title)
+    write_page(cells, page, title)
     out.print(summary(cells))
     _say(f"the map is {picture}, with reasons and recordings {page}")
 
@@ -225,7 +226,7 @@ def list_runs(config: Config, results: Results = Path("results")) -> None:
 
 @app.command()
 def query(
-    sql: Annotated[str, typer.Argument(help="A query over the tables `rows` and `accuracy`.")],
+    sql: Annotated[str, typer.Argument(help="A query over the tables `rows`, `accuracy`, `ablation`.")],
     results: Results = Path("results"),
     csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
 ) -> None:

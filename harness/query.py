@@ -1,4 +1,4 @@
-"""SQL over the rows of all sweeps and accuracy configs (DuckDB on the Parquet files)."""
+"""SQL over the rows of all sweeps, accuracy configs and ablations (DuckDB on the Parquet files)."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from rich.table import Table
 
 from harness import rows
 from harness.errors import InputError
+
+_TABLES: dict[str, pa.Schema] = {"rows": rows.SCHEMA, "accuracy": pa.schema([]), "ablation": pa.schema([])}
+"""The tables by the names of their folders, with the columns that they have even where no row has them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,17 +40,17 @@ class Answer:
 
 
 def answer(sql: str, results: Path) -> Answer:
-    """What a query says of the tables `rows` and `accuracy`; it can read nothing else and write nothing.
+    """What a query says of the tables `rows`, `accuracy` and `ablation`; it can read nothing else and write nothing.
 
     Raises InputError where there are no rows, or with DuckDB's message where the query is wrong.
     """
-    files = {table: sorted(results.glob(f"*/{table}/*.parquet")) for table in ("rows", "accuracy")}
+    files = {table: sorted(results.glob(f"*/{table}/*.parquet")) for table in _TABLES}
     if not any(files.values()):
         raise InputError(f"{results}: holds no rows; run a sweep first, or name its folder with --results")
     with duckdb.connect() as connection:
-        connection.register("rows", rows.read(files["rows"]))
-        if files["accuracy"]:
-            connection.register("accuracy", rows.read(files["accuracy"], pa.schema([])))
+        for table, schema in _TABLES.items():
+            if files[table] or len(schema):
+                connection.register(table, rows.read(files[table], schema))
         connection.execute("SET enable_external_access = false; SET lock_configuration = true")
         try:
             found = connection.execute(sql)

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from harness import rows
+from harness.ablate.rows import SCHEMA
 from harness.errors import InputError
 from harness.query import answer
 
@@ -23,6 +24,15 @@ def test_a_query_sees_the_rows_of_all_sweeps(results: Path):
     assert found.columns == ["sweep", "seconds"]
     assert found.values == [("second", 0.25), ("first", 0.5)]
     assert found.table().row_count == 2
+
+
+def test_a_query_sees_the_rows_of_all_ablations(results: Path):
+    for scene, cost in (("cloth", 0.5), ("chain", 0.25)):
+        (results / scene / "ablation").mkdir(parents=True)
+        row = {"kind": "without", "name": "bending", "scene": scene, "cost": cost}
+        rows.write(results / scene / "ablation" / "a.parquet", [row], SCHEMA)
+    found = answer("SELECT scene, cost FROM ablation ORDER BY cost", results)
+    assert found.values == [("chain", 0.25), ("cloth", 0.5)]
 
 
 @pytest.mark.parametrize(
