@@ -11,6 +11,7 @@ from harness.effects.air_drag import AirDrag
 from harness.effects.attachments import Attachments
 from harness.effects.base import Effect
 from harness.effects.bending import Bending
+from harness.effects.contact import Contact
 from harness.effects.dashpots import Dashpots
 from harness.effects.gas import Gas
 from harness.effects.gravity import Gravity
@@ -37,6 +38,8 @@ RAYLEIGH = Rayleigh(mass=0.5, stiffness=0.02)
 DRAG = AirDrag(coefficient=2.0)
 ATTACHED = Attachments(at=("bottom",), stiffness=50.0, motion=MOVES)
 GAS = Gas(pressure=200.0)
+FLOOR = Contact.model_validate({"obstacles": [{"kind": "plane", "point": (0, -0.02, 0)}], "friction": 0.3})
+"""So little below the level cloth that in `stepped` some of its vertices arrive."""
 
 
 def cloth(*effects: Effect) -> Scene:
@@ -56,6 +59,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "air drag": lambda: cloth(DRAG),
     "attachments": lambda: cloth(ATTACHED),
     "all that are projective": lambda: cloth(BEND, LIMITS, DASHPOTS, RAYLEIGH, DRAG, ATTACHED),
+    "contact": lambda: cloth(FLOOR),
     "gas": lambda: balloon(GAS),
     "gas and all others": lambda: balloon(GAS, BEND, LIMITS, DASHPOTS, RAYLEIGH, DRAG),
 }

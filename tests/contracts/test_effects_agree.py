@@ -18,12 +18,15 @@ SOLVED: dict[str, Solver] = {
 }
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 TAKE_ALL = {"newton", "newton-cg", "hybrid", "lbfgs"}
-PROJECTIVE = {"sparse", "anderson", "chebyshev"}
+PROJECTIVE = {"sparse", "numba", "anderson", "chebyshev"}
+CONTACT = {*PROJECTIVE, "lbfgs", "hybrid", "newton"}
 """Who takes what; those not named take springs only."""
 STOP = StopRule(5000, 1e-11)
 
 
 def takes(solver: str, scene: str) -> bool:
+    if "contact" in scene:
+        return solver in CONTACT
     return solver in TAKE_ALL or (solver in PROJECTIVE and "gas" not in scene)
 
 
