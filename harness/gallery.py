@@ -33,6 +33,7 @@ def _tile(path: Path) -> Any:
     from harness.machine import pinned_threads
     from harness.measure import Settings, steps
     from harness.record.base import Replay
+    from harness.record.obstacles import declared
     from harness.report.contact_sheet import Tile
     from harness.scene import build
     from harness.simulate import prepare
@@ -59,16 +60,14 @@ def _tile(path: Path) -> Any:
         pinned=scene.system.pins.vertices,
         strain_range=run.strain_range,
         scalars={},
-        properties={},
+        properties=declared(run.scene.obstacles),
     )
     kinds = dict.fromkeys(effect.kind for effect in run.scene.effects if effect.kind not in ("springs", "gravity"))
-    obstacles: list[Any] = [one for effect in run.scene.effects for one in getattr(effect, "obstacles", ())]
     camera = run.scene.camera
     return Tile(
         replay=replay,
         mass=scene.system.mass,
         name=run.scene_name.replace("-", " "),
         effects=", ".join(kinds).replace("-", " "),
-        obstacles=obstacles,
         angles=(camera.azimuth, camera.elevation) if camera else None,
     )

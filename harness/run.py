@@ -242,6 +242,7 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
             time_step=run.scene.time_step,
             strain_range=run.strain_range,
             properties=properties,
+            obstacles=run.scene.obstacles,
         ),
     )
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from harness.mesh.base import Mesh
 from solvers.problem import Positions
+
+if TYPE_CHECKING:
+    from harness.obstacles import AnyObstacle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +40,8 @@ class RecordingInfo:
     the scene, which may be fewer than the mesh's; pinned: vertices (q,); time_step [s];
     strain_range: the strain at the ends of the colour scale (0.1 is 10 %);
     properties: everything else about the run and its machine, flat (scene, size, solver, iterations, cpu, ...);
-    iterates: whether the frames are iterates of one solve, by their numbers, instead of steps of a run.
+    iterates: whether the frames are iterates of one solve, by their numbers, instead of steps of a run;
+    obstacles: what is seen beside the mesh.
     """
 
     title: str
@@ -50,6 +54,7 @@ class RecordingInfo:
     strain_range: float
     properties: Mapping[str, str | int | float | bool]
     iterates: bool = False
+    obstacles: Sequence[AnyObstacle] = ()
 
 
 class Recorder(Protocol):

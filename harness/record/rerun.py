@@ -1,13 +1,14 @@
 """A run as a Rerun recording: one file that opens with its own layout.
 
-Topology is written once, positions each frame, scalars in bulk. The stream has no batching thread of its own:
-frames reach the disk every FLUSH frames, so a killed run leaves all but the last few. The file has a partial
-name until it is complete and has been read back.
+Topology is written once, positions every FLUSH frames in one piece, scalars in bulk. The stream has no batching thread
+of its own, so a killed run leaves all but the last few frames. The file has a partial name until it is complete and its
+end has been found.
 
-Entities: `/scene/mesh` (positions, exact to float32), `/scene/pins`, `/scene/springs`; `/energy/*`, `/residual`,
-`/iterations`, `/strain/largest`, `/milliseconds/*` by `frame` and `time`; `/convergence/*/frame_*` also by
-`iteration`; `/network` (springs, rest lengths, pins), `/run` (Markdown) and the recording's properties. Where frames
-are the iterates of a solve, everything is by `iteration`, and `/solve/*` tells how it converges.
+Entities: `/scene/mesh` (positions, exact to float32), `/scene/pins`, `/scene/springs`, `/scene/obstacles/*`;
+`/energy/*`, `/residual`, `/iterations`, `/strain/largest`, `/milliseconds/*` by `frame` and `time`;
+`/convergence/*/frame_*` also by `iteration`; `/network` (springs, rest lengths, pins), `/run` (Markdown) and the
+recording's properties. Where frames are the iterates of a solve, everything is by `iteration`, and `/solve/*` tells
+how it converges.
 """
 
 from __future__ import annotations
@@ -24,11 +25,12 @@ from numpy.typing import NDArray
 
 from harness.record import blueprint
 from harness.record.base import Frame, RecordingInfo
+from harness.record.obstacles import Obstacles, declared
 from harness.record.partial import PartialFile
 from harness.record.shading import Shading
 
 FLUSH = 5
-"""Frames between flushes: what a kill may cost, against a fixed cost of about 0.3 ms and 1.5 kB a flush."""
+"""Frames between flushes: what a kill may cost, against a fixed cost of about 0.4 ms and 1.5 kB a flush."""
 
 SCALARS = 25
 """Frames between batches of scalars, which cost about 1.2 kB each per entity."""
@@ -39,7 +41,8 @@ _STRIPS = rr.components.LineStrip3DBatch([]).as_arrow_array().type
 class RerunRecorder:
     """Records one run to `path`; implements `harness.record.base.Recorder`.
 
-    Raises RunFailed when the file cannot be written or, at the end, not be read back.
+    All but opening the file waits for the first frame, so that it is done by the thread that the frames come from.
+    Raises RunFailed when the file cannot be written or, at the end, is not whole.
     """
 
     def __init__(self, path: Path, info: RecordingInfo) -> None:
@@ -50,18 +53,18 @@ class RerunRecorder:
         self._styled: dict[str, list[str]] = {}
         self._frames = 0
         self._clock: dict[int, float] = {}  # of each frame [s]
+        self._held: list[tuple[int, NDArray[np.float32], NDArray[np.uint32]]] = []
         self._pins: NDArray[np.float32] | None = None
         self._unseen = 1e-6 * info.mesh.size
         self._springs_shown = False
         application = blueprint.application(info)
         self._file = PartialFile(path, application, info.run_id, info.title)
         self._stream = self._file.stream
-        self._stream.send_blueprint(blueprint.blueprint(info, self._box))  # for what a kill leaves
-        self._log_once()
-        self._file.flush()
 
     def frame(self, frame: Frame) -> None:
         """Record one frame; its arrays are only read."""
+        if not self._frames:
+            self._begin()
         with np.errstate(over="ignore"):
             p = frame.positions.astype(np.float32)
         strain, of_vertex = self._shading.strains(frame.positions)
@@ -70,7 +73,8 @@ class RerunRecorder:
         self._clock[frame.index] = frame.time
         # Of a run at 0, else that timeline would show no scene at all.
         self._stream.set_time("iteration", sequence=frame.index if self._info.iterates else 0)
-        self._log_mesh(p, self._shading.colours(of_vertex))
+        self._held.append((frame.index, p, self._shading.colours(of_vertex)))
+        self._obstacles.at(frame.time)
         self._log_pins(p)
         self._log_springs(p, strain)
         self._add(frame.index, {f"/energy/{name}": value for name, value in frame.energies.items()})
@@ -82,6 +86,7 @@ class RerunRecorder:
             self._send_scalars()
         if self._frames % FLUSH == 0 or self._frames == 1:
             self._box.add(p)
+            self._send_mesh()
             self._file.flush()
 
     def convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
@@ -110,6 +115,9 @@ class RerunRecorder:
 
     def close(self, milliseconds: Mapping[str, Sequence[float]]) -> Path:
         """Write the milliseconds of each phase by frame, from frame 1; finish the file and return its path."""
+        if not self._frames:
+            self._begin()
+        self._send_mesh()
         for phase, values in milliseconds.items():
             self._scalars[f"/milliseconds/{phase}"] = list(enumerate(values, start=1))
         self._send_scalars()
@@ -119,9 +127,15 @@ class RerunRecorder:
         """Stop, and remove the partial file; nothing happens after `close`."""
         self._file.abandon()
 
+    def _begin(self) -> None:
+        self._stream.send_blueprint(blueprint.blueprint(self._info, self._box))  # for what a kill leaves
+        self._log_once()
+        self._obstacles = Obstacles(self._stream, self._info.obstacles, self._info.mesh.rest)
+
     def _log_once(self) -> None:
         info, mesh = self._info, self._info.mesh
-        facts: dict[str, Any] = {key: [value] for key, value in info.properties.items()}
+        known = {**info.properties, **declared(info.obstacles)}
+        facts: dict[str, Any] = {key: [value] for key, value in known.items()}
         self._stream.send_property("run", rr.AnyValues(**facts))
         network: dict[str, Any] = {
             "time_step": info.time_step,
@@ -138,14 +152,24 @@ class RerunRecorder:
         if len(mesh.triangles):
             triangles = mesh.triangles.astype(np.uint32)
             self._stream.log("/scene/mesh", rr.Mesh3D.from_fields(triangle_indices=triangles), static=True)
-
-    def _log_mesh(self, p: NDArray[np.float32], colours: NDArray[np.uint32]) -> None:
-        if len(self._info.mesh.triangles):
-            normals = self._shading.normals(p)
-            fields = rr.Mesh3D.from_fields(vertex_positions=p, vertex_normals=normals, vertex_colors=colours)
         else:
-            fields = rr.Points3D.from_fields(positions=p, colors=colours, radii=rr.Radius.ui_points(3))
-        self._stream.log("/scene/mesh", fields)
+            self._stream.log("/scene/mesh", rr.Points3D.from_fields(radii=rr.Radius.ui_points(3)), static=True)
+
+    def _send_mesh(self) -> None:
+        if not self._held:
+            return
+        frames, positions, coloured = zip(*self._held, strict=True)
+        p, colours = np.concatenate(positions), np.concatenate(coloured)
+        if len(self._info.mesh.triangles):
+            normals = np.concatenate([self._shading.normals(of_frame) for of_frame in positions])
+            columns = rr.Mesh3D.columns(vertex_positions=p, vertex_normals=normals, vertex_colors=colours)
+        else:
+            columns = rr.Points3D.columns(positions=p, colors=colours)
+        index = list(self._times(np.array(frames)))
+        if not self._info.iterates:
+            index.append(rr.TimeColumn("iteration", sequence=np.zeros(len(frames), np.int64)))
+        self._stream.send_columns("/scene/mesh", index, columns.partition([len(positions[0])] * len(frames)))
+        self._held.clear()
 
     def _log_pins(self, p: NDArray[np.float32]) -> None:
         pins = p[self._info.pinned]

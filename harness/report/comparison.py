@@ -36,6 +36,7 @@ from harness.report.render import (
     spacing,
     spring_strain,
 )
+from harness.report.solids import seen
 from harness.report.style import HEIGHT, MUTED, RC, RULE, WIDTH, Mark, marks
 
 _LEFT, _TOP, _RIGHT, _BOTTOM = 40, 118, WIDTH - 40, HEIGHT - 28
@@ -125,7 +126,8 @@ def _panel(
     points = np.concatenate([r.positions[-1] for r in finite] or [np.zeros((1, 3))])
     areas = np.concatenate([area_vectors(r, -1) for r in finite] or [np.zeros((0, 3))])
     angles = natural_angles(points, areas)
-    view = frame_all(points, aspect=grid.width / grid.height, angles=angles)
+    framed = np.concatenate([seen(r, [-1]) for r in finite] or [points])
+    view = frame_all(framed, aspect=grid.width / grid.height, angles=angles)
     solvers = [_solver(*entry) for entry in panel]
     for k, (label, replay) in enumerate(panel):
         # Runs of one solver that differ in their settings go by their labels.

@@ -13,11 +13,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from harness.obstacles import AnyObstacle
 from harness.record.base import Replay
 from harness.report.page import save
 from harness.report.render import Studio, area_vectors, frame_all, natural_angles
-from harness.report.solids import solid
+from harness.report.solids import seen
 from harness.report.style import DPI, INK, MUTED, PAGE, RC, WIDTH
 
 COLUMNS = 4
@@ -33,15 +32,14 @@ _MARGIN, _GAP, _TILE, _CAPTION = 28, 20, 290, 62
 class Tile:
     """A scene at one moment.
 
-    replay: of the frame to be drawn alone; mass: of its vertices (n,) [kg]; name and effects: in words; obstacles: what
-    it touches; angles: azimuth and elevation [degrees], chosen by the mesh's shape where None.
+    replay: of the frame to be drawn alone; mass: of its vertices (n,) [kg]; name and effects: in words; angles: azimuth
+    and elevation [degrees], chosen by the mesh's shape where None.
     """
 
     replay: Replay
     mass: NDArray[np.float64]
     name: str
     effects: str
-    obstacles: Sequence[AnyObstacle]
     angles: tuple[float, float] | None
 
 
@@ -63,11 +61,8 @@ def draw_sheet(tiles: Sequence[Tile], path: Path) -> None:
 
 
 def _drawn(studio: Studio, tile: Tile, aspect: float) -> np.ndarray:
-    replay, time = tile.replay, float(tile.replay.times[-1])
-    points = replay.positions[-1]
-    solids = [made for one in tile.obstacles if (made := solid(one, time, points)) is not None]
-    framed = np.concatenate([points, *(made.points for made in solids)])
+    replay, points = tile.replay, tile.replay.positions[-1]
     radius = _BOB * float(np.linalg.norm(np.ptp(points, axis=0)))
-    solids += [pv.Sphere(radius=radius, center=p) for p in points[tile.mass > _HEAVY * np.median(tile.mass)]]
+    bobs = [pv.Sphere(radius=radius, center=p) for p in points[tile.mass > _HEAVY * np.median(tile.mass)]]
     angles = tile.angles or natural_angles(points, area_vectors(replay, -1))
-    return studio.draw(replay, -1, frame_all(framed, aspect=aspect, angles=angles), solids)
+    return studio.draw(replay, -1, frame_all(seen(replay, [-1]), aspect=aspect, angles=angles), bobs)

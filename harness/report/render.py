@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw, ImageFilter
 
 from harness.record.base import Replay
 from harness.report import opengl
+from harness.report.solids import solids
 from harness.report.style import INK, PAGE, STRAIN_MAP
 
 Points = NDArray[np.floating]
@@ -183,8 +184,8 @@ class Studio:
     ) -> None:
         self._plotter.close()
 
-    def draw(self, replay: Replay, frame: int, view: View, solids: Sequence[pv.PolyData] = ()) -> NDArray[np.uint8]:
-        """A recorded frame as pixels (height, width, 3), with solids beside it; its positions must be finite."""
+    def draw(self, replay: Replay, frame: int, view: View, more: Sequence[pv.PolyData] = ()) -> NDArray[np.uint8]:
+        """A recorded frame as pixels (height, width, 3), with more solids than its obstacles; it must be finite."""
         plotter = self._plotter
         plotter.clear_actors()
         plotter.camera.position = tuple(view.position)
@@ -198,7 +199,7 @@ class Studio:
         else:
             self._springs(replay, frame, p)
         self._pins(replay, p)
-        for solid in solids:
+        for solid in (*solids(replay, frame), *more):
             plotter.add_mesh(solid, color=_SOLID, smooth_shading=solid.n_cells > 6, **_MATERIAL)
         plotter.reset_camera_clipping_range()
         plotter.render()

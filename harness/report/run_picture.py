@@ -25,6 +25,7 @@ from harness.report.page import (
     text,
 )
 from harness.report.render import Studio, area_vectors, drawable_frames, frame_all, natural_angles
+from harness.report.solids import seen
 from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, RULE, WIDTH
 
 _MAIN = (36, 114, 1244, 750)  # left, top, width, height of the final frame [pixels from the top left]
@@ -64,17 +65,17 @@ def _facts(replay: Replay) -> list[str]:
 
 def _frames(page: Figure, replay: Replay, shown: NDArray[np.int64], camera: tuple[float, float] | None) -> None:
     left, top, width, height = _MAIN
-    points = replay.positions[shown].reshape(-1, 3)
     *earlier, final = (int(k) for k in shown)
+    points = replay.positions[shown].reshape(-1, 3)
     angles = natural_angles(points, area_vectors(replay, final)) if camera is None else camera
-    close = frame_all(replay.positions[final], aspect=width / height, angles=angles)
+    close = frame_all(seen(replay, [final]), aspect=width / height, angles=angles)
     with Studio(width, height) as studio:
         paste(page, studio.draw(replay, final, close), left, top)
     text(page, left + 4, top + height - 4, clock(replay, final), size=11.5)
     if not earlier:
         return
     tile = (height - (_EARLIER - 1) * _GAP) // _EARLIER
-    whole = frame_all(points, aspect=_STRIP_WIDTH / tile, angles=angles)
+    whole = frame_all(seen(replay, (*earlier, final)), aspect=_STRIP_WIDTH / tile, angles=angles)
     x, ends = (_STRIP_LEFT - 20) / WIDTH, (top + 4, top + height - 4)
     page.add_artist(Line2D([x, x], [1 - y / HEIGHT for y in ends], color=RULE, linewidth=0.8))
     with Studio(_STRIP_WIDTH, tile) as studio:

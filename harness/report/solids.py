@@ -2,17 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, cast
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 
-from harness.obstacles import AnyObstacle, Box, Capsule, Plane, Sphere
+from harness.record.base import Replay
+from harness.record.obstacles import KEY
+
+if TYPE_CHECKING:  # a recording without obstacles imports none of them
+    from harness.obstacles import AnyObstacle, Box, Capsule, Plane, Sphere
 
 _LEVEL = 0.999
 """Planes whose normal is as upright as this are the ground, which pictures show by the shadow on it."""
+
+
+def solids(replay: Replay, frame: int) -> list[pv.PolyData]:
+    """The obstacles of a recording, where they are in a recorded frame."""
+    if KEY not in replay.properties:
+        return []
+    from harness.obstacles import from_json
+
+    time, seen = float(replay.times[frame]), replay.positions[frame]
+    made = (solid(one, time, seen) for one in from_json(str(replay.properties[KEY])))
+    return [one for one in made if one is not None]
+
+
+def seen(replay: Replay, frames: Iterable[int]) -> NDArray[np.float32]:
+    """All points (q, 3) [m] of the mesh and of the obstacles in recorded frames: what a camera should see."""
+    return np.concatenate([p for k in frames for p in (replay.positions[k], *(s.points for s in solids(replay, k)))])
 
 
 def solid(obstacle: AnyObstacle, time: float, seen: NDArray[np.floating]) -> pv.PolyData | None:

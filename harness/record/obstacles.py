@@ -1,0 +1,96 @@
+"""Obstacles in a recording: each shape once, and where its motion takes it in each frame.
+
+Entities: `/scene/obstacles/<number>-<kind>`. A plane has no end; the part of it around the mesh is drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:  # a scene without obstacles imports none of them
+    from harness.motion import Motion
+    from harness.obstacles import AnyObstacle, Box, Capsule, Plane, Sphere
+
+Array = NDArray[np.float64]
+
+KEY = "obstacles"
+"""The property of a recording that declares its obstacles, as scenes do, in JSON."""
+
+_COLOUR = (0x9C, 0x97, 0x8D)
+_AROUND = 2.0
+"""Half the side of what is drawn of a plane, in the mesh's size and distance."""
+
+
+def declared(obstacles: Sequence[AnyObstacle]) -> dict[str, str]:
+    """The property of a recording with these obstacles; none where there are none."""
+    return {KEY: f"[{', '.join(one.model_dump_json(exclude_none=True) for one in obstacles)}]"} if obstacles else {}
+
+
+class Obstacles:
+    """Obstacles beside a mesh at rest (n, 3) [m], in an open recording."""
+
+    def __init__(self, stream: rr.RecordingStream, obstacles: Sequence[AnyObstacle], rest: Array) -> None:
+        self._stream = stream
+        self._moving: list[tuple[str, Motion]] = []
+        for k, one in enumerate(obstacles):
+            entity = f"/scene/obstacles/{k}-{one.kind}"
+            stream.log(entity, _SHAPES[one.kind](one, rest), static=True)
+            if one.motion:
+                self._moving.append((entity, one.motion))
+
+    def at(self, time: float) -> None:
+        """Record where those that move are at a time [s], on the timelines as they are set."""
+        for entity, motion in self._moving:
+            origin, *ends = motion.moved(np.concatenate([np.zeros((1, 3)), np.eye(3)]), time)
+            self._stream.log(entity, rr.Transform3D(translation=origin, mat3x3=(np.array(ends) - origin).T))
+
+
+def _sphere(one: Sphere, rest: Array) -> rr.Ellipsoids3D:
+    return rr.Ellipsoids3D(centers=[one.center], radii=[one.radius], colors=[_COLOUR], fill_mode="solid")
+
+
+def _capsule(one: Capsule, rest: Array) -> rr.Capsules3D:
+    """Rerun's go along z from the origin; this one is turned there by the half way between z and its own direction."""
+    first, last = np.array(one.ends)
+    length = float(np.linalg.norm(last - first))
+    half = (last - first) / length + [0.0, 0.0, 1.0]
+    axis = half if np.linalg.norm(half) > 1e-9 else np.array([1.0, 0.0, 0.0])
+    return rr.Capsules3D(
+        lengths=[length],
+        radii=[one.radius],
+        translations=[first],
+        rotation_axis_angles=[rr.RotationAxisAngle(axis=axis, angle=rr.Angle(deg=180.0))],
+        colors=[_COLOUR],
+        fill_mode="solid",
+    )
+
+
+def _box(one: Box, rest: Array) -> rr.Boxes3D:
+    sizes = np.subtract(one.high, one.low)
+    return rr.Boxes3D(mins=[one.low], sizes=[sizes], colors=[_COLOUR], fill_mode="solid")
+
+
+def _plane(one: Plane, rest: Array) -> rr.Mesh3D:
+    """Two triangles about the foot of the mesh's middle."""
+    origin, x, normal, z = one.model_copy(update={"motion": None}).obstacle().frame(0.0)
+    middle = rest.mean(axis=0)
+    height = float((middle - origin) @ normal)
+    half = _AROUND * (float(np.linalg.norm(np.ptp(rest, axis=0))) + abs(height))
+    corners = middle - height * normal + half * np.array([-x - z, z - x, x + z, x - z])
+    faces = [[0, 1, 2], [0, 2, 3]]
+    return rr.Mesh3D(
+        vertex_positions=corners, triangle_indices=faces, vertex_normals=[normal] * 4, vertex_colors=[_COLOUR] * 4
+    )
+
+
+_SHAPES: dict[str, Callable[[Any, Array], rr.AsComponents]] = {
+    "sphere": _sphere,
+    "capsule": _capsule,
+    "box": _box,
+    "plane": _plane,
+}
