@@ -1,8 +1,8 @@
 """Accelerated first-order methods over one prefactored matrix: `anderson`, `chebyshev` and `lbfgs`.
 
-They share the iteration (`solvers.kernels.accelerate`) and differ in a direction's coefficients. Where springs are
-the only energies and the factor is one whose panels the kernels know, a step is compiled as a whole; else the
-same kernels take turns with the energies' own values and gradients, and with the factor's own solve.
+They share the iteration (`solvers.kernels.accelerate`) and differ in a direction's coefficients. Where the energies
+are springs and quadratic forms, and the factor is one whose panels the kernels know, a step is compiled as a whole;
+else the same kernels take turns with the energies' own values and gradients, and with the factor's own solve.
 
 No iteration raises the objective, round-off apart: a trial that would is shortened or replaced by the plain
 correction, a local-global iteration, which descends by majorisation. Where that does not either, for all that round-off
@@ -19,16 +19,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiled import FAR, ORDERS, PreparedCompiled
-from solvers.energies.springs import Springs
+from solvers.compiled import FAR, PreparedCompiled, compiled
 from solvers.kernels import accelerate, accelerate_step
 from solvers.kernels.accelerate import Window
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.springs import aligned
 from solvers.linear.choice import Linear, Precision, factorise
-from solvers.local_global import PreparedLocalGlobal, only_springs, prepared
+from solvers.local_global import PreparedLocalGlobal, prepared, projective
 from solvers.objective import Objective, StepObjective
-from solvers.problem import Positions, ProjectiveEnergy, Solution, StepProblem, StopRule, System, Unsupported
+from solvers.parts import Parts
+from solvers.problem import Positions, ProjectiveEnergy, Solution, StepProblem, StopRule, System
 from solvers.touching import without_contact
 
 
@@ -57,27 +57,20 @@ class Run(Protocol):
 
 def prepare(system: System, method: Method, linear: Linear, precision: Precision) -> PreparedAccelerated:
     """Factorise Q and compile. Raises Unsupported for energies that the method does not take, NotPositiveDefinite."""
-    projective = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
-    others = {type(e).__name__ for e in system.energies if not isinstance(e, ProjectiveEnergy)}
-    if method.projective and others:
-        raise Unsupported(f"{method.name}: needs projective energies; not so: {', '.join(sorted(others))}")
     bare = without_contact(system)
-    base = prepared(bare, projective, lambda Q: factorise(Q, linear, precision))
-    engine = _engine(bare, method, base)
+    energies = (
+        projective(bare, method.name)
+        if method.projective
+        else [energy for energy in bare.energies if isinstance(energy, ProjectiveEnergy)]
+    )
+    base = prepared(bare, energies, lambda Q: factorise(Q, linear, precision))
+    found = compiled(base)
+    engine: Engine = _Interpreted(method, base) if found is None else _Compiled(method, found)
     if bare is not system:
         from solvers.accelerated_contact import Touching  # for those who need it
 
         engine = Touching(method, base, engine)
     return PreparedAccelerated(base, engine)
-
-
-def _engine(system: System, method: Method, base: PreparedLocalGlobal) -> Engine:
-    if all(isinstance(energy, Springs) for energy in system.energies):
-        for kind, order in ORDERS.items():
-            if isinstance(base.factor, kind):
-                springs = only_springs(system, method.name)
-                return _Compiled(method, PreparedCompiled.of(base, springs, order(base.factor)))
-    return _Interpreted(method, base)
 
 
 class Engine(Protocol):
@@ -145,11 +138,11 @@ def window_for(method: Method, entries: int, whole: int) -> Window:
 
 
 class _Compiled:
-    """Springs alone, over a factor that is cut into blocks."""
+    """Springs and quadratic forms, over a factor that is cut into blocks."""
 
     def __init__(self, method: Method, compiled: PreparedCompiled) -> None:
         self._method = method
-        plan, bundles, rows = compiled.plan, compiled.bundles, compiled.rows
+        self._parts, plan, bundles, rows = compiled.parts, compiled.plan, compiled.form, compiled.rows
         pins = compiled.base.system.pins
         # Corrections are solved for, so that nothing of the exact pins goes to the right-hand side.
         self._rows = rows._replace(coupling=np.empty(0), coupled=np.empty(0, np.int64), pin=np.empty(0, np.int64))
@@ -166,20 +159,23 @@ class _Compiled:
         window = window_for(self._method, self._entries, whole)
         window.trial[4 * self._far] = FAR
         x = aligned(whole, self._plan.squares.dtype)
-        vectors = aligned(whole), x, aligned(whole), np.zeros(2)
+        vectors = aligned(whole), x, aligned(whole), np.zeros(3)
         return accelerate_step.Step(self._plan, self._bundles, self._shares, self._rows, *vectors), window
 
     def begin(self, problem: StepProblem, guess: Positions, *, kept: bool) -> Run:
         """See Engine."""
-        return _CompiledRun(*(self._kept if kept else self._new()), problem, guess)
+        return _CompiledRun(*(self._kept if kept else self._new()), self._parts, problem, guess)
 
 
 class _CompiledRun:
     """See Run."""
 
-    def __init__(self, step: accelerate_step.Step, window: Window, problem: StepProblem, guess: Positions) -> None:
+    def __init__(
+        self, step: accelerate_step.Step, window: Window, parts: Parts, problem: StepProblem, guess: Positions
+    ) -> None:
         self._state = step, window
-        given = (problem.target, problem.force, problem.pin_targets, guess)
+        given = (problem.target, parts.force(problem), problem.pin_targets, guess)
+        step.objective[2] = parts.negative(guess) if parts.forms else 0.0
         self.positions = np.empty_like(guess)
         # The kernels are compiled for arrays that may be written to.
         self.largest = accelerate_step.start(*self._state, *(np.array(x, order="C") for x in given))

@@ -31,5 +31,5 @@ class Anderson:
     precision: Precision = "float64"
 
     def prepare(self, system: System) -> PreparedAccelerated:
-        """Raises Unsupported for energies that are not projective, NotPositiveDefinite."""
+        """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
         return prepare(system, Method("anderson", ANDERSON, self.pairs, 0, True), self.linear, self.precision)

@@ -35,5 +35,5 @@ class Chebyshev:
     precision: Precision = "float64"
 
     def prepare(self, system: System) -> PreparedAccelerated:
-        """Raises Unsupported for energies that are not projective, NotPositiveDefinite."""
+        """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
         return prepare(system, Method("chebyshev", CHEBYSHEV, 1, 0, True), self.linear, self.precision)

@@ -25,7 +25,8 @@ from solvers.linear.choice import Linear, Precision, factorise
 from solvers.linear.inverse import Inverse
 from solvers.linear.supernodal import Supernodal
 from solvers.linear.team import Team
-from solvers.local_global import PreparedLocalGlobal, Project, only_springs, prepared
+from solvers.local_global import PreparedLocalGlobal, Project, prepared, projective
+from solvers.parts import Parts, split
 from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System
 from solvers.touching import without_contact
 
@@ -47,21 +48,32 @@ class CompiledLocalGlobal:
     precision: Precision = "float64"
 
     def prepare(self, system: System) -> Prepared:
-        """Raises Unsupported for energies other than springs and contact, NotPositiveDefinite."""
+        """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
         if without_contact(system) is not system:
             from solvers.contact import local_global  # for those who need it
 
             return local_global(self, system)
-        springs = only_springs(system, "numba")
-        base = prepared(system, [springs], lambda Q: factorise(Q, self.linear, self.precision))
-        for kind, order in ORDERS.items():
-            if isinstance(base.factor, kind):
-                return PreparedCompiled.of(base, springs, order(base.factor))
-        return replace(base, project=_projection(springs, system.vertices))
+        energies = projective(system, "numba")
+        springs = [energy for energy in energies if isinstance(energy, Springs)]
+        alone = [Springs.joined(springs)] if len(springs) == len(energies) else []
+        base = prepared(system, alone or energies, lambda Q: factorise(Q, self.linear, self.precision))
+        found = compiled(base)
+        if found is None and alone:
+            return replace(base, project=_projection(alone[0], system.vertices))
+        return found or base
 
 
 ORDERS: dict[type, Callable[[Any], Order]] = {Supernodal: of_supernodal, Inverse: of_inverse}
 """The linear solvers whose panels the kernels go through; the others are called in between."""
+
+
+def compiled(base: PreparedLocalGlobal) -> PreparedCompiled | None:
+    """The iterations over the factor's own rows; None where the kernels do not know it, or some energy."""
+    for kind, order in ORDERS.items():
+        if isinstance(base.factor, kind):
+            parts = split(base.system)
+            return None if parts.unknown or parts.cancel else PreparedCompiled.of(base, parts, order(base.factor))
+    return None
 
 
 class _Work(NamedTuple):
@@ -76,18 +88,20 @@ class _Work(NamedTuple):
 class PreparedCompiled:
     """The iterations over a factor's own rows (see `solvers.kernels.step`).
 
-    base: the same, step by step; plan: of an iteration; bundles: of the springs; rows: of the vertices; far: the last
-    row.
+    base: the same, step by step; parts: of the energies; plan: of an iteration; bundles: of its local step; form: of
+    |e|_Q^2; rows: of the vertices; far: the last row.
     """
 
     base: PreparedLocalGlobal
+    parts: Parts
     plan: step.Plan
     bundles: kernels.Bundles
+    form: kernels.Bundles
     rows: step_ends.Rows
     far: int
 
     @classmethod
-    def of(cls, base: PreparedLocalGlobal, springs: Springs, order: Order) -> PreparedCompiled:
+    def of(cls, base: PreparedLocalGlobal, parts: Parts, order: Order) -> PreparedCompiled:
         """The iterations over a factor that is cut into blocks."""
         s, pins = base.system, base.system.pins
         exact = pins.vertices[pins.exact]
@@ -98,18 +112,22 @@ class PreparedCompiled:
         row[exact] = order.rows + np.arange(len(exact))
         part = np.full(s.vertices, -1)
         part[s.free] = np.searchsorted(order.spans[:, 0], slot, side="right") - 1
-        bundles, first = kernels.Bundles.of(springs, row, part, len(order.spans), nobody, nobody + 1)
+        corrects = order.squares.dtype != np.float64
+        where = row, part, len(order.spans), nobody, nobody + 1
+        form, first = kernels.Bundles.of(parts.whole, *where)
+        # Positions are solved for with the forms in Q; corrections need their gradient too.
+        bundles = form if corrects or parts.whole is parts.springs else kernels.Bundles.of(parts.springs, *where)[0]
         inertia = s.inertia
         held, measure, loose = np.zeros((3, nobody + 2 + order.shift))
-        held[row] = measure[row] = inertia
+        held[row] = measure[row] = inertia + parts.held
         _, soft, weight = s.penalty
         held[row[soft]] += weight
         measure[row[s.free]] -= 0.5 * base.coupling.sum(axis=1)
         loose[row[s.unpinned]] = 1.0
-        corrects = order.squares.dtype != np.float64
         coupling = csr_array((0, 0)).tocoo() if corrects else base.coupling.tocoo()
         return cls(
             base,
+            parts,
             step.Plan(
                 order.squares,
                 order.panels,
@@ -125,6 +143,7 @@ class PreparedCompiled:
                 order.shift,
             ),
             bundles,
+            form,
             step_ends.Rows(
                 row,
                 inertia,
@@ -155,21 +174,23 @@ class PreparedCompiled:
         """The iterates from `problem.first_guess`; the yielded array is overwritten by the next one."""
         (a, b, c, e), y, p = work = self._new()
         team = Team.of(int(self.plan.top[2]))
-        target, force, pins, _, guess = _arrays(problem)
+        target, force, pins, _, guess = self._arrays(problem)
         step_ends.state(self.rows, target, force, pins, y)
         step_ends.start(self.rows, work.vectors, p, guess, pins)
         out = np.empty_like(target)
         while True:
-            step.iterate(self.plan, self.bundles, (a, b, c, e), y, p, 1, np.nan, 0.0, False, self._threads(), team)
+            step.iterate(
+                self.plan, self.bundles, self.form, (a, b, c, e), y, p, 1, np.nan, 0.0, False, self._threads(), team
+            )
             a, b = b, a
             step_ends.fetch(self.rows, a if p is None else p, out)
             yield out
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """Iterate until `stop` says so; without a tolerance only the last residual is computed."""
-        target, force, pins, current, guess = _arrays(problem)
+        target, force, pins, current, guess = self._arrays(problem)
         out = np.empty_like(target)
-        fixed = self.plan, self.bundles, self.rows, *self._work, target, force, pins
+        fixed = self.plan, self.bundles, self.form, self.rows, *self._work, target, force, pins
         threads = self._threads()
         floor = stop.floor * self.base.trace**0.5
         limit, yardstick, every = 0.0, float("nan"), stop.tolerance is not None
@@ -185,7 +206,7 @@ class PreparedCompiled:
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """The local step over all springs, and a solve, at the first guess; within a solve blocks take turns."""
         (a, b, _, _), y, p = work = self._new()
-        target, force, pins, _, guess = _arrays(problem)
+        target, force, pins, _, guess = self._arrays(problem)
         step_ends.state(self.rows, target, force, pins, y)
         step_ends.start(self.rows, work.vectors, p, guess, pins)
 
@@ -193,6 +214,12 @@ class PreparedCompiled:
             step.local(self.plan, self.bundles, a, y, p, b)
 
         return {"local": local, "global": self.base.phases(problem)["global"]}
+
+    def _arrays(self, problem: StepProblem) -> list[Positions]:
+        """The problem's arrays. The kernels are compiled for arrays that may be written to: what may not is copied."""
+        p = problem
+        given = (p.target, self.parts.force(p), p.pin_targets, p.current, p.first_guess)
+        return [x if x.flags.carray else np.array(x, np.float64, order="C") for x in given]
 
     @cached_property
     def _team(self) -> Team:
@@ -214,13 +241,6 @@ class PreparedCompiled:
         """As many as are allowed and as there are groups of subtrees; None for one."""
         threads = min(numba.get_num_threads(), int(self.plan.top[2]))
         return threads if threads > 1 else None
-
-
-def _arrays(problem: StepProblem) -> list[Positions]:
-    """The problem's arrays. The kernels are compiled for arrays that may be written to: what may not is copied."""
-    p = problem
-    given = (p.target, p.force, p.pin_targets, p.current, p.first_guess)
-    return [x if x.flags.carray else np.array(x, np.float64, order="C") for x in given]
 
 
 def _projection(springs: Springs, n: int) -> Project:

@@ -196,12 +196,16 @@ class SparseLocalGlobal:
             from solvers.contact import local_global  # which builds on this module, and is not for everyone
 
             return local_global(self, system)
-        energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
-        if len(energies) < len(system.energies):
-            others = {type(e).__name__ for e in system.energies if not isinstance(e, ProjectiveEnergy)}
-            raise Unsupported(f"sparse: local-global needs projective energies; not so: {', '.join(sorted(others))}")
+        return prepared(system, projective(system, "sparse"), lambda Q: (SparseLU(Q), "SuperLU"))
 
-        return prepared(system, energies, lambda Q: (SparseLU(Q), "SuperLU"))
+
+def projective(system: System, solver: str) -> list[ProjectiveEnergy]:
+    """The system's energies, all of them projective; raises Unsupported, with the names of those that are not."""
+    energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
+    if len(energies) < len(system.energies):
+        others = {type(e).__name__ for e in system.energies if not isinstance(e, ProjectiveEnergy)}
+        raise Unsupported(f"{solver}: local-global needs projective energies; not so: {', '.join(sorted(others))}")
+    return energies
 
 
 def only_springs(system: System, solver: str) -> Springs:

@@ -95,20 +95,19 @@ def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> csr_array:
     n = system.vertices
     _, vertices, weight = system.penalty
     held = system.inertia + np.bincount(vertices, weight, minlength=n)
-    shares = (energy.stiffness_matrix(n) for energy in _begun(system, energies))
-    Q = without_zeros(reduce(lambda total, share: total + share, shares, diagonal(held)))
+    Q = without_zeros(reduce(lambda total, share: total + share, shares(system, energies), diagonal(held)))
     require_determined(system, Q)
     return Q
 
 
-def _begun(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[ProjectiveEnergy]:
-    """The energies in a step from anywhere, since lagged ones know their stiffness from its rate alone."""
+def shares(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[csr_array]:
+    """Each energy's share A'KA [N/m] of Q, (n, n): lagged ones know it from the rate of the steps alone."""
     nowhere = np.zeros((system.vertices, 3))
     start = Start(nowhere, nowhere, 0.0, nowhere, system.rate, 0.0)
     for energy in energies:
         begun: Energy = energy.begin_step(start) if isinstance(energy, LaggedEnergy) else energy
         if isinstance(begun, ProjectiveEnergy):
-            yield begun
+            yield begun.stiffness_matrix(system.vertices)
 
 
 def require_determined(system: System, Q: csr_array) -> None:

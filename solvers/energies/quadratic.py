@@ -9,7 +9,6 @@ Linear damping of A v is one of them: since the unknown moves with the velocity 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +29,6 @@ class Quadratic:
     weight: NDArray[np.float64]
     d: Positions
 
-    @cached_property
-    def _AtW(self) -> csr_array:
-        return csr_array(self.A.T @ diagonal(self.weight))
-
     def value(self, p: Positions) -> float:
         """The energy [J] at p, shape (n, 3)."""
         away = self.A @ p - self.d
@@ -41,15 +36,19 @@ class Quadratic:
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N], shape (n, 3), to `out`."""
-        out += self._AtW @ (self.A @ p - self.d)
+        out += self._pulled(self.A @ p - self.d)
 
     def add_projection(self, p: Positions, out: Positions) -> None:
         """Add A'W d [N], shape (n, 3), the same for any p, to `out`."""
-        out += self._AtW @ self.d
+        out += self._pulled(self.d)
+
+    def _pulled(self, x: Positions) -> Positions:
+        """A'W x, (n, 3), of x (m, 3)."""
+        return self.A.T @ (self.weight[:, None] * x)
 
     def stiffness_matrix(self, n: int) -> csr_array:
         """A'WA [N/m], shape (n, n)."""
-        return without_zeros(self._AtW @ self.A)
+        return without_zeros(self.A.T @ diagonal(self.weight) @ self.A)
 
     def hessian(self, p: Positions) -> csr_array:
         """The Hessian [N/m], shape (3n, 3n), the same for any p."""

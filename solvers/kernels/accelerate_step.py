@@ -1,4 +1,4 @@
-"""A whole accelerated step over a factor's own rows, without Python; for systems whose energies are springs alone.
+"""A whole accelerated step over a factor's own rows, without Python; for springs, and energies that are like springs.
 
 The plan is that of `solvers.kernels.step`, in which positions are corrected; here a solve stands alone, because whether
 a trial is taken is known only when its objective is.
@@ -25,11 +25,12 @@ NOISE = 4.0 * np.finfo(np.float64).eps
 
 class Step(NamedTuple):
     """A system's plan, bundles, shares of the objective and rows, with vectors of all rows: y, the solve's (x) in the
-    factor's type, scratch (e, zero but in unknown rows); objective (2,): at the position, and the
-    size of what cancels in it [J].
+    factor's type, scratch (e, zero but in unknown rows); objective (3,): at the position, the
+    size of what cancels in it, and what is negative of it where the step begins [J].
 
     The objective is a sum of squares a^2/2, where each a is a difference of two numbers of size A and so known to
-    eps A: the sum to eps (sum of a A), at most eps sqrt(2 g size), with size the sum of A^2.
+    eps A: the sum to eps (sum of a A), at most eps sqrt(2 g size), with size the sum of A^2. Where some squares count
+    as negative, g is the sum of all.
     """
 
     plan: Plan
@@ -70,7 +71,7 @@ def run(step: Step, window: Window, iterations, limit, floor, every, out):
         verdict = AGAIN
         while verdict == AGAIN:
             there = _evaluate(step, window)
-            before, size = abs(step.objective[0]), step.objective[1]
+            before, size = abs(step.objective[0]) + 2.0 * step.objective[2], step.objective[1]
             now.rise, now.noise = there - step.objective[0], NOISE * (before + np.sqrt(2.0 * before * size))
             verdict = judge(window)
         if verdict == STALLED:

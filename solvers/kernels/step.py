@@ -38,9 +38,9 @@ class Plan(NamedTuple):
     top's rows, and the number of groups; blocks (b, 7): of each its first and last slot and bundle, its first chunk,
     and the last for the passes forwards and backwards; leaf (b,): whether it holds whole subtrees, whose vertices have
     springs to each other and to ancestors alone; of_group (groups + 2,): the first block of each group and of the top;
-    held: m/dt^2 + w [N/m] of each row; measure: m/dt^2 and half of the springs to exactly
-    pinned vertices, which no bundle counts from there; loose: 1 for the rows of vertices that no pin holds, else 0;
-    shift: by how many rows a vertex's right-hand side lies behind its position.
+    held: m/dt^2 + w [N/m] of each row, and what quadratic forms hold it with; measure: as held without pins, and half
+    of the springs to exactly pinned vertices, which no bundle counts from there; loose: 1 for the rows of vertices that
+    no pin holds, else 0; shift: by how many rows a vertex's right-hand side lies behind its position.
     """
 
     squares: NDArray[np.float64]
@@ -155,12 +155,12 @@ def _displace(plan, part, x, before, p, e):
 
 
 @inner
-def _squared(plan, bundles, part, e):
+def _squared(plan, form, part, e):
     """|e|_Q^2 [J] of a group or the top: half of each spring's at either end."""
     begin, end = plan.of_group[part], plan.of_group[part + 1]
     if begin == end:
         return 0.0
-    return squared_norm(bundles, plan.blocks[begin, 2], plan.blocks[end - 1, 3], e, plan.measure)
+    return squared_norm(form, plan.blocks[begin, 2], plan.blocks[end - 1, 3], e, plan.measure)
 
 
 @kernel
@@ -175,7 +175,7 @@ def local(plan, bundles, x, y, p, out):
 
 
 @inner
-def _share(plan, bundles, vectors, y, p, iterations, limit, floor, every, team, first):
+def _share(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, team, first):
     """A thread's share of the iterations: the groups from `first` on that no other thread does, and what follows them.
 
     Phase 2 k is iteration k, phase 2 k + 1 measures it where that is wanted.
@@ -193,13 +193,13 @@ def _share(plan, bundles, vectors, y, p, iterations, limit, floor, every, team, 
             if claim(team, group, phase):
                 if measures:
                     _displace(plan, group, a, c, p, e)
-                    team.sums[group] = _squared(plan, bundles, group, e)
+                    team.sums[group] = _squared(plan, form, group, e)
                 else:
                     _group(plan, bundles, group, a, y, p, b, k > 0, k < iterations)
                 if last(team):
                     enough = k == iterations
                     if measures:
-                        total = _squared(plan, bundles, groups, e)
+                        total = _squared(plan, form, groups, e)
                         for value in team.sums:
                             total += value
                         team.found[1] = np.sqrt(total)
@@ -218,26 +218,29 @@ def _share(plan, bundles, vectors, y, p, iterations, limit, floor, every, team, 
 
 
 @inner_in_parallel
-def _side_by_side(plan, bundles, vectors, y, p, iterations, limit, floor, every, team, threads):
+def _side_by_side(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, team, threads):
     for thread in prange(threads):
-        _share(plan, bundles, vectors, y, p, iterations, limit, floor, every, team, thread * plan.top[2] // threads)
+        _share(
+            plan, bundles, form, vectors, y, p, iterations, limit, floor, every, team, thread * plan.top[2] // threads
+        )
 
 
 @kernel
-def iterate(plan, bundles, vectors, y, p, iterations, limit, floor, every, threads, team):
+def iterate(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, threads, team):
     """Iterate from the positions in the first vector, or from p where that is given, which then takes the positions.
 
-    vectors: three that take turns, and one for scratch, of float64; y: the constant right-hand side; every: whether
-    the iterations end once a residual is at most `limit` or `floor`; threads: None for one.
+    form: the bundles of |e|_Q^2, the quadratic forms' pairs among them; vectors: three that take turns, and one for
+    scratch, of float64; y: the constant right-hand side; every: whether the iterations end once a residual is at most
+    `limit` or `floor`; threads: None for one.
     Returns how many were done, the last one's residual |p^k - p^(k-1)|_Q [J^(1/2)] over the vertices that no pin
     holds (nan where none was wanted: limit is nan), and the last vector.
     """
     start(team)
     team.found[1] = np.nan
     if threads is None:
-        _share(plan, bundles, vectors, y, p, iterations, limit, floor, every, team, 0)
+        _share(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, team, 0)
     else:
-        _side_by_side(plan, bundles, vectors, y, p, iterations, limit, floor, every, team, threads)
+        _side_by_side(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, team, threads)
     x0, x1, x2, _ = vectors
     done = int(team.found[0])
     return done, team.found[1], (x0, x1, x2)[done % 3]

@@ -18,8 +18,8 @@ from solvers.registry import SOLVERS, load
 from tests.contacts import OBSTACLES, contact, sheet, steps
 
 SOLVED: dict[str, Solver] = {name: load(target)() for name, target in SOLVERS.items()}
-TAKE = ("sparse", "numba", "lbfgs", "hybrid", "newton")
-PREFACTORED = ("sparse", "numba", "lbfgs")
+PREFACTORED = ("sparse", "numba", "anderson", "chebyshev", "lbfgs")
+TAKE = (*PREFACTORED, "hybrid", "newton")
 FLOOR = contact(OBSTACLES["plane"], friction=0.4)
 FALL = (0.5, -6.0, 0.0)
 
