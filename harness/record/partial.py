@@ -13,23 +13,29 @@ from pathlib import Path
 
 import rerun as rr
 import rerun.blueprint as rrb
-from rerun.chunk import RrdReader
+import rerun_bindings
 
 from harness.errors import RunFailed
+from harness.record.reader import whole_messages
 
 _PATIENCE = 30
 """Seconds that a flush may take."""
+
+_broken: list[rr.RecordingStream] = []
+"""Streams whose writing thread has died."""
 
 
 class PartialFile:
     """An open recording stream into a partial file beside `path`.
 
-    Raises RunFailed, from any method, when the file cannot be written or, at the end, not be read back.
+    Raises RunFailed, from any method, when the file cannot be written or, at the end, is not whole.
     """
 
     def __init__(self, path: Path, application: str, recording_id: str, title: str) -> None:
         self._path, self._broken = path, False
         self._partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.rrd")
+        if not _broken:  # else this would wait for ever
+            rerun_bindings.flush_and_cleanup_orphaned_recordings()  # the library keeps two threads of each until then
         rr.set_strict_mode(True)  # without it a wrong shape is swallowed and logged as nothing
         self.stream = rr.RecordingStream(
             re.sub(r"[^\w .-]", "-", application),  # the viewer warns of other characters
@@ -52,13 +58,28 @@ class PartialFile:
         except Exception as error:
             raise self._failure(error) from error
 
+    def lay_out(self, layout: rrb.Blueprint) -> None:
+        """Write how the file opens; the last one counts.
+
+        As the library's `send_blueprint` does, but for the disconnection: without it two threads stay for ever, for
+        the stream and its storage hold each other.
+        """
+        name = self.stream.get_application_id() or ""
+        sketch = rr.RecordingStream._from_native(rerun_bindings.new_blueprint(name, False, False, True))
+        sketch.set_time("blueprint", sequence=0)
+        layout._log_to_stream(sketch)
+        storage = sketch.memory_recording().storage
+        rerun_bindings.send_blueprint(storage, True, True, recording=self.stream.to_native())
+        sketch.disconnect()
+
     def finish(self, layout: rrb.Blueprint) -> Path:
-        """Close the file, read its footer back and give it its final name, which is returned."""
+        """Close the file, see that it is whole and give it its final name, which is returned."""
         try:
-            self.stream.send_blueprint(layout)
+            self.lay_out(layout)
             self.flush()
             self.stream.disconnect()
-            RrdReader(self._partial).store().schema()
+            if not whole_messages(self._partial)[0]:
+                raise OSError("its end is missing")
             os.replace(self._partial, self._path)
         except (OSError, RuntimeError, ValueError) as error:
             raise self._failure(error) from error
@@ -77,6 +98,7 @@ class PartialFile:
             # The library's writing thread has died (the disk is full), and whatever waits for it may wait for
             # ever: disconnecting, the clean-up at exit, the stream's end. So none of them is to come.
             self._broken = True
+            _broken.append(self.stream)
             rr.unregister_shutdown()
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(self.stream))
         return RunFailed(f"{self._path}: the recording cannot be written: {error}")

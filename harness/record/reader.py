@@ -158,7 +158,7 @@ def open_recording(path: Path) -> Iterator[Source]:
         raise InputError(Mistake(f"{came} and so is not a Rerun recording (.rrd)", file=path))
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of files without a footer: `complete` says so
-        complete, end = _whole_messages(path)
+        complete, end = whole_messages(path)
         readable = path
         if not complete and end < path.stat().st_size:  # the library reads nothing of a file cut within a message
             readable = Path(folder) / path.name
@@ -175,7 +175,7 @@ def open_recording(path: Path) -> Iterator[Source]:
         yield Source(path, store, complete, runs[0].application_id, runs[0].recording_id)
 
 
-def _whole_messages(path: Path) -> tuple[bool, int]:
+def whole_messages(path: Path) -> tuple[bool, int]:
     """Whether the file has its end mark, and where its last whole message ends."""
     size, place = path.stat().st_size, _HEADER
     with path.open("rb") as file:

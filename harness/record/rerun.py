@@ -128,7 +128,7 @@ class RerunRecorder:
         self._file.abandon()
 
     def _begin(self) -> None:
-        self._stream.send_blueprint(blueprint.blueprint(self._info, self._box))  # for what a kill leaves
+        self._file.lay_out(blueprint.blueprint(self._info, self._box))  # for what a kill leaves
         self._log_once()
         self._obstacles = Obstacles(self._stream, self._info.obstacles, self._info.mesh.rest)
 

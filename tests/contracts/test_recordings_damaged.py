@@ -53,6 +53,15 @@ def test_a_full_disk_is_a_failure_and_not_a_damaged_file(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_many_recordings_leave_no_threads_behind(tmp_path: Path):
+    def threads() -> int:
+        record(tmp_path / "a.rrd", count=2)
+        return len(os.listdir("/proc/self/task"))
+
+    before = threads()  # one recording's are there until the next
+    assert [threads() for _ in range(3)] == [before] * 3
+
+
 def test_a_killed_run_leaves_all_frames_up_to_the_last_flush(tmp_path: Path):
     told = run(KILLED, tmp_path / "a.rrd")
     assert told.returncode == -signal.SIGKILL, told.stderr
