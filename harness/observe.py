@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from harness.judge import Judge
 from harness.measure import Settings, digest, steps
 from harness.record.base import Frame, Recorder
+from harness.record.shading import strains
 from harness.scene import Scene
 from harness.simulate import Step, start
 from harness.trace import EnergyNorm, trace
@@ -63,10 +64,10 @@ def observe(
         if recorder:
             recorder.frame(Frame(step.index, scene.time(step.index), p, terms, s.residual, s.iterations))
 
-    if recorder:
-        recorder.frame(Frame(0, 0.0, start(scene).now.positions, {}, float("nan"), 0))
     with ThreadPoolExecutor(1) as beside:
         looked: Future[None] | None = None
+        if recorder:
+            looked = beside.submit(recorder.frame, Frame(0, 0.0, start(scene).now.positions, {}, float("nan"), 0))
         for step in steps(scene, prepared, settings):
             if looked:
                 looked.result()  # raises here what went wrong there
@@ -84,6 +85,5 @@ def observe(
 
 def largest_strain(scene: Scene, p: Positions) -> float:
     """The largest |length / rest length - 1| of a spring at p (n, 3) [m]; 0 without springs."""
-    rest = scene.springs.rest_length
-    strain = np.divide(scene.springs.lengths(p), rest, out=np.ones_like(rest), where=rest > 0.0) - 1.0
-    return float(np.abs(strain).max(initial=0.0))
+    of_spring, _ = strains(p, scene.springs.edges, scene.springs.rest_length)
+    return float(np.abs(of_spring).max(initial=0.0))

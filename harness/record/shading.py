@@ -47,9 +47,7 @@ class Shading:
 
         Where a rest length is 0, or a vertex has no spring, it is 0.
         """
-        of_spring, of_vertex = np.empty(len(self._rest_lengths)), np.zeros(len(p))
-        _strains(p.copy(), self._springs, self._rest_lengths, of_spring, of_vertex)
-        return of_spring, of_vertex
+        return strains(p, self._springs, self._rest_lengths)
 
     def colours(self, strain: NDArray[np.float64]) -> NDArray[np.uint32]:
         """The colour of each strain as 0xRRGGBBAA, shape (len(strain),)."""
@@ -64,8 +62,18 @@ class Shading:
         return normals
 
 
-# Positions come as writable copies: a read-only array is another type to Numba, and another compilation.
-@njit(cache=True, error_model="numpy")
+def strains(
+    p: Positions, springs: NDArray[np.int64], rest_lengths: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """As `Shading` has it, of springs (m, 2) with rest_lengths (m,) [m] at p (n, 3) [m]."""
+    of_spring, of_vertex = np.empty(len(rest_lengths)), np.zeros(len(p))
+    _strains(p.copy(), springs, rest_lengths, of_spring, of_vertex)
+    return of_spring, of_vertex
+
+
+# Positions come as writable copies: a read-only array is another type to Numba, and another compilation. Without the
+# interpreter's lock, so that the solver beside need not wait.
+@njit(cache=True, error_model="numpy", nogil=True)
 def _strains(p, springs, rest_lengths, of_spring, of_vertex):
     for e in range(len(springs)):
         i, j = springs[e, 0], springs[e, 1]
@@ -78,7 +86,7 @@ def _strains(p, springs, rest_lengths, of_spring, of_vertex):
                 of_vertex[v] = strain
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _normals(p, triangles, out):
     for t in range(len(triangles)):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
