@@ -1,8 +1,10 @@
 """How robust each solver is: the outcome of each run of a sweep that was judged, from its rows alone.
 
 A run that means to minimise is right where every step's answer is stationary to the tolerance that was asked for, or
-to round-off, and a certified minimum, and the motion is that of the reference. One that does not minimise is graded by
-the motion alone.
+to round-off, and a certified minimum, and the motion is that of the reference in every frame: all three by the oracle,
+never by what the solver says of itself. What it says is compared: a step that ended because its residual was small
+enough, and that the oracle finds not stationary, makes the run wrong and not merely unconverged. A method that does not
+minimise is graded by the motion alone.
 """
 
 from __future__ import annotations
@@ -22,6 +24,8 @@ from solvers.registry import SOLVERS
 
 SLACK = 1.1
 """On the tolerance: the oracle and a solver factorise the same matrix by different ways."""
+NOISE = 2.0
+"""On round-off, by which one residual has two figures where two factors tell it: each is off by as much as it is."""
 ASKED = 1e-6
 """The tolerance by which a run is graded that was asked for none."""
 SAME = 1e-2
@@ -41,16 +45,21 @@ class Outcome(NamedTuple):
 
 RIGHT = Outcome("right", "#3a9e72", "stationary to the tolerance, a certified minimum, and the motion of the reference")
 OTHER = Outcome(
-    "another minimum", "#8fcbad", "a certified minimum in every step, and another motion than the reference"
+    "another minimum", "#8fcbad", "a certified minimum in every step, and another motion than the reference, or none"
 )
 SADDLE = Outcome("no minimum", "#b9a3d6", "stationary, but where the Hessian is not positive definite: a saddle")
 SHORT = Outcome("not converged", "#f2c45f", "finite, and not yet stationary, or not close to the reference")
+WRONG = Outcome("silently wrong", "#e0683c", "said of a step that it had converged, which the oracle finds untrue")
 DIVERGED = Outcome("diverged", "#d1495b", "positions are not finite any more")
 FAILED = Outcome("failed", "#23262b", "ended with an error")
 REFUSED = Outcome("refused", "#d9d9d6", "refused before it began, with a reason")
-OUTCOMES = (RIGHT, OTHER, SADDLE, SHORT, DIVERGED, FAILED, REFUSED)
+OUTCOMES = (RIGHT, OTHER, SADDLE, SHORT, WRONG, DIVERGED, FAILED, REFUSED)
 
+_CLAIMS = ("tolerance", "floor")
+"""How a solve ends that takes itself for converged."""
 _ENDED = {"unsupported": REFUSED, "diverged": DIVERGED, "failed": FAILED}
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +77,14 @@ class Cell:
 
     @property
     def figure(self) -> str:
-        """The worst residual in few characters: the exponent of ten, or per cent of the size."""
+        """The worst residual in few characters: a power of ten, or per cent of the size."""
         if self.worst is None:
             return ""
         if self.graded == "distance":
             return f"{100 * self.worst:.0f} %" if self.worst < 9.99 else ">999 %"
-        return "0" if self.worst == 0.0 else str(round(math.log10(self.worst)))
+        if not math.isfinite(self.worst):
+            return str(self.worst)
+        return "0" if self.worst == 0.0 else f"10{str(round(math.log10(self.worst))).translate(_RAISED)}"
 
 
 def read_cells(folder: Path) -> list[Cell]:
@@ -106,25 +117,30 @@ def judged(run: Sequence[dict[str, Any]]) -> tuple[Outcome, float | None, str, s
     if first["status"] != "ok":
         where = f"frame {first['frame']}: " if first["frame"] else ""
         return _ENDED[first["status"]], None, "", where + first["reason"]
-    away = [row["distance"] for row in run if row["distance"] is not None]
-    farthest = max(away, default=None)
+    farthest = max((away for row in run if (away := row["distance"]) is not None), default=None)
+    lost = any(row["distance"] is None for row in run)
     if all(row["stationarity"] is None for row in run):
-        near = farthest is not None and farthest <= CLOSE
-        why = "" if near else "there is no reference" if farthest is None else "away from the reference"
+        near = farthest is not None and not lost and farthest <= CLOSE
+        why = "" if near else "there is no reference" if lost else "away from the reference"
         return (RIGHT if near else SHORT), farthest, "distance", why
-    worst = max(row["stationarity"] for row in run)
-    missed = [row["frame"] for row in run if not row["stationarity"] <= _asked(row)]
+    worst = max((row["stationarity"] for row in run), key=lambda value: (math.isnan(value), value))
+    missed = [row for row in run if not row["stationarity"] <= _asked(row)]
     if missed:
-        return SHORT, worst, "stationarity", f"{len(missed)} of {len(run)} steps missed the tolerance"
+        claimed = sum(row["stopped"] in _CLAIMS for row in missed)
+        said = f", {claimed} of which said they had met it" if claimed else ""
+        why = f"{len(missed)} of {len(run)} steps missed the tolerance{said}"
+        return (WRONG if claimed else SHORT), worst, "stationarity", why
     if not all(row["minimum"] for row in run):
         return SADDLE, worst, "stationarity", "the Hessian is not positive definite"
-    if farthest is not None and farthest > SAME:
+    if lost or farthest is None:
+        return OTHER, worst, "stationarity", "there is no reference to compare the motion with"
+    if farthest > SAME:
         return OTHER, worst, "stationarity", f"up to {100 * farthest:.2g} % of the size from the reference"
     return RIGHT, worst, "stationarity", ""
 
 
 def _asked(row: dict[str, Any]) -> float:
-    return SLACK * max(row["tolerance"] or ASKED, row["attainable"])
+    return max(SLACK * (row["tolerance"] or ASKED), NOISE * row["attainable"])
 
 
 _OPTIONS = ("size", "integrator", "time_step", "first_guess", "max_iterations", "tolerance", "threads")
@@ -144,15 +160,43 @@ def _solver(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
     return " ".join([row["solver"], *(str(v) for key, v in own.items() if any(other[key] != v for other in others))])
 
 
+@dataclass(frozen=True, slots=True)
+class Score:
+    """One solver over all cases: how many ended in each outcome, in the order of OUTCOMES; the shares that were right
+    and that stayed finite, of those it did not refuse (None where it refused all); the cell with the worst figure."""
+
+    solver: str
+    counts: tuple[int, ...]
+    right: float | None
+    finite: float | None
+    worst: Cell
+
+
+def scores(cells: Sequence[Cell]) -> list[Score]:
+    """A score for each solver, in the cells' order."""
+    found = []
+    for solver in dict.fromkeys(cell.solver for cell in cells):
+        own = [cell for cell in cells if cell.solver == solver]
+        of = {outcome: sum(cell.outcome == outcome for cell in own) for outcome in OUTCOMES}
+        claimed = len(own) - of[REFUSED]
+        right, broken = of[RIGHT], of[DIVERGED] + of[FAILED]
+        shares = (right / claimed, 1.0 - broken / claimed) if claimed else (None, None)
+        worst = max(
+            own, key=lambda cell: -1.0 if cell.worst is None else math.inf if math.isnan(cell.worst) else cell.worst
+        )
+        found.append(Score(solver, tuple(of.values()), *shares, worst))
+    return found
+
+
+def percent(share: float | None) -> str:
+    """A share in words; nothing for none."""
+    return "" if share is None else f"{share:.0%}"
+
+
 def summary(cells: Sequence[Cell]) -> Table:
     """A row for each solver: how many cases ended how, the shares of those it did not refuse, the worst residual."""
     table = Table("solver", *(outcome.words for outcome in OUTCOMES), "right", "finite", "worst")
-    for solver in dict.fromkeys(cell.solver for cell in cells):
-        own = [cell for cell in cells if cell.solver == solver]
-        counts = [sum(cell.outcome == outcome for cell in own) for outcome in OUTCOMES]
-        claimed = len(own) - counts[OUTCOMES.index(REFUSED)]
-        broken = sum(cell.outcome in (DIVERGED, FAILED) for cell in own)
-        worst = max((cell.worst for cell in own if cell.worst is not None), default=float("nan"))
-        shares = [f"{100 * part / claimed:.0f} %" if claimed else "" for part in (counts[0], claimed - broken)]
-        table.add_row(solver, *map(str, counts), *shares, f"{worst:.1e}")
+    for score in scores(cells):
+        worst = "" if score.worst.worst is None else f"{score.worst.worst:.1e}"
+        table.add_row(score.solver, *map(str, score.counts), percent(score.right), percent(score.finite), worst)
     return table

@@ -4,45 +4,87 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from itertools import groupby
 from pathlib import Path
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from harness.report.robustness import OUTCOMES, Cell, Outcome
-from harness.report.style import DPI, INK, MUTED, PAGE
+from harness.report.robustness import DIVERGED, FAILED, OUTCOMES, RIGHT, WRONG, Cell, Outcome, percent, scores
+from harness.report.style import DPI, INK, MUTED, PAGE, RULE
 
-_ROW, _COLUMN, _LEFT, _TOP, _BOTTOM = 0.21, 0.78, 3.3, 1.75, 1.25
-"""Inches: a cell's height and width, room for the cases' names, for the solvers' names, and for the legend."""
+_ROW, _COLUMN, _LEFT, _TOP, _BOTTOM = 0.2, 0.64, 2.3, 1.75, 1.25
+"""Inches: a cell's height and width, room for the cases' names, for title and solvers' names, and for the legend."""
+
+_SCORES, _HEADING = 3, 1.2
+"""Rows for the solvers' scores, and rows from the last case of a family to the first of the next."""
 
 NOTE = (
-    "Figures: log10 of the largest residual |Q^-1 grad g|_Q of a step, over its value at the step's start (or "
-    "round-off);\nof methods that do not minimise, the largest distance from a converged run, in per cent of the size."
+    "Figures: the largest residual |Q\u207b\u00b9 grad g|_Q that a step ended with, over its value at its start\n"
+    "(or round-off); of methods that do not minimise, the largest distance from a converged run, in per cent of the\n"
+    "size. Shares: of the cases that a solver does not refuse."
 )
+
+
+def headline(cells: Sequence[Cell], name: str) -> str:
+    """The map in a line of words."""
+    of = {outcome: sum(cell.outcome == outcome for cell in cells) for outcome in OUTCOMES}
+    broken = of[DIVERGED] + of[FAILED]
+    return f"{name}: {of[RIGHT]} of {len(cells)} runs right, {of[WRONG]} silently wrong, {broken} diverged or failed"
 
 
 def draw_map(cells: Sequence[Cell], path: Path, title: str) -> None:
     """Draw the map to a PNG."""
-    cases, solvers = (list(dict.fromkeys(getattr(cell, key) for cell in cells)) for key in ("case", "solver"))
-    width, height = _LEFT + _COLUMN * len(solvers) + 0.9, _TOP + _ROW * len(cases) + _BOTTOM
+    solvers = list(dict.fromkeys(cell.solver for cell in cells))
+    places, rows = _places(list(dict.fromkeys(cell.case for cell in cells)))
+    width, height = _LEFT + _COLUMN * len(solvers) + 0.8, _TOP + _ROW * rows + _BOTTOM
     figure = Figure((width, height), DPI, facecolor=PAGE)
-    ax = figure.add_axes((_LEFT / width, _BOTTOM / height, _COLUMN * len(solvers) / width, _ROW * len(cases) / height))
+    ax = figure.add_axes((_LEFT / width, _BOTTOM / height, _COLUMN * len(solvers) / width, _ROW * rows / height))
     ax.set_xlim(0, len(solvers))
-    ax.set_ylim(len(cases), 0)
+    ax.set_ylim(rows, 0)
     ax.set_axis_off()
     for cell in cells:
-        x, y = solvers.index(cell.solver), cases.index(cell.case)
+        x, y = solvers.index(cell.solver), places[cell.case]
         ax.add_patch(Rectangle((x + 0.02, y + 0.05), 0.96, 0.9, facecolor=cell.outcome.color, linewidth=0))
-        ax.text(x + 0.5, y + 0.53, cell.figure, ha="center", va="center", fontsize=7.5, color=_ink(cell.outcome))
-    for y, case in enumerate(cases):
-        ax.text(-0.1, y + 0.53, case, ha="right", va="center", fontsize=8.5, color=INK)
-        if y and _family(case) != _family(cases[y - 1]):
-            ax.plot([-4.2, len(solvers)], [y, y], color=MUTED, linewidth=0.6, clip_on=False)
+        ax.text(x + 0.5, y + 0.53, cell.figure, ha="center", va="center", fontsize=8, color=_ink(cell.outcome))
     for x, solver in enumerate(solvers):
         ax.text(x + 0.45, -0.25, solver, ha="left", va="bottom", rotation=40, fontsize=9, color=INK)
-    figure.text(0.15 / width, 1 - 0.32 / height, title, fontsize=14, color=INK, weight="bold")
+    for case, y in places.items():
+        ax.text(-0.1, y + 0.53, _member(case), ha="right", va="center", fontsize=8.5, color=INK)
+    for family, of in groupby(places, _family):
+        ax.text(-0.1, places[next(of)] - 0.45, family, ha="right", va="center", fontsize=9, color=INK, weight="bold")
+    _draw_scores(ax, cells)
+    figure.text(0.15 / width, 1 - 0.32 / height, title, fontsize=13, color=INK, weight="bold")
     _legend(figure, cells)
     figure.savefig(path, facecolor=PAGE)
+
+
+def _places(cases: Sequence[str]) -> tuple[dict[str, float], float]:
+    """The row of each case, with room above each family for its name; and how many rows there are in all."""
+    places, y = {}, float(_SCORES)
+    for _, family in groupby(cases, _family):
+        y += _HEADING
+        for case in family:
+            places[case] = y
+            y += 1.0
+    return places, y
+
+
+def _draw_scores(ax: Axes, cells: Sequence[Cell]) -> None:
+    """The solvers' scores above their columns: both shares as bars, and the worst of their figures."""
+    for y, words in enumerate(("right", "finite", "worst")):
+        ax.text(-0.1, y + 0.53, words, ha="right", va="center", fontsize=8.5, color=INK, weight="bold")
+    for x, score in enumerate(scores(cells)):
+        for y, share in enumerate((score.right, score.finite)):
+            ax.add_patch(Rectangle((x + 0.02, y + 0.05), 0.96, 0.9, facecolor=RULE, linewidth=0))
+            ax.add_patch(Rectangle((x + 0.02, y + 0.05), 0.96 * (share or 0.0), 0.9, facecolor=_BARS[y], linewidth=0))
+        for y, words in enumerate((percent(score.right), percent(score.finite), score.worst.figure)):
+            ax.text(x + 0.5, y + 0.53, words, ha="center", va="center", fontsize=8, color=INK, weight="bold")
+
+
+_BARS = ("#8fcbad", "#c4ccd6")
+"""Of the shares that are right and finite."""
 
 
 def _legend(figure: Figure, cells: Sequence[Cell]) -> None:
@@ -59,6 +101,10 @@ def _legend(figure: Figure, cells: Sequence[Cell]) -> None:
 
 def _family(case: str) -> str:
     return case.partition("-")[0]
+
+
+def _member(case: str) -> str:
+    return case.partition("-")[2].replace("-", " ") or case
 
 
 def _ink(outcome: Outcome) -> str:
@@ -82,6 +128,7 @@ ul {{ list-style: none; padding: 0 }}
 <p>{note} Point at a cell for its reason; a cell that is underlined leads to the recording of its run.</p>
 <ul>{legend}</ul>
 <table><thead><tr><th></th>{head}</tr></thead><tbody>
+{scores}
 {body}
 </tbody></table></html>
 """
@@ -97,7 +144,18 @@ def write_page(cells: Sequence[Cell], path: Path, title: str) -> None:
     )
     legend = "".join(f'<li><span style="background:{o.color}"></span>{o.words}: {o.meaning}</li>' for o in OUTCOMES)
     head = "".join(f"<th>{escape(solver)}</th>" for solver in solvers)
-    page = _PAGE.format(title=escape(title), note=NOTE, legend=legend, head=head, body=body, ink=INK, page=PAGE)
+    found = scores(cells)
+    rows = {
+        "right": [percent(score.right) for score in found],
+        "finite": [percent(score.finite) for score in found],
+        "worst": [score.worst.figure for score in found],
+    }
+    shares = "\n".join(
+        f"<tr><th><b>{name}</b></th>{''.join(f'<td>{words}</td>' for words in row)}</tr>" for name, row in rows.items()
+    )
+    page = _PAGE.format(
+        title=escape(title), note=NOTE, legend=legend, head=head, scores=shares, body=body, ink=INK, page=PAGE
+    )
     path.write_text(page, encoding="utf-8")
 
 

@@ -13,8 +13,21 @@ from harness.errors import InputError
 from harness.judge import Judge, Oracle, is_minimum, reference
 from harness.load import load_any
 from harness.record.reader import read_replay
-from harness.report.robustness import DIVERGED, OTHER, REFUSED, RIGHT, SADDLE, SHORT, judged, read_cells, summary
-from harness.report.robustness_map import draw_map, write_page
+from harness.report.robustness import (
+    DIVERGED,
+    OTHER,
+    REFUSED,
+    RIGHT,
+    SADDLE,
+    SHORT,
+    WRONG,
+    Cell,
+    judged,
+    read_cells,
+    scores,
+    summary,
+)
+from harness.report.robustness_map import draw_map, headline, write_page
 from harness.run import Files, execute
 from harness.scene import Scene
 from harness.simulate import simulate
@@ -83,18 +96,27 @@ def test_a_reference_that_is_lost_is_no_reference():
 
 
 OK = {"status": "ok", "frame": 1, "stationarity": 1e-7, "attainable": 1e-12, "tolerance": 1e-6, "minimum": True}
-OK |= {"distance": 1e-5, "reason": None}
+OK |= {"distance": 1e-5, "stopped": "tolerance", "reason": None}
 GRADES = {
     "right": ([OK, OK], RIGHT),
     "at round-off": ([OK | {"stationarity": 1e-3, "attainable": 1e-3}], RIGHT),
-    "no reference": ([OK | {"distance": None}], RIGHT),
-    "one step short": ([OK, OK | {"stationarity": 2e-6}], SHORT),
-    "not a number": ([OK | {"stationarity": float("nan")}], SHORT),
+    "at round-off, of which two factors have two figures": ([OK | {"stationarity": 1.9e-3, "attainable": 1e-3}], RIGHT),
+    "no reference": ([OK | {"distance": None}], OTHER),
+    "a reference that is lost": ([OK, OK | {"distance": None}], OTHER),
+    "one step short": ([OK, OK | {"stationarity": 2e-6, "stopped": "iterations"}], SHORT),
+    "stuck": ([OK | {"stationarity": 2e-6, "stopped": "stalled"}, OK], SHORT),
+    "not a number": ([OK | {"stationarity": float("nan"), "stopped": "iterations"}], SHORT),
+    "short, and said not to be": ([OK, OK | {"stationarity": 2e-6}, OK | {"minimum": False}], WRONG),
+    "at round-off, and not": ([OK | {"stationarity": 1e-2, "attainable": 1e-3, "stopped": "floor"}], WRONG),
     "no tolerance asked": ([OK | {"tolerance": None}], RIGHT),
     "elsewhere": ([OK, OK | {"distance": 0.5}], OTHER),
     "a saddle": ([OK | {"minimum": False}], SADDLE),
     "a motion that is close": ([OK | {"stationarity": None, "distance": 0.04}], RIGHT),
     "a motion that is not": ([OK | {"stationarity": None, "distance": 0.06}], SHORT),
+    "a motion that is close while there is a reference": (
+        [OK | {"stationarity": None}, OK | {"stationarity": None, "distance": None}],
+        SHORT,
+    ),
     "a motion without a reference": ([OK | {"stationarity": None, "distance": None}], SHORT),
     "diverged": ([OK | {"status": "diverged", "reason": "not finite"}], DIVERGED),
     "refused": ([OK | {"status": "unsupported", "frame": None, "reason": "no mass"}], REFUSED),
@@ -105,6 +127,28 @@ GRADES = {
 def test_a_run_is_graded_by_its_rows(name: str):
     run, outcome = GRADES[name]
     assert judged(run)[0] is outcome
+
+
+FIGURES = {1e-6: "10⁻⁶", 3.2e2: "10³", 0.0: "0", float("inf"): "inf", float("nan"): "nan"}
+
+
+@pytest.mark.parametrize("worst", FIGURES)
+def test_a_residual_is_shown_as_a_power_of_ten(worst: float):
+    assert Cell("a", "b", SHORT, worst, "stationarity", "", None).figure == FIGURES[worst]
+
+
+def test_a_solver_is_scored_by_the_cases_that_it_does_not_refuse():
+    outcomes = {"a": [RIGHT, DIVERGED, REFUSED, SHORT], "b": [REFUSED, REFUSED]}
+    worst = {RIGHT: 1e-7, SHORT: 1e-2}
+    cells = [
+        Cell(f"case-{k}", solver, outcome, worst.get(outcome), "stationarity", "", None)
+        for solver, own in outcomes.items()
+        for k, outcome in enumerate(own)
+    ]
+    first, second = scores(cells)
+    assert (first.right, first.finite, first.worst.worst) == (pytest.approx(1 / 3), pytest.approx(2 / 3), 1e-2)
+    assert (second.right, second.finite, second.worst.worst) == (None, None, None)
+    assert headline(cells, "hard") == "hard: 1 of 6 runs right, 0 silently wrong, 1 diverged or failed"
 
 
 SCENE = "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 3\ndefault_size: 3\n"
