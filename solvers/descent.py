@@ -80,7 +80,8 @@ def dot(a: Positions, b: Positions) -> float:
 class Metric:
     """Q of a system's projective energies, factorised: what residuals are measured by.
 
-    trace: of its unpinned part [N/m]; diagonal: of its free part (f,) [N/m]; choice: the linear solver in words.
+    trace: of its unpinned part [N/m]; inner: its free part (f, f); diagonal: of that (f,) [N/m]; factor: of that;
+    choice: the linear solver in words.
     """
 
     def __init__(self, system: System) -> None:
@@ -89,12 +90,11 @@ class Metric:
         self._Q = matrices.assemble(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
         free = system.free
         inner = csr_array(csr_array(self._Q[free])[:, free])
-        self._factor, self.choice = (
-            factorise(inner) if len(free) else (DenseCholesky(np.eye(0)), "nothing to solve for")
-        )
+        self.inner = inner
+        self.factor, self.choice = factorise(inner) if len(free) else (DenseCholesky(np.eye(0)), "nothing to solve for")
         self.diagonal: NDArray[np.float64] = np.asarray(inner.diagonal(), np.float64)
         self.trace = float(self._Q.diagonal()[system.unpinned].sum())
-        factor = {} if self._factor.nonzeros is None else {"nnz_factor": float(self._factor.nonzeros)}
+        factor = {} if self.factor.nonzeros is None else {"nnz_factor": float(self.factor.nonzeros)}
         self.facts = {"nnz_system": float(self._Q.nnz)} | factor
 
     def round_off(self, p: Positions) -> float:
@@ -105,7 +105,7 @@ class Metric:
         """Q^-1 b, (n, 3), zero at exactly pinned vertices."""
         out, free = np.zeros_like(b), self.system.free
         x = np.empty((len(free), 3))
-        self._factor.solve(np.ascontiguousarray(b[free]), x)
+        self.factor.solve(np.ascontiguousarray(b[free]), x)
         out[free] = x
         return out
 

@@ -15,6 +15,10 @@ from typing import ClassVar
 import numpy as np
 
 from solvers.descent import Metric, Point, PreparedDescent, dot, search
+from solvers.kernels import conjugate
+from solvers.kernels.hessian import linearise
+from solvers.linear.inverse import Inverse
+from solvers.linear.supernodal import Supernodal
 from solvers.objective import Objective, StepObjective
 from solvers.problem import Positions, System, Unsupported
 from solvers.touching import without_contact
@@ -39,14 +43,16 @@ class NewtonCG:
         if without_contact(system) is not system:
             raise Unsupported("newton-cg: Q preconditions no Contact, which is far stiffer; take newton or lbfgs")
         metric = Metric(system)
-        return PreparedDescent(Objective(system), metric, _Method(metric), metric.choice, metric.facts)
+        objective = Objective(system)
+        return PreparedDescent(objective, metric, Method(metric, objective), metric.choice, metric.facts)
 
 
-class _Method:
-    """The iteration for one system."""
+class Method:
+    """The iteration for one system. compiled: its conjugate gradients in one kernel, None where that cannot be."""
 
-    def __init__(self, metric: Metric) -> None:
+    def __init__(self, metric: Metric, objective: Objective) -> None:
         self._metric = metric
+        self.compiled = _Compiled(objective, factor) if (factor := _known(metric)) else None
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
         """The points after `start`."""
@@ -78,6 +84,8 @@ class _Method:
 
     def _direction(self, step: StepObjective, at: Point, descent: Positions, eta: float) -> Positions:
         """What conjugate gradients make of -H^-1 g; descent: Q^-1 g."""
+        if self.compiled and not step.others:
+            return self.compiled.direction(step, at, descent, eta)
         hessian = step.hessian(at.positions)
         d, r, s = np.zeros_like(descent), at.gradient.copy(), -descent
         norm = dot(at.gradient, descent)
@@ -96,4 +104,30 @@ class _Method:
                 break
             s *= norm / before
             s -= z
+        return d
+
+
+def _known(metric: Metric) -> Supernodal | None:
+    """A factor of the metric that kernels know, small as it may be; None where Q has none."""
+    if isinstance(metric.factor, Inverse):
+        return Supernodal(metric.inner)
+    return metric.factor if isinstance(metric.factor, Supernodal) else None
+
+
+class _Compiled:
+    """The same conjugate gradients in one kernel, for springs alone."""
+
+    def __init__(self, objective: Objective, factor: Supernodal) -> None:
+        system = objective.system
+        self._threads, self._held = factor.threads, system.pins.vertices[system.pins.exact]
+        self._factor = conjugate.Factor.of(factor, system.free)
+        self._linear = np.empty((len(objective.springs.stiffness), 4))
+        self._scratch = np.zeros((4, system.vertices, 3))
+
+    def direction(self, step: StepObjective, at: Point, descent: Positions, eta: float) -> Positions:
+        """See `Method._direction`."""
+        d, terms = np.empty_like(descent), step.whole.terms
+        linearise(terms, at.positions, self._linear)
+        fixed = terms, self._linear, self._factor, self._threads(), self._held
+        conjugate.direction(*fixed, at.gradient, descent, eta, _MOST, self._scratch, d)
         return d

@@ -168,9 +168,10 @@ class Supernodal:
         at = self.layout
         solve(
             *(self.squares, self.panels, at.places, at.chunks, at.spans, at.by_slot, at.by_vertex),
-            *(self._work, b, out, self._team, self._threads()),
+            *(self._work, b, out, self._team, self.threads()),
         )
 
-    def _threads(self) -> int | None:
+    def threads(self) -> int | None:
+        """Of a solve, None for one."""
         threads = min(numba.get_num_threads(), len(self.shares) - 1)
         return threads if threads > 1 and self.panel_bytes >= _WORTH_THREADS else None

@@ -16,7 +16,7 @@ from harness.mesh.surfaces import Balloon
 from solvers.descent import PreparedDescent
 from solvers.hybrid import Hybrid
 from solvers.newton import Newton, certified
-from solvers.newton_cg import NewtonCG
+from solvers.newton_cg import Method, NewtonCG
 from solvers.objective import Objective, StepObjective
 from solvers.problem import StopRule
 from tests.scenes import cloth, first_problem, random_problem, scene
@@ -47,6 +47,19 @@ def test_it_converges_faster_than_linearly_near_a_minimum():
     assert residuals[-1] <= 1e-12 * start
     # The forcing term squares the residual once it is below a tenth; five halvings of 1e-3 would be a linear method's.
     assert 1 <= len(near) <= 6
+
+
+@pytest.mark.parametrize("weight", ["exact", 1e10], ids="pins {}".format)
+@pytest.mark.parametrize("size", [4, 12])
+def test_the_compiled_loop_makes_the_iterates_of_the_one_that_takes_any_energy(size, weight):
+    given = first_problem(cloth(size, weight))
+    compiled, plain = (NewtonCG().prepare(given.system) for _ in range(2))
+    assert isinstance(plain, PreparedDescent)
+    assert isinstance(plain.method, Method)
+    plain.method.compiled = None
+    for p, q in islice(zip(compiled.iterates(given), plain.iterates(given), strict=False), 6):
+        # Sums in another order, which pins of 1e10 beside springs of 1e2 magnify.
+        np.testing.assert_allclose(p, q, rtol=0, atol=1e-9)
 
 
 def test_negative_curvature_at_the_very_first_is_a_local_global_step():
