@@ -23,15 +23,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from solvers.accelerated import PreparedAccelerated
+from solvers.accelerated import PreparedAccelerated, Run
 from solvers.descent import DECREASE, Metric, Point, PreparedDescent, dot, search
 from solvers.lbfgs import Lbfgs
 from solvers.newton import NewtonMethod
 from solvers.objective import Hessian, Objective, StepObjective
 from solvers.problem import Positions, System
 
-_ROUND = 10
-"""Iterations of L-BFGS in a round."""
+_ROUND, _RELAXED = 10, 5
+"""Iterations of L-BFGS in a round, and after a step of Newton's method."""
 
 _QUICK = 0.5
 """What the first round leaves of the residual where L-BFGS suits a problem."""
@@ -82,11 +82,12 @@ class HybridMethod:
         """The points after `start`."""
         origin = point = _lower(step, start)
         predicting = _Predicting(self, step, origin)
-        run = self._lbfgs.engine.begin(step.problem, point.positions, kept=False)
+        run: Run | None = self._lbfgs.engine.begin(step.problem, point.positions, kept=False)
         _, before, _ = run.advance(0, 0.0, 0.0, False)
         gain, newton_gain, ended = np.inf, 0.0, False
         while not ended:
             if gain > newton_gain:
+                run = run or self._lbfgs.engine.begin(step.problem, point.positions, kept=False)
                 _, residual, ended = run.advance(_ROUND, 0.0, 0.0, False)
                 following = _at(step, run.positions)
                 ended |= residual**2 <= self.metric.round_off(following.positions)
@@ -99,7 +100,7 @@ class HybridMethod:
                 following, ended = predicting.next(point)
                 newton_gain = _gain(step, point, following) / self._cost
                 gain = gain or newton_gain  # until it is known
-                run = self._lbfgs.engine.begin(step.problem, following.positions, kept=False)
+                run = None
             if following is not point:
                 point = following
                 yield point
@@ -110,9 +111,9 @@ class HybridMethod:
         return self._newton.phases(step, at) | {"lbfgs": lambda: self.relaxed(step, at.positions)}
 
     def relaxed(self, step: StepObjective, p: Positions) -> Point:
-        """Where a round of L-BFGS leads from p."""
+        """Where some iterations of L-BFGS lead from p."""
         run = self._lbfgs.engine.begin(step.problem, p, kept=True)
-        run.advance(_ROUND, float("nan"), 0.0, False)
+        run.advance(_RELAXED, float("nan"), 0.0, False)
         return _at(step, run.positions)
 
 
@@ -131,9 +132,10 @@ class _Predicting:
         step, at = self._step, self._origin or point
         self._origin = None
         hessian = step.hessian(at.positions)
-        if not self._factorise(hessian):
+        descent = self._solved(hessian, at.gradient)
+        if descent is None:
             return point, True
-        direction = -hessian.solve(at.gradient)
+        direction = -descent
         slope, before = dot(at.gradient, direction), self._slope
         self._slope = slope
         if not -slope > self._method.metric.round_off(at.positions):
@@ -148,14 +150,15 @@ class _Predicting:
             return point, at is point
         return following, self._level == 0 and kept and slope >= _QUADRATIC * before
 
-    def _factorise(self, hessian: Hessian) -> bool:
-        """Whether some level gives a factor: the first one does from that before the last one's on."""
+    def _solved(self, hessian: Hessian, b: Positions) -> Positions | None:
+        """The product of b and the inverse on the first level that has one, from that before the last one's on."""
         for level in range(max(0, self._level - self._bold), len(_LEVELS)):
             keep, by = _LEVELS[level]
-            if hessian.factorise(keep, by * self._method.inertia, self._tension):
+            solution = hessian.solve_anew(b, keep, by * self._method.inertia, self._tension)
+            if solution is not None:
                 self._level = level
-                return True
-        return False
+                return solution
+        return None
 
     def _along(self, at: Point, direction: Positions, slope: float) -> tuple[float, Point | None, bool]:
         """How much of the direction is gone, to where, and whether the objective falls as its model promises."""

@@ -185,13 +185,34 @@ class Hessian:
 
         keep: of the negative lateral part of springs; shift: added to the diagonal [N/m]; tension (m,): of springs [N].
         """
+        matrix = self._assembled(keep, shift, tension)
+        return matrix.factor.factorise(matrix.values)
+
+    def solve_anew(
+        self,
+        b: Positions,
+        keep: float = 1.0,
+        shift: NDArray[np.float64] | float = 0.0,
+        tension: NDArray[np.float64] | None = None,
+    ) -> Positions | None:
+        """Both at once, sooner than one after the other; None if it is not positive definite."""
+        matrix, out = self._assembled(keep, shift, tension), np.zeros_like(b)
+        x = matrix.factor.solve_anew(matrix.values, b[self._free])
+        if x is None:
+            return None
+        out[self._free] = x
+        return out
+
+    def _assembled(
+        self, keep: float, shift: NDArray[np.float64] | float, tension: NDArray[np.float64] | None
+    ) -> Matrix:
         matrix, places, entries = self._placed
         tension = self._tension if tension is None else tension
         hessian.assemble(self._terms, matrix.places, self._p, tension, keep, matrix.values)
         values = matrix.values.reshape(-1)
         values[places] += entries
         values[matrix.diagonal] += shift
-        return matrix.factor.factorise(matrix.values)
+        return matrix
 
     def solve(self, b: Positions) -> Positions:
         """Its inverse, as it was factorised last, times b (n, 3); zero at vertices that are not free."""

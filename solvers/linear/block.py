@@ -17,6 +17,8 @@ from solvers.linear.block_vectors import ROWS, TILE
 from solvers.linear.ordering import nested_dissection
 from solvers.linear.symbolic import Symbolic, analyse
 
+_NOTHING = np.empty((0, 3))
+
 
 class BlockCholesky:
     """The factorisation of H for one pattern of blocks.
@@ -45,12 +47,21 @@ class BlockCholesky:
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
         """Factorise H with these blocks (b, 3, 3), in the order of the graph; False if it is not positive definite."""
-        return factorise(self._fronts, values, self._panels, *self._scratch)
+        return factorise(self._fronts, values, self._panels, _NOTHING, *self._vectors, *self._scratch)
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """H^-1 b, both (n, 3), by what was factorised last."""
         x = np.array(b, order="C")
-        solve(self._fronts, self._panels, x, *self._vectors)
+        solve(self._fronts, self._panels, x, *self._vectors, False)
+        return x
+
+    def solve_anew(self, values: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """H^-1 b, H factorised with these blocks: sooner than one after the other. None if it is not positive
+        definite."""
+        x = np.array(b, order="C")
+        if not factorise(self._fronts, values, self._panels, x, *self._vectors, *self._scratch):
+            return None
+        solve(self._fronts, self._panels, x, *self._vectors, True)
         return x
 
 

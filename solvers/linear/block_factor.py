@@ -6,7 +6,7 @@ columns to the left is subtracted at once, then the tile is divided by its own t
 take turns from level to level of the tree, so that each is made where it waits, while those of its children are read.
 
 Rows begin at whole vectors: those of a panel's columns, and those below, which is all the padding there is. What lies
-above the diagonal is never read.
+above the diagonal is never read; on it are the inverses of L's entries.
 """
 
 from __future__ import annotations
@@ -53,11 +53,12 @@ _whole = inner(whole)
 
 
 @kernel
-def factorise(fronts, values, panels, stacks, waiting, filled, triangle, place, runs):
+def factorise(fronts, values, panels, x, front, y, stacks, waiting, filled, triangle, place, runs):
     """Write L to `panels` from the blocks of the matrix, values (b, 3, 3); returns whether it is positive definite.
 
-    stacks (2, room): of updates, the numbers in use counted in filled (2,); waiting (2, s + 1): supernodes on each,
-    their count first; triangle (TILE, TILE), place (n,), runs (2, n + 1): scratch.
+    x (n, 3), or nothing: overwritten with L^-1 x while each panel is at hand; front, y: see `solve`; stacks (2, room):
+    of updates, the numbers in use counted in filled (2,); waiting (2, s + 1): supernodes on each, their count first;
+    triangle (TILE, TILE), place (n,), runs (2, n + 1): scratch.
     """
     filled[:] = 0
     waiting[:, 0] = 0
@@ -79,6 +80,8 @@ def factorise(fronts, values, panels, stacks, waiting, filled, triangle, place, 
                     size, runs)  # fmt: skip
         if not _eliminate(fronts, s, values, panels, head, stride, triangle):
             return False
+        if len(x) > 0:
+            _forwards(fronts, s, panels, x, front, y)
         _update(panels, base, 3 * own, head, stride, update, begin, 3 * below, size)
         if fronts.parent[s] >= 0:
             waiting[side, 0] += 1
@@ -171,6 +174,8 @@ def _eliminate(fronts, s, values, panels, head, stride, triangle):
                 divide(panels, corner + r, stride, triangle, 6)
             else:
                 divide(panels, corner + r, stride, triangle, 3)
+        for j in range(columns):
+            panels[corner + j * stride + tile + j] = triangle[j, j]
     return True
 
 
@@ -195,31 +200,41 @@ def _update(panels, base, width, head, stride, update, begin, columns, size):
                 subtract_product(panels, row + r, row + tile, stride, width, update, to + r, size, 3)
 
 
+@inner
+def _forwards(fronts, s, panels, x, front, y):
+    """The solve's pass over the panel of a supernode, children first."""
+    first, own, below, head, stride = _sizes(fronts, s)
+    front[: stride + ROWS] = 0.0
+    _gather(x, fronts.members, first, own, front, 0)
+    for tile in range(0, 3 * own, TILE):
+        columns, corner = min(TILE, 3 * own - tile), fronts.panel[s] + tile * stride + tile
+        for j in range(columns):
+            y[j] = front[tile + j]
+            for k in range(j):
+                y[j] -= panels[corner + k * stride + j] * y[k]
+            y[j] *= panels[corner + j * stride + j]
+            front[tile + j] = y[j]
+        to = tile + columns
+        at, strips = corner + columns, (stride - to + ROWS - 1) // ROWS
+        if columns == 6:
+            subtract_columns(panels, at, stride, front, to, strips, y, 6)
+        else:
+            subtract_columns(panels, at, stride, front, to, strips, y, 3)
+    _scatter(front, 0, x, fronts.members, first, own)
+    for k in range(below):
+        for c in range(3):
+            x[fronts.members[first + own + k], c] += front[head + 3 * k + c]
+
+
 @kernel
-def solve(fronts, panels, x, front, y):
-    """Overwrite x (n, 3) with H^-1 x; front, a vector longer than the largest front, and y (TILE,): scratch."""
-    for s in range(len(fronts.own)):
-        first, own, below, head, stride = _sizes(fronts, s)
-        front[: stride + ROWS] = 0.0
-        _gather(x, fronts.members, first, own, front, 0)
-        for tile in range(0, 3 * own, TILE):
-            columns, corner = min(TILE, 3 * own - tile), fronts.panel[s] + tile * stride + tile
-            for j in range(columns):
-                y[j] = front[tile + j]
-                for k in range(j):
-                    y[j] -= panels[corner + k * stride + j] * y[k]
-                y[j] /= panels[corner + j * stride + j]
-                front[tile + j] = y[j]
-            to = tile + columns
-            at, strips = corner + columns, (stride - to + ROWS - 1) // ROWS
-            if columns == 6:
-                subtract_columns(panels, at, stride, front, to, strips, y, 6)
-            else:
-                subtract_columns(panels, at, stride, front, to, strips, y, 3)
-        _scatter(front, 0, x, fronts.members, first, own)
-        for k in range(below):
-            for c in range(3):
-                x[fronts.members[first + own + k], c] += front[head + 3 * k + c]
+def solve(fronts, panels, x, front, y, begun):
+    """Overwrite x (n, 3) with H^-1 x; front, a vector longer than the largest front, and y (TILE,): scratch.
+
+    begun: whether `factorise` has done the first half.
+    """
+    if not begun:
+        for s in range(len(fronts.own)):
+            _forwards(fronts, s, panels, x, front, y)
     for s in range(len(fronts.own) - 1, -1, -1):
         first, own, below, head, stride = _sizes(fronts, s)
         front[: stride + ROWS] = 0.0
@@ -238,7 +253,7 @@ def solve(fronts, panels, x, front, y):
             for j in range(columns - 1, -1, -1):
                 for k in range(j + 1, columns):
                     y[j] -= panels[corner + j * stride + k] * y[k]
-                y[j] /= panels[corner + j * stride + j]
+                y[j] *= panels[corner + j * stride + j]
                 front[tile + j] = y[j]
         _scatter(front, 0, x, fronts.members, first, own)
 
