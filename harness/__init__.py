@@ -11,17 +11,31 @@ files that a kernel calls nor the options that it was compiled with.
 
 import hashlib
 import os
+import shutil
+from contextlib import suppress
 from pathlib import Path
+from time import time
+
+_UNUSED = 3600.0
+"""Seconds for which no process has begun to use a folder before it goes: one that still runs has loaded its kernels,
+and what else it compiles Numba keeps anew."""
 
 
-def _kernels() -> str:
-    """The folder for the compiled code of today's sources; older ones beside it are no longer used."""
-    solvers = Path(__file__).resolve().parents[1] / "solvers"
+def kernels(solvers: Path) -> str:
+    """The folder for the compiled code of today's sources; those of other sources go when it is made."""
     digest = hashlib.sha256()
     for source in sorted(solvers.rglob("*.py")):
         digest.update(source.read_bytes())
-    return str(solvers / "__pycache__" / f"numba-{digest.hexdigest()[:12]}")
+    folder = solvers / "__pycache__" / f"numba-{digest.hexdigest()[:12]}"
+    with suppress(OSError):  # where nothing can be written, Numba looks for another place
+        if not folder.exists():
+            for other in folder.parent.glob("numba-*"):
+                if other.stat().st_mtime < time() - _UNUSED:
+                    shutil.rmtree(other, ignore_errors=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+    return str(folder)
 
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-os.environ.setdefault("NUMBA_CACHE_DIR", _kernels())
+os.environ.setdefault("NUMBA_CACHE_DIR", kernels(Path(__file__).resolve().parents[1] / "solvers"))
