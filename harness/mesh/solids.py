@@ -61,10 +61,17 @@ class Tower(Generator):
         )
 
 
+_FACES = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1), (0, 1, 1), (0, 1, -1))
+_DIAGONALS: dict[str, tuple[tuple[int, int, int], ...]] = {
+    "one": _FACES[::2],
+    "all": (*_FACES, (1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)),
+}
+
+
 class Block(Generator):
     """A soft block of near-cubic cells on the ground y = 0, `size` vertices along its longest side.
 
-    Vertices are numbered with z fastest and x slowest. Springs: along x, y, z (STRETCH); both diagonals of
+    Vertices are numbered with z fastest and x slowest. Springs: along x, y, z (STRETCH); the diagonals of
     the faces in x-y, x-z and y-z, then the four diagonals through each cell (SHEAR). Triangles: the surface,
     facing outwards. Parts: left, right, bottom, top, back, front, corners. Mass goes by the volume of the
     cells. Dimension 3.
@@ -77,6 +84,8 @@ class Block(Generator):
     """Along y [m]."""
     depth: Metres = 0.5
     """Along z [m]."""
+    diagonals: Literal["one", "all"] = "all"
+    """Diagonal springs: one on each face, which is just enough to be rigid, or all on faces and through cells."""
 
     COUNTS: ClassVar[str] = "vertices along its longest side"
 
@@ -102,13 +111,11 @@ class Block(Generator):
         grid = np.meshgrid(x - self.length / 2, y, z - self.depth / 2, indexing="ij")
         rest = np.stack([axis.ravel() for axis in grid], axis=1)
         surface = (index[0].T, index[-1], index[:, 0], index[:, -1].T, index[:, :, 0].T, index[:, :, -1])
-        faces = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1), (0, 1, 1), (0, 1, -1))
-        through = ((1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1))
         return assemble(
             rest=rest,
             springs={
                 STRETCH: offset_pairs(index, (1, 0, 0), (0, 1, 0), (0, 0, 1)),
-                SHEAR: offset_pairs(index, *faces, *through),
+                SHEAR: offset_pairs(index, *_DIAGONALS[self.diagonals]),
             },
             triangles=np.concatenate([lattice_triangles(side) for side in surface]),
             weights=reduce(np.multiply.outer, map(_owned, shape)).ravel(),

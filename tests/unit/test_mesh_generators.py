@@ -30,6 +30,11 @@ def test_the_curtain_of_liu_2013_has_its_springs():
     assert len(mesh.springs) == 32158
 
 
+def test_a_block_of_75_vertices_with_one_diagonal_a_face_is_as_large_as_the_dog_of_liu_2013():
+    mesh = Block(height=0.26, depth=0.25, diagonals="one").build(75)
+    assert (len(mesh.rest), len(mesh.springs)) == (28_500, 161_199)  # the dog: 28,390 and 148,047
+
+
 def test_a_cloth_of_64_vertices_a_side_with_both_diagonals_has_16002_springs():
     assert len(Grid(diagonals="both").build(64).springs) == 16002
 
@@ -47,6 +52,7 @@ def test_a_cloth_of_64_vertices_a_side_with_both_diagonals_has_16002_springs():
         (Tower(), 2, 12, 12 + 8 + 16 + 3, 0),
         (Block(height=1.0, depth=1.0), 2, 8, 28, 12),
         (Block(height=1.0, depth=0.5), 3, 18, 33 + 2 * (4 * 2 + 2 * 2 * 3) + 4 * 4, 32),
+        (Block(height=1.0, depth=0.5, diagonals="one"), 3, 18, 33 + 4 * 2 + 2 * 2 * 3, 32),
     ],
     ids=repr,
 )
@@ -60,6 +66,7 @@ def test_counts_are_those_of_the_lattice(generator, size, vertices, springs, tri
     [
         (Grid(skip_one=True), {STRETCH: [1], SHEAR: [2**0.5], BEND: [2]}),
         (Block(height=1.0, depth=1.0), {STRETCH: [1], SHEAR: [2**0.5, 3**0.5], BEND: []}),
+        (Block(height=1.0, depth=1.0, diagonals="one"), {STRETCH: [1], SHEAR: [2**0.5], BEND: []}),
     ],
     ids=repr,
 )

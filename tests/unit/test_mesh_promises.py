@@ -31,6 +31,7 @@ GENERATORS: list[Generator] = [
     Balloon(radius=0.3),
     Tower(),
     Block(length=1.0, height=0.4, depth=0.6),
+    Block(length=1.0, height=0.6, depth=0.4, diagonals="one"),
 ]
 MESH_CASES = [
     pytest.param(generator, generator.SMALLEST + extra, id=f"{type(generator).__name__}{k}-{extra}")
