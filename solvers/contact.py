@@ -168,8 +168,7 @@ class PreparedContact:
             return self.idle.solve(problem, stop)
         limit, yardstick, every = 0.0, float("nan"), stop.tolerance is not None
         if stop.tolerance is not None:
-            step = StepObjective(self.objective, problem)
-            yardstick = self._residual(self.corrections.plain(step.gradient(problem.current)))
+            yardstick = self.gauge(problem)(problem.current)
             limit = stop.tolerance * yardstick
         floor = stop.floor * float(np.abs(problem.first_guess).max(initial=0.0)) * self.base.trace**0.5
         points, residual, iteration, stopped = self._points(problem, contacts), float("nan"), 0, "iterations"
@@ -186,6 +185,11 @@ class PreparedContact:
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Those of the method while nothing is touched; with contact an iteration has no parts that stand alone."""
         return {} if touching(problem) else self.idle.phases(problem)
+
+    def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
+        """What tells the residual [J^(1/2)] at positions (n, 3)."""
+        step = StepObjective(self.objective, problem)
+        return lambda p: self._residual(self.corrections.plain(step.gradient(p)))
 
     def _residual(self, plain: Positions) -> float:
         return self.corrections.residual(plain)

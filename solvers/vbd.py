@@ -3,9 +3,10 @@
     B_i d_i = -grad_i g(p),   p_i += d_i,   B_i = held_i I + sum over its springs of k (nn' + max(0, 1 - r/l) (I - nn'))
 
 with n the direction and l the length of a spring; compressed springs lose their negative lateral curvature, so B_i is
-positive definite. The paper skips the line search. Here a step that would raise the energy gives way to that of the
-majorant (held_i + sum of k) I, which cannot: so no sweep raises the objective.
-Vertices go by colour: none is joined by a spring to another of its colour.
+positive definite. A quadratic form adds its own entry of the diagonal, and contact its exact second derivatives: it
+acts on single vertices. The paper skips the line search. Here a step that would raise the energy gives way to that of
+the majorant (held_i + sum of k) I, which cannot: so no sweep raises the objective.
+Vertices go by colour: none is joined by a spring or a form to another of its colour.
 
 Sweeps are accelerated by Chebyshev's semi-iteration with the spectral radius rho (Wang 2015),
 
@@ -28,11 +29,13 @@ from solvers import blocks, colouring
 from solvers.compiled import CompiledLocalGlobal
 from solvers.kernels import vbd as kernels
 from solvers.kernels.accelerate_springs import Shares
+from solvers.kernels.half_spaces import HalfSpaces
 from solvers.kernels.springs import Bundles, aligned
 from solvers.kernels.springs_vectors import LANES
 from solvers.kernels.vbd_vectors import NUMBERS
-from solvers.local_global import only_springs
-from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System
+from solvers.parts import Parts, split
+from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System, Unsupported
+from solvers.touching import ContactEnergy, touching, without_contact
 
 _FAR = 1e100
 """Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
@@ -40,7 +43,7 @@ _FAR = 1e100
 
 @dataclass(frozen=True)
 class VertexBlockDescent:
-    """Vertex block descent over springs.
+    """Vertex block descent over springs, quadratic forms and contact.
 
     spectral_radius: rho of the acceleration, at least 0 and less than 1; 0 does not accelerate.
     """
@@ -56,10 +59,13 @@ class VertexBlockDescent:
             raise ValueError(f"spectral_radius: should be at least 0 and less than 1, not {self.spectral_radius}")
 
     def prepare(self, system: System) -> PreparedVertexBlockDescent:
-        """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
-        springs, n = only_springs(system, "vbd"), system.vertices
+        """Raises Unsupported for other energies, NotPositiveDefinite."""
+        bare, n = without_contact(system), system.vertices
+        parts = split(bare)
+        if parts.unknown:
+            raise Unsupported(f"vbd: knows springs, quadratic forms and contact, not {', '.join(parts.unknown)}")
         measure = CompiledLocalGlobal().prepare(system)
-        coloured = colouring.of_vertices(springs.edges, n)
+        coloured = colouring.of_vertices(parts.whole.edges, n)
         colour = np.empty(n, np.int64)
         colour[coloured.order] = np.repeat(np.arange(coloured.colours), np.diff(coloured.start))
         pinned = system.pins.vertices[system.pins.exact]
@@ -67,14 +73,15 @@ class VertexBlockDescent:
         row = np.empty(n, np.int64)
         row[order], row[pinned] = np.arange(len(order)), np.arange(len(order), n)
         colour[pinned] = -1
-        bundles, _ = Bundles.of(springs, row, colour, coloured.colours, n, n + 1)
+        bundles, _ = Bundles.of(parts.whole, row, colour, coloured.colours, n, n + 1)
         held, majorant = np.zeros(n + 2), np.ones(n + 2)
-        held[: len(order)] = majorant[: len(order)] = blocks.held(system)[order]
+        held[: len(order)] = majorant[: len(order)] = (blocks.held(system) + parts.held)[order]
         ends = np.repeat(bundles.own.reshape(-1, LANES), np.diff(bundles.start), axis=0)
         np.add.at(majorant, ends.ravel(), bundles.stiffness)
         shares = Shares.of(bundles, held, row[pinned])
         return PreparedVertexBlockDescent(
             system,
+            parts,
             self.spectral_radius,
             kernels.Blocks(bundles, shares, len(order), held, majorant),
             row,
@@ -85,10 +92,11 @@ class VertexBlockDescent:
 
 @dataclass(frozen=True, eq=False)
 class PreparedVertexBlockDescent:
-    """blocks: of the free vertices; row (n,): where each vertex is in them; measure: one iteration of local-global from
-    p tells the residual at p, and is asked for nothing else."""
+    """parts: of the energies; blocks: of the free vertices; row (n,): where each vertex is in them; measure: one
+    iteration of local-global from p tells the residual at p, and is asked for nothing else."""
 
     system: System
+    parts: Parts
     spectral_radius: float
     blocks: kernels.Blocks
     row: NDArray[np.int64]
@@ -102,23 +110,24 @@ class PreparedVertexBlockDescent:
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """The iterates from `problem.first_guess`."""
-        advance = self._begin(problem)
+        advance = self._begin(problem, touching(problem))
         while True:
             yield advance(1)
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """Iterate until `stop` says so; the residual is that of the positions."""
-        advance = self._begin(problem)
+        contacts = touching(problem)
+        advance, gauge = self._begin(problem, contacts), self._gauge(problem, contacts)
         if stop.tolerance is None:
             p = advance(stop.iterations)
-            return Solution(p, stop.iterations, self._residual(problem, p), np.nan, "iterations")
+            return Solution(p, stop.iterations, gauge(p), np.nan, "iterations")
         p, trace = problem.first_guess, self.blocks.majorant[self.row[self.system.unpinned]].sum()
         floor = stop.floor * float(np.abs(p).max(initial=0.0)) * float(trace) ** 0.5
-        yardstick = residual = self._residual(problem, problem.current)
+        yardstick = residual = gauge(problem.current)
         limit = stop.tolerance * yardstick
         for iteration in range(1, stop.iterations + 1):
             p = advance(1)
-            residual = self._residual(problem, p)
+            residual = gauge(p)
             if residual <= max(limit, floor):
                 return Solution(p, iteration, residual, yardstick, "tolerance" if residual <= limit else "floor")
         return Solution(p, stop.iterations, residual, yardstick, "iterations")
@@ -127,16 +136,18 @@ class PreparedVertexBlockDescent:
         """None: an iteration has no parts."""
         return {}
 
-    def _begin(self, problem: StepProblem) -> Callable[[int], Positions]:
+    def _begin(self, problem: StepProblem, contacts: list[ContactEnergy]) -> Callable[[int], Positions]:
         """What does a number of iterations, from where those before ended, and gives a copy of the positions."""
-        p, y = (self._rows(x) for x in (blocks.placed(problem.first_guess, problem), blocks.pull(problem)))
+        pull = blocks.pull(replace(problem, force=self.parts.force(problem)))
+        p, y = (self._rows(x) for x in (blocks.placed(problem.first_guess, problem), pull))
+        spaces = self._spaces(contacts) if contacts else None
         p[-4] = _FAR
         entries = int(np.diff(self.blocks.bundles.start).max(initial=0))
         scratch = aligned(NUMBERS * LANES * entries)
         work = kernels.Work(p.copy(), p.copy(), np.zeros_like(p), scratch, np.zeros(1), np.full(1, np.nan))
 
         def advance(iterations: int) -> Positions:
-            kernels.iterate(self.blocks, y, self.spectral_radius, work, p, iterations)
+            kernels.iterate(self.blocks, spaces, y, self.spectral_radius, work, p, iterations)
             return p.reshape(-1, 4)[self.row, :3].copy()
 
         return advance
@@ -147,6 +158,16 @@ class PreparedVertexBlockDescent:
         out.reshape(-1, 4)[self.row, :3] = x
         return out
 
-    def _residual(self, problem: StepProblem, p: Positions) -> float:
-        """|Q^-1 grad g(p)|_Q [J^(1/2)] over the unpinned vertices."""
-        return self.measure.solve(replace(problem, first_guess=p), StopRule(1)).residual
+    def _spaces(self, contacts: list[ContactEnergy]) -> HalfSpaces:
+        from solvers.half_spaces import half_spaces  # for those who need it
+
+        return half_spaces(contacts, self.row, self.blocks.bundles, self.blocks.unknowns)
+
+    def _gauge(self, problem: StepProblem, contacts: list[ContactEnergy]) -> Callable[[Positions], float]:
+        """What tells |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices."""
+        if contacts:
+            from solvers.contact import PreparedContact
+
+            assert isinstance(self.measure, PreparedContact)
+            return self.measure.gauge(problem)
+        return lambda p: self.measure.solve(replace(problem, first_guess=p), StopRule(1)).residual

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from solvers.compiling import inner, kernel
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.accelerate_springs import descend as objective
+from solvers.kernels.half_spaces import move, pressed
 from solvers.kernels.springs import Bundles, one_by_one
 from solvers.kernels.springs_vectors import LANES
 from solvers.kernels.vbd_vectors import descend
@@ -41,10 +42,14 @@ class Work(NamedTuple):
 
 
 @inner
-def _sweep(blocks, y, p, work):
+def _sweep(blocks, spaces, y, p, work):
     """Move every vertex once to a lower energy."""
     own, start, neighbour, pull, stiffness, _spring, _direction = blocks.bundles
     for b in range(len(start) - 1):
+        if spaces is not None:  # noqa: SIM102 Numba leaves a branch out for None alone
+            if spaces.near[b]:
+                move(blocks.bundles, spaces, b, blocks.unknowns, p, y, blocks.held, blocks.majorant)
+                continue
         short = descend(
             p, own, b, neighbour, pull, stiffness, start[b], start[b + 1], y, blocks.held, blocks.majorant, work.near
         )
@@ -67,12 +72,17 @@ def _copy(p, out):
         out[k] = p[k]
 
 
+@inner
+def _level(blocks, spaces, p, y, out):
+    return objective(blocks.bundles, blocks.shares, p, y, blocks.held, blocks.unknowns, out) + pressed(spaces, p)
+
+
 @kernel
-def iterate(blocks, y, radius, work, p, iterations):
+def iterate(blocks, spaces, y, radius, work, p, iterations):
     """That many sweeps over all vertices from p, which takes the result.
 
-    radius: of Chebyshev's extrapolation, 0 for none. An extrapolation that raises the objective above that before the
-    sweep is not taken, and they begin again.
+    spaces: half-spaces that vertices are kept in, or None; radius: of Chebyshev's extrapolation, 0 for none. An
+    extrapolation that raises the objective above that before the sweep is not taken, and they begin again.
     """
     omega, level, older = work.omega, work.level, work.older
     for _ in range(iterations):
@@ -84,16 +94,16 @@ def iterate(blocks, y, radius, work, p, iterations):
             else 1.0
         )
         if w > 1.0 and np.isnan(level[0]):
-            level[0] = objective(blocks.bundles, blocks.shares, p, y, blocks.held, blocks.unknowns, work.out)
+            level[0] = _level(blocks, spaces, p, y, work.out)
         _copy(p, work.before)
-        _sweep(blocks, y, p, work)
+        _sweep(blocks, spaces, y, p, work)
         if radius == 0.0:
             continue
         omega[0] = w
         if w > 1.0:
             for k in range(4 * blocks.unknowns):
                 older[k] += w * (p[k] - older[k])
-            new = objective(blocks.bundles, blocks.shares, older, y, blocks.held, blocks.unknowns, work.out)
+            new = _level(blocks, spaces, older, y, work.out)
             if new <= level[0]:
                 _copy(older, p)
                 level[0] = new

@@ -81,9 +81,11 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y,
             for value, pointer in zip([*arrow, builder.fmul(squared, root)], kept(entry), strict=True):
                 builder.store(value, builder.bitcast(pointer, WIDE.as_pointer()), align=8)
             k = wide(stiffness, entry)
-            tension = builder.fsub(builder.fmul(wide(pull, entry), root), k)
-            compressed = builder.fcmp_ordered(">", tension, _ZERO)
-            lateral = builder.select(compressed, _ZERO, builder.fsub(_ZERO, tension))
+            inward = builder.fmul(wide(pull, entry), root)
+            tension = builder.fsub(inward, k)
+            # A spring whose k is negative is a form's, has no rest length and is never compressed.
+            compressed = [builder.fcmp_ordered(">", force, _ZERO) for force in (tension, inward)]
+            lateral = builder.select(builder.and_(*compressed), _ZERO, builder.fsub(_ZERO, tension))
             axial = builder.fsub(k, lateral)
             n = [builder.fmul(component, root) for component in arrow]
             along = [builder.fmul(axial, component) for component in n]

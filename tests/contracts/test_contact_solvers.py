@@ -19,7 +19,7 @@ from tests.contacts import OBSTACLES, contact, sheet, steps
 
 SOLVED: dict[str, Solver] = {name: load(target)() for name, target in SOLVERS.items()}
 PREFACTORED = ("sparse", "numba", "anderson", "chebyshev", "lbfgs")
-TAKE = (*PREFACTORED, "hybrid", "newton")
+TAKE = (*PREFACTORED, "vbd", "hybrid", "newton")
 FLOOR = contact(OBSTACLES["plane"], friction=0.4)
 FALL = (0.5, -6.0, 0.0)
 
@@ -63,7 +63,7 @@ def test_others_refuse_contact_by_name(solver):
 
 @pytest.mark.parametrize("few", [method._FEW, 0], ids=["Woodbury", "conjugate gradients"])
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("solver", PREFACTORED)
+@pytest.mark.parametrize("solver", [*PREFACTORED, "vbd"])
 def test_no_iteration_raises_the_objective(solver, scene, few, monkeypatch):
     monkeypatch.setattr(method, "_FEW", few)
     problem, wanted = landed(scene)
@@ -95,7 +95,7 @@ def test_conjugate_gradients_correct_as_woodburys_formula_does(scene, monkeypatc
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-6 * np.abs(exact).max())
 
 
-@pytest.mark.parametrize("solver", PREFACTORED)
+@pytest.mark.parametrize("solver", [*PREFACTORED, "vbd"])
 def test_contact_that_is_idle_changes_no_bit(solver):
     far = contact({"kind": "plane", "point": (0, -50, 0)}, friction=0.5)
     runs = [

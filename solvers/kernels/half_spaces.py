@@ -1,0 +1,221 @@
+"""Newton steps of vertices that half-spaces keep out of obstacles, one vertex after another.
+
+    k/2 min(0, n.x - d)^2 + F h(|u|),   u = (I - nn')(x - a)             a half-space (see `solvers.energies.contact`)
+
+A vertex's block and gradient are those of its springs and of what presses and grips. What begins to press on the way is
+found by a few repetitions, each from the last one's end. A step that raises the energy gives way to one of a larger
+block, in the end of one that majorises everything.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.compiling import inner
+from solvers.kernels.springs import TINY_SQUARED
+from solvers.kernels.springs_vectors import LANES
+
+_PASSES = 4
+_EXACT, _GRIPPED, _MAJORANT, _EVERYTHING = range(4)
+"""The blocks: exact, but for compressed springs; with a majorant of friction; of springs too; of what may press too."""
+
+_ROUND_OFF = 1e-14
+"""Pivots up to this share of the diagonal's sum are round-off."""
+
+
+class HalfSpaces(NamedTuple):
+    """Half-spaces by the rows of their vertices.
+
+    first (rows + 1,): of each row; near (b,): whether a bundle has a vertex with any; of each half-space normal n and
+    anchor a (k, 3), offset d [m], stiffness k [N/m], grip F [N] and slip [m], (k,).
+    """
+
+    first: NDArray[np.int64]
+    near: NDArray[np.bool_]
+    normal: NDArray[np.float64]
+    anchor: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    stiffness: NDArray[np.float64]
+    grip: NDArray[np.float64]
+    slip: NDArray[np.float64]
+
+
+@inner
+def _rounded(u, slip):
+    return 0.5 * u * u / slip if u <= slip else u - 0.5 * slip
+
+
+@inner
+def _across(s, k, x):
+    """u and |u| of a half-space at x."""
+    n0, n1, n2 = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2]
+    u0, u1, u2 = x[0] - s.anchor[k, 0], x[1] - s.anchor[k, 1], x[2] - s.anchor[k, 2]
+    along = n0 * u0 + n1 * u1 + n2 * u2
+    u0, u1, u2 = u0 - along * n0, u1 - along * n1, u2 - along * n2
+    return u0, u1, u2, np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
+
+
+@inner
+def pressed(s, p):
+    """The half-spaces' energy [J] at positions in rows of four; none without half-spaces."""
+    if s is None:
+        return 0.0
+    total = 0.0
+    for i in range(len(s.first) - 1):
+        x = p[4 * i], p[4 * i + 1], p[4 * i + 2]
+        for k in range(s.first[i], s.first[i + 1]):
+            depth = min(0.0, s.normal[k, 0] * x[0] + s.normal[k, 1] * x[1] + s.normal[k, 2] * x[2] - s.offset[k])
+            total += 0.5 * s.stiffness[k] * depth * depth
+            if s.grip[k] > 0.0:
+                total += s.grip[k] * _rounded(_across(s, k, x)[3], s.slip[k])
+    return total
+
+
+@inner
+def _springs(bundles, b, lane, p, x, held, load):
+    """The gradient and the upper triangle of the block of a vertex's springs and of what holds it."""
+    g0, g1, g2 = -load[0], -load[1], -load[2]
+    a00, a01, a02, a11, a12, a22 = held, 0.0, 0.0, held, 0.0, held
+    for entry in range(bundles.start[b], bundles.start[b + 1]):
+        e = LANES * entry + lane
+        j, k, pull = bundles.neighbour[e], bundles.stiffness[e], bundles.pull[e]
+        if k == 0.0:
+            continue
+        v0, v1, v2 = x[0] - p[4 * j], x[1] - p[4 * j + 1], x[2] - p[4 * j + 2]
+        squared = v0 * v0 + v1 * v1 + v2 * v2
+        if squared <= TINY_SQUARED:
+            length, name = 0.0, bundles.spring[e]
+            sign = -1.0 if name < 0 else 1.0
+            name = ~name if name < 0 else name
+            n0, n1, n2 = bundles.direction[name]
+            n0, n1, n2 = sign * n0, sign * n1, sign * n2
+            lateral = 0.0 if pull > 0.0 else k
+        else:
+            length = np.sqrt(squared)
+            n0, n1, n2 = v0 / length, v1 / length, v2 / length
+            lateral = max(k - pull / length, min(k, 0.0))
+        tension, axial = k * length - pull, k - lateral
+        g0, g1, g2 = g0 + tension * n0, g1 + tension * n1, g2 + tension * n2
+        a00, a01, a02 = a00 + axial * n0 * n0 + lateral, a01 + axial * n0 * n1, a02 + axial * n0 * n2
+        a11, a12, a22 = a11 + axial * n1 * n1 + lateral, a12 + axial * n1 * n2, a22 + axial * n2 * n2 + lateral
+    return (g0, g1, g2), (a00, a01, a02, a11, a12, a22)
+
+
+@inner
+def _add(block, weight, n0, n1, n2):
+    a00, a01, a02, a11, a12, a22 = block
+    return (
+        a00 + weight * n0 * n0, a01 + weight * n0 * n1, a02 + weight * n0 * n2,
+        a11 + weight * n1 * n1, a12 + weight * n1 * n2, a22 + weight * n2 * n2,
+    )  # fmt: skip
+
+
+@inner
+def _pushed(s, i, x, d, level, gradient, block):
+    """The gradient and the block with what presses and grips at x and after a step d; and which those are, as bits."""
+    who = 0
+    for k in range(s.first[i], s.first[i + 1]):
+        n0, n1, n2, weight = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2], s.stiffness[k]
+        gap = n0 * x[0] + n1 * x[1] + n2 * x[2] - s.offset[k]
+        if gap < 0.0 or level == _EVERYTHING or gap + n0 * d[0] + n1 * d[1] + n2 * d[2] < 0.0:
+            who |= 1 << (k - s.first[i])
+            block = _add(block, weight, n0, n1, n2)
+            force = weight * (min(0.0, gap) if level == _EVERYTHING else gap)
+            gradient = gradient[0] + force * n0, gradient[1] + force * n1, gradient[2] + force * n2
+        if s.grip[k] > 0.0:
+            u0, u1, u2, length = _across(s, k, x)
+            weight = s.grip[k] / max(s.slip[k], length)
+            gradient = gradient[0] + weight * u0, gradient[1] + weight * u1, gradient[2] + weight * u2
+            a00, a01, a02, a11, a12, a22 = _add(block, -weight, n0, n1, n2)
+            block = a00 + weight, a01, a02, a11 + weight, a12, a22 + weight
+            if level == _EXACT and length > s.slip[k]:
+                block = _add(block, -weight, u0 / length, u1 / length, u2 / length)
+    return gradient, block, who
+
+
+@inner
+def _solved(block, g):
+    """-B^-1 g, and whether B is positive definite."""
+    a, b, c, d, e, f = block
+    least = _ROUND_OFF * (a + d + f)
+    if not a > least:
+        return (0.0, 0.0, 0.0), False
+    l1, l2 = b / a, c / a
+    second, below = d - l1 * b, e - l2 * b
+    if not second > least:
+        return (0.0, 0.0, 0.0), False
+    l3 = below / second
+    third = f - l2 * c - l3 * below
+    if not third > least:
+        return (0.0, 0.0, 0.0), False
+    y1 = g[1] - l1 * g[0]
+    x2 = -(g[2] - l2 * g[0] - l3 * y1) / third
+    x1 = -y1 / second - l3 * x2
+    return (-g[0] / a - l1 * x1 - l2 * x2, x1, x2), True
+
+
+@inner
+def _rise(bundles, s, b, lane, i, p, x, d, held, load):
+    """By how much a step d of row i raises the energy [J], from differences, which do not cancel."""
+    total = 0.0
+    for c in range(3):
+        total += d[c] * (0.5 * held * d[c] - load[c])
+    for entry in range(bundles.start[b], bundles.start[b + 1]):
+        e = LANES * entry + lane
+        j, before, after, change = bundles.neighbour[e], 0.0, 0.0, 0.0
+        if bundles.stiffness[e] == 0.0:
+            continue
+        for c in range(3):
+            v = x[c] - p[4 * j + c]
+            before += v * v
+            after += (v + d[c]) * (v + d[c])
+            change += d[c] * (2.0 * v + d[c])
+        both = np.sqrt(before) + np.sqrt(after)
+        if both > 0.0:
+            total += change * (0.5 * bundles.stiffness[e] - bundles.pull[e] / both)
+    end = x[0] + d[0], x[1] + d[1], x[2] + d[2]
+    for k in range(s.first[i], s.first[i + 1]):
+        n0, n1, n2 = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2]
+        gap = n0 * x[0] + n1 * x[1] + n2 * x[2] - s.offset[k]
+        depth, deep = min(0.0, gap), min(0.0, gap + n0 * d[0] + n1 * d[1] + n2 * d[2])
+        total += 0.5 * s.stiffness[k] * (deep - depth) * (deep + depth)
+        if s.grip[k] > 0.0:
+            u0, u1, u2, length = _across(s, k, x)
+            w0, w1, w2, longer = _across(s, k, end)
+            both = (w0 - u0) * (w0 + u0) + (w1 - u1) * (w1 + u1) + (w2 - u2) * (w2 + u2)
+            if length <= s.slip[k] and longer <= s.slip[k]:
+                total += 0.5 * s.grip[k] * both / s.slip[k]
+            elif length > s.slip[k] and longer > s.slip[k]:
+                total += s.grip[k] * both / (longer + length)
+            else:
+                total += s.grip[k] * (_rounded(longer, s.slip[k]) - _rounded(length, s.slip[k]))
+    return total
+
+
+@inner
+def move(bundles, s, b, unknowns, p, y, held, majorant):
+    """Move the vertices of a bundle to lower energies, one after another: none is joined to another."""
+    for lane in range(LANES):
+        i = bundles.own[LANES * b + lane]
+        if i >= unknowns:
+            continue
+        h = held[i]
+        x = p[4 * i], p[4 * i + 1], p[4 * i + 2]
+        load = y[4 * i] - h * x[0], y[4 * i + 1] - h * x[1], y[4 * i + 2] - h * x[2]
+        gradient, block = _springs(bundles, b, lane, p, x, h, load)
+        for level in range(_EXACT, _EVERYTHING + 1):
+            if level == _MAJORANT:
+                block = majorant[i], 0.0, 0.0, majorant[i], 0.0, majorant[i]
+            d, definite, before = (0.0, 0.0, 0.0), True, -1
+            for _ in range(_PASSES):
+                slope, whole, who = _pushed(s, i, x, d, level, gradient, block)
+                if who == before:
+                    break
+                before = who
+                d, definite = _solved(whole, slope)
+            if definite and _rise(bundles, s, b, lane, i, p, x, d, h, load) <= 0.0:
+                p[4 * i], p[4 * i + 1], p[4 * i + 2] = x[0] + d[0], x[1] + d[1], x[2] + d[2]
+                break
