@@ -28,7 +28,6 @@ def gallery(
 
 def _tile(path: Path) -> Any:
     """A scene's tile."""
-    from harness.ablate.run import fitting
     from harness.load import load_any
     from harness.machine import pinned_threads
     from harness.measure import Settings, steps
@@ -42,7 +41,7 @@ def _tile(path: Path) -> Any:
 
     (run,) = load_any(path).runs()
     scene = build(run.scene, run.size)
-    solver = load(SOLVERS[fitting(run.scene, run.size)])()
+    solver = load(SOLVERS["hybrid"])()
     p = scene.mesh.rest
     with pinned_threads(1):
         settings = Settings(StopRule(200, 1e-4), run.first_guess, run.frames, 1)

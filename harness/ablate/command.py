@@ -9,11 +9,14 @@ import typer
 
 from harness.console import out, say
 
+SOLVER, TOLERANCE = "hybrid", 1e-4
+"""It takes all effects, and converges: what an effect changes is not to drown in the solver's own error."""
+
 
 def ablate(
     scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
     results: Annotated[Path, typer.Option(help="The folder that holds a folder for each scene.")] = Path("results"),
-    solver: Annotated[str | None, typer.Option(help="The first that takes all of the scene, if left out.")] = None,
+    solver: Annotated[str | None, typer.Option(help=f"{SOLVER}, to {TOLERANCE:g}, if left out.")] = None,
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
     frames: Annotated[int | None, typer.Option(help="How many steps; the scene's if left out.")] = None,
     iterations: Annotated[int, typer.Option(help="Iteration limit of a step.")] = 50,
@@ -23,17 +26,14 @@ def ablate(
 ) -> None:
     """Leave out each effect of a scene: what it costs, what it changes, and which effects the motion calls for."""
     from harness.ablate.run import ablate as run_ablation
-    from harness.ablate.run import fitting
     from harness.load import load_any
     from harness.report.ablation import ablation_table, read, sentences
     from harness.report.ablation_plot import draw_ablation
 
+    if solver is None:
+        solver, tolerance = SOLVER, tolerance or TOLERANCE
     options = {"frames": frames, "iterations": iterations, "tolerance": tolerance, "rounds": rounds, "threads": 1}
-    sizes = [size] if size else []
-    sweep = load_any(scene, solvers=[solver] if solver else [], sizes=sizes, **options)
-    (first,) = sweep.runs()
-    if not solver:
-        sweep = load_any(scene, solvers=[fitting(first.scene, first.size)], sizes=sizes, **options)
+    sweep = load_any(scene, solvers=[solver], sizes=[size] if size else [], **options)
     folder = results / sweep.name
     path = run_ablation(sweep, folder, pairs=pairs, tick=lambda phase: None)
     rows, picture = read(path), folder / "pictures" / f"ablation-{path.stem}.png"

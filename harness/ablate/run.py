@@ -13,38 +13,20 @@ from harness.ablate.difference import Motion, difference, rest_length
 from harness.ablate.rows import SCHEMA
 from harness.ablate.suggest import Seen, suggestions
 from harness.ablate.turns import Turn, cost, motion, seconds, turns
-from harness.errors import InputError
 from harness.load import Sweep
 from harness.measure import Settings
 from harness.run import asked, failure, provenance
 from harness.scene import Scene, build
-from harness.simulate import prepare
-from harness.spec import RunSpec, SceneSpec
-from solvers.problem import Solver, StopRule, Unsupported
+from harness.spec import RunSpec
+from solvers.problem import Solver, StopRule
 from solvers.registry import SOLVERS, load
 
 Row = dict[str, Any]
 
-FITTING = ("numba", "sparse", "lbfgs", "newton")
-"""Solvers in the order in which they are tried where none is named: the fast ones know springs only."""
 BETTER = "newton"
 """Whose answer tells how far the scene's own solver is from the minimum."""
 CONVERGED = StopRule(200, 1e-8)
 """Far below any difference that an effect makes."""
-
-
-def fitting(scene: SceneSpec, size: int) -> str:
-    """The first solver that takes all that the scene lists. Raises InputError."""
-    reasons = []
-    bound = build(scene, size)
-    for name in FITTING:
-        try:
-            prepare(bound, load(SOLVERS[name])())
-        except Unsupported as error:
-            reasons.append(str(error))
-        else:
-            return name
-    raise InputError("no solver takes all of this scene: " + "; ".join(reasons))
 
 
 def ablate(sweep: Sweep, folder: Path, *, pairs: bool, tick: Callable[[str], None]) -> Path:

@@ -54,6 +54,7 @@ def turns(
 
     Raises InputError and Unsupported for the first case, the whole scene; the others say so themselves.
     """
+    _prepared(cases[0], size, integrator, solver)  # what is compiled and imported is not the scene's memory
     found = [_prepared(case, size, integrator, solver) for case in cases]
     for turn in found:
         _keep_motion(turn, settings)

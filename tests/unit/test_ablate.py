@@ -14,14 +14,18 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from harness.ablate.cases import Case, cases
-from harness.ablate.run import ablate, fitting
+from harness.ablate.command import SOLVER
+from harness.ablate.run import ablate
 from harness.ablate.suggest import Seen, suggestions
 from harness.ablate.turns import Turn, cost
 from harness.cli import app
+from harness.effects.springs import Springs
 from harness.load import load_any, load_scene
+from harness.mesh.grid import Grid
 from harness.report.ablation import read, sentences, verdict
 from harness.scene import Scene
 from tests.effects import cloth
+from tests.scenes import scene
 
 CLOTH = """
 mesh: {kind: grid}
@@ -48,12 +52,10 @@ effects:
 
 
 def rows_of(scene: str, tmp_path: Path, *, pairs: bool = False, **options: Any) -> list[dict[str, Any]]:
-    """The rows of an ablation by the first solver that fits."""
+    """The rows of an ablation by local-global."""
     path = tmp_path / "scene.yaml"
     path.write_text(scene)
-    spec = load_scene(path)
-    solver = fitting(spec, spec.default_size or 0)
-    sweep = load_any(path, solvers=[solver], threads=1, rounds=2, **options)
+    sweep = load_any(path, solvers=["sparse"], threads=1, rounds=2, **options)
     return read(ablate(sweep, tmp_path, pairs=pairs, tick=lambda phase: None))
 
 
@@ -221,6 +223,15 @@ def test_a_suggestion_comes_with_its_evidence_unless_the_effect_is_listed(effect
     assert effect not in {s.effect for s in suggestions(seen(made, {listed}, places[effect], speed))}
 
 
+def test_a_corner_alone_asks_for_no_effect():
+    made = scene(Grid(), Springs(stretch=300.0, shear=60.0), size=20)
+    p, h = made.mesh.rest.copy(), made.mesh.spacing
+    p[0] += [-h, 2 * h, -h]  # three springs of 1482, and two edges of 1083
+    assert suggestions(seen(made, set(), p)) == []
+    p[made.mesh.parts["left"]] += [0.0, 3 * h, 0.0]
+    assert {s.effect for s in suggestions(seen(made, set(), p))} == {"strain-limits", "bending"}
+
+
 def test_vertices_that_come_close_are_counted():
     made = still()
     found = {s.effect: s.evidence for s in suggestions(seen(made, set(), folded(made, np.pi * 0.99)))}
@@ -228,21 +239,17 @@ def test_vertices_that_come_close_are_counted():
     assert found["self-contact"].startswith("12 pairs of vertices without a spring")
 
 
+def test_a_body_that_flies_as_a_whole_is_not_asked_to_rest():
+    free = scene(Grid(), Springs(stretch=300.0), size=4)
+    flying = seen(free, set(), free.mesh.rest, 1.0)
+    assert suggestions(flying) == []
+    swelling = replace(flying, velocities=np.tile(free.mesh.rest, (12, 1, 1)))
+    assert [s.effect for s in suggestions(swelling)] == ["air-drag"]
+
+
 def test_a_driven_motion_is_not_asked_to_rest():
     made = replace(still(), forces=(lambda p, v, t: p,))
     assert suggestions(seen(made, set(), made.mesh.rest, 1.0)) == []
-
-
-def test_the_first_solver_that_takes_all_effects_is_chosen(tmp_path: Path):
-    plain, gas = tmp_path / "plain.yaml", tmp_path / "gas.yaml"
-    plain.write_text(CLOTH.replace("  - {kind: bending, stiffness: 1.0e-3}\n", ""))
-    bent = tmp_path / "bent.yaml"
-    bent.write_text(CLOTH)
-    gas.write_text(
-        "mesh: {kind: balloon}\nmass: 1\ntime_step: 0.1\nframes: 1\ndefault_size: 2\n"
-        "effects: [{kind: springs, stretch: 100}, {kind: gas, pressure: 10}]\n"
-    )
-    assert [fitting(load_scene(path), 3) for path in (plain, bent, gas)] == ["numba", "sparse", "lbfgs"]
 
 
 def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: Path):
@@ -259,6 +266,7 @@ def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: 
     (rows,) = tmp_path.glob("cloth/ablation/*.parquet")
     (picture,) = tmp_path.glob("cloth/pictures/*.png")
     assert len(read(rows)) >= 1 + 5 + 2
+    assert {row["solver"] for row in read(rows)} == {SOLVER}
     assert Image.open(picture).size == (1600, 900)
 
 
