@@ -9,7 +9,7 @@ from typing import Any
 
 from harness.config import Document, Key, quote
 from harness.errors import did_you_mean
-from harness.mesh.generator import MAX_VERTICES, Generator
+from harness.mesh.generator import Generator
 from harness.spec import Exclude, Grid, Include, RunSpec, SceneSpec, SolverSpec, SweepFields
 
 MAX_RUNS = 10_000
@@ -137,9 +137,8 @@ def check_size(document: Document, scene_name: str, scene: SceneSpec, size: int,
         return
     if size < mesh.SMALLEST:
         document.report(f"{size} is too small for the scene {scene_name}: {mesh.SMALLEST} at least", at)
-    elif (vertices := mesh.count(size)) > MAX_VERTICES:
-        problem = f"{size} gives the scene {scene_name} {vertices:,} vertices; at most {MAX_VERTICES:,}"
-        document.report(problem, at)
+    elif excess := mesh.excess(size):
+        document.report(f"{size} {excess} (scene {scene_name})", at)
 
 
 def _matches(entry: Exclude, run: RunSpec) -> bool:

@@ -17,6 +17,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, SkipValidation, WithJso
 from harness.effects.base import Effect
 from harness.errors import InputError, Mistake
 from harness.mesh.base import Mesh
+from harness.mesh.generator import MAX_VERTICES
 from harness.model import Many, Model
 from harness.start import AnyStart
 
@@ -54,7 +55,7 @@ TimeStep = Annotated[
     ),
 ]
 Speed = Annotated[float, Field(ge=-1e6, le=1e6)]
-Size = Annotated[int, Field(ge=2, le=10_000)]
+Size = Annotated[int, Field(ge=2, le=MAX_VERTICES)]
 Frames = Annotated[int, Field(ge=1, le=1_000_000)]
 
 

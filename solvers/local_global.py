@@ -21,7 +21,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.sparse import csr_array
 
-from solvers import matrices
+from solvers import matrices, memory
 from solvers.energies.springs import TINY, Springs
 from solvers.linear.factors import DenseCholesky, Factor, SparseLU
 from solvers.problem import (
@@ -152,6 +152,13 @@ class DenseLocalGlobal:
     def prepare(self, system: System) -> PreparedLocalGlobal:
         """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
         springs, n = only_springs(system, "dense"), system.vertices
+        needs, room = 24.0 * n * (len(springs.edges) + n), memory.of_machine()  # three matrices of each shape
+        if needs > room:
+            raise Unsupported(
+                f"dense: its matrices of {n:,} vertices and {len(springs.edges):,} springs take "
+                f"{memory.in_words(needs)} of memory, where {memory.in_words(room)} may be taken; "
+                "take sparse or numba, or a coarser mesh"
+            )
         _, vertices, weight = system.penalty
         A = matrices.signed_incidence_matrix_dense(springs.edges, n)
         M = matrices.mass_matrix_dense(system.mass)

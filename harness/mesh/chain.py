@@ -31,6 +31,7 @@ class Chain(Generator):
     """Where the chain points; its length does not matter."""
 
     COUNTS: ClassVar[str] = "vertices along the chain"
+    SPRINGS: ClassVar[int] = 1
 
     def count(self, size: int) -> int:
         """See Generator."""

@@ -69,6 +69,7 @@ class Grid(_Sheet):
     """Springs from a vertex to the next but one, against bending."""
 
     COUNTS: ClassVar[str] = "vertices along its width"
+    SPRINGS: ClassVar[int] = 4
 
     def count(self, size: int) -> int:
         """See Generator."""
@@ -113,6 +114,7 @@ class Net(_Sheet):
     kind: Literal["net"] = "net"
 
     COUNTS: ClassVar[str] = "knots along its top"
+    SPRINGS: ClassVar[int] = 2
 
     def count(self, size: int) -> int:
         """See Generator."""

@@ -32,6 +32,7 @@ class Tower(Generator):
 
     SMALLEST: ClassVar[int] = 1
     COUNTS: ClassVar[str] = "storeys"
+    SPRINGS: ClassVar[int] = 4
 
     def count(self, size: int) -> int:
         """See Generator."""
@@ -88,6 +89,7 @@ class Block(Generator):
     """Diagonal springs: one on each face, which is just enough to be rigid, or all on faces and through cells."""
 
     COUNTS: ClassVar[str] = "vertices along its longest side"
+    SPRINGS: ClassVar[int] = 12
 
     def count(self, size: int) -> int:
         """See Generator."""

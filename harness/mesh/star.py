@@ -22,6 +22,7 @@ class Star(Generator):
     """Of the circle [m]."""
 
     COUNTS: ClassVar[str] = "vertices around the hub"
+    SPRINGS: ClassVar[int] = 1
 
     def count(self, size: int) -> int:
         """See Generator."""

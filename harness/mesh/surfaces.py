@@ -39,6 +39,7 @@ class Skirt(Generator):
 
     SMALLEST: ClassVar[int] = 3
     COUNTS: ClassVar[str] = "vertices around"
+    SPRINGS: ClassVar[int] = 4
 
     def count(self, size: int) -> int:
         """See Generator."""
@@ -91,6 +92,7 @@ class Balloon(Generator):
 
     SMALLEST: ClassVar[int] = 1
     COUNTS: ClassVar[str] = "springs along an edge of the icosahedron"
+    SPRINGS: ClassVar[int] = 3
 
     def count(self, size: int) -> int:
         """See Generator."""

@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from solvers import memory
 from solvers.linear.block_factor import Fronts, factorise, solve, whole
 from solvers.linear.block_vectors import ROWS, TILE
 from solvers.linear.ordering import nested_dissection
 from solvers.linear.symbolic import Symbolic, analyse
+from solvers.problem import Unsupported
 
 _NOTHING = np.empty((0, 3))
 
@@ -28,7 +30,10 @@ class BlockCholesky:
     """
 
     def __init__(self, graph: csr_array) -> None:
-        """graph: (n, n), symmetric in its pattern, an entry for each block, the diagonal's included."""
+        """graph: (n, n), symmetric in its pattern, an entry for each block, the diagonal's included.
+
+        Raises Unsupported where the factor does not fit in memory.
+        """
         pointers, neighbours = np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int32)
         symbolic = analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
         self.nonzeros = 9 * symbolic.nonzeros - 3 * (len(pointers) - 1)
@@ -39,6 +44,12 @@ class BlockCholesky:
         self.flops = float((w * (w * w / 3.0 + w * h + h * h)).sum())
         room = _room(f, 3 * below * whole(3 * below))
         n, supernodes = len(pointers) - 1, len(f.own)
+        needs, free = 8.0 * (f.panel[-1] + 2 * room), memory.of_machine()
+        if needs > free:
+            raise Unsupported(
+                f"a factor of the Hessian has {self.nonzeros:,} entries and takes {memory.in_words(needs)} of memory, "
+                f"where {memory.in_words(free)} may be taken; take numba or newton-cg, or a coarser mesh"
+            )
         self._panels = np.zeros(f.panel[-1] + ROWS)
         waiting, filled, place, runs = (np.zeros(k, np.int64) for k in ((2, supernodes + 1), 2, n, (2, n + 1)))
         self._scratch = np.zeros((2, room)), waiting, filled, np.zeros((TILE, TILE)), place, runs

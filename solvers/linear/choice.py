@@ -10,7 +10,6 @@ same choice wherever both fit. A system that fits nowhere is refused with the nu
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
@@ -25,6 +24,7 @@ from solvers.linear.inverse import Inverse
 from solvers.linear.ordering import nested_dissection
 from solvers.linear.supernodal import Supernodal, stored
 from solvers.linear.symbolic import Symbolic, analyse
+from solvers.memory import in_words, of_machine
 from solvers.problem import Unsupported
 
 Linear = Literal["auto", "inverse", "cholespy", "supernodal", "cg"]
@@ -80,8 +80,8 @@ def factorise(
     """A solver of Q out = b and, in words, which one it is and why.
 
     With a precision below float64 a solve is only that accurate, and is meant for corrections p - Q^-1 grad; cg is
-    accurate to float64 always. memory [bytes]: what the solver may take beside Q (`memory_of_machine`). Raises
-    Unsupported where nothing fits, NotPositiveDefinite.
+    accurate to float64 always. memory [bytes]: what the solver may take beside Q, by `solvers.memory` if left out.
+    Raises Unsupported where nothing fits, NotPositiveDefinite.
     """
     name, why, symbolic = choose(Q, linear, precision, memory=memory)
     return _MAKERS[name](Q, precision, symbolic), f"{name}: {why}"
@@ -96,7 +96,7 @@ def choose(
     if linear == "cholespy" and precision != "float64":
         raise Unsupported(f"cholespy: is used in float64 alone, not in {precision}; use supernodal")
     n = len(Q.indptr) - 1
-    room = memory_of_machine() if memory is None else memory
+    room = of_machine() if memory is None else memory
     if linear == "cholespy":
         return Choice(linear, "as asked; its factor is not estimated beforehand")
     if linear == "inverse" or (linear == "auto" and n <= SMALL):
@@ -115,16 +115,11 @@ def choose(
     if _fits(direct, room) and direct.traffic <= iterative.traffic:
         return Choice("supernodal", direct.words, symbolic)
     if _fits(iterative, room):
-        reason = "a factor would cost more" if _fits(direct, room) else f"a factor would not fit in {_size(room)}"
+        reason = "a factor would cost more" if _fits(direct, room) else f"a factor would not fit in {in_words(room)}"
         return Choice("cg", f"{iterative.words}; {reason} ({direct.words})")
     if _fits(direct, room):
         return Choice("supernodal", direct.words, symbolic)
     return _refuse(room, {"supernodal": direct, "cg": iterative})
-
-
-def memory_of_machine() -> float:
-    """Three quarters of the machine's memory [bytes]: the rest is for Q, the scene and its recording."""
-    return 0.75 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def estimate(s: Symbolic, precision: Precision = "float64") -> Estimate:
@@ -135,18 +130,20 @@ def estimate(s: Symbolic, precision: Precision = "float64") -> Estimate:
     kept = panels if precision == "float64" else 4 * squares + half * entered
     fronts, flops = _factorisation(s.parent, s.first, s.row_start, s.sequence)
     memory = panels + max(8 * fronts, _ROUNDING[precision] * panels) + _BYTES_PER_VERTEX * len(s.slot)
-    words = f"its factor has {s.nonzeros:,} entries, {_size(kept)} in {precision}, after {flops:.1e} flops"
+    words = f"its factor has {s.nonzeros:,} entries, {in_words(kept)} in {precision}, after {flops:.1e} flops"
     return Estimate(memory, 2 * kept + _BYTES_PER_FLOP * flops / _SOLVES, words)
 
 
 def _inverse(n: int) -> Estimate:
     size = 8.0 * n**2
-    return Estimate(5 * size, size, f"{n**2:,} entries, {_size(size)}")
+    return Estimate(5 * size, size, f"{n**2:,} entries, {in_words(size)}")
 
 
 def _iterative(Q: csr_array) -> Estimate:
     entries = Q.nnz + 4 * (len(Q.indptr) - 1)
-    words = f"{_size(_BYTES_KEPT * entries)} for multigrid on {Q.nnz:,} entries, about {_ITERATIONS} iterations a solve"
+    words = (
+        f"{in_words(_BYTES_KEPT * entries)} for multigrid on {Q.nnz:,} entries, about {_ITERATIONS} iterations a solve"
+    )
     return Estimate(_BYTES_KEPT * entries, _ITERATIONS * _BYTES_READ * entries, words)
 
 
@@ -155,17 +152,8 @@ def _fits(need: Estimate, room: float) -> bool:
 
 
 def _refuse(room: float, needs: dict[str, Estimate]) -> Choice:
-    listed = "; ".join(f"{name} needs {_size(need.memory)} ({need.words})" for name, need in needs.items())
-    raise Unsupported(f"the system does not fit in {_size(room)} of memory: {listed}; use a coarser mesh")
-
-
-def _size(count: float) -> str:
-    """Bytes in words."""
-    for unit in ("bytes", "KiB", "MiB", "GiB"):
-        if count < 1024 or unit == "GiB":
-            break
-        count /= 1024
-    return f"{count:,.3g} {unit}"
+    listed = "; ".join(f"{name} needs {in_words(need.memory)} ({need.words})" for name, need in needs.items())
+    raise Unsupported(f"the system does not fit in {in_words(room)} of memory: {listed}; use a coarser mesh")
 
 
 @njit(cache=True)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from solvers.linear.choice import SMALL, choose, factorise, memory_of_machine
+from solvers.linear.choice import SMALL, choose, factorise
 from solvers.linear.supernodal import Supernodal
+from solvers.memory import of_machine
 from solvers.problem import NotPositiveDefinite, Unsupported
 from tests.networks import backward_error, grid, grid_springs, network, right_hand_sides
 
@@ -88,7 +89,7 @@ def test_the_estimate_of_a_factor_covers_its_panels():
 
 
 def test_the_limit_of_the_machine_is_below_its_memory():
-    assert 2**28 < memory_of_machine() < 2**46
+    assert 2**28 < of_machine() < 2**46
 
 
 @pytest.mark.parametrize("linear", ["auto", *FORCED])

@@ -1,0 +1,155 @@
+"""What would not fit in memory is refused with its size before it is begun: meshes, dense matrices, factors."""
+
+from __future__ import annotations
+
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from harness.cli import app
+from harness.effects.gravity import Gravity
+from harness.effects.springs import Springs
+from harness.errors import InputError
+from harness.mesh.chain import Chain
+from harness.mesh.generator import Generator
+from harness.mesh.grid import Grid, Net
+from harness.mesh.solids import Block, Tower
+from harness.mesh.star import Star
+from harness.mesh.surfaces import Balloon, Skirt
+from solvers import memory
+from solvers.hybrid import Hybrid
+from solvers.linear.choice import factorise
+from solvers.local_global import DenseLocalGlobal
+from solvers.matrices import assemble
+from solvers.newton import Newton
+from solvers.problem import Solver, Unsupported
+from tests.networks import grid
+from tests.scenes import scene
+
+GIB = 2.0**30
+SCENE = """
+mesh: {{kind: {kind}}}
+mass: 1
+time_step: 1/30
+frames: 1
+default_size: {size}
+effects: [{{kind: springs, stretch: 10}}, {{kind: gravity}}]
+"""
+LARGE = {
+    ("grid", 20_000): ("400,000,000 vertices", "414 GiB"),
+    ("grid", 2_237): ("5,004,169 vertices", "5.17 GiB"),
+    ("net", 1_582): ("5,002,285 vertices", "2.94 GiB"),
+    ("block", 10_000): ("250,100,010,000 vertices", "705,759 GiB"),
+    ("block", 271): ("5,012,416 vertices", "14.1 GiB"),
+}
+"""Sizes and what they would give, and take; the least of them are just beyond what any machine may do."""
+
+
+@pytest.fixture
+def none_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    def generate(self: Generator, size: int) -> None:
+        raise AssertionError("the mesh is built")
+
+    for kind in (Grid, Net, Block):
+        monkeypatch.setattr(kind, "generate", generate)
+
+
+def refusal(config: Path, command: str) -> str:
+    answer = CliRunner().invoke(app, [command, str(config), "--results", str(config.parent / "results")])
+    assert answer.exit_code == 2, (answer.output, answer.exception)
+    assert not (config.parent / "results").exists()
+    return answer.output
+
+
+@pytest.mark.usefixtures("none_is_built")
+@pytest.mark.parametrize("command", ["run", "list", "ablate"])
+@pytest.mark.parametrize(("kind", "size"), LARGE)
+def test_a_mesh_too_large_is_refused_with_what_it_would_take(tmp_path: Path, kind: str, size: int, command: str):
+    config = tmp_path / "large.yaml"
+    config.write_text(SCENE.format(kind=kind, size=size))
+    said = refusal(config, command)
+    for needle in (str(config), "size", str(size), *LARGE[kind, size]):
+        assert needle in said
+
+
+@pytest.mark.usefixtures("none_is_built")
+def test_a_size_within_the_limit_is_refused_by_a_machine_that_is_too_small_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """4,999,696 vertices, just below the largest number of all."""
+    config = tmp_path / "large.yaml"
+    config.write_text(SCENE.format(kind="grid", size=2_236))
+    monkeypatch.setattr(memory, "of_machine", lambda: 4.0 * GIB)
+    said = refusal(config, "list")
+    for needle in ("4,999,696 vertices of at most 3,869,339", "5.17 GiB", "4 GiB may be taken"):
+        assert needle in said
+    monkeypatch.setattr(memory, "of_machine", lambda: 6.0 * GIB)
+    Grid().check(2_236)
+    with pytest.raises(InputError, match="allowed for grid: 2 to 2236 "):
+        Grid().check(2_237)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "size"),
+    [
+        (Chain(), 5_000),
+        (Star(), 5_000),
+        (Net(), 50),
+        (Grid(), 70),
+        (Skirt(), 110),
+        (Balloon(), 20),
+        (Tower(), 300),
+        (Block(), 16),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_mesh_takes_what_was_estimated(mesh: Generator, size: int):
+    """With its springs and Q, counted as they are made. Small meshes have fewer springs a vertex than large ones."""
+    estimate = mesh.count(size) * mesh._bytes
+    tracemalloc.start()
+    try:
+        made = scene(mesh, Springs(stretch=10.0, shear=0.0 if mesh.SPRINGS < 3 else 5.0), Gravity(), size=size)
+        assemble(made.system, [made.springs])
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert 0.5 * estimate <= peak <= 1.1 * estimate
+
+
+@pytest.mark.parametrize("solver", [DenseLocalGlobal()], ids=repr)
+def test_dense_matrices_are_refused_at_200_vertices_a_side(solver: Solver, monkeypatch: pytest.MonkeyPatch):
+    system = scene(Grid(), Springs(stretch=10.0, shear=2.0), size=200).system
+    monkeypatch.setattr(memory, "of_machine", lambda: 64.0 * GIB)
+    with pytest.raises(Unsupported, match=r"40,000 vertices and 158,802 springs take 178 GiB .* 64 GiB may be taken"):
+        solver.prepare(system)
+
+
+@pytest.mark.parametrize("solver", [Newton(), Hybrid()], ids=repr)
+def test_a_hessians_factor_that_does_not_fit_is_refused(solver: Solver, monkeypatch: pytest.MonkeyPatch):
+    """Nine times the entries of Q's, which fits."""
+    system = scene(Grid(), Springs(stretch=10.0, shear=2.0), size=40).system
+    monkeypatch.setattr(memory, "of_machine", lambda: 4.0 * 2**20)
+    with pytest.raises(Unsupported, match=r"factor of the Hessian has [\d,]+ entries and takes [\d.]+ MiB .* 4 MiB"):
+        solver.prepare(system)
+
+
+def test_what_no_linear_solver_holds_is_refused_with_what_each_needs():
+    with pytest.raises(
+        Unsupported, match=r"does not fit in 100 KiB of memory: supernodal needs [\d.]+ KiB .* cg needs"
+    ):
+        factorise(grid(40, 40), memory=100.0 * 2**10)
+
+
+def test_bytes_are_told_in_words():
+    assert [memory.in_words(n) for n in (0, 1023, 1024, 3.5 * 2**20, 2.0**30, 3.0 * 2**50)] == [
+        "0 bytes",
+        "1,023 bytes",
+        "1 KiB",
+        "3.5 MiB",
+        "1 GiB",
+        "3,145,728 GiB",
+    ]
+    assert np.isfinite(memory.of_machine())
