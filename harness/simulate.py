@@ -58,7 +58,8 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
     starts = scene.integrator.history and state.before is None
     method, system = (IMPLICIT_EULER, _first(scene)) if starts else (scene.integrator, scene.system)
     target, origin = method.predict(now, before, dt)
-    begun = Start(now.positions, now.velocity, time, origin, system.rate, time + method.when * dt)
+    when, ahead = time + method.when * dt, method.ahead * dt
+    begun = Start(now.positions, now.velocity, time, origin, system.rate, when, ahead)
     force = scene.load
     if scene.forces:
         a = method.ahead

@@ -129,7 +129,8 @@ class Start:
 
     positions: p^t (n, 3) [m]; velocity: v^t, filters included, (n, 3) [m/s]; time: t [s];
     origin (n, 3) [m] and rate [1/s]: the unknown x moves with the velocity rate (x - origin);
-    until: the time of x [s], for what moves by itself (nan, which spoils all that depends on it, where it is not told).
+    until: the time of x [s], for what moves by itself (nan, which spoils all that depends on it, where it is not told);
+    ahead: how far ahead of t [s] extrapolation is to take what an energy lags, for the method to keep its order.
     """
 
     positions: Positions
@@ -138,6 +139,12 @@ class Start:
     origin: Positions
     rate: float
     until: float = float("nan")
+    ahead: float = 0.0
+
+    @property
+    def expected(self) -> Positions:
+        """The positions that an energy is lagged at, (n, 3) [m]: p^t, or extrapolated by `ahead`."""
+        return self.positions + self.ahead * self.velocity if self.ahead else self.positions
 
     def velocity_at(self, x: Positions) -> Positions:
         """The velocity [m/s] of the unknown x, both (n, 3)."""

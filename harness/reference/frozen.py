@@ -122,6 +122,8 @@ def freeze(step: Step, origin: str) -> tuple[Frozen, Arrays]:
 
 def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
     """The frozen problem in saved arrays, bound to a scene; None where today's scene states another problem."""
+    if any(f"start_{name}" not in arrays for name in _START):
+        return None
     system = replace(scene.system, factor=float(arrays["factor"]))
     begun: dict[str, Any] = {name: arrays[f"start_{name}"] for name in _START}
     begun |= {name: float(value) for name, value in begun.items() if not value.ndim}

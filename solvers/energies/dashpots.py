@@ -1,7 +1,8 @@
 """Dashpots: an edge resists the speed at which its length changes, by f = -c n n'(v_i - v_j).
 
-The direction n is that at the step's start, so the force is linear. Since the unknown moves with the velocity
-rate (x - origin), the force is the gradient of
+The direction n is that at the step's start, so the force is linear. Integrators of order 2 take it from where the
+velocity would bring the edges by the time of the unknown, and keep their order. Since the unknown moves with the
+velocity rate (x - origin), the force is the gradient of
 
     E(x) = sum_e c_e rate/2 (n_e'(A x - A origin)_e)^2
 
@@ -40,7 +41,7 @@ class Dashpots(Edges):
 
     def begin_step(self, start: Start) -> Dashpots:
         """The energy of a step."""
-        _, n = directions(self._along(start.positions), self.direction)
+        _, n = directions(self._along(start.expected), self.direction)
         offset = _dot(n, self._along(start.origin))
         return replace(self, stiffness=start.rate * self.stiffness, direction=n, offset=offset)
 

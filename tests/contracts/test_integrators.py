@@ -16,9 +16,11 @@ import pytest
 
 from harness.effects.air_drag import AirDrag
 from harness.effects.base import Effect
+from harness.effects.dashpots import Dashpots
 from harness.effects.ether_drag import EtherDrag
 from harness.effects.gravity import Gravity
 from harness.effects.pins import Pins
+from harness.effects.rayleigh import Rayleigh
 from harness.effects.springs import Springs
 from harness.mesh.chain import Chain
 from harness.mesh.grid import Grid
@@ -80,6 +82,8 @@ PROBLEMS: dict[str, tuple[tuple[Effect, ...], tuple, tuple[float, float, float]]
     "under a force of time, place and speed": ((SOFT, HELD), (gusts,), (1.0, 0.0, 0.5)),
     "slowed by ether drag": ((SOFT, Gravity(), EtherDrag(rate=3.0), HELD), (), (0.0, 0.0, 0.0)),
     "slowed by air": ((SOFT, Gravity(), AirDrag(coefficient=2.0), HELD), (), (1.0, 0.0, 2.0)),
+    "slowed by dashpots": ((SOFT, Gravity(), Dashpots(stretch=0.4), HELD), (), (1.0, 0.0, 2.0)),
+    "slowed by Rayleigh's damping": ((SOFT, Gravity(), Rayleigh(mass=0.5, stiffness=0.02), HELD), (), (1.0, 0.0, 2.0)),
     "swung by its pin": ((SOFT, Gravity(), SWUNG), (), (0.5, 1.0, 0.0)),
 }  # fmt: skip
 
