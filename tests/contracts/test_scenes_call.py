@@ -1,0 +1,41 @@
+"""The scenes list the effects that their motions call for, and no others: `springbench ablate` says so of each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from harness.ablate.command import SOLVER, TOLERANCE
+from harness.ablate.run import ablate
+from harness.load import load_any
+from harness.report.ablation import of_kind, read, verdict
+
+SCENES = Path(__file__).resolve().parents[2] / "configs" / "scenes"
+QUICK: dict[str, int | None] = {"heavy-bob": None, "tower": 8, "hanging-cloth": 12}
+LONG: dict[str, int | None] = {
+    "bending-strip": 21,
+    "block-drop": 5,
+    "block-slide": 5,
+    "cloth-on-sphere": 9,
+    "flag-in-wind": 16,
+    "inflated-balloon": 4,
+    "net-catches-ball": 9,
+    "pulled-curtain": 9,
+    "rope-bridge": 13,
+    "spinning-skirt": 32,
+}
+"""Mesh sizes so small that an ablation takes seconds. What effects and time steps change shrinks with them alike."""
+CALLED = ("this scene calls for it", "without it this is another scene", "the scene is impossible without it")
+
+
+@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.long) for name in LONG)])
+def test_a_scene_has_the_effects_that_its_motion_calls_for_and_no_others(name: str, tmp_path: Path):
+    size = (QUICK | LONG)[name]
+    asked = {"solvers": [SOLVER], "tolerance": TOLERANCE, "sizes": [size] if size else [], "rounds": 1, "threads": 1}
+    sweep = load_any(SCENES / f"{name}.yaml", **asked)
+    rows = read(ablate(sweep, tmp_path, pairs=False, tick=lambda phase: None))
+    told = {row["name"]: verdict(row, rows) for row in of_kind(rows, "without")}
+    assert {name: words for name, words in told.items() if not any(called in words for called in CALLED)} == {}
+    # Contact of a mesh with itself is no effect yet: no scene can list it.
+    assert {row["name"]: row["reason"] for row in of_kind(rows, "suggestion") if row["name"] != "self-contact"} == {}
