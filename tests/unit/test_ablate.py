@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from harness.ablate.cases import Case, cases
 from harness.ablate.command import SOLVER
+from harness.ablate.rows import COLUMNS
 from harness.ablate.run import ablate
 from harness.ablate.suggest import Seen, suggestions
 from harness.ablate.turns import Turn, cost
@@ -23,10 +24,13 @@ from harness.effects.springs import Springs
 from harness.load import load_any, load_scene
 from harness.mesh.grid import Grid
 from harness.report.ablation import read, sentences, verdict
+from harness.rows import COLUMNS as RUN_COLUMNS
+from harness.rows import Column
 from harness.scene import Scene
 from tests.effects import cloth
 from tests.scenes import scene
 
+ROOT = Path(__file__).resolve().parents[2]
 CLOTH = """
 mesh: {kind: grid}
 mass: 0.3
@@ -270,8 +274,14 @@ def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: 
     assert Image.open(picture).size == (1600, 900)
 
 
+@pytest.mark.parametrize("column", [c for c in COLUMNS if c not in RUN_COLUMNS], ids=lambda column: column.name)
+def test_every_column_of_its_own_is_documented(column: Column):
+    line = f"| `{column.name}` | {column.unit} | {column.meaning} |"
+    assert line in (ROOT / "results" / "README.md").read_text().splitlines()
+
+
 def test_a_sweep_is_refused(tmp_path: Path):
-    sweep = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
+    sweep = ROOT / "configs" / "quickstart.yaml"
     told = CliRunner().invoke(app, ["ablate", str(sweep), "--results", str(tmp_path)])
     assert told.exit_code == 2
     assert "is a sweep" in told.stderr
