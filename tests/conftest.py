@@ -8,4 +8,6 @@ import harness  # noqa: F401  sets what Numba and OpenMP read when they load
 
 # derandomize: the same examples in every run; no deadline: a slow machine fails no test.
 settings.register_profile("suite", derandomize=True, deadline=None, max_examples=40, database=None)
+# `pytest --hypothesis-profile=search tests/stability` looks for examples that fail, for an hour; keep them as cases.
+settings.register_profile("search", deadline=None, max_examples=2000, database=None, print_blob=True)
 settings.load_profile("suite")

@@ -1,0 +1,175 @@
+"""What holds of every network once a step has converged: near its minimum, for every method that tends to one.
+
+On the way there a decision may go either way, and methods differ. Near a minimum, from where the solves below start,
+there is one answer. It is known as well as its gradient, each of whose entries is a sum of some ten forces of k times
+the coordinates, good to eps each; over the Hessian's smallest eigenvalue that is a displacement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from harness.reference.minimiser import free_hessian
+from harness.scene import Scene
+from harness.simulate import State, prepare, simulate
+from solvers.integrators import INTEGRATORS, Motion
+from solvers.newton import Newton
+from solvers.problem import Positions, StepProblem, StopRule
+from tests.contracts.test_integrators import LAWS, energies
+from tests.stability.random_networks import (
+    DT,
+    EPS,
+    MINIMISERS,
+    Case,
+    Map,
+    examples,
+    networks,
+    renumbered,
+    turned,
+)
+
+ENOUGH = StopRule(3000)
+"""Without a tolerance: until round-off lets nothing descend any more, where a method knows that."""
+NEAR = 1e-3
+"""How far from the minimum solves start [m]; networks are some metres large."""
+CLEAR = 1e-2
+"""Of the least inertia, the smallest eigenvalue that a minimum has at least: a flatter one is hardly one."""
+
+SLOW = ("dense", "sparse", "numba", "chebyshev")
+"""Take as many iterations as k dt^2/m; `test_properties` holds each of their iterates to the same."""
+SOFT = {"vbd": 0.0}
+"""Powers of ten of the stiffness number up to which a method converges in time: one vertex at a time is slow."""
+
+converging = pytest.mark.parametrize("name", [name for name in MINIMISERS if name not in SLOW])
+EXAMPLES = examples(10)
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """A problem that starts near a minimum; where that is; how well it can be known [m]."""
+
+    problem: StepProblem
+    minimum: Positions
+    known: float
+
+
+def settled(case: Case, problem: StepProblem) -> Settled:
+    """The problem near the minimum that Newton's method finds; a flat one is left out."""
+    p = Newton().prepare(problem.system).solve(problem, ENOUGH).positions
+    least = float(np.linalg.eigvalsh(free_hessian(problem, p).toarray()).min(initial=np.inf))
+    inertia = float(problem.system.inertia.min())
+    assume(least >= CLEAR * inertia)
+    guess = p + NEAR * np.random.default_rng(case.seed).normal(size=p.shape)
+    known = 1000.0 * EPS * case.worst * max(1.0, inertia / least)
+    return Settled(replace(problem, first_guess=guess), p, known)
+
+
+def converged(name: str, problem: StepProblem) -> Positions:
+    return MINIMISERS[name].prepare(problem.system).solve(problem, ENOUGH).positions
+
+
+def for_method(name: str, case: Case) -> Case:
+    """The case, softer where the method needs it."""
+    return replace(case, number=min(case.number, SOFT.get(name, np.inf)), spread=case.spread * (name not in SOFT))
+
+
+@converging
+@EXAMPLES
+@given(case=networks())
+def test_all_methods_end_at_the_minimum_that_they_start_near(name: str, case: Case):
+    case = for_method(name, case)
+    given = settled(case, case.problem())
+    np.testing.assert_allclose(converged(name, given.problem), given.minimum, rtol=0, atol=given.known)
+
+
+CHANGES: dict[str, Callable[[StepProblem, int], tuple[StepProblem, Map]]] = {
+    "turned and shifted": lambda problem, seed: turned(problem, seed, mirror=False),
+    "mirrored": lambda problem, seed: turned(problem, seed, mirror=True),
+    "renumbered, springs flipped": renumbered,
+}
+
+
+@converging
+@pytest.mark.parametrize("change", CHANGES)
+@EXAMPLES
+@given(case=networks(), seed=st.integers(0, 2**16))
+def test_what_is_changed_in_description_alone_ends_at_the_same_minimum(name: str, change: str, case: Case, seed: int):
+    case = for_method(name, case)
+    given = settled(case, case.problem())
+    other, moved = CHANGES[change](given.problem, seed)
+    here, there = converged(name, given.problem), converged(name, other)
+    np.testing.assert_allclose(there, moved(here), rtol=0, atol=2.0 * given.known)
+
+
+@converging
+@EXAMPLES
+@given(case=networks(pinned=0))
+def test_what_nothing_holds_keeps_its_momentum(name: str, case: Case):
+    case = for_method(name, case)
+    free = case.problem()
+    free = replace(free, force=np.zeros_like(free.force))
+    mass, begun = free.system.mass[:, None], free.start
+    moved = (mass * (converged(name, settled(case, free).problem) - begun.positions)).sum(axis=0) / DT
+    scale = (mass * np.abs(begun.positions)).sum() / DT  # what the differences above are taken of
+    wanted = (mass * begun.velocity).sum(axis=0)
+    np.testing.assert_allclose(moved, wanted, rtol=0, atol=100 * EPS * case.worst * scale)
+
+
+@converging
+@EXAMPLES
+@given(case=networks())
+def test_what_flies_freely_at_rest_length_goes_on(name: str, case: Case):
+    case = for_method(name, case)
+    free, wanted = case.flying()
+    atol = 100 * EPS * case.worst * np.abs(wanted).max()
+    np.testing.assert_allclose(converged(name, free), wanted, rtol=0, atol=atol)
+
+
+STEPS = 4
+integrators = pytest.mark.parametrize("integrator", INTEGRATORS)
+LAWFUL = examples(20)
+
+
+def stepped(scene: Scene, state: State) -> list[Motion]:
+    """The motions at the start and after each step."""
+    run = simulate(scene, prepare(scene, Newton()), ENOUGH, first_guess="inertial", frames=STEPS, state=state)
+    return [state.now, *(step.state.now for step in run)]
+
+
+@integrators
+@LAWFUL
+@given(case=networks())
+def test_angular_momentum_obeys_the_integrators_law(integrator: str, case: Case):
+    scene, state = case.thrown(integrator)
+    path = stepped(scene, state)
+    mass = scene.system.mass[:, None]
+    reach = max(np.abs(p).max() for p, _ in path)
+    # A force that is left, k times the coordinates times eps at each of some ten springs, times an arm and dt.
+    left = 100.0 * EPS * case.worst * mass.sum() / DT * reach**2
+    np.testing.assert_allclose(LAWS[integrator](mass, path, DT), 0.0, rtol=0, atol=left)
+
+
+@integrators
+@LAWFUL
+@given(case=networks(stiffest=3.0))
+def test_a_convex_energy_decays_or_stays(integrator: str, case: Case):
+    """Springs without rest length have a quadratic energy: midpoint keeps it, implicit Euler loses some in each step,
+    BDF2 has lost some in the end."""
+    scene, state = case.thrown(integrator)
+    springs = replace(scene.springs, rest_length=np.zeros(case.m))
+    scene = replace(scene, system=replace(scene.system, energies=(springs,)))
+    path = stepped(scene, state)
+    found = energies(scene, path)
+    slack = 100.0 * EPS * case.worst * found[0]  # positions are off by eps times that, and energies by as much
+    if integrator == "midpoint":
+        np.testing.assert_allclose(found, found[0], rtol=0, atol=slack)
+    elif integrator == "implicit-euler":
+        assert (np.diff(found) <= slack).all()
+    else:
+        assert found[-1] <= found[0] + slack
