@@ -141,7 +141,9 @@ def _second_pass(
             measured.prepared,
             settings,
             recorder=recorder,
-            convergence=run.convergence_frames or {1, (run.frames + 1) // 2, run.frames},
+            convergence={1, (run.frames + 1) // 2, run.frames}
+            if run.convergence_frames is None
+            else run.convergence_frames,
             stored=stored,
             judge=_judge(run, scene),
             tick=lambda: tick("second pass"),
