@@ -23,16 +23,19 @@ from harness.errors import InputError
 from solvers.registry import SOLVERS
 
 SLACK = 1.1
-"""On the tolerance: the oracle and a solver factorise the same matrix by different ways."""
+"""On the tolerance: the oracle and a solver factorise the same matrix by different ways. Of 1372 runs of configs/hard
+none changes its outcome at 1.0, and 8 become right at 2.2; all 7902 steps that took themselves for converged were."""
 NOISE = 2.0
 """On round-off, by which one residual has two figures where two factors tell it: each is off by as much as it is."""
 ASKED = 1e-6
 """The tolerance by which a run is graded that was asked for none."""
 SAME = 1e-2
 """Of the rest shape's size: a motion within this of the reference is the same; steps are solved to 1e-6 of what they
-move by, and what is unstable multiplies that."""
+move by, and what is unstable multiplies that. There is a gap to put it in: of 670 runs of configs/hard that end at
+minima 595 stay within 0.5 % and 71 leave by more than 2 %. Half of it takes 2 of the right ones away, twice adds 2."""
 CLOSE = 0.05
-"""Of the rest shape's size: how near a method that does not minimise has to come, about what an eye would notice."""
+"""Of the rest shape's size: how near a method that does not minimise has to come, about what an eye would notice. A
+convention: of its 240 runs of configs/hard 97 are within it, 73 within half of it and 104 within twice."""
 
 
 class Outcome(NamedTuple):
@@ -59,8 +62,6 @@ _CLAIMS = ("tolerance", "floor")
 """How a solve ends that takes itself for converged."""
 _ENDED = {"unsupported": REFUSED, "diverged": DIVERGED, "failed": FAILED}
 
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
 
 @dataclass(frozen=True, slots=True)
 class Cell:
@@ -84,7 +85,7 @@ class Cell:
             return f"{100 * self.worst:.0f} %" if self.worst < 9.99 else ">999 %"
         if not math.isfinite(self.worst):
             return str(self.worst)
-        return "0" if self.worst == 0.0 else f"10{str(round(math.log10(self.worst))).translate(_RAISED)}"
+        return "0" if self.worst == 0.0 else f"1e{round(math.log10(self.worst))}"
 
 
 def read_cells(folder: Path) -> list[Cell]:

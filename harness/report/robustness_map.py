@@ -14,8 +14,9 @@ from matplotlib.patches import Rectangle
 from harness.report.robustness import DIVERGED, FAILED, OUTCOMES, RIGHT, WRONG, Cell, Outcome, percent, scores
 from harness.report.style import DPI, INK, MUTED, PAGE, RULE
 
-_ROW, _COLUMN, _LEFT, _TOP, _BOTTOM = 0.2, 0.64, 2.3, 1.75, 1.25
-"""Inches: a cell's height and width, room for the cases' names, for title and solvers' names, and for the legend."""
+_ROW, _COLUMN, _LEFT, _TOP, _BOTTOM, _ACROSS = 0.2, 0.64, 2.3, 1.75, 1.5, 2.2
+"""Inches: a cell's height and width, room for the cases' names, for title and solvers' names, and for the legend, and
+from one of its columns to the next."""
 
 _SCORES, _HEADING = 3, 1.2
 """Rows for the solvers' scores, and rows from the last case of a family to the first of the next."""
@@ -89,13 +90,12 @@ _BARS = ("#8fcbad", "#c4ccd6")
 
 def _legend(figure: Figure, cells: Sequence[Cell]) -> None:
     width, height = figure.get_size_inches()
-    x = 0.15
-    for outcome in OUTCOMES:
+    for k, outcome in enumerate(OUTCOMES):
+        x, y = 0.15 + _ACROSS * (k % 4), 1.12 - 0.26 * (k // 4)
         words = f"{outcome.words} ({sum(cell.outcome == outcome for cell in cells)})"
-        box = Rectangle((x / width, 0.8 / height), 0.2 / width, 0.16 / height, facecolor=outcome.color)
+        box = Rectangle((x / width, y / height), 0.2 / width, 0.16 / height, facecolor=outcome.color)
         figure.add_artist(box)
-        figure.text((x + 0.27) / width, 0.88 / height, words, fontsize=9, va="center", color=INK)
-        x += 0.55 + 0.078 * len(words)
+        figure.text((x + 0.27) / width, (y + 0.08) / height, words, fontsize=9, va="center", color=INK)
     figure.text(0.15 / width, 0.2 / height, NOTE, fontsize=8, color=MUTED, linespacing=1.5)
 
 
@@ -104,7 +104,7 @@ def _family(case: str) -> str:
 
 
 def _member(case: str) -> str:
-    return case.partition("-")[2].replace("-", " ") or case
+    return case.partition("-")[2] or case
 
 
 def _ink(outcome: Outcome) -> str:

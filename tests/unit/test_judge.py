@@ -129,7 +129,7 @@ def test_a_run_is_graded_by_its_rows(name: str):
     assert judged(run)[0] is outcome
 
 
-FIGURES = {1e-6: "10⁻⁶", 3.2e2: "10³", 0.0: "0", float("inf"): "inf", float("nan"): "nan"}
+FIGURES = {1e-6: "1e-6", 3.2e2: "1e3", 0.0: "0", float("inf"): "inf", float("nan"): "nan"}
 
 
 @pytest.mark.parametrize("worst", FIGURES)
