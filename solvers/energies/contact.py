@@ -34,7 +34,8 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True, eq=False)
 class Obstacle:
     """All points within a radius [m] of the box from low to high (3,) [m] of a frame: its origin in the first row and
-    its three orthonormal axes in the others, (4, 3), at a time [s]. Extents may be infinite."""
+    its three orthonormal axes in the others, (4, 3), at a time [s]: the same array at all times where it does not move.
+    Extents may be infinite."""
 
     low: Array
     high: Array
@@ -88,32 +89,36 @@ class Contact:
         return not len(self.planes.vertices)
 
     @cached_property
-    def _extents(self) -> tuple[Array, Array, Array, Array]:
-        """The obstacles' low and high corners (o, 3), their radii with the thickness, and with the margin too [m]."""
-        o = self.obstacles
-        reach = np.array([one.radius for one in o]) + self.thickness
-        return np.array([one.low for one in o]), np.array([one.high for one in o]), reach, reach + self.margin
+    def _near(self) -> tuple[Array, Array]:
+        """The corners of what is near each obstacle, in its frame, (o, 3) [m]."""
+        reach = np.array([[one.radius + self.thickness + self.margin] for one in self.obstacles])
+        return np.array([o.low for o in self.obstacles]) - reach, np.array([o.high for o in self.obstacles]) + reach
+
+    def _frames(self, time: float) -> Array:
+        """The obstacles' frames at a step's start and end, (o, 2, 4, 3)."""
+        return np.array([(one.frame(time), one.frame(time + self.time_step)) for one in self.obstacles])
+
+    @cached_property
+    def _resting(self) -> Array | None:
+        """Their frames in all steps where none moves."""
+        rest = all(one.frame(0.0) is one.frame(1.0) for one in self.obstacles)
+        return self._frames(0.0) if rest else None
 
     def begin_step(self, start: Start) -> Contact:
-        """The energy of a step; idle after one test of boxes while nothing is near."""
+        """The energy of a step; idle after one test of a box while nothing is near."""
         p, v = (x if x.flags.carray else np.array(x, order="C") for x in (start.positions, start.velocity))
-        dt, o = self.time_step, self.obstacles
-        frames = np.array([[one.frame(start.time), one.frame(start.time + dt)] for one in o])
-        low, high, reach, farther = self._extents
-        touched = np.empty(len(o), np.bool_)
-        way = contact_planes.near(p, v, dt, frames, low, high, farther, touched)
-        near = np.flatnonzero(touched)
-        if not len(near):
+        frames = self._frames(start.time) if self._resting is None else self._resting
+        touched = np.empty(len(frames), np.bool_)
+        way = contact_planes.near(p, v, self.time_step, frames, *self._near, touched)
+        if way < 0.0:
             return self
-        when = (start.until - start.time) / dt
-        found = [self._planes(p, v, frames[k], low[k], high[k], reach[k], way, when) for k in near]
+        when = (start.until - start.time) / self.time_step
+        found = [self._planes(p, v, self.obstacles[k], frames[k], way, when) for k in np.flatnonzero(touched)]
         return replace(self, planes=Planes(*(np.concatenate(part) for part in zip(*found, strict=True))))
 
-    def _planes(
-        self, p: Positions, v: Positions, frames: Array, low: Array, high: Array, radius: float, way: float, when: float
-    ) -> Planes:
+    def _planes(self, p: Positions, v: Positions, obstacle: Obstacle, frames: Array, way: float, when: float) -> Planes:
         """The half-spaces of one obstacle; when: the unknown's time within the step, 1 at its end."""
-        n = len(p)
+        n, low, high, radius = len(p), obstacle.low, obstacle.high, obstacle.radius + self.thickness
         vertices, offset, (normal, carried) = np.empty(n, np.int64), np.empty(n), np.empty((2, n, 3))
         margin, work = self.margin + way, np.empty((5, 3))
         k = contact_planes.planes(

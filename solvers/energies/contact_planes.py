@@ -21,34 +21,28 @@ _CONTACT = 1e-6
 
 
 @kernel
-def near(p, v, dt, frames, low, high, reach, out):
-    """Whether vertices could come near obstacles, by boxes around all of them, to `out` (o,).
+def near(p, v, dt, frames, low, high, out):
+    """Whether vertices could come near obstacles, by a box around all of them, to `out` (o,).
 
     p (n, 3) [m], v (n, 3) [m/s]; frames (o, 2, 4, 3): origin and axes of each obstacle's frame at the step's start and
-    end; low, high (o, 3) and reach (o,) [m] of each. Returns the largest displacement dt |v| [m].
+    end; low, high (o, 3) [m]: corners, in its frame, of what is near an obstacle. Returns the largest displacement
+    dt |v| [m], and -1 where no obstacle is near.
     """
-    smallest, largest = np.inf, 0.0
-    x0, x1, x2, y0, y1, y2 = smallest, smallest, smallest, -smallest, -smallest, -smallest
-    a0, a1, a2, b0, b1, b2 = x0, x1, x2, y0, y1, y2
+    x0, x1, x2, y0, y1, y2, square = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf, 0.0
     for i in range(len(p)):
         p0, p1, p2 = p[i, 0], p[i, 1], p[i, 2]
-        d0, d1, d2 = dt * v[i, 0], dt * v[i, 1], dt * v[i, 2]
-        largest = max(largest, d0 * d0 + d1 * d1 + d2 * d2)
         x0, x1, x2 = min(x0, p0), min(x1, p1), min(x2, p2)
         y0, y1, y2 = max(y0, p0), max(y1, p1), max(y2, p2)
-        a0, a1, a2 = min(a0, p0 + d0), min(a1, p1 + d1), min(a2, p2 + d2)
-        b0, b1, b2 = max(b0, p0 + d0), max(b1, p1 + d1), max(b2, p2 + d2)
-    largest = np.sqrt(largest)
+        square = max(square, v[i, 0] * v[i, 0] + v[i, 1] * v[i, 1] + v[i, 2] * v[i, 2])
+    way, found = dt * np.sqrt(square), -1.0
     for k in range(len(out)):
-        inside = True
+        out[k] = True
         for c in range(3):
-            first, second = frames[k, 0], frames[k, 1]
-            begin, end = _extent(first, c, x0, x1, x2, y0, y1, y2)
-            other, last = _extent(second, c, a0, a1, a2, b0, b1, b2)
-            begin, end = min(begin, other), max(end, last)
-            inside &= begin <= high[k, c] + reach[k] + largest and end >= low[k, c] - reach[k] - largest
-        out[k] = inside
-    return largest
+            begin, end = _extent(frames[k, 0], c, x0, x1, x2, y0, y1, y2)
+            other, last = _extent(frames[k, 1], c, x0, x1, x2, y0, y1, y2)  # less than `way` from where they end
+            out[k] &= min(begin, other - way) <= high[k, c] + way and max(end, last + way) >= low[k, c] - way
+        found = way if out[k] else found
+    return found
 
 
 @inner
@@ -64,9 +58,10 @@ def _extent(frame, c, x0, x1, x2, y0, y1, y2):
 def planes(p, v, dt, frames, low, high, radius, margin, vertices, normal, offset, carried, work):
     """The half-spaces n.x >= d of the vertices that may come near one obstacle; returns how many, k.
 
-    frames (2, 4, 3), low, high (3,) [m] as in `near`; radius: R [m]; margin [m]: a vertex farther away than that and
-    twice its way has none. The first k rows are written of vertices, normal (n, 3), offset d [m], and carried (n, 3)
-    [m]: where the vertex would be had it moved with the obstacle; all in the world, at the step's end. work: (5, 3).
+    frames (2, 4, 3) as in `near`; low, high (3,) [m]: the corners of its box; radius: R [m]; margin [m]: a vertex
+    farther away than that and twice its way has none. The first k rows are written of vertices, normal (n, 3), offset
+    d [m], and carried (n, 3) [m]: where the vertex would be had it moved with the obstacle; all in the world, at the
+    step's end. work: (5, 3).
     """
     count = 0
     a, b, x, c, n = work[0], work[1], work[2], work[3], work[4]
