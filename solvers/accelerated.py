@@ -1,8 +1,9 @@
 """Accelerated first-order methods over one prefactored matrix: `anderson`, `chebyshev` and `lbfgs`.
 
 They share the iteration (`solvers.kernels.accelerate`) and differ in a direction's coefficients. Where the energies
-are springs and quadratic forms, and the factor is one whose panels the kernels know, a step is compiled as a whole;
-else the same kernels take turns with the energies' own values and gradients, and with the factor's own solve.
+are springs, quadratic forms, strain limits and dashpots, and the factor is one whose panels the kernels know, a step is
+compiled as a whole; else the same kernels take turns with the energies' own values and gradients, and with the factor's
+own solve.
 
 No iteration raises the objective, round-off apart: a trial that would is shortened or replaced by the plain
 correction, a local-global iteration, which descends by majorisation. Where that does not either, for all that round-off
@@ -23,6 +24,7 @@ from solvers.compiled import FAR, PreparedCompiled, compiled
 from solvers.kernels import accelerate, accelerate_step
 from solvers.kernels.accelerate import Window
 from solvers.kernels.accelerate_springs import Shares
+from solvers.kernels.edges import Edges
 from solvers.kernels.springs import aligned
 from solvers.linear.choice import Linear, Precision, factorise
 from solvers.local_global import PreparedLocalGlobal, prepared, projective
@@ -64,7 +66,7 @@ def prepare(system: System, method: Method, linear: Linear, precision: Precision
         else [energy for energy in bare.energies if isinstance(energy, ProjectiveEnergy)]
     )
     base = prepared(bare, energies, lambda Q: factorise(Q, linear, precision))
-    found = compiled(base)
+    found = compiled(base, corrects=True)
     engine: Engine = _Interpreted(method, base) if found is None else _Compiled(method, found)
     if bare is not system:
         from solvers.accelerated_contact import Touching  # for those who need it
@@ -138,17 +140,16 @@ def window_for(method: Method, entries: int, whole: int) -> Window:
 
 
 class _Compiled:
-    """Springs and quadratic forms, over a factor that is cut into blocks."""
+    """Springs and what is like them, over a factor that is cut into blocks."""
 
     def __init__(self, method: Method, compiled: PreparedCompiled) -> None:
         self._method = method
-        self._parts, plan, bundles, rows = compiled.parts, compiled.plan, compiled.form, compiled.rows
+        self._parts, self._edges, self._form = compiled.parts, compiled.edges, compiled.form
+        plan, bundles, self._rows = compiled.plan, compiled.bundles, compiled.rows
         pins = compiled.base.system.pins
-        # Corrections are solved for, so that nothing of the exact pins goes to the right-hand side.
-        self._rows = rows._replace(coupling=np.empty(0), coupled=np.empty(0, np.int64), pin=np.empty(0, np.int64))
         self._entries = 4 * int(plan.blocks[:, 1].max())
         self._plan, self._bundles, self._far = plan, bundles, compiled.far
-        self._shares = Shares.of(bundles, plan.held, rows.row[pins.vertices[pins.exact]])
+        self._shares = Shares.of(bundles, plan.held, self._rows.row[pins.vertices[pins.exact]])
 
     @cached_property
     def _kept(self) -> tuple[accelerate_step.Step, Window]:
@@ -160,25 +161,33 @@ class _Compiled:
         window.trial[4 * self._far] = FAR
         x = aligned(whole, self._plan.squares.dtype)
         vectors = aligned(whole), x, aligned(whole), np.zeros(3)
-        return accelerate_step.Step(self._plan, self._bundles, self._shares, self._rows, *vectors), window
+        return accelerate_step.Step(self._plan, self._bundles, self._form, self._shares, self._rows, *vectors), window
 
     def begin(self, problem: StepProblem, guess: Positions, *, kept: bool) -> Run:
         """See Engine."""
-        return _CompiledRun(*(self._kept if kept else self._new()), self._parts, problem, guess)
+        state = self._kept if kept else self._new()
+        return _CompiledRun(*state, self._parts, self._parts.begun(self._edges, problem), problem, guess)
 
 
 class _CompiledRun:
     """See Run."""
 
     def __init__(
-        self, step: accelerate_step.Step, window: Window, parts: Parts, problem: StepProblem, guess: Positions
+        self,
+        step: accelerate_step.Step,
+        window: Window,
+        parts: Parts,
+        edges: Edges | None,
+        problem: StepProblem,
+        guess: Positions,
     ) -> None:
-        self._state = step, window
+        self._state = step, edges, window
         given = (problem.target, parts.force(problem), problem.pin_targets, guess)
         step.objective[2] = parts.negative(guess) if parts.forms else 0.0
         self.positions = np.empty_like(guess)
         # The kernels are compiled for arrays that may be written to.
         self.largest = accelerate_step.start(*self._state, *(np.array(x, order="C") for x in given))
+        step.objective[1] += parts.size(guess)
 
     def advance(self, iterations: int, limit: float, floor: float, every: bool) -> tuple[int, float, bool]:
         """See Run."""

@@ -20,6 +20,7 @@ from scipy.sparse import csr_array
 from solvers.energies.springs import Springs
 from solvers.kernels import springs as kernels
 from solvers.kernels import step, step_ends
+from solvers.kernels.edges import Edges
 from solvers.kernels.plan import Order, of_inverse, of_supernodal, vectors
 from solvers.linear.choice import Linear, Precision, factorise
 from solvers.linear.inverse import Inverse
@@ -67,12 +68,17 @@ ORDERS: dict[type, Callable[[Any], Order]] = {Supernodal: of_supernodal, Inverse
 """The linear solvers whose panels the kernels go through; the others are called in between."""
 
 
-def compiled(base: PreparedLocalGlobal) -> PreparedCompiled | None:
-    """The iterations over the factor's own rows; None where the kernels do not know it, or some energy."""
+def compiled(base: PreparedLocalGlobal, *, corrects: bool = False) -> PreparedCompiled | None:
+    """The iterations over the factor's own rows; None where the kernels do not know it, or some energy.
+
+    corrects: whether corrections are wanted whatever the factor's precision.
+    """
     for kind, order in ORDERS.items():
         if isinstance(base.factor, kind):
             parts = split(base.system)
-            return None if parts.unknown or parts.cancel else PreparedCompiled.of(base, parts, order(base.factor))
+            if parts.unknown or parts.cancel:
+                return None
+            return PreparedCompiled.of(base, parts, order(base.factor), corrects)
     return None
 
 
@@ -88,7 +94,8 @@ class _Work(NamedTuple):
 class PreparedCompiled:
     """The iterations over a factor's own rows (see `solvers.kernels.step`).
 
-    base: the same, step by step; parts: of the energies; plan: of an iteration; bundles: of its local step; form: of
+    base: the same, step by step; parts: of the energies; plan: of an iteration; bundles: of the springs
+    in its local step; edges: beside them; form: of
     |e|_Q^2; rows: of the vertices; far: the last row.
     """
 
@@ -96,13 +103,14 @@ class PreparedCompiled:
     parts: Parts
     plan: step.Plan
     bundles: kernels.Bundles
+    edges: Edges | None
     form: kernels.Bundles
     rows: step_ends.Rows
     far: int
 
     @classmethod
-    def of(cls, base: PreparedLocalGlobal, parts: Parts, order: Order) -> PreparedCompiled:
-        """The iterations over a factor that is cut into blocks."""
+    def of(cls, base: PreparedLocalGlobal, parts: Parts, order: Order, corrects: bool) -> PreparedCompiled:
+        """The iterations over a factor that is cut into blocks; corrects: for corrections in any case."""
         s, pins = base.system, base.system.pins
         exact = pins.vertices[pins.exact]
         nobody = order.rows + len(exact)
@@ -112,11 +120,12 @@ class PreparedCompiled:
         row[exact] = order.rows + np.arange(len(exact))
         part = np.full(s.vertices, -1)
         part[s.free] = np.searchsorted(order.spans[:, 0], slot, side="right") - 1
-        corrects = order.squares.dtype != np.float64
+        corrects |= order.squares.dtype != np.float64
         where = row, part, len(order.spans), nobody, nobody + 1
-        form, first = kernels.Bundles.of(parts.whole, *where)
+        form, first = kernels.Bundles.of(parts.pairs, *where)
         # Positions are solved for with the forms in Q; corrections need their gradient too.
-        bundles = form if corrects or parts.whole is parts.springs else kernels.Bundles.of(parts.springs, *where)[0]
+        local = parts.whole if corrects else parts.springs
+        bundles = form if local is parts.pairs else kernels.Bundles.of(local, *where)[0]
         inertia = s.inertia
         held, measure, loose = np.zeros((3, nobody + 2 + order.shift))
         held[row] = measure[row] = inertia + parts.held
@@ -143,6 +152,7 @@ class PreparedCompiled:
                 order.shift,
             ),
             bundles,
+            parts.edges(row, len(held), order.rows),
             form,
             step_ends.Rows(
                 row,
@@ -177,10 +187,22 @@ class PreparedCompiled:
         target, force, pins, _, guess = self._arrays(problem)
         step_ends.state(self.rows, target, force, pins, y)
         step_ends.start(self.rows, work.vectors, p, guess, pins)
-        out = np.empty_like(target)
+        out, edges = np.empty_like(target), self.parts.begun(self.edges, problem)
         while True:
             step.iterate(
-                self.plan, self.bundles, self.form, (a, b, c, e), y, p, 1, np.nan, 0.0, False, self._threads(), team
+                self.plan,
+                self.bundles,
+                edges,
+                self.form,
+                (a, b, c, e),
+                y,
+                p,
+                1,
+                np.nan,
+                0.0,
+                False,
+                self._threads(),
+                team,
             )
             a, b = b, a
             step_ends.fetch(self.rows, a if p is None else p, out)
@@ -190,7 +212,8 @@ class PreparedCompiled:
         """Iterate until `stop` says so; without a tolerance only the last residual is computed."""
         target, force, pins, current, guess = self._arrays(problem)
         out = np.empty_like(target)
-        fixed = self.plan, self.bundles, self.form, self.rows, *self._work, target, force, pins
+        edges = self.parts.begun(self.edges, problem)
+        fixed = self.plan, self.bundles, edges, self.form, self.rows, *self._work, target, force, pins
         threads = self._threads()
         floor = stop.floor * self.base.trace**0.5
         limit, yardstick, every = 0.0, float("nan"), stop.tolerance is not None
@@ -210,8 +233,10 @@ class PreparedCompiled:
         step_ends.state(self.rows, target, force, pins, y)
         step_ends.start(self.rows, work.vectors, p, guess, pins)
 
+        edges = self.parts.begun(self.edges, problem)
+
         def local() -> None:
-            step.local(self.plan, self.bundles, a, y, p, b)
+            step.local(self.plan, self.bundles, edges, a, y, p, b)
 
         return {"local": local, "global": self.base.phases(problem)["global"]}
 

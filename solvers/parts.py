@@ -7,15 +7,16 @@ couples, and what holds each vertex by itself:
 
 So the kernels of springs add up its forces and its value, from differences of positions, which keep their digits. Where
 it couples more than neighbours, as bending does, some w are negative. Its force at the origin, A'W d, is constant in a
-step: one more external force.
+step: one more external force. Strain limits and dashpots are edges of a kernel of their own (see
+`solvers.kernels.edges`); in Q they too are springs without length.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,20 +26,29 @@ from solvers import matrices
 from solvers.energies.springs import Springs
 from solvers.problem import Energy, LaggedEnergy, Positions, Start, StepProblem, System
 
+if TYPE_CHECKING:
+    from solvers.energies.dashpots import Dashpots
+    from solvers.energies.strain_limits import StrainLimits
+    from solvers.kernels.edges import Edges
+
 _ROUND_OFF = 1e-13
 """Of the sum of a row's absolute values, what its sum may be and still count as zero: a dozen terms' round-off."""
 
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """springs: those of the system; whole: those, and the forms' pairs; held: h of all forms (n,) [N/m]; forms: each in
-    a step; unknown: the names of energies that are in none of these; cancel: whether the pairs and the springs of some
-    vertices cancel, so that Q does not tell that they meet."""
+    """springs: those of the system; whole: those, and the forms' pairs; pairs: those, and the edges', of Q; held: h of
+    all forms (n,) [N/m]; forms: each in a step; limits, dashpots: the edges, with k [N/m] of both; unknown: the names
+    of energies that are in none of these; cancel: whether the pairs and the springs of some vertices cancel, so that Q
+    does not tell that they meet."""
 
     springs: Springs
     whole: Springs
+    pairs: Springs
     held: NDArray[np.float64]
     forms: tuple[Callable[[Start], Any], ...] = field(default=())
+    limits: tuple[StrainLimits, ...] = field(default=())
+    dashpots: tuple[Dashpots, ...] = field(default=())
     unknown: tuple[str, ...] = field(default=())
     cancel: bool = False
 
@@ -58,6 +68,37 @@ class Parts:
         v = p[i] - p[j]
         return -0.5 * float(self.whole.stiffness[below] @ np.einsum("ij,ij->i", v, v))
 
+    def edges(self, row: NDArray[np.int64], rows: int, unknowns: int) -> Edges | None:
+        """The limits and dashpots as they are before a step, between vertices in rows `row` (n,); None without any.
+
+        rows: how many there are; unknowns: how many come before those that do not move.
+        """
+        if not (self.limits or self.dashpots):
+            return None
+        from solvers.kernels.edges import Edges
+
+        both = (*self.limits, *self.dashpots)
+        ends, k = np.concatenate([e.edges for e in both]), np.concatenate([e.stiffness for e in both])
+        none = np.empty(0)
+        low, high = (np.concatenate([none, *(getattr(e, at) for e in self.limits)]) for at in ("low", "high"))
+        edges = Edges.of(ends, k, low, high, row, rows, unknowns)
+        edges.axis[: len(low)] = np.concatenate([none.reshape(0, 3), *(e.rest_direction for e in self.limits)])
+        return edges
+
+    def begun(self, edges: Edges | None, problem: StepProblem) -> Edges | None:
+        """The edges in a step."""
+        if edges is None or not self.dashpots:
+            return edges
+        steps, first = [e.begin_step(problem.start) for e in self.dashpots], len(edges.low)
+        axis, offset = edges.axis.copy(), edges.offset.copy()
+        axis[first:] = np.concatenate([e.direction for e in steps])
+        offset[first:] = np.concatenate([e.offset for e in steps])
+        return edges._replace(axis=axis, offset=offset)
+
+    def size(self, p: Positions) -> float:
+        """The sum of k |v|^2 [J] over limits and dashpots at p (n, 3): what cancels in their energy."""
+        return sum(float(e.stiffness @ e.lengths(p) ** 2) for e in (*self.limits, *self.dashpots))
+
 
 def split(system: System) -> Parts:
     """The parts of a system's energies."""
@@ -65,26 +106,44 @@ def split(system: System) -> Parts:
     springs = Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
     others = [energy for energy in system.energies if not isinstance(energy, Springs)]
     if not others:
-        return Parts(springs, springs, np.zeros(n))
-    from solvers.energies.quadratic import Quadratic  # for those who need it
+        return Parts(springs, springs, springs, np.zeros(n))
+    from solvers.energies.dashpots import Dashpots  # for those who need one of them
+    from solvers.energies.quadratic import Quadratic
+    from solvers.energies.strain_limits import StrainLimits
 
     forms = [energy for energy in others if isinstance(energy, Quadratic)]
-    unknown = tuple(sorted({type(energy).__name__ for energy in others if not isinstance(energy, Quadratic)}))
+    limits = tuple(energy for energy in others if isinstance(energy, StrainLimits))
+    dashpots = tuple(
+        replace(energy, stiffness=system.rate * energy.stiffness) for energy in others if isinstance(energy, Dashpots)
+    )
+    known = Quadratic, StrainLimits, Dashpots
+    unknown = tuple(sorted({type(energy).__name__ for energy in others if not isinstance(energy, known)}))
     L: csr_array = reduce(lambda total, share: total + share, matrices.shares(system, forms), csr_array((n, n)))
     above = coo_array(triu(L, 1))
-    flat = np.zeros(above.nnz)
-    edges = np.column_stack(above.coords).astype(np.int64)
-    pairs = Springs(edges, -np.asarray(above.data, np.float64), flat, flat[:, None] + [1.0, 0.0, 0.0])
+    whole = Springs.joined(
+        [springs, _pairs(np.column_stack(above.coords).astype(np.int64), -np.asarray(above.data, np.float64))]
+    )
+    edges = [_pairs(energy.edges, energy.stiffness) for energy in (*limits, *dashpots)]
+    pairs = Springs.joined([whole, *edges])
     held, size = L.sum(axis=1), abs(L).sum(axis=1)
-    K = springs.stiffness_matrix(n)
+    K = Springs.joined([springs, *edges]).stiffness_matrix(n)
     return Parts(
         springs,
-        Springs.joined([springs, pairs]),
+        whole,
+        pairs,
         np.where(abs(held) <= _ROUND_OFF * size, 0.0, held),
         tuple(form.begin_step if isinstance(form, LaggedEnergy) else _steady(form) for form in forms),
+        limits,
+        dashpots,
         unknown,
         matrices.without_zeros(K + L).nnz < matrices.without_zeros(abs(K) + abs(L)).nnz,
     )
+
+
+def _pairs(edges: NDArray[np.int64], stiffness: NDArray[np.float64]) -> Springs:
+    """Springs without length."""
+    flat = np.zeros(len(stiffness))
+    return Springs(edges, stiffness, flat, flat[:, None] + [1.0, 0.0, 0.0])
 
 
 def _steady(form: Energy) -> Callable[[Start], Energy]:

@@ -62,8 +62,9 @@ class VertexBlockDescent:
         """Raises Unsupported for other energies, NotPositiveDefinite."""
         bare, n = without_contact(system), system.vertices
         parts = split(bare)
-        if parts.unknown:
-            raise Unsupported(f"vbd: knows springs, quadratic forms and contact, not {', '.join(parts.unknown)}")
+        unknown = {*parts.unknown, *(type(energy).__name__ for energy in (*parts.limits, *parts.dashpots))}
+        if unknown:
+            raise Unsupported(f"vbd: knows springs, quadratic forms and contact, not {', '.join(sorted(unknown))}")
         measure = CompiledLocalGlobal().prepare(system)
         coloured = colouring.of_vertices(parts.whole.edges, n)
         colour = np.empty(n, np.int64)

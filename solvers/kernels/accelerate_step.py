@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from solvers.compiling import inner, kernel
 from solvers.kernels.accelerate import AGAIN, STALLED, Window, accept, begin, judge, propose
 from solvers.kernels.accelerate_springs import Shares, descend
+from solvers.kernels.edges import add_edges, energy
 from solvers.kernels.springs import Bundles, squared_norm
 from solvers.kernels.step import Plan
 from solvers.kernels.step_ends import Rows, fetch, place, state
@@ -24,9 +25,9 @@ NOISE = 4.0 * np.finfo(np.float64).eps
 
 
 class Step(NamedTuple):
-    """A system's plan, bundles, shares of the objective and rows, with vectors of all rows: y, the solve's (x) in the
-    factor's type, scratch (e, zero but in unknown rows); objective (3,): at the position, the
-    size of what cancels in it, and what is negative of it where the step begins [J].
+    """A system's plan, bundles, those of the norm of Q (form), shares of the objective and rows, with vectors of all
+    rows: y, the solve's (x) in the factor's type, scratch (e, zero but in unknown rows); objective (3,): at the
+    position, the size of what cancels in it, and what is negative of it where the step begins [J].
 
     The objective is a sum of squares a^2/2, where each a is a difference of two numbers of size A and so known to
     eps A: the sum to eps (sum of a A), at most eps sqrt(2 g size), with size the sum of A^2. Where some squares count
@@ -35,6 +36,7 @@ class Step(NamedTuple):
 
     plan: Plan
     bundles: Bundles
+    form: Bundles
     shares: Shares
     rows: Rows
     y: NDArray[np.float64]
@@ -44,11 +46,11 @@ class Step(NamedTuple):
 
 
 @kernel
-def start(step: Step, window: Window, target, force, pin_targets, guess):
-    """Begin a step's solve; returns the guess's largest coordinate."""
+def start(step: Step, edges, window: Window, target, force, pin_targets, guess):
+    """Begin a step's solve; edges: strain limits and dashpots, or None. Returns the guess's largest coordinate."""
     state(step.rows, target, force, pin_targets, step.y)
     largest = place(step.rows, guess, pin_targets, window.trial)
-    step.objective[0] = _evaluate(step, window)
+    step.objective[0] = _evaluate(step, edges, window)
     step.objective[1] = step.shares.size
     for k in range(len(window.direction)):
         step.objective[1] += step.plan.held[k // 4] * window.trial[k] ** 2
@@ -58,7 +60,7 @@ def start(step: Step, window: Window, target, force, pin_targets, guess):
 
 
 @kernel
-def run(step: Step, window: Window, iterations, limit, floor, every, out):
+def run(step: Step, edges, window: Window, iterations, limit, floor, every, out):
     """Iterate, and put the positions to `out` (n, 3).
 
     every: whether to end once a residual is at most `limit` or `floor`; limit: nan where no residual is wanted. Returns
@@ -70,7 +72,7 @@ def run(step: Step, window: Window, iterations, limit, floor, every, out):
         propose(window)
         verdict = AGAIN
         while verdict == AGAIN:
-            there = _evaluate(step, window)
+            there = _evaluate(step, edges, window)
             before, size = abs(step.objective[0]) + 2.0 * step.objective[2], step.objective[1]
             now.rise, now.noise = there - step.objective[0], NOISE * (before + np.sqrt(2.0 * before * size))
             verdict = judge(window)
@@ -88,16 +90,19 @@ def run(step: Step, window: Window, iterations, limit, floor, every, out):
 
 
 @inner
-def _evaluate(step, window):
-    return descend(
+def _evaluate(step, edges, window):
+    rows = len(window.direction) // 4
+    total = descend(
         step.bundles,
         step.shares,
         window.trial,
         step.y,
         step.plan.held,
-        len(window.direction) // 4,
+        rows,
         window.descent_there,
     )
+    add_edges(edges, 0, rows, window.trial, window.descent_there, 0, True)
+    return total + energy(edges, rows, window.trial)
 
 
 @inner
@@ -106,7 +111,7 @@ def _residual(step, window):
     for i in range(len(window.correction) // 4):
         for k in range(4 * i, 4 * i + 3):
             step.e[k] = step.plan.loose[i] * window.correction[k]
-    return np.sqrt(squared_norm(step.bundles, 0, len(step.bundles.start) - 1, step.e, step.plan.measure))
+    return np.sqrt(squared_norm(step.form, 0, len(step.form.start) - 1, step.e, step.plan.measure))
 
 
 @inner

@@ -26,6 +26,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from solvers.compiling import inner, inner_in_parallel, kernel
+from solvers.kernels.edges import add_edges
 from solvers.kernels.springs import add_descent, add_projection, squared_norm
 from solvers.linear.supernodal_solve import backwards, forwards
 from solvers.linear.team import claim, finish, following, go_on, last, start
@@ -77,13 +78,15 @@ def _add(a, b):
 
 
 @inner
-def _up(plan, bundles, block, x, y, p, out):
+def _up(plan, bundles, edges, block, x, y, p, out):
     """The local step of a block at x (at p, where that is given), and its pass forwards."""
-    _, _, bundle, bundle_end, chunk, chunk_end, _ = plan.blocks[block]
+    slot, slot_end, bundle, bundle_end, chunk, chunk_end, _ = plan.blocks[block]
     if p is None:
         add_projection(bundles, bundle, bundle_end, x, y, plan.held, out, plan.shift)
+        add_edges(edges, slot, slot_end, x, out, plan.shift, False)
     else:
         add_descent(bundles, bundle, bundle_end, p, y, plan.held, out, plan.shift)
+        add_edges(edges, slot, slot_end, p, out, plan.shift, True)
     forwards(plan.panels, plan.places, plan.chunks, chunk, chunk_end, out)
 
 
@@ -103,7 +106,7 @@ def _clear(plan, block, out):
 
 
 @inner
-def _group(plan, bundles, group, x, y, p, out, down, up):
+def _group(plan, bundles, edges, group, x, y, p, out, down, up):
     """A group: down with the vector x, and up again with `out`, block by block."""
     begin, end = plan.of_group[group], plan.of_group[group + 1]
     top = 4 * plan.top[0]
@@ -125,11 +128,11 @@ def _group(plan, bundles, group, x, y, p, out, down, up):
         if up and plan.leaf[block] == back:
             if back:
                 _clear(plan, block, out)
-            _up(plan, bundles, block, x, y, p, out)
+            _up(plan, bundles, edges, block, x, y, p, out)
 
 
 @inner
-def _turn(plan, bundles, x, y, p, out):
+def _turn(plan, bundles, edges, x, y, p, out):
     """The top: up at the positions x, and down again."""
     top, top_end, groups = plan.top
     size = 4 * (top_end - top)
@@ -140,7 +143,7 @@ def _turn(plan, bundles, x, y, p, out):
         else:
             _add(out[begin : begin + size], out[4 * top : 4 * top_end])
     for block in range(plan.of_group[-2], plan.of_group[-1]):
-        _up(plan, bundles, block, x, y, p, out)
+        _up(plan, bundles, edges, block, x, y, p, out)
         _down(plan, block, out, p)
 
 
@@ -164,7 +167,7 @@ def _squared(plan, form, part, e):
 
 
 @kernel
-def local(plan, bundles, x, y, p, out):
+def local(plan, bundles, edges, x, y, p, out):
     """The local step alone, of all blocks."""
     for k in range(len(out)):
         out[k] = 0.0
@@ -172,10 +175,14 @@ def local(plan, bundles, x, y, p, out):
         add_projection(bundles, 0, len(bundles.start) - 1, x, y, plan.held, out, plan.shift)
     else:
         add_descent(bundles, 0, len(bundles.start) - 1, p, y, plan.held, out, plan.shift)
+    for block in range(len(plan.blocks)):
+        add_edges(
+            edges, plan.blocks[block, 0], plan.blocks[block, 1], x if p is None else p, out, plan.shift, p is not None
+        )
 
 
 @inner
-def _share(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, team, first):
+def _share(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, team, first):
     """A thread's share of the iterations: the groups from `first` on that no other thread does, and what follows them.
 
     Phase 2 k is iteration k, phase 2 k + 1 measures it where that is wanted.
@@ -195,7 +202,7 @@ def _share(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, 
                     _displace(plan, group, a, c, p, e)
                     team.sums[group] = _squared(plan, form, group, e)
                 else:
-                    _group(plan, bundles, group, a, y, p, b, k > 0, k < iterations)
+                    _group(plan, bundles, edges, group, a, y, p, b, k > 0, k < iterations)
                 if last(team):
                     enough = k == iterations
                     if measures:
@@ -212,35 +219,36 @@ def _share(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, 
                         team.found[0] = k
                         finish(team)
                     else:
-                        _turn(plan, bundles, a, y, p, b)
+                        _turn(plan, bundles, edges, a, y, p, b)
                         go_on(team, 2 * k + 2)
         phase = following(team, phase)
 
 
 @inner_in_parallel
-def _side_by_side(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, team, threads):
+def _side_by_side(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, team, threads):
     for thread in prange(threads):
         _share(
-            plan, bundles, form, vectors, y, p, iterations, limit, floor, every, team, thread * plan.top[2] // threads
-        )
+            plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, team,
+            thread * plan.top[2] // threads,
+        )  # fmt: skip
 
 
 @kernel
-def iterate(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, threads, team):
+def iterate(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, threads, team):
     """Iterate from the positions in the first vector, or from p where that is given, which then takes the positions.
 
-    form: the bundles of |e|_Q^2, the quadratic forms' pairs among them; vectors: three that take turns, and one for
-    scratch, of float64; y: the constant right-hand side; every: whether the iterations end once a residual is at most
-    `limit` or `floor`; threads: None for one.
+    edges: strain limits and dashpots, or None; form: the bundles of |e|_Q^2, with pairs for all that is not a spring;
+    vectors: three that take turns, and one for scratch, of float64; y: the constant right-hand side; every: whether the
+    iterations end once a residual is at most `limit` or `floor`; threads: None for one.
     Returns how many were done, the last one's residual |p^k - p^(k-1)|_Q [J^(1/2)] over the vertices that no pin
     holds (nan where none was wanted: limit is nan), and the last vector.
     """
     start(team)
     team.found[1] = np.nan
     if threads is None:
-        _share(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, team, 0)
+        _share(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, team, 0)
     else:
-        _side_by_side(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, team, threads)
+        _side_by_side(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, team, threads)
     x0, x1, x2, _ = vectors
     done = int(team.found[0])
     return done, team.found[1], (x0, x1, x2)[done % 3]

@@ -86,7 +86,7 @@ def start(rows, vectors, p, positions, pin_targets):
 
 @kernel
 def solve(
-    plan, bundles, form, rows, vectors, y, p, target, force, pin_targets, guess,
+    plan, bundles, edges, form, rows, vectors, y, p, target, force, pin_targets, guess,
     iterations, limit, floor, every, threads, team, out,
 ):  # fmt: skip
     """A whole step; `limit`, `floor` and `every` as in `iterate`, but `floor` for a largest coordinate of one.
@@ -95,7 +95,9 @@ def solve(
     """
     state(rows, target, force, pin_targets, y)
     floor *= start(rows, vectors, p, guess, pin_targets)
-    count, residual, x = iterate(plan, bundles, form, vectors, y, p, iterations, limit, floor, every, threads, team)
+    count, residual, x = iterate(
+        plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, threads, team
+    )
     if p is None:
         fetch(rows, x, out)
     else:

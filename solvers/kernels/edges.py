@@ -1,0 +1,115 @@
+"""Strain limits and dashpots, compiled: edge by edge, beside the springs.
+
+    E = sum_e k_e/2 |b_e|^2      b = (|v| - t) v/|v| of a limit, with t the nearest length allowed
+                                 b = (n.v - o) n of a dashpot
+
+Both are projective: the gradient is A'K b, the projection d = v - b. Each edge is computed at both of its ends, as
+springs are, so that nobody adds to another's sum.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.compiling import inner
+from solvers.energies.edges import TINY
+from solvers.problem import Positions
+
+
+class Edges(NamedTuple):
+    """Edges by the rows of their ends, limits first.
+
+    first (rows + 1,): the first entry of each row; of each entry the row of the other end (other), the edge, ~edge at
+    its second end, and its share of the energy: 1/2, or 1 where the other end does not move; stiffness: k (m,) [N/m];
+    low, high: the lengths allowed [m] of the limits; axis (m, 3): n of a dashpot, and what a limit without length
+    takes; offset: o (m,) [m].
+    """
+
+    first: NDArray[np.int64]
+    other: NDArray[np.int64]
+    edge: NDArray[np.int64]
+    share: NDArray[np.float64]
+    stiffness: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    axis: Positions
+    offset: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        ends: NDArray[np.int64],
+        stiffness: NDArray[np.float64],
+        low: NDArray[np.float64],
+        high: NDArray[np.float64],
+        row: NDArray[np.int64],
+        rows: int,
+        unknowns: int,
+    ) -> Edges:
+        """Edges between vertices (m, 2) in rows `row` (n,), of which the first ones are unknowns."""
+        kept = np.flatnonzero(ends[:, 0] != ends[:, 1])
+        here, there = row[ends[kept]].T.ravel(), row[ends[kept, ::-1]].T.ravel()
+        order = np.argsort(here, kind="stable")
+        return cls(
+            np.concatenate([[0], np.cumsum(np.bincount(here, minlength=rows))]),
+            there[order],
+            np.concatenate([kept, ~kept])[order],
+            np.where(there < unknowns, 0.5, 1.0)[order],
+            stiffness,
+            low,
+            high,
+            np.zeros((len(ends), 3)),
+            np.zeros(len(ends)),
+        )
+
+
+@inner
+def _at(edges, row, entry, x):
+    """An entry's v and b, from its own end, and its stiffness."""
+    j, e, sign = edges.other[entry], edges.edge[entry], 1.0
+    if e < 0:
+        e, sign = ~e, -1.0
+    v = x[4 * row] - x[4 * j], x[4 * row + 1] - x[4 * j + 1], x[4 * row + 2] - x[4 * j + 2]
+    n = sign * edges.axis[e, 0], sign * edges.axis[e, 1], sign * edges.axis[e, 2]
+    if e >= len(edges.low):
+        scale = n[0] * v[0] + n[1] * v[1] + n[2] * v[2] - edges.offset[e]
+        return v, (scale * n[0], scale * n[1], scale * n[2]), edges.stiffness[e]
+    length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    scale = length - min(max(length, edges.low[e]), edges.high[e])
+    if length <= TINY:
+        return v, (scale * n[0], scale * n[1], scale * n[2]), edges.stiffness[e]
+    scale /= length
+    return v, (scale * v[0], scale * v[1], scale * v[2]), edges.stiffness[e]
+
+
+@inner
+def add_edges(edges, begin, end, x, out, shift, correct):
+    """Add A'K d, or minus the gradient where `correct`, of the rows from `begin` to `end` to rows moved by `shift`."""
+    if edges is None:
+        return
+    for row in range(begin, end):
+        s0 = s1 = s2 = 0.0
+        for entry in range(edges.first[row], edges.first[row + 1]):
+            v, b, k = _at(edges, row, entry, x)
+            if correct:
+                s0, s1, s2 = s0 - k * b[0], s1 - k * b[1], s2 - k * b[2]
+            else:
+                s0, s1, s2 = s0 + k * (v[0] - b[0]), s1 + k * (v[1] - b[1]), s2 + k * (v[2] - b[2])
+        at = 4 * (row + shift)
+        out[at], out[at + 1], out[at + 2] = out[at] + s0, out[at + 1] + s1, out[at + 2] + s2
+
+
+@inner
+def energy(edges, end, x):
+    """The energy [J] of the edges of the rows before `end`."""
+    if edges is None:
+        return 0.0
+    total = 0.0
+    for row in range(end):
+        for entry in range(edges.first[row], edges.first[row + 1]):
+            _, b, k = _at(edges, row, entry, x)
+            total += 0.5 * edges.share[entry] * k * (b[0] * b[0] + b[1] * b[1] + b[2] * b[2])
+    return total
