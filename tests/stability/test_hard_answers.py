@@ -1,0 +1,65 @@
+"""What solvers say of their answers to the hard cases is true, by an oracle that shares nothing with them.
+
+The residual |Q^-1 grad g| comes from a Q of its own, factorised by SuperLU, and the gradient of the plain formulas.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harness.judge import SLACK, Oracle
+from harness.simulate import prepare, problem, start
+from solvers.problem import Solution, StepProblem, StopRule, Unsupported
+from tests.stability.test_hard_scenes import METHODS, cases, scene, spacing
+
+MINIMISERS = {name: solver for name, solver in METHODS.items() if solver.minimises}
+TOLERANCE = 1e-6
+STOP = StopRule(100, TOLERANCE)
+
+UNIQUE = (
+    "geometry-all-rest-lengths-zero",
+    "numbers-nearly-no-springs",
+    "numbers-step-1e-4-soft",
+    "numbers-stiffness-number-1e-4",
+    "numbers-stiffness-number-1e-8",
+    "topology-all-pins",
+    "topology-all-pins-exact",
+    "topology-no-springs",
+    "topology-single-pinned-vertex",
+    "topology-single-vertex",
+)
+"""Cases whose objective is convex: inertia, or springs without length, outweigh what compressed springs take."""
+
+
+def answers(case: str, stop: StopRule) -> tuple[StepProblem, dict[str, Solution]]:
+    """The first step of a case, and the answers of the minimisers that take it."""
+    made, found = scene(case), {}
+    stated = problem(made, start(made), "current")
+    for name, solver in MINIMISERS.items():
+        try:
+            found[name] = prepare(made, solver).solve(stated, stop)
+        except Unsupported:
+            continue
+    return stated, found
+
+
+@cases
+def test_an_answer_is_as_stationary_as_it_is_said_to_be(case: str):
+    stated, found = answers(case, STOP)
+    oracle = Oracle(stated.system)
+    for name, solution in found.items():
+        reached, attainable = oracle.stationarity(stated, solution.positions)
+        wanted = {"tolerance": TOLERANCE, "floor": attainable, "stalled": attainable}.get(solution.stopped, np.inf)
+        assert reached <= SLACK * max(wanted, attainable), (name, solution.stopped, reached, attainable)
+        assert solution.stopped != "iterations" or solution.iterations == STOP.iterations, name
+
+
+@pytest.mark.parametrize("case", UNIQUE)
+def test_all_minimisers_agree_where_there_is_one_minimum(case: str):
+    _, found = answers(case, StopRule(1000, 1e-9))
+    assert {name for name, solution in found.items() if solution.stopped != "iterations"} == set(MINIMISERS)
+    # The tolerance of what the step moves, at most some metres, a hundredfold for what is softer than Q.
+    atol = 1e-7 * spacing(scene(case))
+    for name, solution in found.items():
+        np.testing.assert_allclose(solution.positions, found["newton"].positions, rtol=0, atol=atol, err_msg=name)
