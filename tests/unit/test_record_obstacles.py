@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -93,3 +95,8 @@ def test_a_recording_without_obstacles_has_no_trace_of_any(tmp_path: Path):
     np.testing.assert_array_equal(seen(replay, [0]), replay.positions[0])
     with open_recording(path) as source:
         assert list(source.chunks(content="/scene/obstacles/**")) == []
+
+
+def test_who_records_and_draws_scenes_without_obstacles_does_not_import_them():
+    script = "import sys, harness.run, harness.report.run_picture; sys.exit('harness.obstacles' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
