@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -76,9 +75,9 @@ def prepare(system: System, method: Method, linear: Linear, precision: Precision
 
 
 class Engine(Protocol):
-    """Begins solves: kept for those whose memory may be used again, one at a time."""
+    """Begins solves."""
 
-    def begin(self, problem: StepProblem, guess: Positions, *, kept: bool) -> Run:
+    def begin(self, problem: StepProblem, guess: Positions) -> Run:
         """A run from a first guess (n, 3)."""
         ...
 
@@ -102,7 +101,7 @@ class PreparedAccelerated:
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """The iterates from `problem.first_guess`; the yielded array is overwritten by the next one."""
-        run = self.engine.begin(problem, problem.first_guess, kept=False)
+        run = self.engine.begin(problem, problem.first_guess)
         while True:
             run.advance(1, np.nan, 0.0, False)
             yield run.positions
@@ -111,9 +110,9 @@ class PreparedAccelerated:
         """Iterate until `stop` says so, or round-off; without a tolerance only the last residual is computed."""
         every, limit, yardstick = stop.tolerance is not None, 0.0, float("nan")
         if stop.tolerance is not None:
-            _, yardstick, _ = self.engine.begin(problem, problem.current, kept=True).advance(0, 0.0, 0.0, False)
+            _, yardstick, _ = self.engine.begin(problem, problem.current).advance(0, 0.0, 0.0, False)
             limit = stop.tolerance * yardstick
-        run = self.engine.begin(problem, problem.first_guess, kept=True)
+        run = self.engine.begin(problem, problem.first_guess)
         floor = stop.floor * run.largest * self.base.trace**0.5
         count, residual, stalled = run.advance(stop.iterations, limit, floor, every)
         stopped = "iterations"
@@ -150,12 +149,9 @@ class _Compiled:
         self._entries = 4 * int(plan.blocks[:, 1].max())
         self._plan, self._bundles, self._far = plan, bundles, compiled.far
         self._shares = Shares.of(bundles, plan.held, self._rows.row[pins.vertices[pins.exact]])
+        self._idle: list[_State] = []
 
-    @cached_property
-    def _kept(self) -> tuple[accelerate_step.Step, Window]:
-        return self._new()
-
-    def _new(self) -> tuple[accelerate_step.Step, Window]:
+    def _new(self) -> _State:
         whole = 4 * len(self._plan.held)
         window = window_for(self._method, self._entries, whole)
         window.trial[4 * self._far] = FAR
@@ -163,24 +159,30 @@ class _Compiled:
         vectors = aligned(whole), x, aligned(whole), np.zeros(3)
         return accelerate_step.Step(self._plan, self._bundles, self._form, self._shares, self._rows, *vectors), window
 
-    def begin(self, problem: StepProblem, guess: Positions, *, kept: bool) -> Run:
+    def begin(self, problem: StepProblem, guess: Positions) -> Run:
         """See Engine."""
-        state = self._kept if kept else self._new()
-        return _CompiledRun(*state, self._parts, self._parts.begun(self._edges, problem), problem, guess)
+        state = self._idle.pop() if self._idle else self._new()
+        return _CompiledRun(self._idle, state, self._parts, self._parts.begun(self._edges, problem), problem, guess)
+
+
+_State = tuple[accelerate_step.Step, Window]
+"""The memory of a run."""
 
 
 class _CompiledRun:
-    """See Run."""
+    """See Run. idle: where its memory goes when it is not needed any more."""
 
     def __init__(
         self,
-        step: accelerate_step.Step,
-        window: Window,
+        idle: list[_State],
+        state: _State,
         parts: Parts,
         edges: Edges | None,
         problem: StepProblem,
         guess: Positions,
     ) -> None:
+        self._idle, self._memory = idle, state
+        step, window = state
         self._state = step, edges, window
         given = (problem.target, parts.force(problem), problem.pin_targets, guess)
         step.objective[2] = parts.negative(guess) if parts.forms else 0.0
@@ -193,6 +195,9 @@ class _CompiledRun:
         """See Run."""
         return accelerate_step.run(*self._state, iterations, limit, floor, every, self.positions)
 
+    def __del__(self) -> None:
+        self._idle.append(self._memory)
+
 
 class _Interpreted:
     """Any energies, and any factor."""
@@ -200,7 +205,7 @@ class _Interpreted:
     def __init__(self, method: Method, base: PreparedLocalGlobal) -> None:
         self._method, self._base, self._objective = method, base, Objective(base.system)
 
-    def begin(self, problem: StepProblem, guess: Positions, *, kept: bool) -> Run:
+    def begin(self, problem: StepProblem, guess: Positions) -> Run:
         """See Engine."""
         window = window_for(self._method, guess.size, guess.size)
         return InterpretedRun(self._base, window, StepObjective(self._objective, problem), guess)

@@ -29,11 +29,11 @@ class Touching:
         self._method, self._base, self._idle = method, base, idle
         self._objective, self._corrections = Objective(base.system), Corrections(base)
 
-    def begin(self, problem: StepProblem, guess: Positions, *, kept: bool) -> Run:
+    def begin(self, problem: StepProblem, guess: Positions) -> Run:
         """See Engine."""
         contacts = touching(problem)
         if not contacts:
-            return self._idle.begin(problem, guess, kept=kept)
+            return self._idle.begin(problem, guess)
         window = window_for(self._method, guess.size, guess.size)
         step = StepObjective(self._objective, problem)
         return _ContactRun(self._base, window, step, guess, contacts, self._corrections)

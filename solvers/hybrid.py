@@ -7,8 +7,8 @@ larger than the true ones by orders of magnitude. In the exact Hessian they make
 unstable, where they are neither. Here tensions are unknowns of their own. Newton's method on the optimality conditions
 of both (primal-dual, as in interior point methods: Nocedal and Wright 2006, chapter 19; tensions that outlive an
 iteration stabilise stiff springs in Tournier et al. 2015, "Stable Constrained Dynamics") comes down to a Hessian with
-predicted tensions, and its steps are longer by as much. What such a step stretches at second order is local: a round of
-L-BFGS takes it back. The first one starts where the step before ended, from smooth positions.
+predicted tensions, and its steps are longer by as much. What such a step stretches at second order is local: a few
+iterations of L-BFGS take it back. The first one starts where the step before ended, from smooth positions.
 
 L-BFGS comes first. Once it gets slow, whichever brought the greater descent for its cost the last time goes on. The
 exact method takes over when the Hessian is positive definite as it is and the slope falls as it does where Newton's
@@ -30,11 +30,11 @@ from solvers.newton import NewtonMethod
 from solvers.objective import Hessian, Objective, StepObjective
 from solvers.problem import Positions, System
 
-_ROUND, _RELAXED = 10, 5
-"""Iterations of L-BFGS in a round, and after a step of Newton's method."""
+_PROBE, _ROUND, _RELAXED = 4, 10, 5
+"""Iterations of L-BFGS at the very first, in a round (the first one's are among them), and after a Newton step."""
 
 _QUICK = 0.5
-"""What the first round leaves of the residual where L-BFGS suits a problem."""
+"""What the very first ones leave of the residual where L-BFGS suits a problem."""
 
 _SLOW = 0.8
 """What a round brings beside the one before it where L-BFGS gets slow."""
@@ -82,25 +82,25 @@ class HybridMethod:
         """The points after `start`."""
         origin = point = _lower(step, start)
         predicting = _Predicting(self, step, origin)
-        run: Run | None = self._lbfgs.engine.begin(step.problem, point.positions, kept=False)
+        run: Run | None = self._lbfgs.engine.begin(step.problem, point.positions)
         _, before, _ = run.advance(0, 0.0, 0.0, False)
-        gain, newton_gain, ended = np.inf, 0.0, False
+        _, residual, _ = run.advance(_PROBE, 0.0, 0.0, False)
+        gain, newton_gain = (np.inf, 0.0) if residual <= _QUICK * before else (0.0, np.inf)
+        iterations, ended = _ROUND - _PROBE, False
         while not ended:
             if gain > newton_gain:
-                run = run or self._lbfgs.engine.begin(step.problem, point.positions, kept=False)
-                _, residual, ended = run.advance(_ROUND, 0.0, 0.0, False)
-                following = _at(step, run.positions)
+                run = run or self._lbfgs.engine.begin(step.problem, point.positions)
+                _, residual, ended = run.advance(iterations, 0.0, 0.0, False)
+                following, iterations = _at(step, run.positions), _ROUND
                 ended |= residual**2 <= self.metric.round_off(following.positions)
                 last, gain = gain, _gain(step, point, following)
-                if last == np.inf and residual > _QUICK * before:
-                    gain = 0.0  # of no use yet
                 if newton_gain == 0.0 and (gain == 0.0 or gain > _SLOW * last):
                     newton_gain = np.inf
             else:
-                following, ended = predicting.next(point)
-                newton_gain = _gain(step, point, following) / self._cost
-                gain = gain or newton_gain  # until it is known
                 run = None
+                following, fall, ended = predicting.next(point)
+                newton_gain = fall / self._cost
+                gain = gain or newton_gain  # until it is known
             if following is not point:
                 point = following
                 yield point
@@ -112,7 +112,7 @@ class HybridMethod:
 
     def relaxed(self, step: StepObjective, p: Positions) -> Point:
         """Where some iterations of L-BFGS lead from p."""
-        run = self._lbfgs.engine.begin(step.problem, p, kept=True)
+        run = self._lbfgs.engine.begin(step.problem, p)
         run.advance(_RELAXED, float("nan"), 0.0, False)
         return _at(step, run.positions)
 
@@ -127,28 +127,29 @@ class _Predicting:
         self._tension = np.zeros(len(step.whole.springs.stiffness))
         self._level, self._slope, self._bold = len(_LEVELS), -np.inf, True
 
-    def next(self, point: Point) -> tuple[Point, bool]:
-        """A lower point, or the same one; whether the exact method does better from there."""
+    def next(self, point: Point) -> tuple[Point, float, bool]:
+        """A lower point, or the same one; by how much [J]; whether the exact method does better from there."""
         step, at = self._step, self._origin or point
         self._origin = None
         hessian = step.hessian(at.positions)
         descent = self._solved(hessian, at.gradient)
         if descent is None:
-            return point, True
+            return point, 0.0, True
         direction = -descent
         slope, before = dot(at.gradient, direction), self._slope
         self._slope = slope
         if not -slope > self._method.metric.round_off(at.positions):
-            return point, True
+            return point, 0.0, True
         predicted = step.tensions(at.positions, direction)
         length, following, kept = self._along(at, direction, slope)
         if following is None:
-            return point, True
+            return point, 0.0, True
         self._bold = kept
         self._tension += length * (predicted - self._tension)
-        if _gain(step, point, following) == 0.0:
-            return point, at is point
-        return following, self._level == 0 and kept and slope >= _QUADRATIC * before
+        gain = _gain(step, point, following)
+        if gain == 0.0:
+            return point, 0.0, at is point
+        return following, gain, self._level == 0 and kept and slope >= _QUADRATIC * before
 
     def _solved(self, hessian: Hessian, b: Positions) -> Positions | None:
         """The product of b and the inverse on the first level that has one, from that before the last one's on."""
