@@ -40,10 +40,11 @@ class Limit(NamedTuple):
 class Figures(NamedTuple):
     """One candidate at one size. Times [ms]: the least of all rounds; None: not measured or not known.
 
-    step: of STEP iterations; touched: bytes a second of an iteration, by what the factor's panels hold; binds: the
-    limit that binds; reached: the part of it that an iteration reaches by those bytes and flops; least: the part by
-    the entries of L alone, without the panels' padding; faster: than the yardstick a step; solves_faster: than
-    cholespy a global step; apart: from float64's converged positions, in the scene's size.
+    step: of STEP iterations; entries: of the factor L; touched: bytes a second of an iteration, by what the
+    factor's panels hold; binds: the limit that binds; reached: the part of it that an iteration reaches by those
+    bytes and flops; least: the part by the entries of L alone, without the panels' padding; faster: than the
+    yardstick a step; solves_faster: than cholespy a global step; apart: from float64's converged positions, in the
+    scene's size.
     """
 
     scene: str
@@ -60,6 +61,7 @@ class Figures(NamedTuple):
     local: float | None = None
     global_: float | None = None
     step: float | None = None
+    entries: int | None = None
     bytes: float | None = None
     touched: float | None = None
     binds: str | None = None
@@ -168,6 +170,7 @@ def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], m
     least = work.count({"nnz_factor": facts["nnz_factor"]}, *counts)["iteration"]
     limit, seconds = machine.limit(touched, first["threads"], precision), float(times["step"].min())
     return known._replace(
+        entries=facts["nnz_factor"],
         bytes=touched.bytes,
         touched=touched.bytes / seconds,
         binds=limit.binds,

@@ -97,16 +97,19 @@ def remarks(found: Sequence[Figures]) -> list[str]:
         elif f.choice and "auto" in f.label.split():
             told[f"{f.label} chose {f.choice}"].append(where(f))
     said = [f"{words} (at {', '.join(sizes)})" for words, sizes in told.items()]
+    entries = exponents(found, "entries")
     for (scene, label), exponent in exponents(found).items():
-        said.append(f"{label}: from 10,000 vertices of {scene} on a solve costs n^{exponent:.2f}")
+        factor = f", its factor has n^{entries[scene, label]:.2f} entries" if (scene, label) in entries else ""
+        said.append(f"{label}: from 10,000 vertices of {scene} on a solve costs n^{exponent:.2f}{factor}")
     return said
 
 
-def exponents(found: Sequence[Figures], least: int = 10_000) -> dict[tuple[str, str], float]:
-    """The power of n by which the global step's time grows, by scene and label, from `least` vertices on."""
+def exponents(found: Sequence[Figures], figure: str = "global_", least: int = 10_000) -> dict[tuple[str, str], float]:
+    """The power of n by which a figure grows, that of a solve's time, by scene and label, from `least` vertices on."""
     by_label: dict[tuple[str, str], list[tuple[int, float]]] = defaultdict(list)
     for f in found:
-        if f.global_ and f.vertices >= least:
-            by_label[f.scene, f.label].append((f.vertices, f.global_))
+        value = getattr(f, figure)
+        if value and f.vertices >= least:
+            by_label[f.scene, f.label].append((f.vertices, value))
     logarithms = {label: np.log(np.array(points)).T for label, points in by_label.items() if len(points) > 1}
-    return {label: float(np.polyfit(n, seconds, 1)[0]) for label, (n, seconds) in logarithms.items()}
+    return {label: float(np.polyfit(n, values, 1)[0]) for label, (n, values) in logarithms.items()}

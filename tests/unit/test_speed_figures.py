@@ -9,8 +9,8 @@ import pyarrow as pa
 import pytest
 
 from harness.rows import SCHEMA
-from harness.speed.figures import Machine, figures, interval
-from harness.speed.table import exponents
+from harness.speed.figures import Figures, Machine, figures, interval
+from harness.speed.table import exponents, remarks
 from harness.speed.work import count
 
 
@@ -123,3 +123,13 @@ def test_the_growth_of_a_solve_is_the_power_in_its_times():
             rows.append(row | {"run_id": f"s{size}", "size": size, "vertices": size**2})
     found = figures(pa.Table.from_pylist(rows, schema=SCHEMA))
     assert exponents(found) == {("cloth", "sparse"): pytest.approx(1.25, rel=1e-9)}  # the fit's round-off
+
+
+def test_the_growth_of_a_factor_is_told_beside_that_of_its_solve():
+    found = [
+        Figures("cloth", size, size**2, "a", 1, "ok", None, None, global_=float(size) ** 2.6, entries=size**2 * size)
+        for size in (100, 200)
+    ]
+    assert "a: from 10,000 vertices of cloth on a solve costs n^1.30, its factor has n^1.50 entries" in remarks(found)
+    bare = [f._replace(entries=None) for f in found]
+    assert "a: from 10,000 vertices of cloth on a solve costs n^1.30" in remarks(bare)
