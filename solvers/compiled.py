@@ -57,7 +57,12 @@ class CompiledLocalGlobal:
         energies = projective(system, "numba")
         springs = [energy for energy in energies if isinstance(energy, Springs)]
         alone = [Springs.joined(springs)] if len(springs) == len(energies) else []
-        base = prepared(system, alone or energies, lambda Q: factorise(Q, self.linear, self.precision))
+        base = prepared(
+            system,
+            alone or energies,
+            lambda Q: factorise(Q, self.linear, self.precision),
+            rounded=self.precision != "float64",
+        )
         found = compiled(base)
         if found is None and alone:
             return replace(base, project=_projection(alone[0], system.vertices))

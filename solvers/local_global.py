@@ -53,7 +53,8 @@ class PreparedLocalGlobal:
     project: the local step; factor: of Q's free rows and columns; coupling: Q's free rows and exactly pinned
     columns (f, x); norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins; trace: of the unpinned
     part of Q [N/m]; facts: exact counts of what was built; choice: the linear solver in words; begin: the local step
-    of one problem, where it differs from problem to problem.
+    of one problem, where it differs from problem to problem; rounded: Q's free rows and columns where the factor is
+    less precise: then corrections are solved for, p + Q^-1 (b - Q p), and the fixed point stays accurate to float64.
     """
 
     system: System
@@ -65,6 +66,7 @@ class PreparedLocalGlobal:
     facts: dict[str, float]
     choice: str
     begin: Callable[[StepProblem], Project] | None = None
+    rounded: csr_array | None = None
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """The iterates from `problem.first_guess`; each yielded array is overwritten two iterations later."""
@@ -73,7 +75,7 @@ class PreparedLocalGlobal:
         p, following = self._placed(problem.first_guess, problem), self._placed(problem.current, problem)
         while True:
             project(p, constant, b)
-            self._global(b, following)
+            self._global(b, p, following)
             p, following = following, p
             yield p
 
@@ -105,7 +107,7 @@ class PreparedLocalGlobal:
         p = self._placed(problem.first_guess, problem)
         out, project = p.copy(), self._local(problem)
         project(p, constant, b)
-        return {"local": lambda: project(p, constant, b), "global": lambda: self._global(b, out)}
+        return {"local": lambda: project(p, constant, b), "global": lambda: self._global(b, p, out)}
 
     def _local(self, problem: StepProblem) -> Project:
         return self.begin(problem) if self.begin else self.project
@@ -120,13 +122,18 @@ class PreparedLocalGlobal:
             y[s.free] -= self.coupling @ problem.pin_targets[s.pins.exact]
         return y
 
-    def _global(self, b: Positions, out: Positions) -> None:
+    def _global(self, b: Positions, p: Positions, out: Positions) -> None:
+        """Write where Q p = b leads from p, (n, 3) all; out: exactly pinned vertices are left as they are there."""
         free = self.system.free
-        if len(free) == len(b):
+        if len(free) == len(b) and self.rounded is None:
             self.factor.solve(b, out)
         elif len(free):
-            solved = np.empty((len(free), 3))
-            self.factor.solve(b[free], solved)
+            solved, held = np.empty((len(free), 3)), b[free]
+            if self.rounded is None:
+                self.factor.solve(held, solved)
+            else:
+                self.factor.solve(held - self.rounded @ p[free], solved)
+                solved += p[free]
             out[free] = solved
 
     def _placed(self, p: Positions, problem: StepProblem) -> Positions:
@@ -227,8 +234,11 @@ def prepared(
     system: System,
     energies: Sequence[ProjectiveEnergy],
     factorise: Callable[[csr_array], tuple[Factor, str]],
+    *,
+    rounded: bool = False,
 ) -> PreparedLocalGlobal:
-    """The energies' own local steps, over a factor of the assembled Q that comes with its `choice`."""
+    """The energies' own local steps, over a factor of the assembled Q that comes with its `choice`; rounded: whether
+    that is less precise than float64."""
     Q = matrices.assemble(system, energies)
     free = system.free
     rows = Q if len(free) == system.vertices else csr_array(Q[free])
@@ -246,6 +256,7 @@ def prepared(
         _facts(Q.nnz, factor),
         choice,
         (lambda problem: _projection(problem.energies)) if lagged else None,
+        inner if rounded else None,
     )
 
 

@@ -176,9 +176,11 @@ def local(plan, bundles, edges, x, y, p, out):
     else:
         add_descent(bundles, 0, len(bundles.start) - 1, p, y, plan.held, out, plan.shift)
     for block in range(len(plan.blocks)):
-        add_edges(
-            edges, plan.blocks[block, 0], plan.blocks[block, 1], x if p is None else p, out, plan.shift, p is not None
-        )
+        begin, end = plan.blocks[block, 0], plan.blocks[block, 1]
+        if p is None:
+            add_edges(edges, begin, end, x, out, plan.shift, False)
+        else:  # of another precision than x
+            add_edges(edges, begin, end, p, out, plan.shift, True)
 
 
 @inner
