@@ -29,13 +29,19 @@ DECREASE = 1e-4
 _HALVINGS = 60
 """A step so often halved has no digit left."""
 
+_CLOSE = 1e-5
+"""A tolerance from which on the last point should be a minimum; a greater one asks for less than that."""
+
 
 class Point(NamedTuple):
-    """Where a method is: positions and gradient, (n, 3); stalled: whether round-off lets nothing descend from here."""
+    """Where a method is: positions and gradient, (n, 3); stalled: whether round-off lets nothing descend from here;
+    left: whether the point before was a saddle.
+    """
 
     positions: Positions
     gradient: Positions
     stalled: bool = False
+    left: bool = False
 
 
 class Method(Protocol):
@@ -43,6 +49,10 @@ class Method(Protocol):
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
         """The points after `start`."""
+        ...
+
+    def certifies(self, step: StepObjective, at: Point) -> bool:
+        """Whether a stationary point is a minimum, for all that the method can tell: it may be the last."""
         ...
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
@@ -143,13 +153,14 @@ class PreparedDescent:
         if stop.tolerance is not None:
             yardstick = self.metric.residual(step.gradient(problem.current))
             limit = stop.tolerance * yardstick
+        close = stop.tolerance is not None and stop.tolerance <= _CLOSE
         floor = stop.floor * float(np.abs(point.positions).max(initial=0.0)) * self.metric.trace**0.5
         residual, iteration, stopped = float("nan"), 0, "iterations"
         for point in islice(self.method.points(step, start), stop.iterations):
             iteration += 1
             if every:
                 residual = self.metric.residual(point.gradient)
-                if residual <= max(limit, floor):
+                if residual <= max(limit, floor) and (not close or self.method.certifies(step, point)):
                     stopped = "tolerance" if residual <= limit else "floor"
                     break
             if point.stalled:

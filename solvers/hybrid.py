@@ -79,9 +79,22 @@ class HybridMethod:
         self._cost = 9.0 * max(1.0, factor.flops) / (_FLOPS_PER_ENTRY * max(1, factor.nonzeros))
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
-        """The points after `start`."""
-        origin = point = _lower(step, start)
-        predicting = _Predicting(self, step, origin)
+        """The points after `start`; where a saddle was left, all begins anew."""
+        point = _lower(step, start)
+        while not point.stalled:
+            for following in self._approach(step, point):
+                point = following
+                yield point
+            for following in self._newton.points(step, point):
+                point = following
+                yield point
+                if point.left:
+                    break
+
+    def _approach(self, step: StepObjective, start: Point) -> Iterator[Point]:
+        """The points after `start`, until the exact method does better."""
+        point = start
+        predicting = _Predicting(self, step, start)
         run: Run | None = self._lbfgs.engine.begin(step.problem, point.positions)
         _, before, _ = run.advance(0, 0.0, 0.0, False)
         _, residual, _ = run.advance(_PROBE, 0.0, 0.0, False)
@@ -104,7 +117,10 @@ class HybridMethod:
             if following is not point:
                 point = following
                 yield point
-        yield from self._newton.points(step, point)
+
+    def certifies(self, step: StepObjective, at: Point) -> bool:
+        """See Method."""
+        return self._newton.certifies(step, at)
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
         """Those of Newton's method, and a round of L-BFGS."""
@@ -184,10 +200,8 @@ def _gain(step: StepObjective, before: Point, after: Point) -> float:
 
 
 def _lower(step: StepObjective, start: Point) -> Point:
-    """The lower one of a point and of free fall, where inertia and forces alone would lead."""
-    problem, h = step.problem, step.problem.system.inertia[:, None]
-    fall = problem.target + np.divide(problem.force, h, out=np.zeros_like(problem.force), where=h > 0.0)
-    fall[problem.system.pins.vertices] = problem.pin_targets
+    """The lower one of a point and of free fall."""
+    fall = step.fall()
     return _at(step, fall) if step.rise(start.positions, fall)[0] < 0.0 else start
 
 

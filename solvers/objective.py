@@ -114,6 +114,13 @@ class StepObjective:
         out[self._exact] = self._held
         return out
 
+    def fall(self) -> Positions:
+        """Free fall (n, 3): where inertia and forces alone would lead, pinned vertices on their targets."""
+        problem, h = self.problem, self.problem.system.inertia[:, None]
+        p = problem.target + np.divide(problem.force, h, out=np.zeros_like(problem.force), where=h > 0.0)
+        p[problem.system.pins.vertices] = problem.pin_targets
+        return p
+
     def gradient(self, p: Positions) -> Positions:
         """The gradient [N], (n, 3), zero at exactly pinned vertices."""
         out = np.empty_like(p)

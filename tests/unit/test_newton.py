@@ -16,10 +16,11 @@ from harness.mesh.grid import Grid
 from harness.simulate import problem
 from solvers.descent import PreparedDescent
 from solvers.hybrid import Hybrid
-from solvers.newton import Newton, certified
+from solvers.newton import Newton
 from solvers.newton_cg import NewtonCG
 from solvers.objective import Objective, StepObjective
 from solvers.problem import Positions, StepProblem, StopRule
+from solvers.saddles import certified
 from tests.scenes import cloth, first_problem, random_problem, scene
 from tests.stability.test_hard_cases import CASES, resting
 

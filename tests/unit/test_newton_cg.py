@@ -15,10 +15,11 @@ from harness.effects.springs import Springs
 from harness.mesh.surfaces import Balloon
 from solvers.descent import PreparedDescent
 from solvers.hybrid import Hybrid
-from solvers.newton import Newton, certified
+from solvers.newton import Newton
 from solvers.newton_cg import Method, NewtonCG
 from solvers.objective import Objective, StepObjective
 from solvers.problem import StopRule
+from solvers.saddles import certified
 from tests.scenes import cloth, first_problem, random_problem, scene
 from tests.unit.test_objective import with_links
 
