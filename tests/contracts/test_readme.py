@@ -36,7 +36,7 @@ def test_the_scene_of_the_readme_is_a_scene(tmp_path: Path):
 
 def test_the_effect_of_the_readme_is_an_effect():
     names: dict = {"__name__": "linear_drag"}
-    exec(compile(example("Adding an effect", "python"), "README.md", "exec"), names)
+    exec(compile(example("Adding an effect", "python"), "<README.md>", "exec"), names)
     assert len(example("Adding an effect", "python").splitlines()) <= 40
     mesh = Chain().build(3)
     (drag,) = names["LinearDrag"](coefficient=2.0).bind(mesh, np.ones(3), 0.1).forces
