@@ -7,7 +7,7 @@ convergence quadratic; where it has none, as little as will do is taken from the
 the end a multiple of the diagonal of Q is added. Clamping those parts everywhere (Teran et al. 2005) would converge
 linearly; and the less is taken, the faster a saddle's surroundings are left. A point where the gradient vanishes but
 the exact Hessian has no factor is left too (`solvers.saddles`). A factor serves for more than one step, as long as the
-objective falls as the slope promises (Shamanskii 1967): a solve costs a tenth of it.
+objective falls as the slope promises (Shamanskii 1967): a solve costs a fifth of it.
 """
 
 from __future__ import annotations
