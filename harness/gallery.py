@@ -32,7 +32,7 @@ def _tile(path: Path) -> Any:
     from harness.machine import pinned_threads
     from harness.measure import Settings, steps
     from harness.record.base import Replay
-    from harness.record.obstacles import declared
+    from harness.record.obstacles import declared, listed
     from harness.report.contact_sheet import Tile
     from harness.scene import build
     from harness.simulate import prepare
@@ -59,7 +59,7 @@ def _tile(path: Path) -> Any:
         pinned=scene.system.pins.vertices,
         strain_range=run.strain_range,
         scalars={},
-        properties=declared(run.scene.obstacles),
+        properties=declared(listed(run.scene.effects)),
     )
     kinds = dict.fromkeys(effect.kind for effect in run.scene.effects if effect.kind not in ("springs", "gravity"))
     camera = run.scene.camera

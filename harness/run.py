@@ -26,6 +26,7 @@ from harness.judge import Judge, reference
 from harness.measure import Diverged, Measured, Settings, StepFailed, measure
 from harness.observe import observe
 from harness.record.base import RecordingInfo
+from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
 from harness.scene import Scene, build
 from harness.simulate import prepare
@@ -210,19 +211,11 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
     here = machine.describe()
     properties = {
         "sweep": run.sweep,
-        "scene": run.scene_name,
-        "size": run.size,
-        "solver": run.solver.name,
-        "parameters": json.dumps(dict(run.solver.parameters)),
+        **asked(run),
+        "tolerance": run.tolerance or 0.0,  # a property has no null
         "vertices": len(scene.mesh.rest),
         "springs": len(scene.springs.edges),
-        "time_step": run.scene.time_step,
-        "integrator": run.integrator,
         "frames": run.frames,
-        "iterations": run.iterations,
-        "tolerance": run.tolerance or 0.0,
-        "first_guess": run.first_guess,
-        "threads": machine.threads(run.threads).number,
         **facts,
         "cpu": here.cpu,
         "cores": here.cores,
@@ -244,7 +237,7 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
             time_step=run.scene.time_step,
             strain_range=run.strain_range,
             properties=properties,
-            obstacles=run.scene.obstacles,
+            obstacles=listed(run.scene.effects),
         ),
     )
 

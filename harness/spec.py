@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import BeforeValidator, ConfigDict, Field, SkipValidation, WithJsonSchema
 
@@ -20,9 +20,6 @@ from harness.mesh.base import Mesh
 from harness.mesh.generator import MAX_VERTICES
 from harness.model import Many, Model
 from harness.start import AnyStart
-
-if TYPE_CHECKING:
-    from harness.obstacles import AnyObstacle
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 """Names of scenes and sweeps; they become names of files in the results."""
@@ -125,11 +122,6 @@ class SceneSpec(SceneFields):
     """The file that the scene was read from, for messages."""
     lines: SkipValidation[Mapping[str, int]] = Field(default_factory=dict)
     """The lines of the keys in that file, for messages."""
-
-    @property
-    def obstacles(self) -> tuple[AnyObstacle, ...]:
-        """What effects keep the mesh out of: to be seen beside it."""
-        return tuple(one for effect in self.effects for one in getattr(effect, "obstacles", ()))
 
     def stepped(self, time_step: float) -> SceneSpec:
         """The same scene with another time step [s], the same in all steps."""

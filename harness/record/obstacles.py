@@ -5,7 +5,7 @@ Entities: `/scene/obstacles/<number>-<kind>`. A plane has no end; the part of it
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # a scene without obstacles imports none of them
+    from harness.effects.base import Effect
     from harness.motion import Motion
     from harness.obstacles import AnyObstacle, Box, Capsule, Plane, Sphere
 
@@ -24,6 +25,11 @@ KEY = "obstacles"
 _COLOUR = (0x9C, 0x97, 0x8D)
 _AROUND = 2.0
 """Half the side of what is drawn of a plane, in the mesh's size and distance."""
+
+
+def listed(effects: Iterable[Effect]) -> tuple[AnyObstacle, ...]:
+    """What a scene's effects keep its mesh out of: to be seen beside it."""
+    return tuple(one for effect in effects for one in getattr(effect, "obstacles", ()))
 
 
 def declared(obstacles: Sequence[AnyObstacle]) -> dict[str, str]:
