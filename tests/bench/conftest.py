@@ -1,4 +1,5 @@
-"""`pytest tests/bench --benchmark-only` runs the gates and stores their times under results/bench."""
+"""`pytest tests/bench --benchmark-only` runs the gates, prints their ratios and stores their times under results/bench.
+`-k accuracy` runs the goals of accuracy alone."""
 
 import os
 from typing import Any
@@ -17,6 +18,19 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.benchmark_storage = f"file://{config.rootpath / 'results' / 'bench'}"
         config.option.benchmark_save = config.option.benchmark_save or "gates"
         config.option.benchmark_save_data = True
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """The gates that were measured, as a table."""
+    session: Any = getattr(config, "_benchmarksession", None)
+    measured = [one for one in session.benchmarks if "ratio" in one.extra_info] if session else []
+    for one in measured:
+        ratio, limit = one.extra_info["ratio"], one.extra_info["limit"]
+        verdict = "met" if ratio["high"] <= limit else "NOT met" if ratio["low"] > limit else "met, or not"
+        terminalreporter.write_line(
+            f"{one.name.removeprefix('test_the_gate_holds'):48} {ratio['median']:9.3g} [{ratio['low']:.3g}, "
+            f"{ratio['high']:.3g}], wanted {limit:.3g}: {verdict}"
+        )
 
 
 def pytest_benchmark_update_machine_info(machine_info: dict[str, Any]) -> None:

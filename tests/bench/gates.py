@@ -41,7 +41,8 @@ class Gate:
     """Two makers of work that must come to the same positions, and how their times may compare.
 
     limit: of time of the candidate / time of the yardstick; why: where the limit comes from; clock: what time is;
-    tolerance: the largest difference of the two answers, in their unit; turns: A B A, how often.
+    tolerance: the largest difference of the two answers, in their unit, None where each maker makes sure of its own;
+    turns: A B A, how often.
     """
 
     name: str
@@ -50,7 +51,7 @@ class Gate:
     limit: float
     why: str
     clock: Callable[[], float] = process_time
-    tolerance: float = 0.0
+    tolerance: float | None = 0.0
     turns: int = 15
 
 
