@@ -185,7 +185,7 @@ class _CompiledRun:
         step, window = state
         self._state = step, edges, window
         given = (problem.target, parts.force(problem), problem.pin_targets, guess)
-        step.objective[2] = parts.negative(guess) if parts.forms else 0.0
+        step.objective[2] = parts.negative(guess)
         self.positions = np.empty_like(guess)
         # The kernels are compiled for arrays that may be written to.
         self.largest = accelerate_step.start(*self._state, *(np.array(x, order="C") for x in given))
@@ -229,7 +229,7 @@ class InterpretedRun:
         np.negative(self._objective.gradient(self._trial), out=self._there)
 
     def _solved(self) -> NDArray[np.float64]:
-        self._base._global(self._there, self._image)
+        self._base.correction(self._there, self._image)
         return self._image.ravel()
 
     def _accept(self) -> None:

@@ -52,7 +52,7 @@ class Corrections:
     def plain(self, gradient: Positions) -> Positions:
         """Q^-1 gradient, (n, 3), zero at exactly pinned vertices."""
         out = np.zeros_like(gradient)
-        self._base._global(gradient, out)
+        self._base.correction(gradient, out)
         return out
 
     def residual(self, plain: Positions) -> float:

@@ -122,19 +122,25 @@ class PreparedLocalGlobal:
             y[s.free] -= self.coupling @ problem.pin_targets[s.pins.exact]
         return y
 
-    def _global(self, b: Positions, p: Positions, out: Positions) -> None:
-        """Write where Q p = b leads from p, (n, 3) all; out: exactly pinned vertices are left as they are there."""
+    def correction(self, b: Positions, out: Positions) -> None:
+        """Write Q^-1 b, by the factor as it is, to `out`, both (n, 3); exactly pinned vertices keep what is there."""
         free = self.system.free
-        if len(free) == len(b) and self.rounded is None:
+        if len(free) == len(b):
             self.factor.solve(b, out)
         elif len(free):
-            solved, held = np.empty((len(free), 3)), b[free]
-            if self.rounded is None:
-                self.factor.solve(held, solved)
-            else:
-                self.factor.solve(held - self.rounded @ p[free], solved)
-                solved += p[free]
+            solved = np.empty((len(free), 3))
+            self.factor.solve(b[free], solved)
             out[free] = solved
+
+    def _global(self, b: Positions, p: Positions, out: Positions) -> None:
+        """Write where Q p = b leads from p to `out`, (n, 3) all, as `correction` does."""
+        if self.rounded is None:
+            self.correction(b, out)
+            return
+        free, left = self.system.free, b.copy()
+        left[free] -= self.rounded @ p[free]
+        self.correction(left, out)
+        out[free] += p[free]
 
     def _placed(self, p: Positions, problem: StepProblem) -> Positions:
         """A copy of p with the exactly pinned vertices on their targets, where they stay."""

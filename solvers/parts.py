@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -63,10 +63,12 @@ class Parts:
 
     def negative(self, p: Positions) -> float:
         """What pairs of negative stiffness take from the value of the others at p (n, 3) [J], not negative."""
+        return 0.5 * abs(float(np.einsum("ij,ij->", p, self._negative @ p))) if self.forms else 0.0
+
+    @cached_property
+    def _negative(self) -> csr_array:
         below = self.whole.stiffness < 0.0
-        i, j = self.whole.edges[below].T
-        v = p[i] - p[j]
-        return -0.5 * float(self.whole.stiffness[below] @ np.einsum("ij,ij->i", v, v))
+        return _pairs(self.whole.edges[below], -self.whole.stiffness[below]).stiffness_matrix(len(self.held))
 
     def edges(self, row: NDArray[np.int64], rows: int, unknowns: int) -> Edges | None:
         """The limits and dashpots as they are before a step, between vertices in rows `row` (n,); None without any.

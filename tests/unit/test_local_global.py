@@ -197,14 +197,14 @@ def test_an_energy_that_a_backend_does_not_know_is_refused_by_name(backend):
         backend.prepare(system)
 
 
-def test_the_sparse_backend_takes_any_projective_energy_and_the_others_refuse_it():
+def test_backends_with_sparse_factors_take_any_projective_energy_and_the_dense_one_refuses_it():
     problem = random_problem(10)
     problem = replace(problem, system=replace(problem.system, energies=(*problem.system.energies, ProjectiveWell())))
-    p = iterates(SparseLocalGlobal(), problem, 3000)[-1]
-    assert np.abs(problem.gradient(p)).max() <= 1e-9 * np.abs(problem.gradient(problem.first_guess)).max()
-    for backend in (DenseLocalGlobal(), CompiledLocalGlobal()):
-        with pytest.raises(Unsupported, match="ProjectiveWell"):
-            backend.prepare(problem.system)
+    for backend in (SparseLocalGlobal(), CompiledLocalGlobal(), CompiledLocalGlobal("supernodal", "float32")):
+        p = iterates(backend, problem, 3000)[-1]
+        assert np.abs(problem.gradient(p)).max() <= 1e-9 * np.abs(problem.gradient(problem.first_guess)).max()
+    with pytest.raises(Unsupported, match="ProjectiveWell"):
+        DenseLocalGlobal().prepare(problem.system)
 
 
 INDEFINITE = {
