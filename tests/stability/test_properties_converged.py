@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from harness.reference.minimiser import free_hessian
@@ -50,6 +50,11 @@ converging = pytest.mark.parametrize("name", [name for name in MINIMISERS if nam
 EXAMPLES = examples(10)
 
 
+FEW_SOFT_WAYS, ONE_SOFT_WAY = Case(6, 12, 0, 5.0, 0.0, 0), Case(4, 12, 558, 5.0, 0.0, 0)
+"""Found by a search: Anderson's method and L-BFGS end 140 and 120 eps k/lambda from the minimum, lambda the smallest
+eigenvalue. A sum of ten forces is known to ten eps, not to one."""
+
+
 @dataclass(frozen=True, eq=False)
 class Settled:
     """A problem that starts near a minimum; where that is; how well it can be known [m]."""
@@ -82,6 +87,8 @@ def for_method(name: str, case: Case) -> Case:
 @converging
 @EXAMPLES
 @given(case=networks())
+@example(case=FEW_SOFT_WAYS)
+@example(case=ONE_SOFT_WAY)
 def test_all_methods_end_at_the_minimum_that_they_start_near(name: str, case: Case):
     case = for_method(name, case)
     given = settled(case, case.problem())
