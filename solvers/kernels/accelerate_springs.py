@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner
 from solvers.kernels.springs import TINY_SQUARED, Bundles, aligned, one_by_one
-from solvers.kernels.springs_vectors import F64, I8, I64, LANES, LEAST, MASK, WIDE, Vectors, constant
+from solvers.kernels.springs_vectors import F64, I8, I64, LANES, LEAST, MASK, WIDE, Vectors, constant, unpacked
 
 
 class Shares(NamedTuple):
@@ -50,11 +50,8 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, weight, rest, 
     """A bundle's code: writes its rows of `out`, returns its springs' energy; -1, and writes none, if one is short."""
 
     def generate(context, builder: Any, signature, args):
-        x, own, chunk, neighbour, pull, stiffness, weight, rest, begin, end, y, held, out = (
-            context.make_array(argument)(context, builder, value).data
-            if isinstance(argument, types.Array)
-            else context.cast(builder, value, argument, types.int64)
-            for argument, value in zip(signature.args, args, strict=True)
+        x, own, chunk, neighbour, pull, stiffness, weight, rest, begin, end, y, held, out = unpacked(
+            context, builder, signature, args
         )
         v = Vectors(context, builder)
         places = v.places(builder.gep(own, [builder.mul(chunk, I64(LANES))]))

@@ -145,16 +145,23 @@ class Vectors:
         return y
 
 
+def unpacked(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
+    """A kernel's arguments: of arrays where they begin, of numbers int64."""
+    return [
+        context.make_array(argument)(context, builder, value).data
+        if isinstance(argument, types.Array)
+        else context.cast(builder, value, argument, types.int64)
+        for argument, value in zip(signature.args, args, strict=True)
+    ]
+
+
 def _over_chunk(kind: Kind):
     """The code for a chunk: its eight vertices and their springs."""
 
     def declare(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, out, shift):
         def generate(context, builder: Any, signature, args):
-            x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, out, shift = (
-                context.make_array(argument)(context, builder, value).data
-                if isinstance(argument, types.Array)
-                else context.cast(builder, value, argument, types.int64)
-                for argument, value in zip(signature.args, args, strict=True)
+            x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, out, shift = unpacked(
+                context, builder, signature, args
             )
             v = Vectors(context, builder)
             places = v.places(builder.gep(own, [builder.mul(chunk, I64(LANES))]))

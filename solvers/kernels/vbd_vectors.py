@@ -9,7 +9,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from solvers.kernels.springs_vectors import I8, I64, LANES, LEAST, MASK, WIDE, Vectors, constant
+from solvers.kernels.springs_vectors import I8, I64, LANES, LEAST, MASK, WIDE, Vectors, constant, unpacked
 
 NUMBERS = 4
 """What is kept of each spring between the two passes: its vector and its length."""
@@ -46,11 +46,8 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y,
     """A bundle's code: moves its vertices in x, and returns whether a spring is too short, when it moves none."""
 
     def generate(context, builder: Any, signature, args):
-        x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, majorant, near = (
-            context.make_array(argument)(context, builder, value).data
-            if isinstance(argument, types.Array)
-            else context.cast(builder, value, argument, types.int64)
-            for argument, value in zip(signature.args, args, strict=True)
+        x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, majorant, near = unpacked(
+            context, builder, signature, args
         )
         v = Vectors(context, builder)
         places = v.places(builder.gep(own, [builder.mul(chunk, I64(LANES))]))
