@@ -127,10 +127,9 @@ class System:
 class Start:
     """Where a step starts, for energies that depend on it and for methods that do not minimise.
 
-    positions: p^t (n, 3) [m]; velocity: v^t, filters included, (n, 3) [m/s]; time: t [s];
-    origin (n, 3) [m] and rate [1/s]: the unknown x moves with the velocity rate (x - origin);
-    until: the time of x [s], for what moves by itself (nan, which spoils all that depends on it, where it is not told);
-    ahead: how far ahead of t [s] extrapolation is to take what an energy lags, for the method to keep its order.
+    positions: p^t (n, 3) [m]; velocity: v^t, filters included, (n, 3) [m/s]; time: t [s]; origin (n, 3) [m] and rate
+    [1/s]: the unknown x moves with the velocity rate (x - origin); until: the time of x [s], for what moves by itself
+    (nan, which spoils all that depends on it, where it is not told); ahead: how far [s] to extrapolate what is lagged.
     """
 
     positions: Positions
@@ -153,10 +152,8 @@ class Start:
 
 @runtime_checkable
 class LaggedEnergy(Energy, Protocol):
-    """An energy that depends on where the step starts: damping, friction, obstacles that move.
-
-    The stiffness of a projective one may depend on the start's rate and on nothing else of it, for Q is made once.
-    """
+    """An energy that depends on where the step starts: damping, friction, obstacles that move. The stiffness of a
+    projective one may depend on the start's rate and on nothing else of it, for Q is made once."""
 
     def begin_step(self, start: Start) -> Energy:
         """The energy of this one step."""
