@@ -15,7 +15,7 @@ from harness.scene import Scene, build
 from harness.simulate import FIRST_GUESSES
 from solvers.compiled import CompiledLocalGlobal
 from solvers.linear.choice import Linear
-from solvers.local_global import DenseLocalGlobal, SparseLocalGlobal, only_springs
+from solvers.local_global import DenseLocalGlobal, only_springs
 from solvers.problem import Positions, Solver
 from tests.scenes import BACKENDS, SCENES, first_problem, random_problem, trajectory
 
@@ -98,10 +98,7 @@ def test_backends_agree_on_the_assignments_small_scenes(name):
 @pytest.mark.skipif(not ASSIGNMENT.is_dir(), reason="the assignment's scenes are not beside the repository")
 def test_all_but_the_dense_backend_agree_on_the_assignments_flag():
     made = assignment_scene("flag")
-    found = [
-        trajectory(made, backend, 12, first_guess="assignment")
-        for backend in WAYS[1:]
-    ]
+    found = [trajectory(made, backend, 12, first_guess="assignment") for backend in WAYS[1:]]
     assert apart(found) <= AGREEMENT * made.mesh.size
 
 
