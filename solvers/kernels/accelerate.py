@@ -20,11 +20,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from solvers.compiling import inner, inner_options, kernel
+from solvers.compiling import inner, kernel
 from solvers.kernels.accelerate_coefficients import coefficients
+from solvers.kernels.dots import dot, dots
 
 DECREASE, FLATTER = 1e-4, 0.1
 AGAIN, ACCEPTED, STALLED = 0, 1, 2
@@ -34,10 +34,6 @@ _BLOCK = 512
 """Entries that are gone through together, so that what all pairs need stays in the first cache."""
 
 _HALVINGS = 40
-
-# Sums may be reordered, which vectors need; NaN and infinity keep their meaning. No loop both adds up and writes:
-# whether that becomes vectors is decided by where the arrays lie, and with it the order of the sum.
-_vectors: Any = njit(**inner_options, fastmath={"contract", "reassoc", "nsz"})
 
 NOW = np.dtype(
     [
@@ -115,7 +111,7 @@ def judge(window):
     now = window.now[0]
     even = abs(now.rise) <= now.noise < np.inf
     if even:
-        there = -_dot(window.direction, window.descent_there)
+        there = -dot(window.direction, window.descent_there, len(window.direction))
         enough = now.slope <= 0.0 and there <= (2.0 * FLATTER - 1.0) * now.slope
         excess = 0.5 * now.length * (there - now.slope)
     else:
@@ -162,14 +158,15 @@ def accept(window, correction):
             correction[begin:end],
             window.direction[begin:end],
         )
-        now.squared += _dot(window.descent[begin:end], window.correction[begin:end])
+        now.squared += dot(window.descent[begin:end], window.correction[begin:end], end - begin)
         for back in range(now.count):
             j = (new - back + m) % m
-            sg, sy, wg, wy = _dots(
+            sg, sy, wg, wy = dots(
                 window.steps[j * size + begin : j * size + end],
                 window.images[j * size + begin : j * size + end],
                 window.descent[begin:end],
                 window.direction[begin:end],
+                end - begin,
             )
             window.sg[j] -= sg
             window.wg[j] -= wg
@@ -205,11 +202,11 @@ def _combine(window):
                 window.b[j],
                 window.images[j * size + begin : j * size + end],
             )
-        slope -= _dot(direction, window.descent[begin:end])
+        slope -= dot(direction, window.descent[begin:end], end - begin)
     now.slope = slope
 
 
-@_vectors
+@inner
 def _renew(step, image, position, trial, descent, there, correction, corrected, y):
     """A block of s, w and y, and the new p, -grad g and c in the place of the old."""
     for k in range(len(y)):
@@ -220,33 +217,13 @@ def _renew(step, image, position, trial, descent, there, correction, corrected, 
         position[k], descent[k], correction[k] = trial[k], there[k], c
 
 
-@_vectors
-def _dots(s, w, g, y):
-    sg = sy = wg = wy = 0.0
-    for k in range(len(s)):
-        sg += s[k] * g[k]
-        sy += s[k] * y[k]
-        wg += w[k] * g[k]
-        wy += w[k] * y[k]
-    return sg, sy, wg, wy
-
-
-@_vectors
-def _dot(a, b):
-    """Over the entries of a, of which b may have more."""
-    total = 0.0
-    for k in range(len(a)):
-        total += a[k] * b[k]
-    return total
-
-
-@_vectors
+@inner
 def _set(out, scale, c):
     for k in range(len(out)):
         out[k] = scale * c[k]
 
 
-@_vectors
+@inner
 def _subtract(out, a, s, b, w):
     for k in range(len(out)):
         out[k] -= a * s[k] + b * w[k]

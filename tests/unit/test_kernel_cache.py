@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -47,3 +49,32 @@ def test_a_folder_that_was_not_used_for_long_serves_its_sources_again(solvers: P
 def test_sources_that_cannot_be_written_beside_are_no_obstacle(tmp_path: Path):
     (tmp_path / "__pycache__").write_text("a file, where a folder would have to be")
     assert kernels(tmp_path).startswith(str(tmp_path))
+
+
+DIGESTS = """
+import hashlib
+from itertools import islice
+import harness
+from solvers.registry import SOLVERS, load
+from tests.scenes import cloth, first_problem
+problem = first_problem(cloth(12))
+for name in ("numba", "lbfgs", "vbd"):
+    iterates = load(SOLVERS[name])().prepare(problem.system).iterates(problem)
+    print(name, hashlib.sha256(b"".join(p.tobytes() for p in islice(iterates, 20))).hexdigest())
+"""
+
+
+def test_the_process_that_compiles_a_kernel_finds_the_bits_of_those_that_load_it(tmp_path: Path):
+    root = Path(__file__).resolve().parents[2]
+    compiling, loading = (
+        subprocess.run(
+            [sys.executable, "-c", DIGESTS],
+            cwd=root,
+            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for _ in range(2)
+    )
+    assert compiling == loading
