@@ -117,12 +117,11 @@ TELLING = [case for case in CASES if case.startswith("saddle")] + [
 ]
 """Where a residual alone would end some step at no minimum."""
 VALLEY = {"numbers-stiffness-number-1e12", "numbers-stiffness-number-1e8"}
+"""Where thousands of iterations follow a curved valley, in steps as short as it is narrow."""
 DEGENERATE = {"numbers-massless-vertices", "saddle-standing-chain"}
-EXCEPTIONS = {Hybrid: {"numbers-stiffness-number-1e12", *DEGENERATE}, Newton: VALLEY | DEGENERATE}
-"""Where 300 iterations may end at no certified minimum. In a narrow valley there are thousands to go (355 for Newton's
-method at 1e8). A vertex without mass at the end of a chain turns freely about its neighbour, and a chain that stands on
-a point buckles to any side: their minima are a sphere and a circle, along which the curvature is zero, and round-off
-gives it a sign."""
+"""Where steps may end at no certified minimum. A vertex without mass at the end of a chain turns freely about its
+neighbour, and a chain that stands on a point buckles to any side: their minima are a sphere and a circle, along which
+the curvature is zero, and round-off gives it a sign."""
 
 
 def ends(case: str, solver: Solver, frames: int) -> list[str]:
@@ -130,7 +129,8 @@ def ends(case: str, solver: Solver, frames: int) -> list[str]:
     spec = load_scene(CASES[case])
     made = build(spec, spec.default_size or 0)
     judge, wrong = Judge(made, None, minimises=True), []
-    for step in simulate(made, prepare(made, solver), STOP, first_guess="current", frames=frames):
+    stop = StopRule(20_000, 1e-6) if case in VALLEY else STOP
+    for step in simulate(made, prepare(made, solver), stop, first_guess="current", frames=frames):
         assert np.isfinite(step.positions).all()
         found = judge(step)
         if not (found["minimum"] and found["stationarity"] <= SLACK * max(1e-6, found["attainable"])):
@@ -142,7 +142,7 @@ def ends(case: str, solver: Solver, frames: int) -> list[str]:
 @solvers
 def test_a_step_that_a_residual_would_end_too_early_ends_at_a_certified_minimum(case: str, solver: Solver):
     wrong = ends(case, solver, 3)
-    assert not wrong or case in EXCEPTIONS[type(solver)], wrong
+    assert not wrong or case in DEGENERATE, wrong
 
 
 @pytest.mark.long
@@ -150,4 +150,4 @@ def test_a_step_that_a_residual_would_end_too_early_ends_at_a_certified_minimum(
 @solvers
 def test_all_steps_of_a_hard_scene_end_at_certified_minima(case: str, solver: Solver):
     wrong = ends(case, solver, 10)
-    assert not wrong or case in EXCEPTIONS[type(solver)], wrong
+    assert not wrong or case in DEGENERATE, wrong
