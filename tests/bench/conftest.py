@@ -25,11 +25,13 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     session: Any = getattr(config, "_benchmarksession", None)
     measured = [one for one in session.benchmarks if "ratio" in one.extra_info] if session else []
     for one in measured:
-        ratio, limit = one.extra_info["ratio"], one.extra_info["limit"]
-        verdict = "met" if ratio["high"] <= limit else "NOT met" if ratio["low"] > limit else "met, or not"
+        ratio, limit, goal = (one.extra_info[key] for key in ("ratio", "limit", "goal"))
+        wanted = goal or limit
+        verdict = "met" if ratio["high"] <= wanted else "NOT met" if ratio["low"] > wanted else "met, or not"
+        kept = f", kept below {limit:.3g}" if goal else ""
         terminalreporter.write_line(
             f"{one.name.removeprefix('test_the_gate_holds'):48} {ratio['median']:9.3g} [{ratio['low']:.3g}, "
-            f"{ratio['high']:.3g}], wanted {limit:.3g}: {verdict}"
+            f"{ratio['high']:.3g}], wanted {wanted:.3g}: {verdict}{kept}"
         )
 
 
