@@ -50,9 +50,16 @@ class Corrections:
         self._columns: dict[int, NDArray[np.float64]] = {}
 
     def plain(self, gradient: Positions) -> Positions:
-        """Q^-1 gradient, (n, 3), zero at exactly pinned vertices."""
+        """Q^-1 gradient, (n, 3), zero at exactly pinned vertices; of a rounded factor refined once, for which vertices
+        touch is decided by the last digits."""
         out = np.zeros_like(gradient)
         self._base.correction(gradient, out)
+        Q, free = self._base.rounded, self._base.system.free
+        if Q is not None:
+            left, more = np.zeros_like(gradient), np.zeros_like(gradient)
+            left[free] = gradient[free] - Q @ out[free]
+            self._base.correction(left, more)
+            out += more
         return out
 
     def residual(self, plain: Positions) -> float:
