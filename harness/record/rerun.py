@@ -165,9 +165,12 @@ class RerunRecorder:
             columns = rr.Mesh3D.columns(vertex_positions=p, vertex_normals=normals, vertex_colors=colours)
         else:
             columns = rr.Points3D.columns(positions=p, colors=colours)
-        index = list(self._times(np.array(frames)))
-        if not self._info.iterates:
-            index.append(rr.TimeColumn("iteration", sequence=np.zeros(len(frames), np.int64)))
+        numbers = np.array(frames)
+        index = [
+            rr.TimeColumn("frame", sequence=numbers),
+            self._seconds(numbers),
+            rr.TimeColumn("iteration", sequence=numbers if self._info.iterates else np.zeros_like(numbers)),
+        ]
         self._stream.send_columns("/scene/mesh", index, columns.partition([len(positions[0])] * len(frames)))
         self._held.clear()
 
@@ -206,10 +209,10 @@ class RerunRecorder:
     def _times(self, frames: NDArray[np.int64]) -> Iterable[rr.TimeColumn]:
         if self._info.iterates:
             return rr.TimeColumn("frame", sequence=frames), rr.TimeColumn("iteration", sequence=frames)
-        return (
-            rr.TimeColumn("frame", sequence=frames),
-            rr.TimeColumn("time", duration=np.array([self._clock[frame] for frame in frames.tolist()])),
-        )
+        return rr.TimeColumn("frame", sequence=frames), self._seconds(frames)
+
+    def _seconds(self, frames: NDArray[np.int64]) -> rr.TimeColumn:
+        return rr.TimeColumn("time", duration=np.array([self._clock[frame] for frame in frames.tolist()]))
 
     def _style(self, entity: str, label: str) -> None:
         group, name = entity.rsplit("/", 1)

@@ -37,6 +37,15 @@ FULL = RECORD.format(
     after="recorder.close({})",
 )
 
+THREADS = """
+import os, sys
+from pathlib import Path
+from tests.recordings import record
+for _ in range(4):
+    record(Path(sys.argv[1]), count=2)
+    print(len(os.listdir("/proc/self/task")))
+"""
+
 
 def run(code: str, path: Path) -> subprocess.CompletedProcess[str]:
     """Run Python code in a process of its own, in the repository."""
@@ -54,12 +63,9 @@ def test_a_full_disk_is_a_failure_and_not_a_damaged_file(tmp_path: Path):
 
 
 def test_many_recordings_leave_no_threads_behind(tmp_path: Path):
-    def threads() -> int:
-        record(tmp_path / "a.rrd", count=2)
-        return len(os.listdir("/proc/self/task"))
-
-    before = threads()  # one recording's are there until the next
-    assert [threads() for _ in range(3)] == [before] * 3
+    told = run(THREADS, tmp_path / "a.rrd")
+    one, *more = map(int, told.stdout.split())  # those of a recording are there until the next one begins
+    assert more == [one] * 3, told.stderr
 
 
 def test_a_killed_run_leaves_all_frames_up_to_the_last_flush(tmp_path: Path):
