@@ -23,7 +23,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     """The gates that were measured, as a table."""
     session: Any = getattr(config, "_benchmarksession", None)
-    measured = [one for one in session.benchmarks if "ratio" in one.extra_info] if session else []
+    measured = [one for one in session.benchmarks if "limit" in one.extra_info] if session else []
     for one in measured:
         ratio, limit, goal = (one.extra_info[key] for key in ("ratio", "limit", "goal"))
         wanted = goal or limit
