@@ -54,12 +54,8 @@ class Corrections:
         touch is decided by the last digits."""
         out = np.zeros_like(gradient)
         self._base.correction(gradient, out)
-        Q, free = self._base.rounded, self._base.system.free
-        if Q is not None:
-            left, more = np.zeros_like(gradient), np.zeros_like(gradient)
-            left[free] = gradient[free] - Q @ out[free]
-            self._base.correction(left, more)
-            out += more
+        if self._base.rounded is not None:
+            self._base.toward(gradient, out.copy(), out)
         return out
 
     def residual(self, plain: Positions) -> float:

@@ -75,7 +75,7 @@ class PreparedLocalGlobal:
         p, following = self._placed(problem.first_guess, problem), self._placed(problem.current, problem)
         while True:
             project(p, constant, b)
-            self._global(b, p, following)
+            self.toward(b, p, following)
             p, following = following, p
             yield p
 
@@ -107,7 +107,7 @@ class PreparedLocalGlobal:
         p = self._placed(problem.first_guess, problem)
         out, project = p.copy(), self._local(problem)
         project(p, constant, b)
-        return {"local": lambda: project(p, constant, b), "global": lambda: self._global(b, p, out)}
+        return {"local": lambda: project(p, constant, b), "global": lambda: self.toward(b, p, out)}
 
     def _local(self, problem: StepProblem) -> Project:
         return self.begin(problem) if self.begin else self.project
@@ -132,8 +132,8 @@ class PreparedLocalGlobal:
             self.factor.solve(b[free], solved)
             out[free] = solved
 
-    def _global(self, b: Positions, p: Positions, out: Positions) -> None:
-        """Write where Q p = b leads from p to `out`, (n, 3) all, as `correction` does."""
+    def toward(self, b: Positions, p: Positions, out: Positions) -> None:
+        """Write where Q p = b leads from p to `out`, (n, 3) all, as `correction` does; by a rounded factor, nearer."""
         if self.rounded is None:
             self.correction(b, out)
             return
