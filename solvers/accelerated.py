@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiled import FAR, PreparedCompiled, compiled
-from solvers.kernels import accelerate, accelerate_step
+from solvers.kernels import accelerate, accelerate_step, step_ends
 from solvers.kernels.accelerate import Window
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.edges import Edges
@@ -53,6 +53,10 @@ class Run(Protocol):
 
     def advance(self, iterations: int, limit: float, floor: float, every: bool) -> tuple[int, float, bool]:
         """Iterate, as `accelerate_step.run` does."""
+        ...
+
+    def gradient(self) -> Positions:
+        """That of the objective [N], (n, 3), where it is."""
         ...
 
 
@@ -127,15 +131,19 @@ class PreparedAccelerated:
         return {}
 
 
-def window_for(method: Method, entries: int, whole: int) -> Window:
-    """Memory for the unknowns' entries, in vectors that have `whole` of them."""
+def window_for(method: Method, entries: int, whole: int, precision: Any = np.float64) -> Window:
+    """Memory for the unknowns' entries, in vectors that have `whole` of them; precision: the factor's."""
     m = method.pairs
     now = np.zeros(1, accelerate.NOW)
     now["method"], now["retries"] = method.coefficients, method.retries
-    steps, images = aligned(m * entries), aligned(m * entries)
-    long, short = [aligned(whole) for _ in range(4)], [aligned(entries) for _ in range(2)]
-    (sy, wy), (sg, wg, a, b) = np.zeros((2, m, m)), np.zeros((4, m))
-    return Window(steps, images, *long, *short, sy=sy, wy=wy, sg=sg, wg=wg, a=a, b=b, now=now)
+    steps, images, correction, direction = (aligned(k * entries, precision) for k in (m, m, 1, 1))
+    position, trial, descent, there = (aligned(whole) for _ in range(4))
+    sy, wy = np.zeros((2, m, m))
+    sg, wg, a, b = np.zeros((4, m))
+    block = aligned(accelerate.BLOCK)
+    return Window(
+        steps, images, position, trial, descent, there, correction, direction, block, sy, wy, sg, wg, a, b, now
+    )
 
 
 class _Compiled:
@@ -153,7 +161,7 @@ class _Compiled:
 
     def _new(self) -> _State:
         whole = 4 * len(self._plan.held)
-        window = window_for(self._method, self._entries, whole)
+        window = window_for(self._method, self._entries, whole, self._plan.squares.dtype)
         window.trial[4 * self._far] = FAR
         x = aligned(whole, self._plan.squares.dtype)
         vectors = aligned(whole), x, aligned(whole), np.zeros(3)
@@ -194,6 +202,13 @@ class _CompiledRun:
     def advance(self, iterations: int, limit: float, floor: float, every: bool) -> tuple[int, float, bool]:
         """See Run."""
         return accelerate_step.run(*self._state, iterations, limit, floor, every, self.positions)
+
+    def gradient(self) -> Positions:
+        """See Run."""
+        step, _, window = self._state
+        out = np.empty_like(self.positions)
+        step_ends.fetch(step.rows, window.descent, out)
+        return np.negative(out, out=out)
 
     def __del__(self) -> None:
         self._idle.append(self._memory)
@@ -239,6 +254,10 @@ class InterpretedRun:
         e = self._window.correction.reshape(-1, 3).copy()
         e[self._base.system.pins.vertices] = 0.0
         return self._base.norm(e)
+
+    def gradient(self) -> Positions:
+        """See Run."""
+        return -self._window.descent.reshape(-1, 3)
 
     def advance(self, iterations: int, limit: float, floor: float, every: bool) -> tuple[int, float, bool]:
         """See Run; the loop of `accelerate_step.run`."""

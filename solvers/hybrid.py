@@ -10,7 +10,8 @@ iteration stabilise stiff springs in Tournier et al. 2015, "Stable Constrained D
 predicted tensions, and its steps are longer by as much. What such a step stretches at second order is local: a few
 iterations of L-BFGS take it back. The first one starts where the step before ended, from smooth positions.
 
-L-BFGS comes first. Once it gets slow, whichever brought the greater descent for its cost the last time goes on. The
+L-BFGS comes first, over a factor of Q in float32: it is the memory that its iterations wait for, and its directions
+need no more digits. Once it gets slow, whichever brought the greater descent for its cost the last time goes on. The
 exact method takes over when the Hessian is positive definite as it is and the slope falls as it does where Newton's
 method converges quadratically. The start is the lower one of first guess and free fall.
 """
@@ -62,7 +63,7 @@ class Hybrid:
     def prepare(self, system: System) -> PreparedDescent:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
         metric, objective = Metric(system), Objective(system)
-        method = HybridMethod(objective, metric, Lbfgs().prepare(system))
+        method = HybridMethod(objective, metric, Lbfgs(precision="float32").prepare(system))
         factor = objective.matrix.factor
         facts = metric.facts | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {metric.choice}"
@@ -104,7 +105,7 @@ class HybridMethod:
             if gain > newton_gain:
                 run = run or self._lbfgs.engine.begin(step.problem, point.positions)
                 _, residual, ended = run.advance(iterations, 0.0, 0.0, False)
-                following, iterations = _at(step, run.positions), _ROUND
+                following, iterations = _reached(run), _ROUND
                 ended |= residual**2 <= self.metric.round_off(following.positions)
                 last, gain = gain, _gain(step, point, following)
                 if newton_gain == 0.0 and (gain == 0.0 or gain > _SLOW * last):
@@ -130,7 +131,7 @@ class HybridMethod:
         """Where some iterations of L-BFGS lead from p."""
         run = self._lbfgs.engine.begin(step.problem, p)
         run.advance(_RELAXED, float("nan"), 0.0, False)
-        return _at(step, run.positions)
+        return _reached(run)
 
 
 class _Predicting:
@@ -202,9 +203,8 @@ def _gain(step: StepObjective, before: Point, after: Point) -> float:
 def _lower(step: StepObjective, start: Point) -> Point:
     """The lower one of a point and of free fall."""
     fall = step.fall()
-    return _at(step, fall) if step.rise(start.positions, fall)[0] < 0.0 else start
+    return Point(fall, step.gradient(fall)) if step.rise(start.positions, fall)[0] < 0.0 else start
 
 
-def _at(step: StepObjective, p: Positions) -> Point:
-    placed = step.placed(p)
-    return Point(placed, step.gradient(placed))
+def _reached(run: Run) -> Point:
+    return Point(run.positions.copy(), run.gradient())

@@ -30,7 +30,7 @@ DECREASE, FLATTER = 1e-4, 0.1
 AGAIN, ACCEPTED, STALLED = 0, 1, 2
 """What `judge` says: evaluate the next trial, go there, or that round-off lets nothing descend."""
 
-_BLOCK = 512
+BLOCK = 512
 """Entries that are gone through together, so that what all pairs need stays in the first cache."""
 
 _HALVINGS = 40
@@ -62,18 +62,20 @@ class Window(NamedTuple):
     """The state of a solve. m: pairs kept; N: entries of a vector.
 
     steps, images (m N,): s and w; position, trial: p and p + t d, N entries and maybe more that do not move; descent,
-    descent_there: -grad g at p and at the trial; correction, direction (N,): c and d; sy, wy (m, m): s_i y_j for i
-    not younger than j, and w_i y_j; sg, wg (m,): s_i grad g(p) and w_i grad g(p); a, b (m,); now: one of NOW.
+    descent_there: -grad g at p and at the trial; correction, direction (N,): c and d; block: scratch; sy, wy (m, m):
+    s_i y_j for i not younger than j, and w_i y_j; sg, wg (m,): s_i grad g(p) and w_i grad g(p); a, b (m,); now: one of
+    NOW. s, w, c and d are as precise as the factor.
     """
 
-    steps: NDArray[np.float64]
-    images: NDArray[np.float64]
+    steps: NDArray[Any]
+    images: NDArray[Any]
     position: NDArray[np.float64]
     trial: NDArray[np.float64]
     descent: NDArray[np.float64]
     descent_there: NDArray[np.float64]
-    correction: NDArray[np.float64]
-    direction: NDArray[np.float64]
+    correction: NDArray[Any]
+    direction: NDArray[Any]
+    block: NDArray[np.float64]
     sy: NDArray[np.float64]
     wy: NDArray[np.float64]
     sg: NDArray[np.float64]
@@ -102,7 +104,6 @@ def propose(window):
     now = window.now[0]
     now.plain, now.tries = coefficients(window), 0
     _combine(window)
-    _try(window, 1.0)
 
 
 @kernel
@@ -142,37 +143,38 @@ def accept(window, correction):
     new = (now.newest + 1) % m
     now.count = min(now.count + 1, m)
     for j in range(m):
-        window.sg[j] = window.wg[j] = window.sy[j, new] = window.wy[j, new] = 0.0
+        # What a gradient's difference gives is the difference of what the gradients do.
+        window.sy[j, new], window.wy[j, new] = -window.sg[j], -window.wg[j]
+        window.sg[j] = window.wg[j] = 0.0
+    window.sy[new, new] = window.wy[new, new] = 0.0
     now.squared = 0.0
     size = len(window.direction)
-    for begin in range(0, size, _BLOCK):
-        end = min(size, begin + _BLOCK)
-        _renew(
-            window.steps[new * size + begin : new * size + end],
-            window.images[new * size + begin : new * size + end],
-            window.position[begin:end],
-            window.trial[begin:end],
-            window.descent[begin:end],
-            window.descent_there[begin:end],
-            window.correction[begin:end],
-            correction[begin:end],
-            window.direction[begin:end],
-        )
+    for begin in range(0, size, BLOCK):
+        end = min(size, begin + BLOCK)
+        step = window.steps[new * size + begin : new * size + end]
+        image = window.images[new * size + begin : new * size + end]
+        y = window.block[: end - begin]
+        _replace(window.trial[begin:end], window.position[begin:end], step, 1.0)
+        _replace(correction[begin:end], window.correction[begin:end], image, -1.0)
+        _replace(window.descent_there[begin:end], window.descent[begin:end], y, -1.0)
         now.squared += dot(window.descent[begin:end], window.correction[begin:end], end - begin)
+        sy, wy = dots(step, image, y, end - begin)
+        window.sy[new, new] += sy
+        window.wy[new, new] += wy
         for back in range(now.count):
             j = (new - back + m) % m
-            sg, sy, wg, wy = dots(
+            sg, wg = dots(
                 window.steps[j * size + begin : j * size + end],
                 window.images[j * size + begin : j * size + end],
                 window.descent[begin:end],
-                window.direction[begin:end],
                 end - begin,
             )
             window.sg[j] -= sg
             window.wg[j] -= wg
-            window.sy[j, new] += sy
-            window.wy[j, new] += wy
     for j in range(m):
+        if j != new:
+            window.sy[j, new] += window.sg[j]
+            window.wy[j, new] += window.wg[j]
         window.wy[new, j] = window.wy[j, new]
     now.newest = new
 
@@ -180,18 +182,24 @@ def accept(window, correction):
 @inner
 def _try(window, length):
     window.now[0].length = length
-    for k in range(len(window.direction)):
-        window.trial[k] = window.position[k] + length * window.direction[k]
+    size = len(window.direction)
+    _go(window.position[:size], length, window.direction, window.trial[:size])
+
+
+@inner
+def _go(position, length, direction, trial):
+    for k in range(len(trial)):
+        trial[k] = position[k] + length * direction[k]
 
 
 @inner
 def _combine(window):
-    """The direction by the coefficients, and its slope."""
+    """The direction by the coefficients, its slope, and a trial at its full length."""
     now, size, m = window.now[0], len(window.direction), len(window.a)
     slope = 0.0
-    for begin in range(0, size, _BLOCK):
-        end = min(size, begin + _BLOCK)
-        direction = window.direction[begin:end]
+    for begin in range(0, size, BLOCK):
+        end = min(size, begin + BLOCK)
+        direction = window.block[: end - begin]
         _set(direction, now.scale, window.correction[begin:end])
         for back in range(now.count):
             j = (now.newest - back + m) % m
@@ -202,19 +210,18 @@ def _combine(window):
                 window.b[j],
                 window.images[j * size + begin : j * size + end],
             )
-        slope -= dot(direction, window.descent[begin:end], end - begin)
-    now.slope = slope
+        _set(window.direction[begin:end], 1.0, direction)
+        slope -= dot(window.direction[begin:end], window.descent[begin:end], end - begin)
+        _go(window.position[begin:end], 1.0, window.direction[begin:end], window.trial[begin:end])
+    now.slope, now.length = slope, 1.0
 
 
 @inner
-def _renew(step, image, position, trial, descent, there, correction, corrected, y):
-    """A block of s, w and y, and the new p, -grad g and c in the place of the old."""
-    for k in range(len(y)):
-        c = np.float64(corrected[k])
-        step[k] = trial[k] - position[k]
-        image[k] = correction[k] - c
-        y[k] = descent[k] - there[k]
-        position[k], descent[k], correction[k] = trial[k], there[k], c
+def _replace(new, old, change, sign):
+    """The new in the place of the old, and by how much it changes, or minus that."""
+    for k in range(len(new)):
+        change[k] = sign * (new[k] - old[k])
+        old[k] = new[k]
 
 
 @inner

@@ -92,15 +92,7 @@ def run(step: Step, edges, window: Window, iterations, limit, floor, every, out)
 @inner
 def _evaluate(step, edges, window):
     rows = len(window.direction) // 4
-    total = descend(
-        step.bundles,
-        step.shares,
-        window.trial,
-        step.y,
-        step.plan.held,
-        rows,
-        window.descent_there,
-    )
+    total = descend(step.bundles, step.shares, window.trial, step.y, step.plan.held, window.descent_there)
     add_edges(edges, 0, rows, window.trial, window.descent_there, 0, True)
     return total + energy(edges, rows, window.trial)
 

@@ -2,7 +2,8 @@
 
 A sum that may be reordered becomes vectors, but in an order that the compiler chooses anew wherever it puts the code:
 the process that compiles a kernel and later ones, which load it, would differ in the last bits. So the vectors are
-written here: lane l adds the terms l, l + 8, ..., the lanes are added pairwise, and what is left over one by one.
+written here: of four vectors of eight, which hide how long an addition takes, lane l adds the terms l, l + 32, ...; the
+vectors and then the lanes are added pairwise, and what is left over one by one. Arrays may be float32; sums are not.
 """
 
 from __future__ import annotations
@@ -16,6 +17,9 @@ from numba.extending import intrinsic
 
 from solvers.kernels.springs_vectors import F64, I64, LANES, WIDE, Vectors, constant, unpacked
 
+_TOGETHER = 4
+"""Vectors that are added to side by side."""
+
 
 def _sums(*pairs: tuple[int, int]):
     """The code for the scalar products of these pairs of arrays, over their first `count` entries."""
@@ -23,19 +27,31 @@ def _sums(*pairs: tuple[int, int]):
     def generate(context, builder: Any, signature, args):
         *arrays, count = unpacked(context, builder, signature, args)
         v = Vectors(context, builder)
-        whole = builder.and_(count, I64(-LANES))
+        whole = builder.and_(count, I64(-_TOGETHER * LANES))
 
-        def add(place: Any, kind: ir.Type, sums: list[Any]) -> None:
-            terms = [v.load(builder.gep(array, [place]), kind) for array in arrays]
+        def read(array: Any, place: Any, lanes: int) -> Any:
+            kept = array.type.pointee
+            narrow, wide = (ir.VectorType(kept, lanes), WIDE) if lanes > 1 else (kept, F64)
+            term = v.load(builder.gep(array, [place]), narrow, 8 if kept == F64 else 4)
+            return term if kept == F64 else builder.fpext(term, wide)
+
+        def add(place: Any, lanes: int, sums: list[Any]) -> None:
+            terms = [read(array, place, lanes) for array in arrays]
             for (a, b), total in zip(pairs, sums, strict=True):
                 builder.store(v.multiply_add(terms[a], terms[b], builder.load(total)), total)
 
-        lanes = [cgutils.alloca_once_value(builder, constant(0.0)) for _ in pairs]
-        with cgutils.for_range_slice(builder, I64(0), whole, I64(LANES), I64) as (place, _):
-            add(place, WIDE, lanes)
-        sums = [cgutils.alloca_once_value(builder, v.total(builder.load(total))) for total in lanes]
+        wide = [[cgutils.alloca_once(builder, WIDE) for _ in pairs] for _ in range(_TOGETHER)]
+        for total in (total for sums in wide for total in sums):
+            builder.store(constant(0.0), total)
+        with cgutils.for_range_slice(builder, I64(0), whole, I64(_TOGETHER * LANES), I64) as (place, _):
+            for k, sums in enumerate(wide):
+                add(builder.add(place, I64(k * LANES)), LANES, sums)
+        sums = [
+            cgutils.alloca_once_value(builder, v.total(v.paired([builder.load(total) for total in totals])))
+            for totals in zip(*wide, strict=True)
+        ]
         with cgutils.for_range_slice(builder, whole, count, I64(1), I64) as (place, _):
-            add(place, F64, sums)
+            add(place, 1, sums)
         found = [builder.load(total) for total in sums]
         return found[0] if len(found) == 1 else context.make_tuple(builder, signature.return_type, found)
 
@@ -47,9 +63,9 @@ def _dot(typingctx, a, b, count):
     return types.float64(a, b, count), _sums((0, 1))
 
 
-def _dots(typingctx, s, w, g, y, count):
-    """s g, s y, w g and w y."""
-    return types.UniTuple(types.float64, 4)(s, w, g, y, count), _sums((0, 2), (0, 3), (1, 2), (1, 3))
+def _dots(typingctx, s, w, g, count):
+    """s g and w g."""
+    return types.UniTuple(types.float64, 2)(s, w, g, count), _sums((0, 2), (1, 2))
 
 
 # Numba passes the first argument itself, which type checkers do not know.

@@ -105,7 +105,10 @@ class Vectors:
 
     def total(self, a: Any) -> Any:
         """The sum of the lanes, taken pairwise."""
-        terms = [self.builder.extract_element(a, I32(lane)) for lane in range(LANES)]
+        return self.paired([self.builder.extract_element(a, I32(lane)) for lane in range(LANES)])
+
+    def paired(self, terms: list[Any]) -> Any:
+        """The sum of as many terms as a power of two, taken pairwise."""
         while len(terms) > 1:
             terms = [self.builder.fadd(p, q) for p, q in zip(terms[::2], terms[1::2], strict=True)]
         return terms[0]

@@ -74,7 +74,7 @@ def _copy(p, out):
 
 @inner
 def _level(blocks, spaces, p, y, out):
-    return objective(blocks.bundles, blocks.shares, p, y, blocks.held, blocks.unknowns, out) + pressed(spaces, p)
+    return objective(blocks.bundles, blocks.shares, p, y, blocks.held, out) + pressed(spaces, p)
 
 
 @kernel
