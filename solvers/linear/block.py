@@ -52,27 +52,27 @@ class BlockCholesky:
             )
         self._panels = np.zeros(f.panel[-1] + ROWS)
         waiting, filled, place, runs = (np.zeros(k, np.int64) for k in ((2, supernodes + 1), 2, n, (2, n + 1)))
-        self._scratch = np.zeros((2, room)), waiting, filled, np.zeros((TILE, TILE)), place, runs
+        self._scratch = np.zeros((2, room)), waiting, filled, np.zeros(TILE), np.zeros((TILE, TILE)), place, runs
         largest = int((whole(3 * f.own) + whole(3 * below)).max(initial=0))
-        self._vectors = np.zeros(largest + ROWS), np.zeros(TILE)
+        self._front = np.zeros(largest + ROWS)
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
         """Factorise H with these blocks (b, 3, 3), in the order of the graph; False if it is not positive definite."""
-        return factorise(self._fronts, values, self._panels, _NOTHING, *self._vectors, *self._scratch)
+        return factorise(self._fronts, values, self._panels, _NOTHING, self._front, *self._scratch)
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """H^-1 b, both (n, 3), by what was factorised last."""
         x = np.array(b, order="C")
-        solve(self._fronts, self._panels, x, *self._vectors, False)
+        solve(self._fronts, self._panels, x, self._front, False)
         return x
 
     def solve_anew(self, values: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """H^-1 b, H factorised with these blocks: sooner than one after the other. None if it is not positive
         definite."""
         x = np.array(b, order="C")
-        if not factorise(self._fronts, values, self._panels, x, *self._vectors, *self._scratch):
+        if not factorise(self._fronts, values, self._panels, x, self._front, *self._scratch):
             return None
-        solve(self._fronts, self._panels, x, *self._vectors, True)
+        solve(self._fronts, self._panels, x, self._front, True)
         return x
 
 
@@ -105,7 +105,11 @@ def _fronts(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], symbolic
     heights = whole(3 * own) + whole(3 * below)
     panel = np.concatenate([[0], np.cumsum(3 * own * heights)])
     rank = np.asarray(s.slot, np.int64)
-    return Fronts(pointers, neighbours.astype(np.int64), rank, start, members, own, within, parent, stack, panel)
+    lines = np.repeat(np.arange(len(place)), np.diff(pointers))
+    diagonal = np.flatnonzero(lines == neighbours)
+    return Fronts(
+        pointers, neighbours.astype(np.int64), rank, start, members, own, within, parent, stack, panel, diagonal
+    )
 
 
 def _room(fronts: Fronts, sizes: NDArray[np.int64]) -> int:

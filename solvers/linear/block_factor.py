@@ -17,7 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
-from solvers.linear.block_vectors import ROWS, TILE, add, divide, subtract_columns, subtract_product, subtract_rows
+from solvers.linear.block_vectors import (
+    ROWS,
+    TILE,
+    add,
+    divide,
+    factorise_corner,
+    solve_columns,
+    solve_rows,
+    subtract_product,
+)
 
 _NO_DIGITS = 4.0 * np.finfo(np.float64).eps
 """A pivot this small beside its entry of the matrix is round-off."""
@@ -29,7 +38,8 @@ class Fronts(NamedTuple):
     pointers (n + 1,), neighbours: the graph of the matrix's blocks in CSR; rank (n,): when a vertex is eliminated;
     start (s + 1,), members: of each supernode the vertices of its columns, and then of the rows below; own (s,): how
     many are columns; within: of each member below its place among the parent's; parent (s,), -1 for a root;
-    stack (s,): which of the two its update waits on; panel (s + 1,): where its panel begins.
+    stack (s,): which of the two its update waits on; panel (s + 1,): where its panel begins; diagonal (n,): the
+    diagonal block of each vertex.
     """
 
     pointers: NDArray[np.int64]
@@ -42,6 +52,7 @@ class Fronts(NamedTuple):
     parent: NDArray[np.int64]
     stack: NDArray[np.int64]
     panel: NDArray[np.int64]
+    diagonal: NDArray[np.int64]
 
 
 def whole(rows):
@@ -53,12 +64,12 @@ _whole = inner(whole)
 
 
 @kernel
-def factorise(fronts, values, panels, x, front, y, stacks, waiting, filled, triangle, place, runs):
+def factorise(fronts, values, panels, x, front, stacks, waiting, filled, least, triangle, place, runs):
     """Write L to `panels` from the blocks of the matrix, values (b, 3, 3); returns whether it is positive definite.
 
-    x (n, 3), or nothing: overwritten with L^-1 x while each panel is at hand; front, y: see `solve`; stacks (2, room):
+    x (n, 3), or nothing: overwritten with L^-1 x while each panel is at hand; front: see `solve`; stacks (2, room):
     of updates, the numbers in use counted in filled (2,); waiting (2, s + 1): supernodes on each, their count first;
-    triangle (TILE, TILE), place (n,), runs (2, n + 1): scratch.
+    least (TILE,), triangle (TILE, TILE), place (n,), runs (2, n + 1): scratch.
     """
     filled[:] = 0
     waiting[:, 0] = 0
@@ -78,10 +89,10 @@ def factorise(fronts, values, panels, x, front, y, stacks, waiting, filled, tria
             filled[other] -= 3 * rows * _whole(3 * rows)
             _extend(fronts, c, rows, stacks[other], filled[other], own, head, stride, panels, base, update, begin,
                     size, runs)  # fmt: skip
-        if not _eliminate(fronts, s, values, panels, head, stride, triangle):
+        if not _eliminate(fronts, s, values, panels, head, stride, least, triangle):
             return False
         if len(x) > 0:
-            _forwards(fronts, s, panels, x, front, y)
+            _forwards(fronts, s, panels, x, front)
         _update(panels, base, 3 * own, head, stride, update, begin, 3 * below, size)
         if fronts.parent[s] >= 0:
             waiting[side, 0] += 1
@@ -144,7 +155,7 @@ def _add_runs(runs, run, count, b, source, start, target, column):
 
 
 @inner
-def _eliminate(fronts, s, values, panels, head, stride, triangle):
+def _eliminate(fronts, s, values, panels, head, stride, least, triangle):
     """Factorise the panel of a supernode; False at a pivot that is not positive."""
     base, width = fronts.panel[s], 3 * fronts.own[s]
     for tile in range(0, width, TILE):
@@ -159,16 +170,13 @@ def _eliminate(fronts, s, values, panels, head, stride, triangle):
                     subtract_product(panels, base + r, base + tile, stride, tile, panels, corner + r, stride, 3)
         for j in range(columns):
             v = fronts.members[fronts.start[s] + (tile + j) // 3]
-            for i in range(j, columns):
-                entry = panels[corner + j * stride + tile + i]
-                for k in range(j):
-                    entry -= triangle[i, k] * triangle[j, k]
-                if i == j:
-                    if not entry > _NO_DIGITS * values[_diagonal(fronts, v), j % 3, j % 3]:
-                        return False
-                    triangle[j, j] = 1.0 / np.sqrt(entry)
-                else:
-                    triangle[i, j] = entry * triangle[j, j]
+            least[j] = _NO_DIGITS * values[fronts.diagonal[v], j % 3, j % 3]
+        if columns == 6:
+            positive = factorise_corner(panels, corner + tile, stride, least, triangle, 6)
+        else:
+            positive = factorise_corner(panels, corner + tile, stride, least, triangle, 3)
+        if not positive:
+            return False
         for r in range(above, stride, ROWS):
             if columns == 6:
                 divide(panels, corner + r, stride, triangle, 6)
@@ -177,15 +185,6 @@ def _eliminate(fronts, s, values, panels, head, stride, triangle):
         for j in range(columns):
             panels[corner + j * stride + tile + j] = triangle[j, j]
     return True
-
-
-@inner
-def _diagonal(fronts, v):
-    """Which block is the diagonal's of vertex v."""
-    e = fronts.pointers[v]
-    while fronts.neighbours[e] != v:
-        e += 1
-    return e
 
 
 @inner
@@ -201,25 +200,18 @@ def _update(panels, base, width, head, stride, update, begin, columns, size):
 
 
 @inner
-def _forwards(fronts, s, panels, x, front, y):
+def _forwards(fronts, s, panels, x, front):
     """The solve's pass over the panel of a supernode, children first."""
     first, own, below, head, stride = _sizes(fronts, s)
     front[: stride + ROWS] = 0.0
     _gather(x, fronts.members, first, own, front, 0)
     for tile in range(0, 3 * own, TILE):
         columns, corner = min(TILE, 3 * own - tile), fronts.panel[s] + tile * stride + tile
-        for j in range(columns):
-            y[j] = front[tile + j]
-            for k in range(j):
-                y[j] -= panels[corner + k * stride + j] * y[k]
-            y[j] *= panels[corner + j * stride + j]
-            front[tile + j] = y[j]
-        to = tile + columns
-        at, strips = corner + columns, (stride - to + ROWS - 1) // ROWS
+        strips = (stride - tile - columns + ROWS - 1) // ROWS
         if columns == 6:
-            subtract_columns(panels, at, stride, front, to, strips, y, 6)
+            solve_columns(panels, corner, stride, front, tile, strips, 6)
         else:
-            subtract_columns(panels, at, stride, front, to, strips, y, 3)
+            solve_columns(panels, corner, stride, front, tile, strips, 3)
     _scatter(front, 0, x, fronts.members, first, own)
     for k in range(below):
         for c in range(3):
@@ -227,14 +219,14 @@ def _forwards(fronts, s, panels, x, front, y):
 
 
 @kernel
-def solve(fronts, panels, x, front, y, begun):
-    """Overwrite x (n, 3) with H^-1 x; front, a vector longer than the largest front, and y (TILE,): scratch.
+def solve(fronts, panels, x, front, begun):
+    """Overwrite x (n, 3) with H^-1 x; front: scratch, a vector longer than the largest front.
 
     begun: whether `factorise` has done the first half.
     """
     if not begun:
         for s in range(len(fronts.own)):
-            _forwards(fronts, s, panels, x, front, y)
+            _forwards(fronts, s, panels, x, front)
     for s in range(len(fronts.own) - 1, -1, -1):
         first, own, below, head, stride = _sizes(fronts, s)
         front[: stride + ROWS] = 0.0
@@ -242,19 +234,11 @@ def solve(fronts, panels, x, front, y, begun):
         _gather(x, fronts.members, first + own, below, front, head)
         for tile in range((3 * own - 1) // TILE * TILE, -1, -TILE):
             columns, corner = min(TILE, 3 * own - tile), fronts.panel[s] + tile * stride + tile
-            for j in range(columns):
-                y[j] = front[tile + j]
-            to = tile + columns
-            at, strips = corner + columns, (stride - to + ROWS - 1) // ROWS
+            strips = (stride - tile - columns + ROWS - 1) // ROWS
             if columns == 6:
-                subtract_rows(panels, at, stride, front, to, strips, y, 6)
+                solve_rows(panels, corner, stride, front, tile, strips, 6)
             else:
-                subtract_rows(panels, at, stride, front, to, strips, y, 3)
-            for j in range(columns - 1, -1, -1):
-                for k in range(j + 1, columns):
-                    y[j] -= panels[corner + j * stride + k] * y[k]
-                y[j] *= panels[corner + j * stride + j]
-                front[tile + j] = y[j]
+                solve_rows(panels, corner, stride, front, tile, strips, 3)
         _scatter(front, 0, x, fronts.members, first, own)
 
 

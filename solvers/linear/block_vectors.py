@@ -29,10 +29,50 @@ def _store(builder: Any, value: Any, pointer: Any) -> None:
     builder.store(value, builder.bitcast(pointer, _WIDE.as_pointer()), align=8)
 
 
-def _spread(builder: Any, pointer: Any) -> Any:
+def _wide(builder: Any, value: Any) -> Any:
     """A number in all lanes."""
-    single = builder.insert_element(ir.Constant(_WIDE, ir.Undefined), builder.load(pointer), ir.IntType(32)(0))
+    kind = ir.VectorType(value.type, ROWS)
+    single = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
     return builder.shuffle_vector(single, single, ir.Constant(ir.VectorType(ir.IntType(32), ROWS), [0] * ROWS))
+
+
+def _spread(builder: Any, pointer: Any) -> Any:
+    """A number in memory, in all lanes."""
+    return _wide(builder, builder.load(pointer))
+
+
+def _total(builder: Any, lanes: Any) -> Any:
+    """The sum of the lanes, half of them added to the other half."""
+    count = ROWS
+    while count > 1:
+        count //= 2
+        halves = [ir.Constant(ir.VectorType(ir.IntType(32), count), list(range(k, k + count))) for k in (0, count)]
+        lanes = builder.fadd(*(builder.shuffle_vector(lanes, lanes, half) for half in halves))
+    return builder.extract_element(lanes, ir.IntType(32)(0))
+
+
+def _masked(builder: Any, pointer: Any, mask: Any, value: Any = None) -> Any:
+    """Load the lanes that a mask has, zero for the others; or store those of a value."""
+    place = builder.bitcast(pointer, _WIDE.as_pointer())
+    kinds = [_WIDE.as_pointer(), ir.IntType(32), mask.type]
+    if value is None:
+        load = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(_WIDE, [*kinds, _WIDE]), "llvm.masked.load.v8f64.p0"
+        )
+        return builder.call(load, [place, ir.IntType(32)(8), mask, ir.Constant(_WIDE, [0.0] * ROWS)])
+    store = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(ir.VoidType(), [_WIDE, *kinds]), "llvm.masked.store.v8f64.p0"
+    )
+    return builder.call(store, [value, place, ir.IntType(32)(8), mask])
+
+
+def _prefetch(builder: Any, pointer: Any) -> None:
+    """Ask for a cache line."""
+    byte, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
+    call = builder.module.declare_intrinsic(
+        "llvm.prefetch.p0", fnty=ir.FunctionType(ir.VoidType(), [byte, i32, i32, i32])
+    )
+    builder.call(call, [builder.bitcast(pointer, byte), i32(0), i32(3), i32(1)])
 
 
 def _minus_product(builder: Any, c: Any, a: Any, b: Any) -> Any:
@@ -106,18 +146,54 @@ def _divide(typingctx: Any, L: Any, at: Any, stride: Any, triangle: Any, columns
     return signature, generate
 
 
-def _subtract_columns(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any, strips: Any, y: Any,
-                      columns: Any) -> Any:  # fmt: skip
-    """x[to + r] -= sum over j < columns of L[at + r + stride j] y[j], for as many strips of eight r."""
-    signature = _signature(L, at, stride, x, to, strips, y, columns)
+def _factorise_corner(typingctx: Any, L: Any, at: Any, stride: Any, least: Any, triangle: Any, columns: Any) -> Any:
+    """Write the Cholesky factor of a tile's corner, at `at`, to triangle (TILE, TILE), its diagonal inverted; returns
+    whether each pivot is above its entry of `least` (TILE,)."""
+    signature = types.boolean(*_signature(L, at, stride, least, triangle, columns).args)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        L, at, stride, x, to, strips, y, columns = _arguments(context, builder, signature, args)
-        factors = [_spread(builder, builder.gep(y, [_I64(j)])) for j in range(columns)]
+        L, at, stride, least, triangle, columns = _arguments(context, builder, signature, args)
+        root = builder.module.declare_intrinsic("llvm.sqrt", [_F64])
+        t: dict[tuple[int, int], Any] = {}
+        positive: Any = ir.Constant(ir.IntType(1), 1)
+        for j in range(columns):
+            column = builder.gep(L, [builder.add(at, builder.mul(stride, _I64(j)))])
+            for i in range(j, columns):
+                entry = builder.load(builder.gep(column, [_I64(i)]))
+                for k in range(j):
+                    entry = _minus_product(builder, entry, t[i, k], t[j, k])
+                if i == j:
+                    above = builder.fcmp_ordered(">", entry, builder.load(builder.gep(least, [_I64(j)])))
+                    positive = builder.and_(positive, above)
+                    t[j, j] = builder.fdiv(_F64(1.0), builder.call(root, [entry]))
+                else:
+                    t[i, j] = builder.fmul(entry, t[j, j])
+                builder.store(t[i, j], builder.gep(triangle, [_I64(TILE * i + j)]))
+        return positive
+
+    return signature, generate
+
+
+def _solve_columns(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any, strips: Any, columns: Any) -> Any:
+    """A tile's pass forwards: x[to + j] for j < columns, by its corner at `at`; what is below, in as many strips of
+    eight, less by what that brings."""
+    signature = _signature(L, at, stride, x, to, strips, columns)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        L, at, stride, x, to, strips, columns = _arguments(context, builder, signature, args)
         starts = [builder.gep(L, [builder.add(at, builder.mul(stride, _I64(j)))]) for j in range(columns)]
         x = builder.gep(x, [to])
+        y: list[Any] = []
+        for j in range(columns):
+            value = builder.load(builder.gep(x, [_I64(j)]))
+            for k in range(j):
+                value = _minus_product(builder, value, builder.load(builder.gep(starts[k], [_I64(j)])), y[k])
+            y.append(builder.fmul(value, builder.load(builder.gep(starts[j], [_I64(j)]))))
+        for j, value in enumerate(y):
+            builder.store(value, builder.gep(x, [_I64(j)]))
+        factors = [_wide(builder, value) for value in y]
         with cgutils.for_range(builder, strips) as loop:
-            row = builder.mul(loop.index, _I64(ROWS))
+            row = builder.add(builder.mul(loop.index, _I64(ROWS)), _I64(columns))
             target = builder.gep(x, [row])
             total = _load(builder, target)
             for start, factor in zip(starts, factors, strict=True):
@@ -128,51 +204,55 @@ def _subtract_columns(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: 
     return signature, generate
 
 
-def _subtract_rows(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any, strips: Any, y: Any,
-                   columns: Any) -> Any:  # fmt: skip
-    """y[j] -= sum over r of L[at + r + stride j] x[to + r], for as many strips of eight r and for j < columns."""
-    signature = _signature(L, at, stride, x, to, strips, y, columns)
+def _solve_rows(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any, strips: Any, columns: Any) -> Any:
+    """A tile's pass backwards: x[to + j] for j < columns, less by what as many strips of eight below bring, by its
+    corner at `at`."""
+    signature = _signature(L, at, stride, x, to, strips, columns)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        L, at, stride, x, to, strips, y, columns = _arguments(context, builder, signature, args)
+        L, at, stride, x, to, strips, columns = _arguments(context, builder, signature, args)
         starts = [builder.gep(L, [builder.add(at, builder.mul(stride, _I64(j)))]) for j in range(columns)]
+        ahead = builder.mul(stride, _I64(-TILE))
+        x = builder.gep(x, [to])
         sums = [cgutils.alloca_once(builder, _WIDE) for _ in range(columns)]
         for accumulator in sums:
             builder.store(ir.Constant(_WIDE, [0.0] * ROWS), accumulator)
-        x = builder.gep(x, [to])
         with cgutils.for_range(builder, strips) as loop:
-            row = builder.mul(loop.index, _I64(ROWS))
+            row = builder.add(builder.mul(loop.index, _I64(ROWS)), _I64(columns))
             factor = _load(builder, builder.gep(x, [row]))
             for start, accumulator in zip(starts, sums, strict=True):
-                column = _load(builder, builder.gep(start, [row]))
-                builder.store(_minus_product(builder, builder.load(accumulator), column, factor), accumulator)
-        for j, accumulator in enumerate(sums):
-            lanes = builder.load(accumulator)
-            terms = [builder.extract_element(lanes, ir.IntType(32)(lane)) for lane in range(ROWS)]
-            while len(terms) > 1:
-                terms = [builder.fadd(a, b) for a, b in zip(terms[::2], terms[1::2], strict=True)]
-            place = builder.gep(y, [_I64(j)])
-            builder.store(builder.fadd(builder.load(place), terms[0]), place)
+                place = builder.gep(start, [row])
+                _prefetch(builder, builder.gep(place, [ahead]))  # of the tile that is next
+                builder.store(_minus_product(builder, builder.load(accumulator), _load(builder, place), factor),
+                              accumulator)  # fmt: skip
+        y: list[Any] = [None] * columns
+        for j in range(columns - 1, -1, -1):
+            value = builder.fadd(builder.load(builder.gep(x, [_I64(j)])), _total(builder, builder.load(sums[j])))
+            for k in range(columns - 1, j, -1):
+                value = _minus_product(builder, value, builder.load(builder.gep(starts[j], [_I64(k)])), y[k])
+            y[j] = builder.fmul(value, builder.load(builder.gep(starts[j], [_I64(j)])))
+            builder.store(y[j], builder.gep(x, [_I64(j)]))
         return context.get_dummy_value()
 
     return signature, generate
 
 
 def _add(typingctx: Any, source: Any, at: Any, target: Any, to: Any, count: Any) -> Any:
-    """target[to + r] += source[at + r] for r < count, a multiple of three."""
+    """target[to + r] += source[at + r] for r < count; the lanes behind are neither read nor written."""
     signature = types.void(source, at, target, to, count)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         source, at, target, to, count = _arguments(context, builder, signature, args)
         source, target = builder.gep(source, [at]), builder.gep(target, [to])
-        with cgutils.for_range(builder, builder.udiv(count, _I64(ROWS))) as loop:
+        lanes = ir.Constant(ir.VectorType(_I64, ROWS), list(range(ROWS)))
+        strips = builder.udiv(builder.add(count, _I64(ROWS - 1)), _I64(ROWS))
+        with cgutils.for_range(builder, strips) as loop:
             row = builder.mul(loop.index, _I64(ROWS))
+            left = _wide(builder, builder.sub(count, row))
+            mask = builder.icmp_signed("<", lanes, left)
             place = builder.gep(target, [row])
-            _store(builder, builder.fadd(_load(builder, place), _load(builder, builder.gep(source, [row]))), place)
-        done = builder.sub(count, builder.urem(count, _I64(ROWS)))
-        with cgutils.for_range_slice(builder, done, count, _I64(1), _I64) as (row, _):
-            place = builder.gep(target, [row])
-            builder.store(builder.fadd(builder.load(place), builder.load(builder.gep(source, [row]))), place)
+            total = builder.fadd(*(_masked(builder, p, mask) for p in (place, builder.gep(source, [row]))))
+            _masked(builder, place, mask, total)
         return context.get_dummy_value()
 
     return signature, generate
@@ -182,5 +262,6 @@ def _add(typingctx: Any, source: Any, at: Any, target: Any, to: Any, count: Any)
 subtract_product: Any = intrinsic(_subtract_product)
 add: Any = intrinsic(_add)
 divide: Any = intrinsic(_divide)
-subtract_columns: Any = intrinsic(_subtract_columns)
-subtract_rows: Any = intrinsic(_subtract_rows)
+factorise_corner: Any = intrinsic(_factorise_corner)
+solve_columns: Any = intrinsic(_solve_columns)
+solve_rows: Any = intrinsic(_solve_rows)
