@@ -51,8 +51,8 @@ class BlockCholesky:
                 f"where {memory.in_words(free)} may be taken; take numba or newton-cg, or a coarser mesh"
             )
         self._panels = np.zeros(f.panel[-1] + ROWS)
-        waiting, filled, place, runs = (np.zeros(k, np.int64) for k in ((2, supernodes + 1), 2, n, (2, n + 1)))
-        self._scratch = np.zeros((2, room)), waiting, filled, np.zeros(TILE), np.zeros((TILE, TILE)), place, runs
+        waiting, filled, runs = (np.zeros(k, np.int64) for k in ((2, supernodes + 1), 2, (2, n + 1)))
+        self._scratch = np.zeros((2, room)), waiting, filled, np.zeros(TILE), np.zeros((TILE, TILE)), runs
         largest = int((whole(3 * f.own) + whole(3 * below)).max(initial=0))
         self._front = np.zeros(largest + ROWS)
 
@@ -104,12 +104,40 @@ def _fronts(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], symbolic
     below = np.diff(start) - own
     heights = whole(3 * own) + whole(3 * below)
     panel = np.concatenate([[0], np.cumsum(3 * own * heights)])
-    rank = np.asarray(s.slot, np.int64)
-    lines = np.repeat(np.arange(len(place)), np.diff(pointers))
-    diagonal = np.flatnonzero(lines == neighbours)
-    return Fronts(
-        pointers, neighbours.astype(np.int64), rank, start, members, own, within, parent, stack, panel, diagonal
-    )
+    entered = _entered(pointers, neighbours.astype(np.int64), s.slot, start, members, own, heights, panel)
+    return Fronts(start, members, own, within, parent, stack, panel, *entered)
+
+
+def _entered(
+    pointers: NDArray[np.int64],
+    u: NDArray[np.int64],
+    rank: NDArray[np.int32],
+    start: NDArray[np.int64],
+    members: NDArray[np.int64],
+    own: NDArray[np.int64],
+    heights: NDArray[np.int64],
+    panel: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], ...]:
+    """`entered`, `block`, `entry` and `diagonal` of fronts.
+
+    A block (v, u), with u not eliminated before v, goes to the column of v in its supernode's panel, to the row of u.
+    """
+    n = len(pointers) - 1
+    v = np.repeat(np.arange(n), np.diff(pointers))
+    node = np.repeat(np.arange(len(own)), np.diff(start))
+    place = np.arange(len(members)) - start[node]
+    mine = place < own[node]
+    home, column = np.empty((2, n), np.int64)
+    home[members[mine]], column[members[mine]] = node[mine], place[mine]
+    block = np.flatnonzero(rank[u] >= rank[v])
+    block = block[np.argsort(home[v[block]], kind="stable")]
+    at = home[v[block]]
+    key = node * n + members
+    order = np.argsort(key)
+    row = place[order[np.searchsorted(key[order], at * n + u[block])]]
+    row = np.where(row < own[at], 3 * row, whole(3 * own[at]) + 3 * (row - own[at]))
+    entry = panel[at] + 3 * column[v[block]] * heights[at] + row
+    return np.searchsorted(at, np.arange(len(own) + 1)), block, entry, np.flatnonzero(u == v)
 
 
 def _room(fronts: Fronts, sizes: NDArray[np.int64]) -> int:

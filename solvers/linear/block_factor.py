@@ -35,16 +35,12 @@ _NO_DIGITS = 4.0 * np.finfo(np.float64).eps
 class Fronts(NamedTuple):
     """The structure of a factor over n vertices, s supernodes in a postorder.
 
-    pointers (n + 1,), neighbours: the graph of the matrix's blocks in CSR; rank (n,): when a vertex is eliminated;
     start (s + 1,), members: of each supernode the vertices of its columns, and then of the rows below; own (s,): how
     many are columns; within: of each member below its place among the parent's; parent (s,), -1 for a root;
-    stack (s,): which of the two its update waits on; panel (s + 1,): where its panel begins; diagonal (n,): the
-    diagonal block of each vertex.
+    stack (s,): which of the two its update waits on; panel (s + 1,): where its panel begins; entered (s + 1,): the
+    first of its matrix's blocks in `block` (b,), which go to `entry` (b,); diagonal (n,): that of each vertex.
     """
 
-    pointers: NDArray[np.int64]
-    neighbours: NDArray[np.int64]
-    rank: NDArray[np.int64]
     start: NDArray[np.int64]
     members: NDArray[np.int64]
     own: NDArray[np.int64]
@@ -52,6 +48,9 @@ class Fronts(NamedTuple):
     parent: NDArray[np.int64]
     stack: NDArray[np.int64]
     panel: NDArray[np.int64]
+    entered: NDArray[np.int64]
+    block: NDArray[np.int64]
+    entry: NDArray[np.int64]
     diagonal: NDArray[np.int64]
 
 
@@ -64,12 +63,12 @@ _whole = inner(whole)
 
 
 @kernel
-def factorise(fronts, values, panels, x, front, stacks, waiting, filled, least, triangle, place, runs):
+def factorise(fronts, values, panels, x, front, stacks, waiting, filled, least, triangle, runs):
     """Write L to `panels` from the blocks of the matrix, values (b, 3, 3); returns whether it is positive definite.
 
     x (n, 3), or nothing: overwritten with L^-1 x while each panel is at hand; front: see `solve`; stacks (2, room):
     of updates, the numbers in use counted in filled (2,); waiting (2, s + 1): supernodes on each, their count first;
-    least (TILE,), triangle (TILE, TILE), place (n,), runs (2, n + 1): scratch.
+    least (TILE,), triangle (TILE, TILE), runs (2, n + 1): scratch.
     """
     filled[:] = 0
     waiting[:, 0] = 0
@@ -80,7 +79,7 @@ def factorise(fronts, values, panels, x, front, stacks, waiting, filled, least, 
         update, begin = stacks[side], filled[side]
         panels[base : fronts.panel[s + 1]] = 0.0
         update[begin : begin + 3 * below * size] = 0.0
-        _enter(fronts, s, values, panels, head, stride, place)
+        _enter(fronts, s, values, panels, stride)
         other = 1 - side
         while waiting[other, 0] > 0 and fronts.parent[waiting[other, waiting[other, 0]]] == s:
             c = waiting[other, waiting[other, 0]]
@@ -102,21 +101,13 @@ def factorise(fronts, values, panels, x, front, stacks, waiting, filled, least, 
 
 
 @inner
-def _enter(fronts, s, values, panels, head, stride, place):
+def _enter(fronts, s, values, panels, stride):
     """Put the matrix's blocks below the diagonal into the panel of a supernode."""
-    first, own = fronts.start[s], fronts.own[s]
-    for k in range(fronts.start[s + 1] - first):
-        place[fronts.members[first + k]] = 3 * k if k < own else head + 3 * (k - own)
-    for k in range(own):
-        v = fronts.members[first + k]
-        column = fronts.panel[s] + 3 * k * stride
-        for e in range(fronts.pointers[v], fronts.pointers[v + 1]):
-            u = fronts.neighbours[e]
-            if fronts.rank[u] >= fronts.rank[v]:
-                at = column + place[u]
-                for j in range(3):
-                    for i in range(3):
-                        panels[at + j * stride + i] = values[e, j, i]
+    for k in range(fronts.entered[s], fronts.entered[s + 1]):
+        e, at = fronts.block[k], fronts.entry[k]
+        for j in range(3):
+            for i in range(3):
+                panels[at + j * stride + i] = values[e, j, i]
 
 
 @inner
@@ -162,12 +153,12 @@ def _eliminate(fronts, s, values, panels, head, stride, least, triangle):
         columns = min(TILE, width - tile)
         corner = base + tile * stride
         above = tile // ROWS * ROWS
-        if tile > 0:
-            for r in range(above, stride, ROWS):
-                if columns == 6:
-                    subtract_product(panels, base + r, base + tile, stride, tile, panels, corner + r, stride, 6)
-                else:
-                    subtract_product(panels, base + r, base + tile, stride, tile, panels, corner + r, stride, 3)
+        strips = (stride - above) // ROWS
+        left, row, to = base + above, base + tile, corner + above
+        if columns == 6:
+            subtract_product(panels, left, row, stride, tile, panels, to, stride, strips, 6)
+        else:
+            subtract_product(panels, left, row, stride, tile, panels, to, stride, strips, 3)
         for j in range(columns):
             v = fronts.members[fronts.start[s] + (tile + j) // 3]
             least[j] = _NO_DIGITS * values[fronts.diagonal[v], j % 3, j % 3]
@@ -177,11 +168,10 @@ def _eliminate(fronts, s, values, panels, head, stride, least, triangle):
             positive = factorise_corner(panels, corner + tile, stride, least, triangle, 3)
         if not positive:
             return False
-        for r in range(above, stride, ROWS):
-            if columns == 6:
-                divide(panels, corner + r, stride, triangle, 6)
-            else:
-                divide(panels, corner + r, stride, triangle, 3)
+        if columns == 6:
+            divide(panels, to, stride, triangle, strips, 6)
+        else:
+            divide(panels, to, stride, triangle, strips, 3)
         for j in range(columns):
             panels[corner + j * stride + tile + j] = triangle[j, j]
     return True
@@ -191,12 +181,12 @@ def _eliminate(fronts, s, values, panels, head, stride, least, triangle):
 def _update(panels, base, width, head, stride, update, begin, columns, size):
     """Subtract the product of a panel's rows below from the update."""
     for tile in range(0, columns, TILE):
-        row, to = base + head, begin + tile * size
-        for r in range(tile // ROWS * ROWS, size, ROWS):
-            if columns - tile >= 6:
-                subtract_product(panels, row + r, row + tile, stride, width, update, to + r, size, 6)
-            else:
-                subtract_product(panels, row + r, row + tile, stride, width, update, to + r, size, 3)
+        above = tile // ROWS * ROWS
+        row, to, strips = base + head, begin + tile * size + above, (size - above) // ROWS
+        if columns - tile >= 6:
+            subtract_product(panels, row + above, row + tile, stride, width, update, to, size, strips, 6)
+        else:
+            subtract_product(panels, row + above, row + tile, stride, width, update, to, size, strips, 3)
 
 
 @inner

@@ -15,7 +15,7 @@ from numba.core.errors import TypingError
 from numba.extending import intrinsic
 
 ROWS, TILE = 8, 6
-"""Of a tile, rows and columns (two vertices): its sums and a factor fit the registers of AVX2."""
+"""Of a tile, rows and columns (two vertices): its sums and a factor fit the registers of AVX2, two tiles' AVX-512's."""
 
 _I64, _F64 = ir.IntType(64), ir.DoubleType()
 _WIDE = ir.VectorType(_F64, ROWS)
@@ -101,46 +101,70 @@ def _signature(*kinds: Any) -> Any:
 
 
 def _subtract_product(typingctx: Any, L: Any, at: Any, top: Any, stride: Any, depth: Any, C: Any, to: Any, step: Any,
-                      columns: Any) -> Any:  # fmt: skip
-    """C[to + r + step j] -= sum over k < depth of L[at + r + stride k] L[top + j + stride k], r < 8, j < columns."""
-    signature = _signature(L, at, top, stride, depth, C, to, step, columns)
+                      strips: Any, columns: Any) -> Any:  # fmt: skip
+    """C[to + r + step j] -= sum over k < depth of L[at + r + stride k] L[top + j + stride k] for j < columns, and r in
+    as many strips of eight."""
+    signature = _signature(L, at, top, stride, depth, C, to, step, strips, columns)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        L, at, top, stride, depth, C, to, step, columns = _arguments(context, builder, signature, args)
+        L, at, top, stride, depth, C, to, step, strips, columns = _arguments(context, builder, signature, args)
         left, above = builder.gep(L, [at]), builder.gep(L, [top])
-        targets = [builder.gep(C, [builder.add(to, builder.mul(step, _I64(j)))]) for j in range(columns)]
-        sums = [cgutils.alloca_once(builder, _WIDE) for _ in range(columns)]
-        for accumulator, target in zip(sums, targets, strict=True):
-            builder.store(_load(builder, target), accumulator)
-        with cgutils.for_range(builder, depth) as loop:
-            column = builder.mul(loop.index, stride)
-            rows = _load(builder, builder.gep(left, [column]))
-            across = builder.gep(above, [column])
-            for j, accumulator in enumerate(sums):
-                factor = _spread(builder, builder.gep(across, [_I64(j)]))
-                builder.store(_minus_product(builder, builder.load(accumulator), rows, factor), accumulator)
-        for accumulator, target in zip(sums, targets, strict=True):
-            _store(builder, builder.load(accumulator), target)
+
+        def tile(row: Any, vectors: int) -> None:
+            """So many vectors of rows from `row` on."""
+            begins = [builder.add(row, _I64(ROWS * v)) for v in range(vectors)]
+            targets = [
+                builder.gep(C, [builder.add(builder.add(to, builder.mul(step, _I64(j))), begin)])
+                for j in range(columns) for begin in begins
+            ]  # fmt: skip
+            sums = [cgutils.alloca_once(builder, _WIDE) for _ in targets]
+            for accumulator, target in zip(sums, targets, strict=True):
+                builder.store(_load(builder, target), accumulator)
+            with cgutils.for_range(builder, depth) as loop:
+                column = builder.mul(loop.index, stride)
+                rows = [_load(builder, builder.gep(left, [builder.add(column, begin)])) for begin in begins]
+                across = builder.gep(above, [column])
+                for j in range(columns):
+                    factor = _spread(builder, builder.gep(across, [_I64(j)]))
+                    for v, x in enumerate(rows):
+                        place = sums[j * vectors + v]
+                        builder.store(_minus_product(builder, builder.load(place), x, factor), place)
+            for accumulator, target in zip(sums, targets, strict=True):
+                _store(builder, builder.load(accumulator), target)
+
+        together = 2 if "+avx512f" in context.codegen().magic_tuple()[2] else 1
+        whole = builder.udiv(strips, _I64(together))
+        with cgutils.for_range(builder, whole) as loop:
+            tile(builder.mul(loop.index, _I64(ROWS * together)), together)
+        with cgutils.for_range_slice(builder, builder.mul(whole, _I64(together)), strips, _I64(1), _I64) as (strip, _):
+            tile(builder.mul(strip, _I64(ROWS)), 1)
         return context.get_dummy_value()
 
     return signature, generate
 
 
-def _divide(typingctx: Any, L: Any, at: Any, stride: Any, triangle: Any, columns: Any) -> Any:
-    """Eight rows X of a tile, at `at`, become X T^-T; triangle (TILE, TILE): T, its diagonal inverted."""
-    signature = _signature(L, at, stride, triangle, columns)
+def _divide(typingctx: Any, L: Any, at: Any, stride: Any, triangle: Any, strips: Any, columns: Any) -> Any:
+    """The rows X of a tile, in as many strips of eight from `at` on, become X T^-T; triangle (TILE, TILE): T, its
+    diagonal inverted."""
+    signature = _signature(L, at, stride, triangle, strips, columns)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        L, at, stride, triangle, columns = _arguments(context, builder, signature, args)
-        done: list[Any] = []
-        for j in range(columns):
-            pointer = builder.gep(L, [builder.add(at, builder.mul(stride, _I64(j)))])
-            x = _load(builder, pointer)
-            for k in range(j):
-                x = _minus_product(builder, x, done[k], _spread(builder, builder.gep(triangle, [_I64(TILE * j + k)])))
-            x = builder.fmul(x, _spread(builder, builder.gep(triangle, [_I64(TILE * j + j)])))
-            _store(builder, x, pointer)
-            done.append(x)
+        L, at, stride, triangle, strips, columns = _arguments(context, builder, signature, args)
+        T = {
+            (j, k): _spread(builder, builder.gep(triangle, [_I64(TILE * j + k)]))
+            for j in range(columns) for k in range(j + 1)
+        }  # fmt: skip
+        with cgutils.for_range(builder, strips) as loop:
+            row = builder.add(at, builder.mul(loop.index, _I64(ROWS)))
+            done: list[Any] = []
+            for j in range(columns):
+                pointer = builder.gep(L, [builder.add(row, builder.mul(stride, _I64(j)))])
+                x = _load(builder, pointer)
+                for k in range(j):
+                    x = _minus_product(builder, x, done[k], T[j, k])
+                x = builder.fmul(x, T[j, j])
+                _store(builder, x, pointer)
+                done.append(x)
         return context.get_dummy_value()
 
     return signature, generate
