@@ -51,6 +51,11 @@ class Run(Protocol):
     positions: Positions
     largest: float
 
+    @property
+    def fallen(self) -> float:
+        """By how much the objective fell so far [J], where round-off does not hide it."""
+        ...
+
     def advance(self, iterations: int, limit: float, floor: float, every: bool) -> tuple[int, float, bool]:
         """Iterate, as `accelerate_step.run` does."""
         ...
@@ -203,6 +208,11 @@ class _CompiledRun:
         """See Run."""
         return accelerate_step.run(*self._state, iterations, limit, floor, every, self.positions)
 
+    @property
+    def fallen(self) -> float:
+        """See Run."""
+        return float(self._state[-1].now["fallen"][0])
+
     def gradient(self) -> Positions:
         """See Run."""
         step, _, window = self._state
@@ -254,6 +264,11 @@ class InterpretedRun:
         e = self._window.correction.reshape(-1, 3).copy()
         e[self._base.system.pins.vertices] = 0.0
         return self._base.norm(e)
+
+    @property
+    def fallen(self) -> float:
+        """See Run."""
+        return float(self._window.now["fallen"][0])
 
     def gradient(self) -> Positions:
         """See Run."""

@@ -100,14 +100,15 @@ class HybridMethod:
         _, before, _ = run.advance(0, 0.0, 0.0, False)
         _, residual, _ = run.advance(_PROBE, 0.0, 0.0, False)
         gain, newton_gain = (np.inf, 0.0) if residual <= _QUICK * before else (0.0, np.inf)
-        iterations, ended = _ROUND - _PROBE, False
+        iterations, fallen, ended = _ROUND - _PROBE, 0.0, False
         while not ended:
             if gain > newton_gain:
-                run = run or self._lbfgs.engine.begin(step.problem, point.positions)
+                if run is None:
+                    run, fallen = self._lbfgs.engine.begin(step.problem, point.positions), 0.0
                 _, residual, ended = run.advance(iterations, 0.0, 0.0, False)
                 following, iterations = _reached(run), _ROUND
                 ended |= residual**2 <= self.metric.round_off(following.positions)
-                last, gain = gain, _gain(step, point, following)
+                last, gain, fallen = gain, run.fallen - fallen or _gain(step, point, following), run.fallen
                 if newton_gain == 0.0 and (gain == 0.0 or gain > _SLOW * last):
                     newton_gain = np.inf
             else:

@@ -45,6 +45,7 @@ NOW = np.dtype(
         ("plain", np.int64),  # whether the trial is along c
         ("rise", np.float64),  # g(trial) - g(p) [J]
         ("noise", np.float64),  # what of it may be round-off
+        ("fallen", np.float64),  # by how much g fell since the start, where round-off does not hide it [J]
         ("length", np.float64),  # t
         ("slope", np.float64),  # grad g(p) d [J]
         ("squared", np.float64),  # |c|_Q^2 [J]
@@ -90,12 +91,12 @@ def begin(window, correction):
     """Start at the trial point, where `descent_there` and the correction are known."""
     now = window.now[0]
     now.count, now.newest, now.radius, now.degree = 0, -1, 0.0, 0
-    now.squared = 0.0
+    size = len(window.correction)
     for k in range(len(window.position)):
         window.position[k] = window.trial[k]
-    for k in range(len(window.correction)):
+    for k in range(size):
         window.descent[k], window.correction[k] = window.descent_there[k], correction[k]
-        now.squared += window.descent[k] * window.correction[k]
+    now.squared = dot(window.descent, window.correction, size)
 
 
 @kernel
@@ -119,6 +120,7 @@ def judge(window):
         enough = now.rise <= DECREASE * now.length * min(0.0, now.slope)
         excess = now.rise - now.length * now.slope
     if enough:
+        now.fallen -= 0.0 if even else now.rise
         return ACCEPTED
     now.tries += 1
     if now.plain and (even or now.tries > _HALVINGS):

@@ -51,11 +51,13 @@ def start(step: Step, edges, window: Window, target, force, pin_targets, guess):
     state(step.rows, target, force, pin_targets, step.y)
     largest = place(step.rows, guess, pin_targets, window.trial)
     step.objective[0] = _evaluate(step, edges, window)
-    step.objective[1] = step.shares.size
+    size = step.shares.size
     for k in range(len(window.direction)):
-        step.objective[1] += step.plan.held[k // 4] * window.trial[k] ** 2
+        size += step.plan.held[k // 4] * window.trial[k] ** 2
+    step.objective[1] = size
     _solve(step.plan, window.descent_there, len(window.direction), step.x)
     begin(window, step.x)
+    window.now[0].fallen = 0.0
     return largest
 
 
