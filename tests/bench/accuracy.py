@@ -112,12 +112,11 @@ def step_gates(
     step: Callable[[], Scored],
     error: float,
     iterations: int | None = None,
-    kept: float | None = None,
     **limits: float,
 ) -> Iterator[Gate]:
     """The hybrid up to an error, beside local-global: `iterations` of it, or up to the same error.
 
-    limits: of the ratio, by local-global's backend; kept: what the ratio is kept below where the limit is a goal yet.
+    limits: of the ratio, by local-global's backend.
     """
 
     def candidate() -> Work:
@@ -136,8 +135,7 @@ def step_gates(
             name=f"accuracy-{name}-{error:g}-{backend}",
             candidate=candidate,
             yardstick=lambda backend=backend: yardstick(backend),
-            limit=kept or limit,
-            goal=limit if kept else None,
+            limit=limit,
             why=f"a goal: the hybrid to {error:g} beside {iterations or 'as good'} iterations of {backend}",
             tolerance=None,
             turns=5,
@@ -210,9 +208,9 @@ ACCURACY = (
     *step_gates("curtain", lambda: gap(CURTAIN, 81, 34, "inertial"), 1e-6, sparse=1 / 50, numba=1 / 15),
     *step_gates("soft-flag", lambda: gap(flag(100.0), 0, 20), 1e-4, sparse=1 / 15),
     *step_gates("soft-flag", lambda: gap(flag(100.0), 0, 20), 1e-6, sparse=1 / 20),
-    *step_gates("stiff-cloth", lambda: gap(CLOTH, 64, 11), 1e-3, iterations=50, kept=0.5, sparse=0.4),
+    *step_gates("stiff-cloth", lambda: gap(CLOTH, 64, 11), 1e-3, iterations=50, sparse=0.4),
     *step_gates("stiff-cloth", lambda: gap(CLOTH, 64, 11), 1e-6, iterations=50, sparse=2.5),
-    *step_gates("soft-cloth", lambda: gap(SOFT, 64, 11), 1e-6, iterations=50, kept=0.25, sparse=0.15),
+    *step_gates("soft-cloth", lambda: gap(SOFT, 64, 11), 1e-6, iterations=50, sparse=0.15),
     # 2 s a step, where 50 iterations take 50 ms.
     *step_gates("flag-frame-1", lambda: stationary(flag(), 1), 1e-6, iterations=50, sparse=40.0),
     *step_gates("flag-frame-2", lambda: stationary(flag(), 2), 1e-6, iterations=50, sparse=40.0),
