@@ -83,6 +83,26 @@ def test_a_step_compiled_as_a_whole_is_the_step_with_calls_in_between(method, na
 
 
 @methods
+@problems
+@pytest.mark.parametrize("linear", ["supernodal", "cholespy"])
+def test_a_run_tells_its_gradient_and_by_how_much_the_objective_fell(method, name, linear):
+    problem = PROBLEMS[name]()
+    prepared = method(linear=linear).prepare(problem.system)
+    run = prepared.engine.begin(problem, problem.first_guess)
+    run.advance(0, np.nan, 0.0, False)
+    start, size = problem.value(run.positions), problem.magnitude(run.positions)
+    for _ in range(2):
+        run.advance(6, np.nan, 0.0, False)
+        # A dozen differences, each of which may be round-off of the terms, here or where the run started.
+        size = max(size, problem.magnitude(run.positions))
+        assert abs(start - problem.value(run.positions) - run.fallen) <= 12 * 4 * np.finfo(float).eps * size
+        wanted = problem.gradient(run.positions)
+        wanted[problem.system.pins.vertices[problem.system.pins.exact]] = 0.0
+        # Some units in the last place of stiffness times position.
+        np.testing.assert_allclose(run.gradient(), wanted, rtol=0, atol=1e-15 * prepared.base.trace * run.largest)
+
+
+@methods
 def test_fewer_iterations_reach_an_accuracy_than_of_local_global(method):
     problem = first_problem(cloth(12, "exact"))
     lowest = problem.value(iterates(Lbfgs(), problem, 1500)[-1])
