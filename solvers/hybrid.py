@@ -63,10 +63,11 @@ class Hybrid:
     def prepare(self, system: System) -> PreparedDescent:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
         metric, objective = Metric(system), Objective(system)
-        method = HybridMethod(objective, metric, Lbfgs(precision="float32").prepare(system))
+        lbfgs = Lbfgs(precision="float32").prepare(system)
+        method = HybridMethod(objective, metric, lbfgs)
         factor = objective.matrix.factor
         facts = metric.facts | {"nnz_hessian_factor": float(factor.nonzeros)}
-        choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {metric.choice}"
+        choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {lbfgs.choice}"
         return PreparedDescent(objective, metric, method, choice, facts)
 
 
