@@ -22,7 +22,7 @@ def half_spaces(contacts: list[ContactEnergy], row: NDArray[np.int64], bundles: 
     order = np.argsort(rows, kind="stable")
     order = order[rows[order] < unknowns]
     count = np.bincount(rows[order], minlength=len(row) + 2)
-    near = count[bundles.own].reshape(-1, LANES).max(axis=1, initial=0) > 0
+    near = count[bundles.own // 4].reshape(-1, LANES).max(axis=1, initial=0) > 0
     first = np.concatenate([[0], np.cumsum(count)])
     return HalfSpaces(
         first, near, *(np.ascontiguousarray(x[order]) for x in (normal, anchor, offset, stiffness, grip, slip))

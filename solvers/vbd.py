@@ -78,7 +78,7 @@ class VertexBlockDescent:
         held, majorant = np.zeros(n + 2), np.ones(n + 2)
         held[: len(order)] = majorant[: len(order)] = (blocks.held(system) + parts.held)[order]
         ends = np.repeat(bundles.own.reshape(-1, LANES), np.diff(bundles.start), axis=0)
-        np.add.at(majorant, ends.ravel(), bundles.stiffness)
+        np.add.at(majorant, ends.ravel() // 4, bundles.each()[1])
         shares = Shares.of(bundles, held, row[pinned])
         return PreparedVertexBlockDescent(
             system,

@@ -32,8 +32,13 @@ class Springs(Edges):
 
     @classmethod
     def at_rest(cls, rest: Positions, edges: NDArray[np.int64], stiffness: NDArray[np.float64]) -> Springs:
-        """Springs whose rest shape is `rest`, (n, 3) [m], with stiffness (m,) [N/m]."""
-        return cls(edges, stiffness, *rest_directions(rest, edges))
+        """Springs whose rest shape is `rest`, (n, 3) [m], with stiffness (m,) [N/m].
+
+        Rest lengths that differ by the round-off of positions alone are made equal.
+        """
+        length, direction = rest_directions(rest, edges)
+        round_off = 4.0 * np.finfo(float).eps * float(np.abs(rest).max(initial=0.0))
+        return cls(edges, stiffness, _levelled(length, round_off), direction)
 
     @classmethod
     def joined(cls, parts: Sequence[Springs]) -> Springs:
@@ -67,3 +72,13 @@ class Springs(Edges):
         length, unit = directions(self._along(p), self.rest_direction)
         ratio = np.divide(self.rest_length, length, out=np.ones_like(length), where=length > TINY)
         return self._blocks(np.where(self.rest_length == 0.0, 1.0, 1.0 - ratio), unit, len(p))
+
+
+def _levelled(lengths: NDArray[np.float64], round_off: float) -> NDArray[np.float64]:
+    """The lengths (m,) [m], each the least of those that it can be told from by no more than `round_off` [m]."""
+    order = np.argsort(lengths, kind="stable")
+    ascending = lengths[order]
+    first = np.diff(ascending, prepend=-np.inf) > round_off
+    out = np.empty_like(lengths)
+    out[order] = ascending[first][np.cumsum(first) - 1]
+    return out

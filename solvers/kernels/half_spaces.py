@@ -80,11 +80,11 @@ def _springs(bundles, b, lane, p, x, held, load):
     g0, g1, g2 = -load[0], -load[1], -load[2]
     a00, a01, a02, a11, a12, a22 = held, 0.0, 0.0, held, 0.0, held
     for entry in range(bundles.start[b], bundles.start[b + 1]):
-        e = LANES * entry + lane
-        j, k, pull = bundles.neighbour[e], bundles.stiffness[e], bundles.pull[e]
+        e, w = LANES * entry + lane, bundles.kind[entry] + lane
+        j, k, pull = bundles.neighbour[e], bundles.weights[w + LANES], bundles.weights[w]
         if k == 0.0:
             continue
-        v0, v1, v2 = x[0] - p[4 * j], x[1] - p[4 * j + 1], x[2] - p[4 * j + 2]
+        v0, v1, v2 = x[0] - p[j], x[1] - p[j + 1], x[2] - p[j + 2]
         squared = v0 * v0 + v1 * v1 + v2 * v2
         if squared <= TINY_SQUARED:
             length, name = 0.0, bundles.spring[e]
@@ -164,18 +164,18 @@ def _rise(bundles, s, b, lane, i, p, x, d, held, load):
     for c in range(3):
         total += d[c] * (0.5 * held * d[c] - load[c])
     for entry in range(bundles.start[b], bundles.start[b + 1]):
-        e = LANES * entry + lane
-        j, before, after, change = bundles.neighbour[e], 0.0, 0.0, 0.0
-        if bundles.stiffness[e] == 0.0:
+        j, w = bundles.neighbour[LANES * entry + lane], bundles.kind[entry] + lane
+        stiffness, before, after, change = bundles.weights[w + LANES], 0.0, 0.0, 0.0
+        if stiffness == 0.0:
             continue
         for c in range(3):
-            v = x[c] - p[4 * j + c]
+            v = x[c] - p[j + c]
             before += v * v
             after += (v + d[c]) * (v + d[c])
             change += d[c] * (2.0 * v + d[c])
         both = np.sqrt(before) + np.sqrt(after)
         if both > 0.0:
-            total += change * (0.5 * bundles.stiffness[e] - bundles.pull[e] / both)
+            total += change * (0.5 * stiffness - bundles.weights[w] / both)
     end = x[0] + d[0], x[1] + d[1], x[2] + d[2]
     for k in range(s.first[i], s.first[i + 1]):
         n0, n1, n2 = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2]
@@ -199,7 +199,7 @@ def _rise(bundles, s, b, lane, i, p, x, d, held, load):
 def move(bundles, s, b, unknowns, p, y, held, majorant):
     """Move the vertices of a bundle to lower energies, one after another: none is joined to another."""
     for lane in range(LANES):
-        i = bundles.own[LANES * b + lane]
+        i = bundles.own[LANES * b + lane] // 4
         if i >= unknowns:
             continue
         h = held[i]

@@ -27,17 +27,18 @@ WINDOW = 128
 class Bundles(NamedTuple):
     """Springs by their ends: bundles of eight vertices (b of them), and of each as many entries as one has springs.
 
-    own (8 b,): the row of each vertex; start (b + 1,): the first entry of each bundle; of each entry eight times the
-    row of the other end (neighbour), k r [N] (pull), k [N/m] (stiffness) and the spring, ~spring at its second end.
-    What fills up is vertex `nobody` with zeros, and springs of no strength to row `far`. direction (m, 3): taken at
-    zero length.
+    own (8 b,): the place of each vertex, four times its row; start (b + 1,): the first entry of each bundle; of each
+    entry eight times the place of the other end (neighbour) and the spring, ~spring at its second end, and once where
+    in `weights` it has eight times k r [N] and eight times k [N/m] (kind), kept once where entries have the same, as
+    nearly all of a regular mesh do. What fills up is vertex `nobody`, and springs of no strength to row `far`.
+    direction (m, 3): taken at zero length.
     """
 
     own: NDArray[np.int32]
     start: NDArray[np.int64]
     neighbour: NDArray[np.int32]
-    pull: NDArray[np.float64]
-    stiffness: NDArray[np.float64]
+    kind: NDArray[np.int32]
+    weights: NDArray[np.float64]
     spring: NDArray[np.int32]
     direction: NDArray[np.float64]
 
@@ -69,9 +70,11 @@ class Bundles(NamedTuple):
         start = np.concatenate([[0], np.cumsum(at.reshape(-1, LANES).max(axis=1, initial=1))])
         here, there = ends.T.ravel(), ends[:, ::-1].T.ravel()
         spring = np.concatenate([keep, ~keep])
-        order = np.argsort(place[here], kind="stable")
+        k = springs.stiffness[np.maximum(spring, ~spring)]
+        pull = k * springs.rest_length[np.maximum(spring, ~spring)]
+        order = np.lexsort((pull, k, place[here]))  # so that lanes have equal springs side by side
         order = order[np.searchsorted(place[here[order]], 0) :]
-        here, there, spring = place[here[order]], row[there[order]], spring[order]
+        here, there, spring, k, pull = place[here[order]], row[there[order]], spring[order], k[order], pull[order]
         nth = np.arange(len(here)) - np.searchsorted(here, here)
         entry = LANES * (start[here // LANES] + nth) + here % LANES
 
@@ -81,17 +84,31 @@ class Bundles(NamedTuple):
             out[entry] = values
             return out
 
-        k = springs.stiffness[np.maximum(spring, ~spring)]
-        r = springs.rest_length[np.maximum(spring, ~spring)]
         return cls(
-            own,
+            4 * own,
             start,
-            filled(there.astype(np.int32), far),
-            filled(k * r, 0.0),
-            filled(k, 0.0),
+            filled(4 * there.astype(np.int32), 4 * far),
+            *kinds(filled(pull, 0.0), filled(k, 0.0)),
             filled(spring.astype(np.int32), 0),
             np.array(springs.rest_direction, order="C"),
         ), first
+
+    def each(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """k r and k of each entry's springs."""
+        pull, k = self.weights.reshape(-1, 2, LANES)[self.kind // (2 * LANES)].transpose(1, 0, 2)
+        return pull.ravel(), k.ravel()
+
+
+def kinds(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Where each entry's numbers begin, and the numbers: eight of each array, kept once where entries have the same."""
+    rows = np.concatenate([array.reshape(-1, LANES) for array in numbers], axis=1)
+    mixing = np.random.default_rng(0).integers(2**63, size=rows.shape[1], dtype=np.uint64)
+    _, first, kind = np.unique(rows.view(np.uint64) @ mixing, return_index=True, return_inverse=True)
+    if not np.array_equal(rows[first[kind]], rows):  # two kinds were mixed to one number
+        first = kind = np.arange(len(rows))
+    kept = aligned(rows[first].size)
+    kept[:] = rows[first].ravel()
+    return (rows.shape[1] * kind).astype(np.int32), kept
 
 
 def aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
@@ -105,38 +122,41 @@ def aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
 @inner
 def add_projection(bundles, begin, end, p, y, held, out, shift):
     """Add y + A'K d(p) of the bundles from `begin` to `end` to rows of `out`, moved by `shift`."""
-    own, start, neighbour, pull, stiffness, _spring, _direction = bundles
+    own, start, neighbour, kind, weights, _spring, _direction = bundles
+    moved = out[4 * shift :]
     for b in range(begin, end):
-        if vectors.project(p, own, b, neighbour, pull, stiffness, start[b], start[b + 1], y, held, out, shift):
-            one_by_one(bundles, b, p, y, held, out, shift, False)
+        if vectors.project(p, own, b, neighbour, kind, weights, start[b], start[b + 1], y, held, moved):
+            one_by_one(bundles, b, p, y, held, moved, False)
 
 
 @inner
 def add_descent(bundles, begin, end, p, y, held, out, shift):
     """Add y - Q p + A'K d(p), minus the gradient, of the bundles from `begin` to `end` to rows of `out`."""
-    own, start, neighbour, pull, stiffness, _spring, _direction = bundles
+    own, start, neighbour, kind, weights, _spring, _direction = bundles
+    moved = out[4 * shift :]
     for b in range(begin, end):
-        if vectors.correct(p, own, b, neighbour, pull, stiffness, start[b], start[b + 1], y, held, out, shift):
-            one_by_one(bundles, b, p, y, held, out, shift, True)
+        if vectors.correct(p, own, b, neighbour, kind, weights, start[b], start[b + 1], y, held, moved):
+            one_by_one(bundles, b, p, y, held, moved, True)
 
 
 @inner
-def one_by_one(bundles, b, p, y, held, out, shift, correct):
+def one_by_one(bundles, b, p, y, held, out, correct):
     """A bundle in which a spring has no length: that takes the direction of its rest shape."""
     for lane in range(LANES):
         i = bundles.own[LANES * b + lane]
-        s0, s1, s2 = y[4 * i], y[4 * i + 1], y[4 * i + 2]
-        x0, x1, x2 = p[4 * i], p[4 * i + 1], p[4 * i + 2]
+        s0, s1, s2 = y[i], y[i + 1], y[i + 2]
+        x0, x1, x2 = p[i], p[i + 1], p[i + 2]
         if correct:
-            s0, s1, s2 = s0 - held[i] * x0, s1 - held[i] * x1, s2 - held[i] * x2
+            h = held[i // 4]
+            s0, s1, s2 = s0 - h * x0, s1 - h * x1, s2 - h * x2
         for entry in range(bundles.start[b], bundles.start[b + 1]):
-            e = LANES * entry + lane
+            e, w = LANES * entry + lane, bundles.kind[entry] + lane
             j = bundles.neighbour[e]
-            v0, v1, v2 = x0 - p[4 * j], x1 - p[4 * j + 1], x2 - p[4 * j + 2]
+            v0, v1, v2 = x0 - p[j], x1 - p[j + 1], x2 - p[j + 2]
             if correct:
-                k = bundles.stiffness[e]
+                k = bundles.weights[w + LANES]
                 s0, s1, s2 = s0 - k * v0, s1 - k * v1, s2 - k * v2
-            scale, squared = bundles.pull[e], v0 * v0 + v1 * v1 + v2 * v2
+            scale, squared = bundles.weights[w], v0 * v0 + v1 * v1 + v2 * v2
             if squared <= TINY_SQUARED:
                 name = bundles.spring[e]
                 if name < 0:
@@ -145,17 +165,16 @@ def one_by_one(bundles, b, p, y, held, out, shift, correct):
             else:
                 scale /= np.sqrt(squared)
             s0, s1, s2 = s0 + scale * v0, s1 + scale * v1, s2 + scale * v2
-        at = 4 * (i + shift)
-        out[at], out[at + 1], out[at + 2] = out[at] + s0, out[at + 1] + s1, out[at + 2] + s2
+        out[i], out[i + 1], out[i + 2] = out[i] + s0, out[i + 1] + s1, out[i + 2] + s2
 
 
 @inner
 def squared_norm(bundles, begin, end, e, measure):
     """|e|_Q^2 [J] of displacements in rows of four, half of each spring at each end and `measure` [N/m] of each row."""
-    own, start, neighbour, pull, stiffness, _spring, _direction = bundles
+    own, start, neighbour, kind, weights, _spring, _direction = bundles
     total = 0.0
     for b in range(begin, end):
-        total += vectors.energy(e, own, b, neighbour, pull, stiffness, start[b], start[b + 1], e, measure, e, 0)
+        total += vectors.energy(e, own, b, neighbour, kind, weights, start[b], start[b + 1], e, measure, e)
     return total
 
 

@@ -1,7 +1,9 @@
 """The springs of eight vertices at a time, in LLVM vectors that a compiler does not find by itself.
 
 Positions have rows of four numbers, x, y, z and padding: one load brings a vertex, and eight loaded rows are transposed
-into vectors of x, y and z. Lane l holds a spring of vertex l, so that no two lanes add to one place.
+into vectors of x, y and z. Lane l holds a spring of vertex l, so that no two lanes add to one place. A row is named by
+the place of its first number: processors add that to an address for nothing, and instructions are what these loops
+take time for.
 
     1/|v|   from a guess, e = 1 - s y^2, y <- y (1 - e)^(-1/2) by its series, to about one unit in the last place:
             from AVX-512's estimate, 2^-14 off, by a step of degree 3;
@@ -27,6 +29,9 @@ BITS = ir.VectorType(I64, LANES)
 _GUESS, _ESTIMATE = 0x5FE6EB50C7B537A9, "llvm.x86.avx512.rsqrt14.pd.512"
 LEAST, MOST = TINY * TINY, 1.7e308
 """Squared lengths are kept between these, so that no guess is infinite."""
+
+AHEAD = 128
+"""How many rows ahead memory is asked for what is read once an iteration: of large meshes it is in no cache by then."""
 
 Kind = Literal["project", "correct", "energy"]
 
@@ -57,24 +62,33 @@ class Vectors:
         """c - a b."""
         return self.builder.fsub(c, self.builder.fmul(a, b, flags=("contract",)), flags=("contract",))
 
-    def row(self, array: Any, place: Any) -> Any:
-        """Where row `place` of four numbers begins."""
-        return self.builder.gep(array, [self.builder.shl(place, I64(2))])
-
-    def places(self, indices: Any) -> list[Any]:
-        """The eight int32 at a pointer."""
+    def places(self, indices: Any, bundle: Any) -> list[Any]:
+        """The places of eight rows, the bundle's of those that are listed, int32."""
         b = self.builder
-        return [b.zext(b.load(b.gep(indices, [I64(lane)])), I64) for lane in range(LANES)]
+        first = b.mul(bundle, I64(LANES))
+        return [b.zext(b.load(b.gep(indices, [b.add(first, I64(lane))])), I64) for lane in range(LANES)]
+
+    def at(self, array: Any, place: Any) -> Any:
+        """Where a row's number is in an array of one float64 a row."""
+        b = self.builder
+        byte = b.gep(b.bitcast(array, I8.as_pointer()), [b.mul(place, I64(2))])
+        return b.bitcast(byte, F64.as_pointer())
 
     def gather(self, array: Any, places: list[Any]) -> list[Any]:
         """x, y and z of eight rows."""
-        rows = [self.load(self.row(array, place), ROW) for place in places]
-        pairs = [self.shuffle(rows[lane], rows[lane + 4], list(range(8))) for lane in range(4)]
+        rows = [self.load(self.builder.gep(array, [place]), ROW) for place in places]
+        pairs = [self.shuffle(rows[lane], rows[lane + 2], list(range(8))) for lane in (0, 1, 4, 5)]
         low = [0, 8, 2, 10, 4, 12, 6, 14]
         xz = [self.shuffle(pairs[i], pairs[i + 1], low) for i in (0, 2)]
         y = [self.shuffle(pairs[i], pairs[i + 1], [k + 1 for k in low]) for i in (0, 2)]
-        first, second = [0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]
+        first, second = [0, 1, 4, 5, 8, 9, 12, 13], [2, 3, 6, 7, 10, 11, 14, 15]
         return [self.shuffle(a[0], a[1], lanes) for a, lanes in ((xz, first), (y, first), (xz, second))]
+
+    def eights(self, table: Any, kind: Any, entry: Any, many: int = 2) -> list[Any]:
+        """The vectors of an entry's kind (see `kinds`)."""
+        b = self.builder
+        begin = b.zext(b.load(b.gep(kind, [entry])), I64)
+        return [self.load(b.gep(table, [b.add(begin, I64(LANES * k))]), WIDE) for k in range(many)]
 
     def rows(self, x: Any, y: Any, z: Any) -> list[Any]:
         """Eight rows of x, y, z and zero."""
@@ -126,11 +140,40 @@ class Vectors:
         total = self.builder.fadd(self.load(pointer, row.type, size), row)
         self.builder.store(total, self.builder.bitcast(pointer, row.type.as_pointer()), align=size)
 
-    def inverse_root(self, s: Any) -> Any:
-        """1/sqrt(s), s taken to lie between LEAST and MOST."""
+    def clamped(self, s: Any) -> Any:
+        """s, between LEAST and MOST."""
+        return self.least(self.least(s, constant(LEAST), ">="), constant(MOST))
+
+    def least(self, a: Any, b: Any, order: str = "<=") -> Any:
+        """The lesser of two vectors' numbers, or the greater with the order ">="; a, where that is not a number."""
+        return self.builder.select(self.builder.fcmp_ordered(order, b, a), b, a)
+
+    def ask(self, pointer: Any) -> None:
+        """Ask memory for what is at a pointer."""
+        kinds = [I8.as_pointer(), I32, I32, I32]
+        name = self.builder.module.declare_intrinsic("llvm.prefetch.p0", fnty=ir.FunctionType(ir.VoidType(), kinds))
+        byte = self.builder.bitcast(pointer, I8.as_pointer())
+        self.builder.call(name, [byte, I32(0), I32(3), I32(1)])
+
+    def ask_ahead(self, places: list[Any], entry: Any, rows: list[Any], numbers: Any, neighbour: Any) -> None:
+        """Ask for what a bundle reads AHEAD rows on, of arrays of rows, of numbers and of the entries' other ends."""
         b = self.builder
-        for order, bound in (("<=", constant(LEAST)), (">=", constant(MOST))):
-            s = b.select(b.fcmp_ordered(order, s, bound), bound, s)
+        ahead = [b.add(place, I64(4 * AHEAD)) for place in places]
+        for array in rows:
+            for place in ahead[::2]:
+                self.ask(b.gep(array, [place]))
+        self.ask(self.at(numbers, ahead[0]))
+        first = b.mul(b.add(entry, I64(AHEAD)), I64(LANES))  # about as many entries as rows
+        for k in range(LANES // 2):
+            self.ask(b.gep(neighbour, [b.add(first, I64(2 * LANES * k))]))
+
+    def any(self, mask: Any) -> Any:
+        """Whether one of eight is true."""
+        return self.builder.icmp_unsigned("!=", self.builder.bitcast(mask, I8), I8(0))
+
+    def inverse_root(self, s: Any) -> Any:
+        """1/sqrt(s), for s between LEAST and MOST."""
+        b = self.builder
         if self.estimates:
             kind = ir.FunctionType(WIDE, [WIDE, WIDE, I8])
             estimate = b.module.globals.get(_ESTIMATE) or ir.Function(b.module, kind, _ESTIMATE)
@@ -158,49 +201,44 @@ def unpacked(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]
     ]
 
 
-def _over_chunk(kind: Kind):
-    """The code for a chunk: its eight vertices and their springs."""
+def _over_bundle(kind: Kind):
+    """The code for a bundle: its eight vertices and their springs."""
 
-    def declare(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, out, shift):
+    def declare(typingctx, x, own, bundle, neighbour, kinds, weights, begin, end, y, held, out):
         def generate(context, builder: Any, signature, args):
-            x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, out, shift = unpacked(
+            x, own, bundle, neighbour, kinds, weights, begin, end, y, held, out = unpacked(
                 context, builder, signature, args
             )
             v = Vectors(context, builder)
-            places = v.places(builder.gep(own, [builder.mul(chunk, I64(LANES))]))
+            places = v.places(own, bundle)
             centre = v.gather(x, places)
+            v.ask_ahead(places, begin, [y, out], held, neighbour)
             sums = [cgutils.alloca_once(builder, WIDE) for _ in range(3)]
             for accumulator in sums:
                 builder.store(constant(0.0), accumulator)
-            short = cgutils.alloca_once(builder, MASK)
-            builder.store(ir.Constant(MASK, [0] * LANES), short)
+            shortest = cgutils.alloca_once(builder, WIDE)
+            builder.store(constant(MOST), shortest)
 
             def read(entry):
                 """What an entry's springs need: k r, k, and the vector from their other ends with its square."""
-                first = builder.mul(entry, I64(LANES))
-                others = v.gather(x, v.places(builder.gep(neighbour, [first])))
+                others = v.gather(x, v.places(neighbour, entry))
                 arrow = [builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
-                weights = [v.load(builder.gep(array, [first]), WIDE) for array in weighted]
-                return [*weights, v.dot(arrow), *arrow]
+                return [*v.eights(weights, kinds, entry), v.dot(arrow), *arrow]
 
             def add(values):
                 """Add an entry's springs to the sums."""
-                *weights, squared = values[: len(weighted) + 1]
-                added = values[len(weighted) + 1 :]
-                scale = weights[0]
+                pull, stiffness, squared, *arrow = values
                 if kind == "energy":
-                    added = [squared]
+                    scale, arrow = stiffness, [squared]
                 else:
-                    tiny = builder.fcmp_ordered("<=", squared, constant(LEAST))
-                    builder.store(builder.or_(builder.load(short), tiny), short)
-                    scale = builder.fmul(scale, v.inverse_root(squared))
+                    builder.store(v.least(builder.load(shortest), squared), shortest)
+                    scale = builder.fmul(pull, v.inverse_root(squared))
                 if kind == "correct":
-                    scale = builder.fsub(scale, weights[1])
-                for term, accumulator in zip(added, sums, strict=False):
+                    scale = builder.fsub(scale, stiffness)
+                for term, accumulator in zip(arrow, sums, strict=False):
                     builder.store(v.multiply_add(scale, term, builder.load(accumulator)), accumulator)
 
             # One entry is read while the one before is added: a root waits for its springs no longer than they do.
-            weighted = {"project": [pull], "correct": [pull, stiffness], "energy": [stiffness]}[kind]
             waiting = [cgutils.alloca_once_value(builder, value) for value in read(begin)]
             second = builder.add(begin, I64(1))
             with cgutils.for_range_slice(builder, second, end, I64(1), I64) as (entry, _):
@@ -210,26 +248,27 @@ def _over_chunk(kind: Kind):
                     builder.store(value, place)
             add([builder.load(value) for value in waiting])
             total = [builder.load(accumulator) for accumulator in sums]
-            weights = [builder.load(builder.gep(held, [place])) for place in places]
+            places = v.places(own, bundle)  # again: they would not stay in registers
+            held = [builder.load(v.at(held, place)) for place in places]
             if kind == "energy":
-                lanes = v.multiply_add(v.dot(centre), v.gathered(weights), builder.fmul(constant(0.5), total[0]))
+                lanes = v.multiply_add(v.dot(centre), v.gathered(held), builder.fmul(constant(0.5), total[0]))
                 return v.total(lanes)
-            any_short = builder.icmp_unsigned("!=", builder.bitcast(builder.load(short), I8), I8(0))
-            with builder.if_then(builder.not_(any_short), likely=True):
-                for place, row, weight in zip(places, v.rows(*total), weights, strict=True):
-                    row = builder.fadd(row, v.load(v.row(y, place), ROW))
+            short = v.any(builder.fcmp_ordered("<=", builder.load(shortest), constant(LEAST)))
+            with builder.if_then(builder.not_(short), likely=True):
+                for place, row, weight in zip(places, v.rows(*total), held, strict=True):
+                    row = builder.fadd(row, v.load(builder.gep(y, [place]), ROW))
                     if kind == "correct":
-                        row = v.subtract_product(row, v.broadcast(weight), v.load(v.row(x, place), ROW))
-                    v.add_to(v.row(out, builder.add(place, shift)), row)
-            return any_short
+                        row = v.subtract_product(row, v.broadcast(weight), v.load(builder.gep(x, [place]), ROW))
+                    v.add_to(builder.gep(out, [place]), row)
+            return short
 
         returned = types.float64 if kind == "energy" else types.boolean
-        return returned(x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, out, shift), generate
+        return returned(x, own, bundle, neighbour, kinds, weights, begin, end, y, held, out), generate
 
     return declare
 
 
 # Numba passes the first argument itself, which type checkers do not know.
-project: Any = intrinsic(_over_chunk("project"))
-correct: Any = intrinsic(_over_chunk("correct"))
-energy: Any = intrinsic(_over_chunk("energy"))
+project: Any = intrinsic(_over_bundle("project"))
+correct: Any = intrinsic(_over_bundle("correct"))
+energy: Any = intrinsic(_over_bundle("energy"))

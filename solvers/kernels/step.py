@@ -198,7 +198,8 @@ def _share(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, 
         # Positions p^k are in a, or on the way there, and those before in c.
         a, b, c = turns[k % 3], turns[(k + 1) % 3], turns[(k + 2) % 3]
         for i in range(groups):
-            group = (first + i) % groups
+            # There and back again: what was read last is in the cache still.
+            group = (first + (groups - 1 - i if k % 2 == 1 else i)) % groups
             if claim(team, group, phase):
                 if measures:
                     _displace(plan, group, a, c, p, e)

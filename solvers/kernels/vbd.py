@@ -44,25 +44,25 @@ class Work(NamedTuple):
 @inner
 def _sweep(blocks, spaces, y, p, work):
     """Move every vertex once to a lower energy."""
-    own, start, neighbour, pull, stiffness, _spring, _direction = blocks.bundles
+    own, start, neighbour, kind, weights, _spring, _direction = blocks.bundles
     for b in range(len(start) - 1):
         if spaces is not None:  # noqa: SIM102 Numba leaves a branch out for None alone
             if spaces.near[b]:
                 move(blocks.bundles, spaces, b, blocks.unknowns, p, y, blocks.held, blocks.majorant)
                 continue
         short = descend(
-            p, own, b, neighbour, pull, stiffness, start[b], start[b + 1], y, blocks.held, blocks.majorant, work.near
+            p, own, b, neighbour, kind, weights, start[b], start[b + 1], y, blocks.held, blocks.majorant, work.near
         )
         if short:
             # A spring without length has no Hessian: the majorant's step takes it apart.
             for lane in range(LANES):
                 for k in range(4):
-                    work.out[4 * own[LANES * b + lane] + k] = 0.0
-            one_by_one(blocks.bundles, b, p, y, blocks.held, work.out, 0, True)
+                    work.out[own[LANES * b + lane] + k] = 0.0
+            one_by_one(blocks.bundles, b, p, y, blocks.held, work.out, True)
             for lane in range(LANES):
                 i = own[LANES * b + lane]
-                for k in range(4 * i, 4 * i + 3):
-                    p[k] += work.out[k] / blocks.majorant[i]
+                for k in range(i, i + 3):
+                    p[k] += work.out[k] / blocks.majorant[i // 4]
                     work.out[k] = 0.0
 
 

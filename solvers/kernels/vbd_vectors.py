@@ -9,7 +9,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from solvers.kernels.springs_vectors import I8, I64, LANES, LEAST, MASK, WIDE, Vectors, constant, unpacked
+from solvers.kernels.springs_vectors import I64, LANES, LEAST, MASK, WIDE, Vectors, constant, unpacked
 
 NUMBERS = 4
 """What is kept of each spring between the two passes: its vector and its length."""
@@ -42,25 +42,22 @@ def _newton(v: Vectors, block: list[Any], g: list[Any]) -> tuple[list[Any], Any]
     return [x0, x1, x2], builder.and_(builder.and_(large[0], large[1]), large[2])
 
 
-def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, majorant, near):
+def _bundle(typingctx, x, own, bundle, neighbour, kind, weights, begin, end, y, held, majorant, near):
     """A bundle's code: moves its vertices in x, and returns whether a spring is too short, when it moves none."""
 
     def generate(context, builder: Any, signature, args):
-        x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, majorant, near = unpacked(
+        x, own, bundle, neighbour, kind, weights, begin, end, y, held, majorant, near = unpacked(
             context, builder, signature, args
         )
         v = Vectors(context, builder)
-        places = v.places(builder.gep(own, [builder.mul(chunk, I64(LANES))]))
+        places = v.places(own, bundle)
 
         def at_vertices(array):
-            return v.gathered([builder.load(builder.gep(array, [place])) for place in places])
+            return v.gathered([builder.load(v.at(array, place)) for place in places])
 
         def kept(entry):
             begins = builder.mul(builder.sub(entry, begin), I64(LANES * NUMBERS))
             return [builder.gep(near, [builder.add(begins, I64(LANES * k))]) for k in range(NUMBERS)]
-
-        def wide(array, entry):
-            return v.load(builder.gep(array, [builder.mul(entry, I64(LANES))]), WIDE)
 
         centre, weight = v.gather(x, places), at_vertices(held)
         load = [v.subtract_product(here, weight, p) for here, p in zip(v.gather(y, places), centre, strict=True)]
@@ -69,16 +66,16 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y,
         sums = [cgutils.alloca_once_value(builder, value) for value in first]
         short = cgutils.alloca_once_value(builder, ir.Constant(MASK, [0] * LANES))
         with cgutils.for_range_slice(builder, begin, end, I64(1), I64) as (entry, _):
-            others = v.gather(x, v.places(builder.gep(neighbour, [builder.mul(entry, I64(LANES))])))
+            others = v.gather(x, v.places(neighbour, entry))
             arrow = [builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
             squared = v.dot(arrow)
             tiny = builder.fcmp_ordered("<=", squared, constant(LEAST))
             builder.store(builder.or_(builder.load(short), tiny), short)
-            root = v.inverse_root(squared)
+            root = v.inverse_root(v.clamped(squared))
             for value, pointer in zip([*arrow, builder.fmul(squared, root)], kept(entry), strict=True):
                 builder.store(value, builder.bitcast(pointer, WIDE.as_pointer()), align=8)
-            k = wide(stiffness, entry)
-            inward = builder.fmul(wide(pull, entry), root)
+            pull, k = v.eights(weights, kind, entry)
+            inward = builder.fmul(pull, root)
             tension = builder.fsub(inward, k)
             # A spring whose k is negative is a form's, has no rest length and is never compressed.
             compressed = [builder.fcmp_ordered(">", force, _ZERO) for force in (tension, inward)]
@@ -104,24 +101,24 @@ def _bundle(typingctx, x, own, chunk, neighbour, pull, stiffness, begin, end, y,
             *arrow, length = [v.load(pointer, WIDE) for pointer in kept(entry)]
             moved = [builder.fadd(a, b) for a, b in zip(arrow, d, strict=True)]
             squared = v.dot(moved)
-            both = v.multiply_add(squared, v.inverse_root(squared), length)
+            both = v.multiply_add(squared, v.inverse_root(v.clamped(squared)), length)
             change = builder.fmul(builder.fadd(arrow[0], moved[0]), d[0])
             for c in (1, 2):
                 change = v.multiply_add(builder.fadd(arrow[c], moved[c]), d[c], change)
-            mean = builder.fdiv(wide(pull, entry), both)
-            factor = builder.fsub(builder.fmul(_HALF, wide(stiffness, entry)), mean)
+            pull, k = v.eights(weights, kind, entry)
+            factor = builder.fsub(builder.fmul(_HALF, k), builder.fdiv(pull, both))
             builder.store(v.multiply_add(factor, change, builder.load(rises)), rises)
         better = builder.and_(definite, builder.fcmp_ordered("<=", builder.load(rises), _ZERO))
         scale = builder.fdiv(_ONE, at_vertices(majorant))
         safe = [builder.fmul(scale, component) for component in force]
         ends = [builder.fadd(p, builder.select(better, a, b)) for p, a, b in zip(centre, d, safe, strict=True)]
-        any_short = builder.icmp_unsigned("!=", builder.bitcast(builder.load(short), I8), I8(0))
+        any_short = v.any(builder.load(short))
         with builder.if_then(builder.not_(any_short), likely=True):
             for place, row in zip(places, v.rows(*ends), strict=True):
-                builder.store(row, builder.bitcast(v.row(x, place), row.type.as_pointer()), align=8)
+                builder.store(row, builder.bitcast(builder.gep(x, [place]), row.type.as_pointer()), align=8)
         return any_short
 
-    arguments = x, own, chunk, neighbour, pull, stiffness, begin, end, y, held, majorant, near
+    arguments = x, own, bundle, neighbour, kind, weights, begin, end, y, held, majorant, near
     return types.boolean(*arguments), generate
 
 

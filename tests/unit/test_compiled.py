@@ -71,6 +71,19 @@ def test_the_local_step_is_that_of_the_energy(seed, scale):
     assert (np.abs(local(springs, p, y) - wanted) <= ROUND_OFF * (np.abs(y) + pull[:, None])).all()
 
 
+def test_springs_keep_their_weights_and_equal_ones_share_them():
+    rng = np.random.default_rng(0)
+    for springs in (random_network(rng, 30, 90)[1], cloth(40).springs):
+        n = int(springs.edges.max()) + 1
+        bundles, _ = Bundles.of(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
+        pull, k = bundles.each()
+        used = bundles.neighbour != 4 * (n + 1)
+        name = np.maximum(bundles.spring, ~bundles.spring)[used]
+        np.testing.assert_array_equal(k[used], springs.stiffness[name])
+        np.testing.assert_array_equal(pull[used], springs.stiffness[name] * springs.rest_length[name])
+    assert len(bundles.weights) < 0.2 * len(pull)  # a cloth's springs are of two kinds, in a few orders
+
+
 def test_positions_that_are_not_numbers_stay_so_where_they_are_and_at_their_neighbours():
     rest = np.arange(12.0).reshape(4, 3)
     springs = Springs.at_rest(rest, np.array([[0, 1], [1, 2], [2, 3]]), np.ones(3))

@@ -129,6 +129,16 @@ def test_a_spring_at_rest_is_at_rest():
     assert springs.value(rest) <= ROUND_OFF**2 * springs.stiffness.sum()  # its square root is a length
 
 
+def test_rest_lengths_that_round_off_alone_tells_apart_are_equal():
+    x = np.linspace(0.0, 1.0, 1000)  # differences of neighbours have several last bits
+    edges = np.stack([np.arange(999), np.arange(1, 1000)], axis=1)
+    even = np.stack([x, 0 * x, 0 * x], axis=1)
+    assert len(np.unique(Springs.at_rest(even, edges, np.ones(999)).rest_length)) == 1
+    other = even.copy()
+    other[-1, 0] += 1e-14
+    assert len(np.unique(Springs.at_rest(other, edges, np.ones(999)).rest_length)) == 2
+
+
 def test_value_and_gradient_of_one_stretched_spring():
     springs, p = single(rest_length=1.0, length=1.5)
     assert springs.value(p) == 0.5 * 10 * 0.5**2
