@@ -232,7 +232,10 @@ class PreparedCompiled:
         return Solution(out, count, residual, yardstick, stopped)
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The local step over all springs, and a solve, at the first guess; within a solve blocks take turns."""
+        """The local step over all springs at the first guess, and a solve with the factor as it is, once.
+
+        Within a step neither is done alone: blocks take turns at both.
+        """
         (a, b, _, _), y, p = work = self._new()
         target, force, pins, _, guess = self._arrays(problem)
         step_ends.state(self.rows, target, force, pins, y)
@@ -243,7 +246,8 @@ class PreparedCompiled:
         def local() -> None:
             step.local(self.plan, self.bundles, edges, a, y, p, b)
 
-        return {"local": local, "global": self.base.phases(problem)["global"]}
+        right, out = self.base.system.inertia[:, None] * target + force, np.zeros_like(target)
+        return {"local": local, "global": lambda: self.base.correction(right, out)}
 
     def _arrays(self, problem: StepProblem) -> list[Positions]:
         """The problem's arrays. The kernels are compiled for arrays that may be written to: what may not is copied."""
