@@ -39,6 +39,8 @@ def read(folder: Path, files: Iterable[Path] | None = None) -> Table:
     kinds: dict[str, list[_Row]] = defaultdict(list)
     for row in pa.concat_tables(tables, promote_options="permissive").to_pylist():
         kinds[row["kind"]].append(row)
+    for rows in kinds.values():  # files come by their names, 122 before 22
+        rows.sort(key=lambda row: (row["scene"], row["size"]))
     label = _labels(kinds["curve"] + kinds["work"])
     problems = _problems(kinds)
     return Table(
