@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner
 from solvers.kernels.springs import TINY_SQUARED, Bundles, kinds, one_by_one
-from solvers.kernels.springs_vectors import F64, I64, LANES, LEAST, MOST, WIDE, Vectors, constant, unpacked
+from solvers.kernels.springs_vectors import F64, LANES, LEAST, MOST, WIDE, Vectors, constant, unpacked
 
 
 class Shares(NamedTuple):
@@ -79,14 +79,7 @@ def _bundle(typingctx, x, own, bundle, neighbour, kind, weights, part, shares, b
             for factor, term, accumulator in zip(factors, terms, sums, strict=True):
                 builder.store(v.multiply_add(factor, term, builder.load(accumulator)), accumulator)
 
-        # One entry is read while the one before is added, as in `springs_vectors`.
-        waiting = [cgutils.alloca_once_value(builder, value) for value in read(begin)]
-        with cgutils.for_range_slice(builder, builder.add(begin, I64(1)), end, I64(1), I64) as (entry, _):
-            following = read(entry)
-            add([builder.load(value) for value in waiting])
-            for value, place in zip(following, waiting, strict=True):
-                builder.store(value, place)
-        add([builder.load(value) for value in waiting])
+        v.over_entries(begin, end, read, add)
         *total, energy = [builder.load(accumulator) for accumulator in sums]
         short = v.any(builder.fcmp_ordered("<=", builder.load(shortest), constant(LEAST)))
         with builder.if_then(builder.not_(short), likely=True):

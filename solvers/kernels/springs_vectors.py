@@ -12,6 +12,7 @@ take time for.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 from llvmlite import ir
@@ -28,7 +29,7 @@ I8, MASK = ir.IntType(8), ir.VectorType(ir.IntType(1), LANES)
 BITS = ir.VectorType(I64, LANES)
 _GUESS, _ESTIMATE = 0x5FE6EB50C7B537A9, "llvm.x86.avx512.rsqrt14.pd.512"
 LEAST, MOST = TINY * TINY, 1.7e308
-"""Squared lengths are kept between these, so that no guess is infinite."""
+"""Between these, a squared length has a guess that is finite."""
 
 AHEAD = 128
 """How many rows ahead memory is asked for what is read once an iteration: of large meshes it is in no cache by then."""
@@ -89,6 +90,19 @@ class Vectors:
         b = self.builder
         begin = b.zext(b.load(b.gep(kind, [entry])), I64)
         return [self.load(b.gep(table, [b.add(begin, I64(LANES * k))]), WIDE) for k in range(many)]
+
+    def over_entries(
+        self, begin: Any, end: Any, read: Callable[[Any], list[Any]], add: Callable[[list[Any]], None]
+    ) -> None:
+        """Read one entry while the one before is added: a root waits for its springs no longer than they do."""
+        b = self.builder
+        waiting = [cgutils.alloca_once_value(b, value) for value in read(begin)]
+        with cgutils.for_range_slice(b, b.add(begin, I64(1)), end, I64(1), I64) as (entry, _):
+            following = read(entry)
+            add([b.load(value) for value in waiting])
+            for value, place in zip(following, waiting, strict=True):
+                b.store(value, place)
+        add([b.load(value) for value in waiting])
 
     def rows(self, x: Any, y: Any, z: Any) -> list[Any]:
         """Eight rows of x, y, z and zero."""
@@ -238,15 +252,7 @@ def _over_bundle(kind: Kind):
                 for term, accumulator in zip(arrow, sums, strict=False):
                     builder.store(v.multiply_add(scale, term, builder.load(accumulator)), accumulator)
 
-            # One entry is read while the one before is added: a root waits for its springs no longer than they do.
-            waiting = [cgutils.alloca_once_value(builder, value) for value in read(begin)]
-            second = builder.add(begin, I64(1))
-            with cgutils.for_range_slice(builder, second, end, I64(1), I64) as (entry, _):
-                following = read(entry)
-                add([builder.load(value) for value in waiting])
-                for value, place in zip(following, waiting, strict=True):
-                    builder.store(value, place)
-            add([builder.load(value) for value in waiting])
+            v.over_entries(begin, end, read, add)
             total = [builder.load(accumulator) for accumulator in sums]
             places = v.places(own, bundle)  # again: they would not stay in registers
             held = [builder.load(v.at(held, place)) for place in places]

@@ -108,11 +108,7 @@ def solved(solver: str, scored: Scored, iterations: int) -> Work:
 
 
 def step_gates(
-    name: str,
-    step: Callable[[], Scored],
-    error: float,
-    iterations: int | None = None,
-    **limits: float,
+    name: str, step: Callable[[], Scored], error: float, iterations: int | None = None, **limits: float
 ) -> Iterator[Gate]:
     """The hybrid up to an error, beside local-global: `iterations` of it, or up to the same error.
 
