@@ -24,9 +24,9 @@ from solvers.kernels import accelerate, accelerate_step, step_ends
 from solvers.kernels.accelerate import Window
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.edges import Edges
-from solvers.kernels.springs import aligned
 from solvers.linear.choice import Linear, Precision, factorise
 from solvers.local_global import PreparedLocalGlobal, prepared, projective
+from solvers.memory import aligned
 from solvers.objective import Objective, StepObjective
 from solvers.parts import Parts
 from solvers.problem import Positions, ProjectiveEnergy, Solution, StepProblem, StopRule, System

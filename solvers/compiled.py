@@ -27,6 +27,7 @@ from solvers.linear.inverse import Inverse
 from solvers.linear.supernodal import Supernodal
 from solvers.linear.team import Team
 from solvers.local_global import PreparedLocalGlobal, Project, prepared, projective
+from solvers.memory import aligned
 from solvers.parts import Parts, split
 from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System
 from solvers.touching import without_contact
@@ -149,8 +150,9 @@ class PreparedCompiled:
                 order.chunks,
                 order.top,
                 np.ascontiguousarray(np.column_stack([order.spans[:, :2], first[:-1], first[1:], order.spans[:, 2:]])),
-                order.leaf,
                 order.of_group,
+                order.visits,
+                order.visits_of,
                 held,
                 measure,
                 loose,
@@ -266,10 +268,10 @@ class PreparedCompiled:
     def _new(self) -> _Work:
         rows, dtype = len(self.plan.held), self.plan.squares.dtype
         arrays = vectors(dtype, rows)
-        p = None if dtype == np.float64 else kernels.aligned(4 * rows)
+        p = None if dtype == np.float64 else aligned(4 * rows)
         for x in arrays[:3] if p is None else [p]:
             x[4 * self.far] = FAR
-        return _Work(arrays, kernels.aligned(4 * rows), p)
+        return _Work(arrays, aligned(4 * rows), p)
 
     def _threads(self) -> int | None:
         """As many as are allowed and as there are groups of subtrees; None for one."""
@@ -280,7 +282,7 @@ class PreparedCompiled:
 def _projection(springs: Springs, n: int) -> Project:
     """The compiled local step for a linear solver that is called from Python."""
     bundles, _ = kernels.Bundles.of(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
-    x, b, zero = (kernels.aligned(4 * (n + 2)) for _ in range(3))
+    x, b, zero = (aligned(4 * (n + 2)) for _ in range(3))
     x[4 * (n + 1)] = FAR
 
     def project(p: Positions, y: Positions, out: Positions) -> None:

@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 from solvers import blocks
 from solvers.energies.springs import Springs
 from solvers.kernels.explicit import advance
-from solvers.kernels.springs import Bundles, aligned
+from solvers.kernels.springs import Bundles
 from solvers.local_global import only_springs
+from solvers.memory import aligned
 from solvers.problem import Positions, Solution, StepProblem, StopRule, System, Unsupported
 
 _SAFETY = 0.95

@@ -30,9 +30,10 @@ from solvers.compiled import CompiledLocalGlobal
 from solvers.kernels import vbd as kernels
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.half_spaces import HalfSpaces
-from solvers.kernels.springs import Bundles, aligned
+from solvers.kernels.springs import Bundles
 from solvers.kernels.springs_vectors import LANES
 from solvers.kernels.vbd_vectors import NUMBERS
+from solvers.memory import aligned
 from solvers.parts import Parts, split
 from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System, Unsupported
 from solvers.touching import ContactEnergy, touching, without_contact

@@ -19,8 +19,9 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from solvers.compiling import inner
+from solvers.intrinsics import unpacked
 from solvers.kernels.springs import TINY_SQUARED, Bundles, kinds, one_by_one
-from solvers.kernels.springs_vectors import F64, LANES, LEAST, MOST, WIDE, Vectors, constant, unpacked
+from solvers.kernels.springs_vectors import F64, LANES, LEAST, MOST, WIDE, Vectors, constant
 
 
 class Shares(NamedTuple):

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.kernels.springs import aligned
 from solvers.linear.inverse import Inverse
 from solvers.linear.supernodal import Supernodal
 from solvers.linear.supernodes import LANES, WIDTH
+from solvers.memory import aligned
 
-BLOCK_BYTES = 1 << 20
-"""Of the panels of a block: a core's second cache. From there to 16 MiB all are alike; half of it costs up to 5 %."""
+BLOCK_BYTES = 2 << 20
+"""Of the panels of a block. Up to 8 MiB all are alike; a half of it costs up to 3 %, a quarter 8 %."""
+
+DOWN, UP = 0, 1
+"""What a visit adds to twice a block's number."""
 
 
 class Order(NamedTuple):
     """A factor, cut into blocks.
 
-    squares, panels, places, chunks, top, leaf, of_group, shift: see `solvers.kernels.step.Plan`; spans (b, 5): the
-    columns of its `blocks` without the bundles; slot (n,): the row of each unknown; rows: of a vector.
+    squares, panels, places, chunks, top, of_group, visits, visits_of, shift: see `solvers.kernels.step.Plan`; spans
+    (b, 5): the columns of its `blocks` without the bundles; slot (n,): the row of each unknown; rows: of a vector.
     """
 
     squares: NDArray[Any]
@@ -29,8 +33,9 @@ class Order(NamedTuple):
     chunks: NDArray[np.int64]
     top: NDArray[np.int64]
     spans: NDArray[np.int64]
-    leaf: NDArray[np.bool_]
     of_group: NDArray[np.int64]
+    visits: NDArray[np.int64]
+    visits_of: NDArray[np.int64]
     slot: NDArray[np.int64]
     rows: int
     shift: int
@@ -41,18 +46,22 @@ def of_supernodal(factor: Supernodal) -> Order:
     squares, panels, at = factor.squares, factor.panels, factor.layout
     places, chunks, spans = at.places, at.chunks, at.spans
     top, top_end = spans[-1, -2:].tolist()
-    subtree, begin = _subtrees(chunks, places, top, squares.itemsize, panels.itemsize)
-    blocks: list[tuple[int, int, bool]] = []
-    of_group = [0]
+    subtree, begin, children = _subtrees(chunks, places, top, squares.itemsize, panels.itemsize)
+    blocks: list[tuple[int, int]] = []
+    visits: list[int] = []
+    of_group, visits_of = [0], [0]
     for first, last in spans[:-1, :2].tolist():
-        blocks += _cut(first, last, subtree, begin)
+        cut = _cut(first, last, subtree, begin, children)
+        visits += _visits(cut, begin, len(blocks))
+        blocks += cut
         of_group.append(len(blocks))
+        visits_of.append(len(visits))
     first, last = spans[-1, :2].tolist()
     if last > first:
-        blocks.append((first, last, False))
+        blocks.append((first, last))
     of_group.append(len(blocks))
     slots = np.append(chunks[:, 6], top_end)
-    table = [(slots[first], slots[last], first, last, last) for first, last, _ in blocks]
+    table = [(slots[first], slots[last], first, last, last) for first, last in blocks]
     slot = np.empty(len(at.by_slot), np.int64)
     slot[at.by_slot[:, 0]] = at.by_slot[:, 1]
     return Order(
@@ -62,8 +71,9 @@ def of_supernodal(factor: Supernodal) -> Order:
         chunks,
         np.array([top, top_end, len(spans) - 1]),
         np.array(table, np.int64).reshape(-1, 5),
-        np.array([leaf for _, _, leaf in blocks], bool),
         np.array(of_group),
+        np.array(visits, np.int64),
+        np.array(visits_of),
         slot,
         at.rows,
         0,
@@ -76,7 +86,8 @@ def of_inverse(factor: Inverse) -> Order:
     n = len(inverse)
     first = np.arange(0, n, WIDTH)
     quads = np.minimum(WIDTH, n - first) // LANES
-    panels = [inverse[:, i : i + WIDTH].ravel() for i in first]
+    tiles = inverse.reshape(-1, LANES, n).swapaxes(1, 2)
+    panels = [tiles[:, i : i + WIDTH].ravel() for i in first]
     zero = np.zeros(len(first), np.int64)
     return Order(
         np.zeros(1, inverse.dtype),
@@ -85,8 +96,9 @@ def of_inverse(factor: Inverse) -> Order:
         np.stack([zero, n * first, zero, zero, zero + n, quads, first], axis=1),
         np.array([2 * n, 2 * n, 1]),
         np.array([[0, n, 0, 0, len(first)]]),
-        np.array([True]),
         np.array([0, 1, 1]),
+        np.array([DOWN, UP]),
+        np.array([0, 2]),
         np.arange(n),
         2 * n,
         n,
@@ -100,38 +112,54 @@ def vectors(dtype: Any, rows: int) -> tuple[NDArray[Any], ...]:
 
 def _subtrees(
     chunks: NDArray[np.int64], places: NDArray[np.int32], top: int, square: int, panel: int
-) -> tuple[list[int], list[int]]:
-    """The bytes of each chunk's subtree and its first chunk; subtrees end at the top."""
-    _, _, at, own, below, quads, slot = chunks.T
+) -> tuple[list[int], list[int], list[int]]:
+    """The bytes of each chunk's subtree, its first chunk, and how many children it has; subtrees end at the top."""
+    _, _, at, _, below, quads, slot = chunks.T
     above = places[np.minimum(at, len(places) - 1)] if len(places) else np.zeros(len(chunks), np.int64)
     inside = (below > 0) & (above < top)
     parent = np.where(inside, np.searchsorted(slot, above, side="right") - 1, -1).tolist()
-    size = ((square * own + panel * below) * quads * LANES).tolist()
+    size = ((square * LANES * quads + panel * below) * quads * LANES).tolist()
     first = list(range(len(chunks)))
+    children = [0] * len(chunks)
     for chunk, above in enumerate(parent):
         if above >= 0:
             size[above] += size[chunk]
             first[above] = min(first[above], first[chunk])
-    return size, first
+            children[above] += 1
+    return size, first, children
 
 
-def _cut(begin: int, end: int, size: list[int], first: list[int]) -> list[tuple[int, int, bool]]:
-    """The chunks from `begin` to `end` as blocks, each the chunks it spans and whether they are whole subtrees.
+def _cut(begin: int, end: int, size: list[int], first: list[int], children: list[int]) -> list[tuple[int, int]]:
+    """The chunks from `begin` to `end` as blocks, each the chunks it spans: whole subtrees, or a path above some.
 
     Chunks are in a postorder, so that a subtree is a stretch of them; neighbours join where they still fit.
     """
-    blocks: list[tuple[int, int, bool]] = []
-    filled = 0
+    blocks: list[tuple[int, int]] = []
+    filled, whole = 0, False
     last = end
     while last > begin:
         chunk = last - 1
         leaf = size[chunk] <= BLOCK_BYTES
         start = first[chunk] if leaf else chunk
-        if blocks and blocks[-1][2] == leaf and (not leaf or filled + size[chunk] <= BLOCK_BYTES):
-            blocks[-1] = (start, blocks[-1][1], leaf)
+        joins = filled + size[chunk] <= BLOCK_BYTES if leaf else last < end and children[last] == 1
+        if blocks and whole == leaf and joins:
+            blocks[-1] = (start, blocks[-1][1])
             filled += size[chunk]
         else:
-            blocks.append((start, last, leaf))
+            blocks.append((start, last))
             filled = size[chunk]
-        last = start
+        last, whole = start, leaf
     return blocks[::-1]
+
+
+def _visits(blocks: list[tuple[int, int]], first: list[int], number: int) -> list[int]:
+    """The blocks of a group, the first of them with this number, in the order of both passes: down to each after those
+    above it, and up from each in the order in which they lie, after all below it."""
+    begins = [begin for begin, _ in blocks]
+    below: list[list[int]] = [[] for _ in blocks]  # by the first block of their subtrees
+    for k, (begin, end) in enumerate(blocks):
+        below[bisect_right(begins, min(begin, first[end - 1])) - 1].append(k)
+    out: list[int] = []
+    for k, downs in enumerate(below):
+        out += [2 * (number + d) + DOWN for d in reversed(downs)] + [2 * (number + k) + UP]
+    return out

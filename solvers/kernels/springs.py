@@ -18,6 +18,7 @@ from solvers.compiling import inner, kernel
 from solvers.energies.springs import TINY, Springs
 from solvers.kernels import springs_vectors as vectors
 from solvers.kernels.springs_vectors import LANES
+from solvers.memory import aligned
 
 TINY_SQUARED = TINY * TINY
 WINDOW = 128
@@ -25,7 +26,7 @@ WINDOW = 128
 
 
 class Bundles(NamedTuple):
-    """Springs by their ends: bundles of eight vertices (b of them), and of each as many entries as one has springs.
+    """Springs by their ends: bundles of eight vertices (b of them), of each as many entries as one has springs, or two.
 
     own (8 b,): the place of each vertex, four times its row; start (b + 1,): the first entry of each bundle; of each
     entry eight times the place of the other end (neighbour) and the spring, ~spring at its second end, and once where
@@ -67,7 +68,7 @@ class Bundles(NamedTuple):
 
         at = np.zeros(len(own), np.int64)
         at[place[vertices]] = degree[vertices]
-        start = np.concatenate([[0], np.cumsum(at.reshape(-1, LANES).max(axis=1, initial=1))])
+        start = np.concatenate([[0], np.cumsum(at.reshape(-1, LANES).max(axis=1, initial=2))])
         here, there = ends.T.ravel(), ends[:, ::-1].T.ravel()
         spring = np.concatenate([keep, ~keep])
         k = springs.stiffness[np.maximum(spring, ~spring)]
@@ -109,14 +110,6 @@ def kinds(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.
     kept = aligned(rows[first].size)
     kept[:] = rows[first].ravel()
     return (rows.shape[1] * kind).astype(np.int32), kept
-
-
-def aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
-    """Zeros that begin at a cache line, so that no row of four numbers lies in two."""
-    bytes_ = np.dtype(dtype).itemsize * size
-    raw = np.zeros(bytes_ + 64, np.uint8)
-    begin = -raw.ctypes.data % 64
-    return raw[begin : begin + bytes_].view(dtype)
 
 
 @inner

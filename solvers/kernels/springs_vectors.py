@@ -21,6 +21,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from solvers.energies.springs import TINY
+from solvers.intrinsics import ask, unpacked
 
 LANES = 8
 I32, I64, F64 = ir.IntType(32), ir.IntType(64), ir.DoubleType()
@@ -92,17 +93,30 @@ class Vectors:
         return [self.load(b.gep(table, [b.add(begin, I64(LANES * k))]), WIDE) for k in range(many)]
 
     def over_entries(
-        self, begin: Any, end: Any, read: Callable[[Any], list[Any]], add: Callable[[list[Any]], None]
+        self, begin: Any, end: Any, read: Callable[[Any], list[Any]], *stages: Callable[[list[Any]], Any]
     ) -> None:
-        """Read one entry while the one before is added: a root waits for its springs no longer than they do."""
-        b = self.builder
-        waiting = [cgutils.alloca_once_value(b, value) for value in read(begin)]
-        with cgutils.for_range_slice(b, b.add(begin, I64(1)), end, I64(1), I64) as (entry, _):
-            following = read(entry)
-            add([b.load(value) for value in waiting])
-            for value, place in zip(following, waiting, strict=True):
+        """Read one entry while each stage is at one of those before it: none waits long for what it needs. There are
+        as many entries as stages at least."""
+        b, depth = self.builder, len(stages)
+        waiting: list[list[Any]] = []  # for each stage, the last one first
+        for k in range(depth):
+            values = read(b.add(begin, I64(k)))
+            for stage in stages[: depth - 1 - k]:
+                values = stage(values)
+            waiting.append([cgutils.alloca_once(b, value.type) for value in values])
+            for value, place in zip(values, waiting[-1], strict=True):
                 b.store(value, place)
-        add([b.load(value) for value in waiting])
+        with cgutils.for_range_slice(b, b.add(begin, I64(depth)), end, I64(1), I64) as (entry, _):
+            fresh = read(entry)
+            for stage, places in zip(stages, reversed(waiting), strict=True):
+                values = [b.load(place) for place in places]
+                for value, place in zip(fresh, places, strict=True):
+                    b.store(value, place)
+                fresh = stage(values)
+        for k, places in enumerate(waiting):
+            values = [b.load(place) for place in places]
+            for stage in stages[depth - 1 - k :]:
+                values = stage(values)
 
     def rows(self, x: Any, y: Any, z: Any) -> list[Any]:
         """Eight rows of x, y, z and zero."""
@@ -162,57 +176,51 @@ class Vectors:
         """The lesser of two vectors' numbers, or the greater with the order ">="; a, where that is not a number."""
         return self.builder.select(self.builder.fcmp_ordered(order, b, a), b, a)
 
-    def ask(self, pointer: Any) -> None:
-        """Ask memory for what is at a pointer."""
-        kinds = [I8.as_pointer(), I32, I32, I32]
-        name = self.builder.module.declare_intrinsic("llvm.prefetch.p0", fnty=ir.FunctionType(ir.VoidType(), kinds))
-        byte = self.builder.bitcast(pointer, I8.as_pointer())
-        self.builder.call(name, [byte, I32(0), I32(3), I32(1)])
-
     def ask_ahead(self, places: list[Any], entry: Any, rows: list[Any], numbers: Any, neighbour: Any) -> None:
         """Ask for what a bundle reads AHEAD rows on, of arrays of rows, of numbers and of the entries' other ends."""
         b = self.builder
         ahead = [b.add(place, I64(4 * AHEAD)) for place in places]
         for array in rows:
             for place in ahead[::2]:
-                self.ask(b.gep(array, [place]))
-        self.ask(self.at(numbers, ahead[0]))
+                ask(b, b.gep(array, [place]))
+        ask(b, self.at(numbers, ahead[0]))
         first = b.mul(b.add(entry, I64(AHEAD)), I64(LANES))  # about as many entries as rows
         for k in range(LANES // 2):
-            self.ask(b.gep(neighbour, [b.add(first, I64(2 * LANES * k))]))
+            ask(b, b.gep(neighbour, [b.add(first, I64(2 * LANES * k))]))
 
     def any(self, mask: Any) -> Any:
         """Whether one of eight is true."""
         return self.builder.icmp_unsigned("!=", self.builder.bitcast(mask, I8), I8(0))
 
-    def inverse_root(self, s: Any) -> Any:
-        """1/sqrt(s), for s between LEAST and MOST."""
+    def guess(self, s: Any) -> tuple[Any, Any]:
+        """y, nearly 1/sqrt(s), and 1 - s y^2, for s between LEAST and MOST; `correction` does the rest."""
         b = self.builder
         if self.estimates:
             kind = ir.FunctionType(WIDE, [WIDE, WIDE, I8])
             estimate = b.module.globals.get(_ESTIMATE) or ir.Function(b.module, kind, _ESTIMATE)
-            y, steps = b.call(estimate, [s, constant(0.0), I8(-1)]), ([5 / 16, 3 / 8, 1 / 2],)
+            y = b.call(estimate, [s, constant(0.0), I8(-1)])
         else:
             half = b.lshr(b.bitcast(s, BITS), ir.Constant(BITS, [1] * LANES))
             y = b.bitcast(b.sub(ir.Constant(BITS, [_GUESS] * LANES), half), WIDE)
-            steps = [35 / 128, 5 / 16, 3 / 8, 1 / 2], [3 / 8, 1 / 2]
-        for coefficients in steps:
             e = self.subtract_product(constant(1.0), b.fmul(s, y), y)
-            series = constant(coefficients[0])
-            for c in coefficients[1:]:
-                series = self.multiply_add(series, e, constant(c))
-            y = self.multiply_add(b.fmul(y, e), series, y)
-        return y
+            y = self.multiply_add(b.fmul(y, e), self.series(e, 35 / 128, 5 / 16, 3 / 8, 1 / 2), y)
+        return y, self.subtract_product(constant(1.0), b.fmul(s, y), y)
 
+    def correction(self, e: Any) -> Any:
+        """((1 - e)^(-1/2) - 1)/e, as far as a guess needs it."""
+        return self.series(e, *(5 / 16, 3 / 8, 1 / 2) if self.estimates else (3 / 8, 1 / 2))
 
-def unpacked(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
-    """A kernel's arguments: of arrays where they begin, of numbers int64."""
-    return [
-        context.make_array(argument)(context, builder, value).data
-        if isinstance(argument, types.Array)
-        else context.cast(builder, value, argument, types.int64)
-        for argument, value in zip(signature.args, args, strict=True)
-    ]
+    def series(self, e: Any, *coefficients: float) -> Any:
+        """The polynomial in e with these coefficients, the highest power's first."""
+        first, *others = map(constant, coefficients)
+        for c in others:
+            first = self.multiply_add(first, e, c)
+        return first
+
+    def inverse_root(self, s: Any) -> Any:
+        """1/sqrt(s), for s between LEAST and MOST."""
+        y, e = self.guess(s)
+        return self.multiply_add(self.builder.fmul(y, e), self.correction(e), y)
 
 
 def _over_bundle(kind: Kind):
@@ -239,20 +247,28 @@ def _over_bundle(kind: Kind):
                 arrow = [builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
                 return [*v.eights(weights, kinds, entry), v.dot(arrow), *arrow]
 
+            def scale(values):
+                """What the vectors are multiplied by, as a guess and what is to be added to it."""
+                pull, stiffness, squared, *arrow = values
+                builder.store(v.least(builder.load(shortest), squared), shortest)
+                y, e = v.guess(squared)
+                guess = builder.fmul(pull, y)
+                short = builder.fmul(guess, e)
+                if kind == "correct":
+                    guess = builder.fsub(guess, stiffness)
+                return [guess, short, e, *arrow]
+
             def add(values):
                 """Add an entry's springs to the sums."""
-                pull, stiffness, squared, *arrow = values
                 if kind == "energy":
-                    scale, arrow = stiffness, [squared]
+                    _, factor, *terms = values[:3]
                 else:
-                    builder.store(v.least(builder.load(shortest), squared), shortest)
-                    scale = builder.fmul(pull, v.inverse_root(squared))
-                if kind == "correct":
-                    scale = builder.fsub(scale, stiffness)
-                for term, accumulator in zip(arrow, sums, strict=False):
-                    builder.store(v.multiply_add(scale, term, builder.load(accumulator)), accumulator)
+                    guess, short, e, *terms = values
+                    factor = v.multiply_add(short, v.correction(e), guess)
+                for term, accumulator in zip(terms, sums, strict=False):
+                    builder.store(v.multiply_add(factor, term, builder.load(accumulator)), accumulator)
 
-            v.over_entries(begin, end, read, add)
+            v.over_entries(begin, end, read, *([add] if kind == "energy" else [scale, add]))
             total = [builder.load(accumulator) for accumulator in sums]
             places = v.places(own, bundle)  # again: they would not stay in registers
             held = [builder.load(v.at(held, place)) for place in places]

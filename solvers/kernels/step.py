@@ -7,9 +7,9 @@ An iteration turns positions p^k into p^(k+1):
     down    parents first: the pass backwards
 
 Vertices of a subtree have springs among themselves and to their ancestors only. So once a pass backwards has left a
-subtree, all that its next local step reads is known: going down a block of subtrees, the next iteration goes up
-the same block while its panels are in the cache, and reads them from memory once. The order of all sums is the same
-with and without that, and whatever the number of threads. These are started once a step, not once an iteration: a
+subtree, all that its next local step reads is known. A group is therefore gone through subtree by subtree: down to it
+in one iteration and, once that is done with all below it, up from it in the next, while its panels are in a cache. The
+order of all sums is the same whatever the number of threads. These are started once a step, not once an iteration: a
 thread that sleeps takes longer to wake than an iteration takes.
 
 A vector has rows of four numbers, `Supernodal`'s slots and behind them the groups' copies of the top, the vertices that
@@ -37,8 +37,8 @@ class Plan(NamedTuple):
 
     squares, panels, places, chunks: a factor's (see `solvers.linear.supernodal`); top (3,): the first and last of the
     top's rows, and the number of groups; blocks (b, 7): of each its first and last slot and bundle, its first chunk,
-    and the last for the passes forwards and backwards; leaf (b,): whether it holds whole subtrees, whose vertices have
-    springs to each other and to ancestors alone; of_group (groups + 2,): the first block of each group and of the top;
+    and the last for the passes forwards and backwards; of_group (groups + 2,): the first block of each group and of the
+    top; visits: twice the block that a group goes down to, or up from (one more), from visits_of (groups + 1,) on;
     held: m/dt^2 + w [N/m] of each row, and what quadratic forms hold it with; measure: as held without pins, and half
     of the springs to exactly pinned vertices, which no bundle counts from there; loose: 1 for the rows of vertices that
     no pin holds, else 0; shift: by how many rows a vertex's right-hand side lies behind its position.
@@ -50,8 +50,9 @@ class Plan(NamedTuple):
     chunks: NDArray[np.int64]
     top: NDArray[np.int64]
     blocks: NDArray[np.int64]
-    leaf: NDArray[np.bool_]
     of_group: NDArray[np.int64]
+    visits: NDArray[np.int64]
+    visits_of: NDArray[np.int64]
     held: NDArray[np.float64]
     measure: NDArray[np.float64]
     loose: NDArray[np.float64]
@@ -107,8 +108,7 @@ def _clear(plan, block, out):
 
 @inner
 def _group(plan, bundles, edges, group, x, y, p, out, down, up):
-    """A group: down with the vector x, and up again with `out`, block by block."""
-    begin, end = plan.of_group[group], plan.of_group[group + 1]
+    """A group: down with the vector x, and up again with `out`, in the order of its visits."""
     top = 4 * plan.top[0]
     size = 4 * plan.top[1] - top
     copy = top + (group + 1) * size
@@ -116,18 +116,14 @@ def _group(plan, bundles, edges, group, x, y, p, out, down, up):
         _copy(x[top : top + size], x[copy : copy + size])
     if up:
         _zero(out[copy : copy + size])
-        for block in range(begin, end):
-            if not plan.leaf[block]:
+    for visit in plan.visits[plan.visits_of[group] : plan.visits_of[group + 1]]:
+        block = visit >> 1
+        if visit & 1 == 0:
+            if down:
+                _down(plan, block, x, p)
+            if up:
                 _clear(plan, block, out)
-    # First from the last block to the first, then from the first to the last.
-    for visit in range(2 * (end - begin)):
-        back = begin + visit < end
-        block = end - 1 - visit if back else 2 * begin - end + visit
-        if back and down:
-            _down(plan, block, x, p)
-        if up and plan.leaf[block] == back:
-            if back:
-                _clear(plan, block, out)
+        elif up:
             _up(plan, bundles, edges, block, x, y, p, out)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
+from solvers.intrinsics import ask_for
 from solvers.kernels.step import iterate
 
 
@@ -28,10 +29,20 @@ class Rows(NamedTuple):
     pin: NDArray[np.int64]
 
 
+_AHEAD = 64
+"""How many vertices ahead memory is asked for their rows, which lie in another order."""
+
+
+@inner
+def _ask_ahead(rows, v, x):
+    ask_for(x, 4 * rows.row[min(v + _AHEAD, len(rows.row) - 1)])
+
+
 @kernel
 def state(rows, target, force, pin_targets, y):
     """y = M target/dt^2 + f + w C'C p_pin, with the exact pins' columns of Q moved to the right-hand side."""
     for v in range(len(target)):
+        _ask_ahead(rows, v, y)
         for c in range(3):
             y[4 * rows.row[v] + c] = rows.inertia[v] * target[v, c] + force[v, c]
     for q in range(len(rows.pinned)):
@@ -56,11 +67,13 @@ def pin(rows, pin_targets, x):
 def place(rows, positions, pin_targets, x):
     """Positions to the rows of x, exactly pinned vertices on their targets; returns the largest coordinate."""
     for v in range(len(positions)):
+        _ask_ahead(rows, v, x)
         for c in range(3):
             x[4 * rows.row[v] + c] = positions[v, c]
     pin(rows, pin_targets, x)
     largest = 0.0
     for v in range(len(positions)):
+        _ask_ahead(rows, v, x)
         for c in range(3):
             largest = max(largest, abs(x[4 * rows.row[v] + c]))
     return largest
@@ -70,6 +83,7 @@ def place(rows, positions, pin_targets, x):
 def fetch(rows, x, out):
     """The rows of x back to positions (n, 3)."""
     for v in range(len(out)):
+        _ask_ahead(rows, v, x)
         for c in range(3):
             out[v, c] = x[4 * rows.row[v] + c]
 

@@ -9,7 +9,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from solvers.kernels.springs_vectors import I64, LANES, LEAST, MASK, WIDE, Vectors, constant, unpacked
+from solvers.intrinsics import unpacked
+from solvers.kernels.springs_vectors import I64, LANES, LEAST, MASK, WIDE, Vectors, constant
 
 NUMBERS = 4
 """What is kept of each spring between the two passes: its vector and its length."""

@@ -11,8 +11,9 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.errors import TypingError
 from numba.extending import intrinsic
+
+from solvers.intrinsics import signature, unpacked
 
 ROWS, TILE = 8, 6
 """Of a tile, rows and columns (two vertices): its sums and a factor fit the registers of AVX2, two tiles' AVX-512's."""
@@ -80,34 +81,14 @@ def _minus_product(builder: Any, c: Any, a: Any, b: Any) -> Any:
     return builder.fsub(c, builder.fmul(a, b, flags=("contract",)), flags=("contract",))
 
 
-def _arguments(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
-    """The arrays' data pointers, the integers as int64, and a literal as Python's int."""
-    out: list[Any] = []
-    for kind, value in zip(signature.args, args, strict=True):
-        if isinstance(kind, types.Array):
-            out.append(context.make_array(kind)(context, builder, value).data)
-        elif isinstance(kind, types.IntegerLiteral):
-            out.append(kind.literal_value)
-        else:
-            out.append(context.cast(builder, value, kind, types.int64))
-    return out
-
-
-def _signature(*kinds: Any) -> Any:
-    """Nothing returned; the last argument, the count of columns, is compiled in."""
-    if not isinstance(kinds[-1], types.IntegerLiteral):
-        raise TypingError("the count of columns must be a literal")
-    return types.void(*(types.unliteral(kind) for kind in kinds[:-1]), kinds[-1])
-
-
 def _subtract_product(typingctx: Any, L: Any, at: Any, top: Any, stride: Any, depth: Any, C: Any, to: Any, step: Any,
                       strips: Any, columns: Any) -> Any:  # fmt: skip
     """C[to + r + step j] -= sum over k < depth of L[at + r + stride k] L[top + j + stride k] for j < columns, and r in
     as many strips of eight."""
-    signature = _signature(L, at, top, stride, depth, C, to, step, strips, columns)
+    declared = signature(L, at, top, stride, depth, C, to, step, strips, columns)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        L, at, top, stride, depth, C, to, step, strips, columns = _arguments(context, builder, signature, args)
+        L, at, top, stride, depth, C, to, step, strips, columns = unpacked(context, builder, signature, args)
         left, above = builder.gep(L, [at]), builder.gep(L, [top])
 
         def tile(row: Any, vectors: int) -> None:
@@ -140,16 +121,16 @@ def _subtract_product(typingctx: Any, L: Any, at: Any, top: Any, stride: Any, de
             tile(builder.mul(strip, _I64(ROWS)), 1)
         return context.get_dummy_value()
 
-    return signature, generate
+    return declared, generate
 
 
 def _divide(typingctx: Any, L: Any, at: Any, stride: Any, triangle: Any, strips: Any, columns: Any) -> Any:
     """The rows X of a tile, in as many strips of eight from `at` on, become X T^-T; triangle (TILE, TILE): T, its
     diagonal inverted."""
-    signature = _signature(L, at, stride, triangle, strips, columns)
+    declared = signature(L, at, stride, triangle, strips, columns)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        L, at, stride, triangle, strips, columns = _arguments(context, builder, signature, args)
+        L, at, stride, triangle, strips, columns = unpacked(context, builder, signature, args)
         T = {
             (j, k): _spread(builder, builder.gep(triangle, [_I64(TILE * j + k)]))
             for j in range(columns) for k in range(j + 1)
@@ -167,16 +148,16 @@ def _divide(typingctx: Any, L: Any, at: Any, stride: Any, triangle: Any, strips:
                 done.append(x)
         return context.get_dummy_value()
 
-    return signature, generate
+    return declared, generate
 
 
 def _factorise_corner(typingctx: Any, L: Any, at: Any, stride: Any, least: Any, triangle: Any, columns: Any) -> Any:
     """Write the Cholesky factor of a tile's corner, at `at`, to triangle (TILE, TILE), its diagonal inverted; returns
     whether each pivot is above its entry of `least` (TILE,)."""
-    signature = types.boolean(*_signature(L, at, stride, least, triangle, columns).args)
+    declared = types.boolean(*signature(L, at, stride, least, triangle, columns).args)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        L, at, stride, least, triangle, columns = _arguments(context, builder, signature, args)
+        L, at, stride, least, triangle, columns = unpacked(context, builder, signature, args)
         root = builder.module.declare_intrinsic("llvm.sqrt", [_F64])
         t: dict[tuple[int, int], Any] = {}
         positive: Any = ir.Constant(ir.IntType(1), 1)
@@ -195,16 +176,16 @@ def _factorise_corner(typingctx: Any, L: Any, at: Any, stride: Any, least: Any, 
                 builder.store(t[i, j], builder.gep(triangle, [_I64(TILE * i + j)]))
         return positive
 
-    return signature, generate
+    return declared, generate
 
 
 def _solve_columns(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any, strips: Any, columns: Any) -> Any:
     """A tile's pass forwards: x[to + j] for j < columns, by its corner at `at`; what is below, in as many strips of
     eight, less by what that brings."""
-    signature = _signature(L, at, stride, x, to, strips, columns)
+    declared = signature(L, at, stride, x, to, strips, columns)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        L, at, stride, x, to, strips, columns = _arguments(context, builder, signature, args)
+        L, at, stride, x, to, strips, columns = unpacked(context, builder, signature, args)
         starts = [builder.gep(L, [builder.add(at, builder.mul(stride, _I64(j)))]) for j in range(columns)]
         x = builder.gep(x, [to])
         y: list[Any] = []
@@ -225,16 +206,16 @@ def _solve_columns(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any
             _store(builder, total, target)
         return context.get_dummy_value()
 
-    return signature, generate
+    return declared, generate
 
 
 def _solve_rows(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any, strips: Any, columns: Any) -> Any:
     """A tile's pass backwards: x[to + j] for j < columns, less by what as many strips of eight below bring, by its
     corner at `at`."""
-    signature = _signature(L, at, stride, x, to, strips, columns)
+    declared = signature(L, at, stride, x, to, strips, columns)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        L, at, stride, x, to, strips, columns = _arguments(context, builder, signature, args)
+        L, at, stride, x, to, strips, columns = unpacked(context, builder, signature, args)
         starts = [builder.gep(L, [builder.add(at, builder.mul(stride, _I64(j)))]) for j in range(columns)]
         ahead = builder.mul(stride, _I64(-TILE))
         x = builder.gep(x, [to])
@@ -258,15 +239,15 @@ def _solve_rows(typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any, s
             builder.store(y[j], builder.gep(x, [_I64(j)]))
         return context.get_dummy_value()
 
-    return signature, generate
+    return declared, generate
 
 
 def _add(typingctx: Any, source: Any, at: Any, target: Any, to: Any, count: Any) -> Any:
     """target[to + r] += source[at + r] for r < count; the lanes behind are neither read nor written."""
-    signature = types.void(source, at, target, to, count)
+    declared = types.void(source, at, target, to, count)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        source, at, target, to, count = _arguments(context, builder, signature, args)
+        source, at, target, to, count = unpacked(context, builder, signature, args)
         source, target = builder.gep(source, [at]), builder.gep(target, [to])
         lanes = ir.Constant(ir.VectorType(_I64, ROWS), list(range(ROWS)))
         strips = builder.udiv(builder.add(count, _I64(ROWS - 1)), _I64(ROWS))
@@ -279,7 +260,7 @@ def _add(typingctx: Any, source: Any, at: Any, target: Any, to: Any, count: Any)
             _masked(builder, place, mask, total)
         return context.get_dummy_value()
 
-    return signature, generate
+    return declared, generate
 
 
 # Numba passes the first argument itself, which type checkers do not know.

@@ -12,7 +12,7 @@ part of a vertex's force each neighbour takes on.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numba
 import numpy as np
@@ -25,9 +25,13 @@ from solvers.linear.supernodal_solve import solve
 from solvers.linear.supernodes import LANES, WIDTH
 from solvers.linear.symbolic import Symbolic, analyse
 from solvers.linear.team import Team
+from solvers.memory import aligned
 from solvers.problem import NotPositiveDefinite, Positions
 
 Precision = Literal["float64", "float32", "float16"]
+
+_SPARE = LANES - 1
+"""Names that a supernode's list of rows has behind the last one, copies of that: for rows of zeros that fill a tile."""
 
 _WORTH_THREADS = 4e6
 """Bytes of panels from which a single solve gains by waking a second thread (a sheet of 110 vertices a side)."""
@@ -37,10 +41,11 @@ class Layout(NamedTuple):
     """Where the panels of a factor lie. A supernode is cut into chunks of at most WIDTH columns, a panel each.
 
     chunks (c, 7): of each the offsets of its S, of its W and of the slots of its rows in `places`, its columns
-    without padding, its rows below, its padded columns in LANES, its first slot; chunk_of (s + 1,): the first chunk
-    of each supernode; places: of each supernode the slots of its columns and of the rows below, in a group's own
-    copy where they are in the top; by_slot, by_vertex, spans: see `supernodal_solve` (unsigned: no test of the sign
-    when indexing); squares, panels: entries in all S and in all W; rows: of four numbers, of the work vector.
+    without padding, its rows below with padding, its padded columns in LANES, its first slot; chunk_of (s + 1,): the
+    first chunk of each supernode; places: of each supernode the slots of its columns and of the rows below, in a group's
+    own copy where they are in the top, and the last one again for rows that fill up; by_slot, by_vertex, spans: see `supernodal_solve` (unsigned: no test of the sign
+    when indexing); squares, panels: entries in all S and in all W, which lie as `supernodal_vectors` reads them; rows:
+    of four numbers, of the work vector.
     """
 
     chunks: NDArray[np.int64]
@@ -58,8 +63,8 @@ class Layout(NamedTuple):
         """The layout of a factor of this structure."""
         width, below = s.width.astype(np.int64), np.diff(s.row_start)
         chunk_of, node, done, own, rows, quads = _chunks(width, below)
-        squares, panels = own * quads * LANES, rows * quads * LANES
-        base = np.concatenate([[0], np.cumsum(width + below)])
+        squares, panels = LANES**2 * quads**2, rows * quads * LANES
+        base = np.concatenate([[0], np.cumsum(width + below + _SPARE)])
         columns = [
             np.cumsum(squares) - squares,
             np.cumsum(panels) - panels,
@@ -70,10 +75,12 @@ class Layout(NamedTuple):
             s.first[node] + done,
         ]
         used = np.flatnonzero(s.vertex >= 0)
-        is_row = np.repeat(np.tile([False, True], len(width)), np.stack([width, below], axis=1).ravel())
+        parts = np.stack([width, below, np.full(len(width), _SPARE)], axis=1)
+        kind = np.repeat(np.tile([0, 1, 2], len(width)), parts.ravel())
         places = np.empty(base[-1], np.int32)
-        places[is_row] = s.rows
-        places[~is_row] = used
+        places[kind == 0] = used
+        places[kind == 1] = s.rows
+        places[kind == 2] = np.repeat(places[base[1:] - _SPARE - 1], _SPARE)
 
         bounds = s.group_start
         slots = s.first[bounds]
@@ -108,13 +115,23 @@ def _chunks(width: NDArray[np.int64], below: NDArray[np.int64]) -> tuple[NDArray
     node = np.repeat(np.arange(len(width)), many)
     done = (np.arange(len(node)) - chunk_of[node]) * WIDTH
     own = np.minimum(WIDTH, width[node] - done)
-    return chunk_of, node, done, own, width[node] - done - own + below[node], -(-own // LANES)
+    rows = width[node] - done - own + below[node]
+    return chunk_of, node, done, own, -(-rows // LANES) * LANES, -(-own // LANES)
 
 
 def stored(s: Symbolic) -> tuple[int, int]:
     """The entries in all S and in all W of a factor of this structure."""
-    *_, own, rows, quads = _chunks(s.width.astype(np.int64), np.diff(s.row_start))
-    return int(LANES * own @ quads), int(LANES * rows @ quads)
+    *_, rows, quads = _chunks(s.width.astype(np.int64), np.diff(s.row_start))
+    return int(LANES**2 * quads @ quads), int(LANES * rows @ quads)
+
+
+def _rounded(entries: NDArray[Any], dtype: np.dtype) -> NDArray[Any]:
+    """The same where they are of this type already."""
+    if entries.dtype == dtype:
+        return entries
+    out = aligned(len(entries), dtype)
+    out[:] = entries
+    return out
 
 
 class Supernodal:
@@ -138,7 +155,7 @@ class Supernodal:
         neighbours = np.asarray(Q.indices, np.int32)
         s = symbolic or analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
         layout = Layout.of(s)
-        squares, panels = np.empty(layout.squares), np.empty(layout.panels)
+        squares, panels = aligned(layout.squares), aligned(layout.panels)
         v = factorise(
             pointers, neighbours, Q.data, s.slot, s.vertex, s.parent, s.first, s.row_start, s.rows,
             s.sequence, layout.chunk_of, layout.chunks, squares, panels,
@@ -149,16 +166,16 @@ class Supernodal:
                 "determines its position, or stiffnesses, masses and pin weights lie too far apart or are negative"
             )
         self.nonzeros: int | None = s.nonzeros
-        work = np.zeros(4 * layout.rows, np.float64 if precision == "float64" else np.float32)
+        work = aligned(4 * layout.rows, np.float64 if precision == "float64" else np.float32)
         if precision == "float16":
             keep_sums(panels, panels - panels.astype(np.float16), layout.chunks)
-        squares, panels = squares.astype(work.dtype, copy=False), panels.astype(work.dtype, copy=False)
+        squares, panels = _rounded(squares, work.dtype), _rounded(panels, np.dtype(precision))
         if precision == "float16":
-            panels = panels.astype(np.float16).view(np.uint16)  # which Numba has arrays of
+            panels = panels.view(np.uint16)  # which Numba has arrays of
         self.panel_bytes = squares.nbytes + panels.nbytes
-        own, below, quads = layout.chunks[:, 3:6].T
-        self.flops = int(2 * 3 * LANES * quads @ (own + 2 * below))
-        entries = (own + 2 * below) * quads
+        below, quads = layout.chunks[:, 4:6].T
+        entries = LANES * quads * (LANES * quads + 2 * below)
+        self.flops = int(2 * 3 * entries.sum())
         self.shares = [float(entries[a:e].sum() / max(1, entries.sum())) for a, e in layout.spans[:, :2]]
         self.squares, self.panels, self.layout = squares, panels, layout
         self._work, self._team = work, Team.of(len(self.shares) - 1)

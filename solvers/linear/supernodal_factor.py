@@ -65,6 +65,7 @@ def factorise(
     begun = np.zeros(nodes, np.int64)  # where a supernode's update matrix lies
     front = np.empty(largest * largest)
     panel = np.empty((largest, WIDTH))
+    tiles = np.empty(largest * WIDTH)
     block = np.empty((WIDTH, 4))
     inverse = np.empty((WIDTH, WIDTH))
     place = np.empty(len(vertex), np.int64)  # of a slot in the front
@@ -109,6 +110,7 @@ def factorise(
                 own,
                 below,
                 panel,
+                tiles,
                 block,
                 inverse,
                 index,
@@ -141,6 +143,12 @@ def _at(size, row, col):
 
 
 @njit(cache=True)
+def _in_tile(row, col, width):
+    """Where a panel of a width has an entry: by tiles of four rows, each column by column."""
+    return (row >> 2) * 4 * width + 4 * col + (row & 3)
+
+
+@njit(cache=True)
 def _extend_add(front, size, stack, begin, rows, start, end, place):
     """Add a child's update matrix to its parent's front."""
     count = end - start
@@ -167,6 +175,7 @@ def _eliminate(
     own,
     below,
     panel,
+    tiles,
     block,
     inverse,
     index,
@@ -208,12 +217,11 @@ def _eliminate(
                 total -= panel[i, k] * inverse[k, j]
             inverse[i, j] = total / panel[i, i]
     for i in range(real):  # S
-        for j in range(width):
+        for j in range(real):
             total = 0.0
             for k in range(max(i, j), real):
                 total += inverse[k, i] * inverse[k, j]
-            squares[square + j] = total if j < real else 0.0
-        square += width
+            squares[square + _in_tile(i, j, width)] = total
     row = np.empty(WIDTH)
     for r in range(width, size - start):
         for j in range(width):  # L21 = A21 L11^-T
@@ -223,12 +231,8 @@ def _eliminate(
             for j in range(width):
                 row[j] += factor * inverse[j, k]
         for j in range(width):
-            panel[r, j] = row[j]
-            row[j] = 0.0
-    tight = panel.ravel()
-    for r in range(width, size - start):  # rows one after the other, as wide as they are
-        for j in range(width):
-            tight[r * width + j] = panel[r, j]
+            tiles[_in_tile(r, j, width)] = row[j]
+    done = 0
     for r in range(width, size - start):
         local = start + r
         if local < own:
@@ -239,28 +243,28 @@ def _eliminate(
         for j in range(width):
             row[j] = 0.0
         for k in range(width):
-            factor = tight[r * width + k]
+            factor = tiles[_in_tile(r, k, width)]
             for j in range(width):
                 row[j] -= factor * inverse[k, j]
         for j in range(width):
-            panels[at + j] = row[j]
-        at += width
+            panels[at + _in_tile(done, j, width)] = row[j]
+        done += 1
     flat = block.ravel()
     for strip in range((start + width) // 4, size // 4):
         r = 4 * strip - start
         for c in range(4):
             for j in range(width):
-                flat[4 * j + c] = -tight[(r + c) * width + j]
+                flat[4 * j + c] = -tiles[_in_tile(r + c, j, width)]
         begin = strip * size + 4 * strip
         count = size - 4 * strip
         if quads == 4:
-            add_forward(tight, r * width, index, 0, count, flat, 0, front, begin, 4)
+            add_forward(tiles, r * width, index, 0, count, flat, 0, front, begin, 4, 4)
         elif quads == 3:
-            add_forward(tight, r * width, index, 0, count, flat, 0, front, begin, 3)
+            add_forward(tiles, r * width, index, 0, count, flat, 0, front, begin, 4, 3)
         elif quads == 2:
-            add_forward(tight, r * width, index, 0, count, flat, 0, front, begin, 2)
+            add_forward(tiles, r * width, index, 0, count, flat, 0, front, begin, 4, 2)
         else:
-            add_forward(tight, r * width, index, 0, count, flat, 0, front, begin, 1)
+            add_forward(tiles, r * width, index, 0, count, flat, 0, front, begin, 4, 1)
     return -1
 
 
@@ -271,15 +275,16 @@ def keep_sums(panels, rounding, chunks):
     A column holds the weights with which a vertex follows those below. Noise in their sum would part vertices that
     ought to move together, against stiff springs: the largest eigenvalue of what a solve makes of Q, 1 for no rounding,
     was 1.028 on a sheet of 128 x 128 vertices and grew with their number; with the sums kept it is 1.0002 at any.
+    A row that fills up a tile will do as well: it names the last one.
     rounding: each entry less what it is rounded to.
     """
     for k in range(len(chunks)):
         offset, below, width = chunks[k, 1], chunks[k, 4], 4 * chunks[k, 5]
         for j in range(width if below > 0 else 0):
             lost = 0.0
-            least = offset + j
+            least = offset + 4 * j
             for r in range(below):
-                at = offset + r * width + j
+                at = offset + _in_tile(r, j, width)
                 lost += rounding[at]
                 if abs(panels[at]) < abs(panels[least]):
                     least = at

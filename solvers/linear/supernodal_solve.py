@@ -19,8 +19,12 @@ from __future__ import annotations
 from numba import prange
 
 from solvers.compiling import inner, inner_in_parallel, kernel
+from solvers.intrinsics import ask_for
 from solvers.linear.supernodal_vectors import add_forward, set_backward
 from solvers.linear.team import claim, finish, following, go_on, last, start
+
+_AHEAD = 64
+"""How many vertices ahead memory is asked for what lies in another order."""
 
 
 @inner
@@ -28,6 +32,7 @@ def _load(b, order, begin, end, work):
     """The right-hand sides b (n, 3) to rows of `work`."""
     rows = work.reshape(-1, 4)
     for i in range(begin, end):
+        ask_for(b, 3 * order[min(i + _AHEAD, end - 1), 0])
         v, k = order[i, 0], order[i, 1]
         for c in range(3):
             rows[k, c] = b[v, c]
@@ -38,6 +43,7 @@ def _store(work, order, begin, end, out):
     """The solution in rows of `work` to out (n, 3)."""
     rows = work.reshape(-1, 4)
     for i in range(begin, end):
+        ask_for(work, 4 * order[min(i + _AHEAD, end - 1), 1])
         v, k = order[i, 0], order[i, 1]
         for c in range(3):
             out[v, c] = rows[k, c]
@@ -49,13 +55,13 @@ def forwards(panels, index, chunks, begin, end, work):
     for k in range(begin, end):
         offset, at, below, quads, first = chunks[k, 1], chunks[k, 2], chunks[k, 4], chunks[k, 5], chunks[k, 6]
         if quads == 4:
-            add_forward(panels, offset, index, at, below, work, first, work, 0, 4)
+            add_forward(panels, offset, index, at, below, work, first, work, 0, 3, 4)
         elif quads == 1:
-            add_forward(panels, offset, index, at, below, work, first, work, 0, 1)
+            add_forward(panels, offset, index, at, below, work, first, work, 0, 3, 1)
         elif quads == 2:
-            add_forward(panels, offset, index, at, below, work, first, work, 0, 2)
+            add_forward(panels, offset, index, at, below, work, first, work, 0, 3, 2)
         else:
-            add_forward(panels, offset, index, at, below, work, first, work, 0, 3)
+            add_forward(panels, offset, index, at, below, work, first, work, 0, 3, 3)
 
 
 @inner

@@ -1,10 +1,16 @@
 """A panel times four interleaved right-hand sides, both ways, in LLVM vectors that a compiler does not find by itself.
 
-A panel W has rows of 4 m entries (m = 1 to 4), one after the other; a work vector has rows of 4: x, y, z and padding.
-In a pass forwards, row r of W meets the panel's 4 m rows of x, which stay in registers, and its result is added to the
-row of y that `index` names. In a pass backwards each row of y that `index` names meets its row of W, four columns
-of which are a vector, and the sums are transposed at the end: no padding is multiplied. Panels have the work vector's
-type, or are float16, seen as uint16, beside float32.
+A panel W has 4 m columns (m = 1 to 4), and its rows by fours, tiles, each of them column by column: a lane of four
+numbers is a column of a tile. A work vector has rows of 4: x, y, z and zero. What an entry of W is multiplied by is the
+same in all of a lane's places or in all lanes, so that W is loaded as it lies, and no padding is multiplied:
+
+    forwards    x, y and z of a column's row, four times each, are held for all tiles; the lanes of the products are
+                summed, transposed, and added to the rows of y that `index` names
+    backwards   x, y and z of the four rows of y that `index` names, transposed, are the same for all lanes; sums over
+                all tiles are held, and in the end those of a lane are added up
+
+What fills up the last tile is zero, and names a row of its own panel. Panels have the work vector's type, or are
+float16, seen as uint16, beside float32.
 """
 
 from __future__ import annotations
@@ -14,235 +20,191 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.errors import TypingError
 from numba.extending import intrinsic
+
+from solvers.intrinsics import ask, signature, unpacked
 
 _I32 = ir.IntType(32)
 _I64 = ir.IntType(64)
-_I8P = ir.IntType(8).as_pointer()
-_AHEAD = 2048
-"""How many bytes ahead a panel is asked for: rows are short, and the hardware's own guess comes too late."""
+_AHEAD = 4096
+"""How many bytes ahead a panel is asked for on the way down, which the hardware's own guess follows less well."""
 
 
-class _Vectors:
-    """Vectors of the element type of the work vector, written with a builder."""
+class _Tiles:
+    """Tiles of 4 m columns in vectors of 512 bits, written with a builder; `element` is the work vector's type."""
 
-    def __init__(self, context, builder, element: types.Float) -> None:
+    def __init__(self, context: Any, builder: Any, element: types.Float, m: int) -> None:
         self.builder = builder
         self.element = context.get_value_type(element)
         self.size = element.bitwidth // 8
-        self.narrow = element.bitwidth == 32
+        self.lanes = 16 // self.size  # of a vector
+        self.vectors = 4 * m // self.lanes  # of a tile
+        self.entries = 16 * m  # of a tile
 
     def zero(self, lanes: int) -> ir.Constant:
-        return ir.Constant(ir.VectorType(self.element, lanes), [0.0] * lanes)
+        return ir.Constant(ir.VectorType(self.element, 4 * lanes), [0.0] * (4 * lanes))
 
-    def load(self, pointer: ir.Value, lanes: int) -> ir.Value:
-        wide = self.builder.bitcast(pointer, ir.VectorType(self.element, lanes).as_pointer())
-        return self.builder.load(wide, align=self.size)
+    def load(self, pointer: Any, lanes: int = 1) -> Any:
+        kind = ir.VectorType(self.element, 4 * lanes)
+        return self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()), align=self.size)
 
-    def entries(self, pointer: Any, kind: types.Array, lanes: int, times: int = 1) -> ir.Value:
-        """Entries of a panel of this kind, all of them so many times; float16 is widened."""
-        half = kind.dtype == types.uint16
-        stored = ir.VectorType(ir.HalfType() if half else self.element, lanes)
-        found = self.builder.load(self.builder.bitcast(pointer, stored.as_pointer()), align=2 if half else self.size)
-        if times > 1:
-            found = self.shuffle(found, found, list(range(lanes)) * times)
-        return self.builder.fpext(found, ir.VectorType(self.element, lanes * times)) if half else found
+    def store(self, value: Any, pointer: Any) -> None:
+        self.builder.store(value, self.builder.bitcast(pointer, value.type.as_pointer()), align=self.size)
 
-    def interleaved(self, rows: list[Any]) -> Any:
-        """Two or four vectors as one: the first entries of all, then the second ones, ..."""
+    def panel(self, tile: Any, kind: types.Array, z: int) -> Any:
+        """Vector z of a tile of a panel of this kind; float16 is widened."""
+        at = self.builder.gep(tile, [_I64(4 * self.lanes * z)])
+        if kind.dtype != types.uint16:
+            return self.load(at, self.lanes)
+        half, wide = (ir.VectorType(e, 4 * self.lanes) for e in (ir.HalfType(), self.element))
+        return self.builder.fpext(self.builder.load(self.builder.bitcast(at, half.as_pointer()), align=2), wide)
+
+    def shuffle(self, a: Any, b: Any, places: Any) -> Any:
+        places = list(places)
+        return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(places)), places))
+
+    def picked(self, a: Any, b: Any, lanes: list[int]) -> Any:
+        """These lanes of two vectors, counted through both."""
+        return self.shuffle(a, b, [4 * lane + i for lane in lanes for i in range(4)])
+
+    def mixed(self, a: Any, b: Any, places: tuple[int, ...]) -> Any:
+        """Lane by lane the numbers in these places, counted through both vectors' lanes."""
+        n = a.type.count
+        return self.shuffle(a, b, [n * (i // 4) + lane + i % 4 for lane in range(0, n, 4) for i in places])
+
+    def joined(self, rows: list[Any]) -> Any:
+        """One vector of one, two or four."""
         while len(rows) > 1:
-            half = len(rows) // 2
-            lanes = rows[0].type.count
-            mixed = [k + side * lanes for k in range(lanes) for side in range(2)]
-            rows = [self.shuffle(a, b, mixed) for a, b in zip(rows[:half], rows[half:], strict=True)]
+            many = rows[0].type.count // 4
+            rows = [self.picked(a, b, list(range(2 * many))) for a, b in zip(rows[::2], rows[1::2], strict=True)]
         return rows[0]
 
-    def summed(self, rows: list[Any]) -> list[Any]:
-        """Of two or four vectors of as many neighbours four times, the sums of neighbours: four of each vector."""
-        many, size = len(rows), 1
-        while len(rows) > 1:  # each vector now holds parts of the sums of `size` of them
-            half = many // 2
-            sides = [
-                [4 * many * k + c * many + i + j
-                 for c in range(4) for i in range(begin, begin + half, size) for k in range(2) for j in range(size)]
-                for begin in (0, half)
-            ]  # fmt: skip
-            rows = [
-                self.builder.fadd(*(self.shuffle(a, b, lanes) for lanes in sides))
-                for a, b in zip(rows[::2], rows[1::2], strict=True)
-            ]
-            size *= 2
-        return [self.shuffle(rows[0], rows[0], [c * many + r for c in range(4)]) for r in range(many)]
+    def spread(self, vector: Any, c: int) -> Any:
+        """Of each lane its number c, four times."""
+        return self.shuffle(vector, vector, [i // 4 * 4 + c for i in range(vector.type.count)])
 
-    def prefetch(self, row: ir.Value, kind: Any, quads: int, distance: int) -> None:
-        """Ask for the cache lines `distance` bytes on from a row of a panel of this kind."""
-        call = self.builder.module.declare_intrinsic(
-            "llvm.prefetch.p0", fnty=ir.FunctionType(ir.VoidType(), [_I8P, _I32, _I32, _I32])
-        )
-        byte = self.builder.bitcast(row, _I8P)
-        for line in range(0, quads * kind.dtype.bitwidth // 2, 64):
-            self.builder.call(call, [self.builder.gep(byte, [_I64(distance + line)]), _I32(0), _I32(3), _I32(1)])
+    def add(self, a: Any, b: Any) -> Any:
+        return self.builder.fadd(a, b)
 
-    def store(self, value: Any, pointer: ir.Value) -> None:
-        wide = self.builder.bitcast(pointer, value.type.as_pointer())
-        self.builder.store(value, wide, align=self.size)
-
-    def shuffle(self, a: ir.Value, b: ir.Value, lanes) -> ir.Value:
-        lanes = list(lanes)
-        return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(lanes)), lanes))
-
-    def broadcast(self, pointer: ir.Value, lanes: int) -> ir.Value:
-        single = self.builder.insert_element(self.zero(lanes), self.builder.load(pointer, align=self.size), _I32(0))
-        return self.shuffle(single, single, [0] * lanes)
-
-    def multiply_add(self, a: ir.Value, b: ir.Value, c: ir.Value | None) -> ir.Value:
+    def multiply_add(self, a: Any, b: Any, c: Any) -> Any:
         """a b + c; a b for no c. `contract` lets the target fuse them where it can."""
         product = self.builder.fmul(a, b, flags=("contract",))
         return product if c is None else self.builder.fadd(product, c, flags=("contract",))
 
-    def total(self, terms: list[ir.Value]) -> ir.Value:
-        """The sum, taken pairwise: a short chain of dependent additions."""
-        while len(terms) > 1:
-            pairs = [self.builder.fadd(a, b) for a, b in zip(terms[::2], terms[1::2], strict=False)]
-            terms = pairs + terms[len(pairs) * 2 :]
-        return terms[0]
+    def rows(self, totals: list[Any]) -> list[Any]:
+        """The lanes of each of three or four vectors summed, and the four rows, filled up with zero, that they are."""
+        vectors, even = [*totals, self.zero(self.lanes)][:4], list(range(0, 2 * self.lanes, 2))
+        for _ in range(self.lanes // 2):  # until a lane is a sum
+            vectors = [
+                self.add(self.picked(a, b, even), self.picked(a, b, [lane + 1 for lane in even]))
+                for a, b in zip(vectors[::2], vectors[1::2], strict=True)
+            ]
+        whole = self.joined(vectors)
+        turned = self.shuffle(whole, whole, [4 * c + r for r in range(4) for c in range(4)])
+        return [self.picked(turned, turned, [r]) for r in range(4)]
+
+    def transposed(self, rows: list[Any]) -> list[Any]:
+        """x, y and z of four rows, in each lane of a vector."""
+        if self.lanes == 2:
+            whole = self.joined(rows)
+            return [self.shuffle(whole, whole, [4 * r + c for r in range(4)] * 2) for c in range(3)]
+        rows = [self.picked(row, row, [0] * 4) for row in rows]  # so that all that follows stays within lanes
+        (xy01, z01), (xy23, z23) = (
+            [self.mixed(a, b, at) for at in ((0, 4, 1, 5), (2, 6, 3, 7))] for a, b in (rows[:2], rows[2:])
+        )
+        x, y = (self.mixed(xy01, xy23, at) for at in ((0, 1, 4, 5), (2, 3, 6, 7)))
+        return [x, y, self.mixed(z01, z23, (0, 1, 4, 5))]
+
+    def summed(self, x: Any, y: Any, z: Any) -> Any:
+        """Each lane's sums of x, y and z, and zero."""
+        xy, z0 = (
+            self.add(self.mixed(a, b, (0, 4, 1, 5)), self.mixed(a, b, (2, 6, 3, 7)))
+            for a, b in ((x, y), (z, self.zero(self.lanes)))
+        )
+        return self.add(self.mixed(xy, z0, (0, 1, 4, 5)), self.mixed(xy, z0, (2, 3, 6, 7)))
+
+    def ask(self, tile: Any, kind: Any) -> None:
+        """Ask for the cache lines that lie _AHEAD bytes before those of a tile of a panel of this kind."""
+        for line in reversed(range(0, self.entries * kind.dtype.bitwidth // 8, 64)):
+            ask(self.builder, tile, line - _AHEAD)
 
 
-def _arguments(context, builder, signature, args):
-    """The arrays' data pointers, the integers as int64, and the last, a literal, as Python's int."""
-    out = []
-    for kind, value in zip(signature.args[:-1], args, strict=False):
-        if isinstance(kind, types.Array):
-            out.append(context.make_array(kind)(context, builder, value).data)
-        else:
-            out.append(context.cast(builder, value, kind, types.int64))
-    return [*out, signature.args[-1].literal_value]
+def _named(builder: Any, index: Any, first: Any, rows: Any) -> list[Any]:
+    """Where the four rows are that `index` names from `first` on."""
+    names = [builder.zext(builder.load(builder.gep(index, [builder.add(first, _I64(r))])), _I64) for r in range(4)]
+    return [builder.gep(rows, [builder.mul(name, _I64(4))]) for name in names]
 
 
-def _signature(*kinds):
-    """Nothing returned; the last argument, the count of quads, is compiled in."""
-    if not isinstance(kinds[-1], types.IntegerLiteral):
-        raise TypingError("the count of quads must be a literal")
-    return types.void(*(types.unliteral(kind) for kind in kinds[:-1]), kinds[-1])
+def _add_forward(typingctx, panel, offset, index, at, count, x, x_row, y, y_row, numbers, quads):
+    """y[y_row + index[at + r]] += sum_j W[r, j] x[x_row + j] for r < count, a multiple of four; W from `offset` on.
 
-
-def _add_forward(typingctx, panel, offset, index, at, count, x, x_row, y, y_row, quads):
-    """y[y_row + index[at + r]] += sum_j panel[offset + 4 quads r + j] x[x_row + j], for r < count."""
-    signature = _signature(panel, offset, index, at, count, x, x_row, y, y_row, quads)
+    numbers: how many of a row of x are not zero, 3 or 4."""
+    declared = signature(panel, offset, index, at, count, x, x_row, y, y_row, numbers, quads, compiled_in=2)
 
     def generate(context, builder, signature, args):
-        panel, offset, index, at, count, x, x_row, y, y_row, quads = _arguments(context, builder, signature, args)
+        panel, offset, index, at, count, x, x_row, y, y_row, numbers, m = unpacked(context, builder, signature, args)
         kind = signature.args[0]
-        vectors = _Vectors(context, builder, signature.args[7].dtype)
-        panel = builder.gep(panel, [offset])
-        index = builder.gep(index, [at])
-        x = builder.gep(x, [builder.mul(x_row, _I64(4))])
-        y = builder.gep(y, [builder.mul(y_row, _I64(4))])
-        # 512 bits are as many columns of W as x has numbers in a row, for each of these numbers.
-        together = 4 if vectors.narrow else 2
-        rows = [vectors.load(builder.gep(x, [_I64(4 * j)]), 4) for j in range(4 * quads)]
-        xs = [vectors.interleaved(rows[j : j + together]) for j in range(0, 4 * quads, together)]
-
-        def product(r):
-            """Row r times x, before the sums over columns that lie side by side."""
-            row = builder.gep(panel, [builder.mul(r, _I64(4 * quads))])
-            vectors.prefetch(row, kind, quads, _AHEAD)
-            total = None
-            for j, wide in enumerate(xs):
-                w = vectors.entries(builder.gep(row, [_I64(together * j)]), kind, together, 4)
-                total = vectors.multiply_add(w, wide, total)
-            return total
-
-        def add(r, row):
-            place = builder.zext(builder.load(builder.gep(index, [r])), _I64)
-            target = builder.gep(y, [builder.mul(place, _I64(4))])
-            vectors.store(builder.fadd(row, vectors.load(target, 4)), target)
-
-        whole = builder.udiv(count, _I64(together))
-        with cgutils.for_range(builder, whole) as loop:
-            first = builder.mul(loop.index, _I64(together))
-            places = [builder.add(first, _I64(k)) for k in range(together)]
-            for r, row in zip(places, vectors.summed([product(r) for r in places]), strict=True):
-                add(r, row)
-        done = builder.mul(whole, _I64(together))
-        with cgutils.for_range(builder, builder.sub(count, done)) as loop:
-            r = builder.add(done, loop.index)
-            add(r, vectors.summed([product(r)] * together)[0])
+        t = _Tiles(context, builder, signature.args[7].dtype, m)
+        panel, index = builder.gep(panel, [offset]), builder.gep(index, [at])
+        x, y = (builder.gep(rows, [builder.mul(first, _I64(4))]) for rows, first in ((x, x_row), (y, y_row)))
+        columns = [t.load(builder.gep(x, [_I64(4 * j)])) for j in range(4 * m)]
+        held = [t.joined(columns[j : j + t.lanes]) for j in range(0, 4 * m, t.lanes)]
+        factors = [[t.spread(vector, c) for c in range(numbers)] for vector in held]
+        with cgutils.for_range(builder, builder.lshr(count, _I64(2))) as loop:
+            first = builder.mul(loop.index, _I64(4))
+            tile = builder.gep(panel, [builder.mul(loop.index, _I64(t.entries))])
+            sums: list[Any] = [None] * numbers
+            for z, three in enumerate(factors):
+                w = t.panel(tile, kind, z)
+                sums = [t.multiply_add(w, factor, total) for factor, total in zip(three, sums, strict=True)]
+            for row, place in zip(t.rows(sums), _named(builder, index, first, y), strict=True):
+                t.store(t.add(row, t.load(place)), place)
         return context.get_dummy_value()
 
-    return signature, generate
+    return declared, generate
 
 
 def _set_backward(typingctx, square, start, own, panel, offset, index, at, below, y, x_row, quads):
-    """y[x_row + j] = sum over r < own of square[start + 4 quads r + j] y[x_row + r]
-    + sum over r < below of panel[offset + 4 quads r + j] y[index[at + r]]."""
-    signature = _signature(square, start, own, panel, offset, index, at, below, y, x_row, quads)
+    """y[x_row + j] = sum over r < 4 quads of S[r, j] y[x_row + r] + sum over r < below of W[r, j] y[index[at + r]];
+    S from `start` on, and none where `own` is zero; W from `offset` on, `below` a multiple of four."""
+    declared = signature(square, start, own, panel, offset, index, at, below, y, x_row, quads)
 
     def generate(context, builder, signature, args):
-        square, start, own, panel, offset, index, at, below, y, x_row, quads = _arguments(
-            context, builder, signature, args
-        )
+        square, start, own, panel, offset, index, at, below, y, x_row, m = unpacked(context, builder, signature, args)
         square_kind, panel_kind = signature.args[0], signature.args[3]
-        vectors = _Vectors(context, builder, signature.args[8].dtype)
-        square = builder.gep(square, [start])
-        panel = builder.gep(panel, [offset])
-        index = builder.gep(index, [at])
+        t = _Tiles(context, builder, signature.args[8].dtype, m)
+        square, panel, index = (builder.gep(a, [begin]) for a, begin in ((square, start), (panel, offset), (index, at)))
         out = builder.gep(y, [builder.mul(x_row, _I64(4))])
-        group = 16 if vectors.narrow else 8  # entries in 512 bits
-        groups = [(j, min(group, 4 * quads - j)) for j in range(0, 4 * quads, group)]
-        # Enough sums side by side to hide the latency of an addition.
-        unroll = max(1, 4 // len(groups))
-        sums = [
-            [[cgutils.alloca_once_value(builder, vectors.zero(lanes)) for _ in range(3)] for _, lanes in groups]
-            for _ in range(unroll)
-        ]
-        for accumulators in sums:  # alloca_once_value sets them at the entry of the function alone
-            for (_, lanes), triple in zip(groups, accumulators, strict=True):
-                for accumulator in triple:
-                    builder.store(vectors.zero(lanes), accumulator)
+        vector = t.zero(t.lanes)
+        sums = [[cgutils.alloca_once(builder, vector.type) for _ in range(3)] for _ in range(t.vectors)]
+        for total in (total for three in sums for total in three):
+            builder.store(vector, total)
 
-        def add(row, kind, source, accumulators):
-            for (j, lanes), triple in zip(groups, accumulators, strict=True):
-                w = vectors.entries(builder.gep(row, [_I64(j)]), kind, lanes)
-                for c, accumulator in enumerate(triple):
-                    factor = vectors.broadcast(builder.gep(source, [_I64(c)]), lanes)
-                    builder.store(vectors.multiply_add(w, factor, builder.load(accumulator)), accumulator)
-
-        def add_below(r, accumulators):
-            row = builder.gep(panel, [builder.mul(r, _I64(4 * quads))])
-            vectors.prefetch(row, panel_kind, quads, -_AHEAD)
-            place = builder.zext(builder.load(builder.gep(index, [r])), _I64)
-            add(row, panel_kind, builder.gep(y, [builder.mul(place, _I64(4))]), accumulators)
+        def add(tile, kind, places):
+            t.ask(tile, kind)
+            factors = t.transposed([t.load(place) for place in places])
+            for z, three in reversed(list(enumerate(sums))):
+                w = t.panel(tile, kind, z)
+                for factor, total in zip(factors, three, strict=True):
+                    builder.store(t.multiply_add(w, factor, builder.load(total)), total)
 
         # From the last row to the first: the panels are then read strictly downwards, as they were read upwards before,
         # so that what is still in the cache is read first.
-        last = builder.sub(below, _I64(1))
-        whole = builder.udiv(below, _I64(unroll))
-        with cgutils.for_range(builder, whole) as loop:
-            first = builder.sub(last, builder.mul(loop.index, _I64(unroll)))
-            for k in range(unroll):
-                add_below(builder.sub(first, _I64(k)), sums[k])
-        if unroll > 1:
-            with cgutils.for_range(builder, builder.urem(below, _I64(unroll))) as loop:
-                add_below(loop.index, sums[0])
-        bottom = builder.sub(own, _I64(1))
-        with cgutils.for_range(builder, own) as loop:
-            r = builder.sub(bottom, loop.index)
-            row = builder.gep(square, [builder.mul(r, _I64(4 * quads))])
-            vectors.prefetch(row, square_kind, quads, -_AHEAD)
-            add(row, square_kind, builder.gep(out, [builder.mul(r, _I64(4))]), sums[-1])
-
-        for g, (j, lanes) in enumerate(groups):
-            a, b, c = (vectors.total([builder.load(s[g][k]) for s in sums]) for k in range(3))
-            ab = vectors.shuffle(a, b, range(2 * lanes))
-            c0 = vectors.shuffle(c, vectors.zero(lanes), range(2 * lanes))
-            for i in range(lanes):
-                row = vectors.shuffle(ab, c0, [i, lanes + i, 2 * lanes + i, 3 * lanes + i])
-                vectors.store(row, builder.gep(out, [_I64(4 * (j + i))]))
+        tiles = builder.lshr(below, _I64(2))
+        with cgutils.for_range(builder, tiles) as loop:
+            k = builder.sub(builder.sub(tiles, _I64(1)), loop.index)
+            tile = builder.gep(panel, [builder.mul(k, _I64(t.entries))])
+            add(tile, panel_kind, _named(builder, index, builder.mul(k, _I64(4)), y))
+        with builder.if_then(builder.icmp_signed(">", own, _I64(0)), likely=True):
+            for k in reversed(range(m)):
+                places = [builder.gep(out, [_I64(4 * (4 * k + r))]) for r in range(4)]
+                add(builder.gep(square, [_I64(t.entries * k)]), square_kind, places)
+        done = [t.summed(*(builder.load(total) for total in three)) for three in sums]
+        for z, rows in enumerate(done):
+            t.store(rows, builder.gep(out, [_I64(4 * t.lanes * z)]))
         return context.get_dummy_value()
 
-    return signature, generate
+    return declared, generate
 
 
 # Numba passes the first argument itself, which type checkers do not know.

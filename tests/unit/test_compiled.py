@@ -174,7 +174,9 @@ def test_blocks_change_nothing_but_the_order_of_work(solver, size, monkeypatch):
     assert isinstance(cut, PreparedCompiled)
     assert isinstance(whole, PreparedCompiled)
     assert len(cut.plan.blocks) > 10 > len(whole.plan.blocks)
-    assert 0 < np.count_nonzero(cut.plan.leaf) < len(cut.plan.leaf)
+    downs, ups = (cut.plan.visits[cut.plan.visits & 1 == side] >> 1 for side in (plan.DOWN, plan.UP))
+    assert sorted(downs) == list(ups)  # the blocks of all groups, once each way
+    assert (np.diff(downs) < 0).any()  # some lie above others
     expected = whole.solve(problem, StopRule(12)).positions
     found = cut.solve(problem, StopRule(12)).positions
     # Ancestors add what comes from below in another order: the last digits, of the precision that corrections have.
