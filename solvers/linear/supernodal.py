@@ -42,10 +42,10 @@ class Layout(NamedTuple):
 
     chunks (c, 7): of each the offsets of its S, of its W and of the slots of its rows in `places`, its columns
     without padding, its rows below with padding, its padded columns in LANES, its first slot; chunk_of (s + 1,): the
-    first chunk of each supernode; places: of each supernode the slots of its columns and of the rows below, in a group's
-    own copy where they are in the top, and the last one again for rows that fill up; by_slot, by_vertex, spans: see `supernodal_solve` (unsigned: no test of the sign
-    when indexing); squares, panels: entries in all S and in all W, which lie as `supernodal_vectors` reads them; rows:
-    of four numbers, of the work vector.
+    first chunk of each supernode; places: of each supernode the slots of its columns, of the rows below, in a group's
+    own copy where they are in the top, and the last one again for rows that fill up a tile; by_slot, by_vertex, spans:
+    see `supernodal_solve` (unsigned: no test of the sign when indexing); squares, panels: entries in all S and in all
+    W, which lie as `supernodal_vectors` reads them; rows: of four numbers, of the work vector.
     """
 
     chunks: NDArray[np.int64]
