@@ -104,7 +104,7 @@ def run(
 def speed(
     config: Config,
     results: Results = Path("results"),
-    budget: Annotated[float, typer.Option(help="Seconds that a candidate may take at a size.")] = 180.0,
+    budget: Annotated[float, typer.Option(help="Seconds that a candidate may take at a size.")] = 210.0,
     again: Annotated[bool, typer.Option("--again", help="Do all sizes, also those that are there.")] = False,
 ) -> None:
     """Time a sweep's solvers in turns, beside a yardstick in C++ and the machine's own limits."""

@@ -31,7 +31,7 @@ class Interval(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """What binds, `bandwidth` or `arithmetic`, and the seconds that it allows for some work."""
+    """What binds, `bandwidth` or `arithmetic`, and the seconds that some work takes at least."""
 
     binds: str
     seconds: float
@@ -41,10 +41,10 @@ class Figures(NamedTuple):
     """One candidate at one size. Times [ms]: the least of all rounds; None: not measured or not known.
 
     step: of STEP iterations; entries: of the factor L; touched: bytes a second of an iteration, by what the
-    factor's panels hold; binds: the limit that binds; reached: the part of it that an iteration reaches by those
-    bytes and flops; least: the part by the entries of L alone, without the panels' padding; faster: than the
-    yardstick a step; solves_faster: than cholespy a global step; apart: from float64's converged positions, in the
-    scene's size.
+    factor's panels hold; binds: the limit that binds; reached: the part of it that an iteration reaches, by those
+    bytes and flops; passes: the part of the time that two passes over the entries of L alone take, both from where
+    they lie, which whoever reads them twice while they are near can pass; faster: than the yardstick a step;
+    solves_faster: than cholespy a global step; apart: from float64's converged positions, in the scene's size.
     """
 
     scene: str
@@ -66,7 +66,7 @@ class Figures(NamedTuple):
     touched: float | None = None
     binds: str | None = None
     reached: float | None = None
-    least: float | None = None
+    passes: float | None = None
     faster: Interval | None = None
     cheap_faster: Interval | None = None
     solves_faster: Interval | None = None
@@ -96,11 +96,19 @@ class Machine:
         return self._best[threads, f"fma {kind}"][0.0]
 
     def limit(self, counted: work.Work, threads: int, precision: str) -> Limit:
-        """The seconds that the machine needs at least, and for what."""
-        seconds = {
-            "bandwidth": counted.bytes / self.bandwidth(threads, counted.working_set),
-            "arithmetic": counted.flops / self.flops(threads, precision),
-        }
+        """What no order of reading goes below: each byte comes once from where the working set lies, and as often as
+        it is moved besides from the nearest cache."""
+        again = (counted.bytes - counted.working_set) / max(self._best[threads, "read"].values())
+        far = counted.working_set / self.bandwidth(threads, counted.working_set)
+        return self._binding(far + again, counted, threads, precision)
+
+    def passes(self, counted: work.Work, threads: int, precision: str) -> Limit:
+        """The same where all that is moved comes from where the working set lies, each time."""
+        far = counted.bytes / self.bandwidth(threads, counted.working_set)
+        return self._binding(far, counted, threads, precision)
+
+    def _binding(self, moving: float, counted: work.Work, threads: int, precision: str) -> Limit:
+        seconds = {"bandwidth": moving, "arithmetic": counted.flops / self.flops(threads, precision)}
         binds = max(seconds, key=seconds.__getitem__)
         return Limit(binds, seconds[binds])
 
@@ -165,17 +173,17 @@ def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], m
     if "nnz_factor" not in facts:
         return known
     precision = json.loads(first["parameters"]).get("precision", "float64")
-    counts = first["vertices"], first["springs"], precision
+    counts, how = (first["vertices"], first["springs"], precision), (first["threads"], precision)
     touched = work.count(facts, *counts)["iteration"]
-    least = work.count({"nnz_factor": facts["nnz_factor"]}, *counts)["iteration"]
-    limit, seconds = machine.limit(touched, first["threads"], precision), float(times["step"].min())
+    bare = work.count({"nnz_factor": facts["nnz_factor"]}, *counts)["iteration"]
+    limit, seconds = machine.limit(touched, *how), float(times["step"].min())
     return known._replace(
         entries=facts["nnz_factor"],
         bytes=touched.bytes,
         touched=touched.bytes / seconds,
         binds=limit.binds,
         reached=limit.seconds / seconds,
-        least=machine.limit(least, first["threads"], precision).seconds / seconds,
+        passes=machine.passes(bare, *how).seconds / seconds,
     )
 
 

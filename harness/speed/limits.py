@@ -23,6 +23,7 @@ from numba.extending import intrinsic
 WORKING_SETS = tuple(int(2.0**k) for k in np.arange(14, 29.5, 0.5))
 """Bytes in all threads together: from 16 KiB, in the first cache, to 512 MiB, in memory."""
 
+_CALL_BYTES = 1 << 27
 _CHAINS, _VECTOR_BYTES = 12, 64
 _REPEATS = 1 << 18
 _FAST = {"contract", "reassoc", "nsz"}
@@ -46,8 +47,8 @@ def probes(sets: tuple[int, ...] = WORKING_SETS) -> Iterator[Probe]:
     room = np.ones(max(sets) // 8)
     for size in sets:
         a = room[: size // 8]
-        # Short sets are gone through many times in a call, or its overhead would be what is measured.
-        repeats = max(1, 2**24 // size)
+        # Short sets are gone through many times in a call, or starting the threads would be what is measured.
+        repeats = max(1, _CALL_BYTES // size)
         yield Probe("read", size, 8 * len(a) * repeats, len(a) * repeats, lambda a=a, r=repeats: _read(a, threads, r))
         b, c, d = np.split(a[: len(a) // 3 * 3], 3)
         moved, flops = 24 * len(b) * repeats, 2 * len(b) * repeats

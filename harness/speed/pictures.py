@@ -25,7 +25,7 @@ PICTURES = (
     Picture("global", "Milliseconds a global step: one solve, three right-hand sides", lambda f: f.global_),
     Picture("local", "Milliseconds a local step", lambda f: f.local),
     Picture("prepare", "Milliseconds to prepare, warm", lambda f: f.warm or f.cold),
-    Picture("limit", "Part of the binding limit that an iteration reaches", lambda f: f.reached, share=True),
+    Picture("limit", "Part of the limit that binds an iteration", lambda f: f.reached, share=True),
 )
 
 

@@ -38,7 +38,7 @@ TEMPORARIES = {"default": "", "cheap": yardstick.CHEAP_TEMPORARIES}
 
 
 def run_speed(
-    sweep: Sweep, folder: Path, say: Callable[[str], None], *, again: bool = False, budget: float = 180.0
+    sweep: Sweep, folder: Path, say: Callable[[str], None], *, again: bool = False, budget: float = 210.0
 ) -> pa.Table:
     """Do the sizes of a sweep that are missing (all with `again`) and return all rows.
 

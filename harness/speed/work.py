@@ -18,8 +18,11 @@ _SPRING_BYTES, _SPRING_FLOPS = 16, 19
 """k r and two indices; a difference, its length, a division and a sum at each end."""
 
 _LOCAL_BYTES, _GLOBAL_BYTES = 72, 176
-"""Bytes of the vectors at each vertex. Local: p and y read, b written. Global: b read, p written, and a work vector
-of 4 numbers read and written in each pass."""
+"""Bytes of the vectors that are moved at each vertex. Local: p and y read, b written. Global: b read, p written, and a
+work vector of 4 numbers read and written in each pass."""
+
+_VECTORS = 80
+"""Bytes of the vectors that there are at each vertex: b and p, or in an iteration y and p, and the work vector."""
 
 
 class Work(NamedTuple):
@@ -35,16 +38,13 @@ def count(facts: Mapping[str, float], vertices: int, springs: int, precision: st
 
     facts: of a prepared solver (`nnz_factor`, `panel_bytes`, `flops_per_solve`).
     """
-    local = Work(
-        _SPRING_BYTES * springs + _LOCAL_BYTES * vertices,
-        _SPRING_FLOPS * springs,
-        _SPRING_BYTES * springs + _LOCAL_BYTES * vertices,
-    )
+    moved = _SPRING_BYTES * springs + _LOCAL_BYTES * vertices
+    local = Work(moved, _SPRING_FLOPS * springs, moved)
     if "nnz_factor" not in facts:
         return {"local": local}
     entry = _ENTRY[precision]
     flops = facts.get("flops_per_solve", 12 * facts["nnz_factor"])
     stored = facts.get("panel_bytes", entry * facts["nnz_factor"])
-    vectors = _GLOBAL_BYTES * vertices
-    whole = Work(flops / 6 * entry + vectors, flops, stored + vectors)
-    return {"local": local, "global": whole, "iteration": Work(*(a + b for a, b in zip(local, whole, strict=True)))}
+    whole = Work(flops / 6 * entry + _GLOBAL_BYTES * vertices, flops, stored + _VECTORS * vertices)
+    both = Work(local.bytes + whole.bytes, local.flops + flops, whole.working_set + _SPRING_BYTES * springs)
+    return {"local": local, "global": whole, "iteration": both}

@@ -150,8 +150,9 @@ def test_an_entry_that_is_read_is_a_multiply_and_an_add_for_each_of_three_sides(
     work = count(facts, vertices=10, springs=20)
     assert work["global"].flops == 1440
     assert work["global"].bytes == 240 * 8 + 176 * 10
-    assert work["global"].working_set == 960 + 176 * 10
+    assert work["global"].working_set == 960 + 80 * 10
     assert work["iteration"].bytes == work["global"].bytes + work["local"].bytes
+    assert work["iteration"].working_set == 960 + 80 * 10 + 16 * 20  # vectors are there once
     # L alone is read once in each pass.
     assert count({"nnz_factor": 100.0}, 10, 20, "float32")["global"].bytes == 2 * 100 * 4 + 176 * 10
     assert set(count({}, 10, 20)) == {"local"}
