@@ -92,7 +92,7 @@ class _Work(NamedTuple):
     """What the kernels write to: three vectors and scratch, the right-hand side, positions to be corrected or None."""
 
     vectors: tuple[NDArray[Any], ...]
-    y: NDArray[np.float64]
+    right: NDArray[np.float64]
     p: NDArray[np.float64] | None
 
 
@@ -154,7 +154,7 @@ class PreparedCompiled:
                 order.visits,
                 order.visits_of,
                 held,
-                measure,
+                form.in_lanes(measure),
                 loose,
                 order.shift,
             ),
@@ -163,11 +163,12 @@ class PreparedCompiled:
             form,
             step_ends.Rows(
                 row,
+                bundles.right(held)[1][row],
                 inertia,
                 np.array(pins.weight),
                 np.array(pins.vertices),
                 np.array(coupling.data, np.float64),
-                row[s.free][coupling.coords[0]],
+                s.free[coupling.coords[0]],
                 np.flatnonzero(pins.exact)[coupling.coords[1]],
             ),
             nobody + 1,
@@ -189,10 +190,10 @@ class PreparedCompiled:
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """The iterates from `problem.first_guess`; the yielded array is overwritten by the next one."""
-        (a, b, c, e), y, p = work = self._new()
+        (a, b, c, e), right, p = work = self._new()
         team = Team.of(int(self.plan.top[2]))
         target, force, pins, _, guess = self._arrays(problem)
-        step_ends.state(self.rows, target, force, pins, y)
+        step_ends.state(self.rows, target, force, pins, right)
         step_ends.start(self.rows, work.vectors, p, guess, pins)
         out, edges = np.empty_like(target), self.parts.begun(self.edges, problem)
         while True:
@@ -202,7 +203,7 @@ class PreparedCompiled:
                 edges,
                 self.form,
                 (a, b, c, e),
-                y,
+                right,
                 p,
                 1,
                 np.nan,
@@ -238,15 +239,15 @@ class PreparedCompiled:
 
         Within a step neither is done alone: blocks take turns at both.
         """
-        (a, b, _, _), y, p = work = self._new()
+        (a, b, _, _), right, p = work = self._new()
         target, force, pins, _, guess = self._arrays(problem)
-        step_ends.state(self.rows, target, force, pins, y)
+        step_ends.state(self.rows, target, force, pins, right)
         step_ends.start(self.rows, work.vectors, p, guess, pins)
 
         edges = self.parts.begun(self.edges, problem)
 
         def local() -> None:
-            step.local(self.plan, self.bundles, edges, a, y, p, b)
+            step.local(self.plan, self.bundles, edges, a, right, p, b)
 
         right, out = self.base.system.inertia[:, None] * target + force, np.zeros_like(target)
         return {"local": local, "global": lambda: self.base.correction(right, out)}
@@ -271,7 +272,7 @@ class PreparedCompiled:
         p = None if dtype == np.float64 else aligned(4 * rows)
         for x in arrays[:3] if p is None else [p]:
             x[4 * self.far] = FAR
-        return _Work(arrays, aligned(4 * rows), p)
+        return _Work(arrays, self.bundles.right(self.plan.held)[0], p)
 
     def _threads(self) -> int | None:
         """As many as are allowed and as there are groups of subtrees; None for one."""
@@ -282,8 +283,9 @@ class PreparedCompiled:
 def _projection(springs: Springs, n: int) -> Project:
     """The compiled local step for a linear solver that is called from Python."""
     bundles, _ = kernels.Bundles.of(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
-    x, b, zero = (aligned(4 * (n + 2)) for _ in range(3))
+    x, b = (aligned(4 * (n + 2)) for _ in range(2))
     x[4 * (n + 1)] = FAR
+    zero, _ = bundles.right(np.zeros(n + 2))
 
     def project(p: Positions, y: Positions, out: Positions) -> None:
         kernels.project(bundles, p, y, x, b, zero, out)

@@ -110,11 +110,10 @@ class PreparedSymplecticEuler:
         rate = np.divide(h, s.mass, out=np.zeros(s.vertices), where=s.unpinned)
         begin, end = start.positions[pins], problem.pin_targets.copy()
         p, v, force = (self._rows(x) for x in (start.positions, start.velocity, problem.force))
-        for row in v, force:
-            row.reshape(-1, 4)[pins] = 0.0
+        v.reshape(-1, 4)[pins] = 0.0
         p[4 * (s.vertices + 1)] = _FAR
-        zero = np.zeros(s.vertices + 2)
-        advance(self.bundles, pins.copy(), begin, end, force, zero, rate, h, self.substeps, p, v, np.zeros_like(v))
+        force, _ = self.bundles.right(np.zeros(s.vertices + 2), force)
+        advance(self.bundles, pins.copy(), begin, end, force, rate, h, self.substeps, p, v, np.zeros_like(v))
         velocity = v.reshape(-1, 4)[: s.vertices, :3].copy()
         velocity[pins] = (end - begin) / s.time_step
         return p.reshape(-1, 4)[: s.vertices, :3].copy(), velocity

@@ -85,8 +85,10 @@ class VertexBlockDescent:
             system,
             parts,
             self.spectral_radius,
-            kernels.Blocks(bundles, shares, len(order), held, majorant),
+            kernels.Blocks(bundles, shares, len(order), bundles.in_lanes(majorant)),
             row,
+            held,
+            float(majorant[row[system.unpinned]].sum()),
             measure,
             f"vertices in {coloured.colours} colours; for the residual alone {measure.choice}",
         )
@@ -94,14 +96,17 @@ class VertexBlockDescent:
 
 @dataclass(frozen=True, eq=False)
 class PreparedVertexBlockDescent:
-    """parts: of the energies; blocks: of the free vertices; row (n,): where each vertex is in them; measure: one
-    iteration of local-global from p tells the residual at p, and is asked for nothing else."""
+    """parts: of the energies; blocks: of the free vertices; row (n,): where each vertex is in them; held: what
+    inertia and pins hold each row with [N/m]; trace: of the majorant, over vertices that no pin holds [N/m]; measure:
+    one iteration of local-global from p tells the residual at p, and is asked for nothing else."""
 
     system: System
     parts: Parts
     spectral_radius: float
     blocks: kernels.Blocks
     row: NDArray[np.int64]
+    held: NDArray[np.float64]
+    trace: float
     measure: Prepared
     choice: str
 
@@ -123,8 +128,8 @@ class PreparedVertexBlockDescent:
         if stop.tolerance is None:
             p = advance(stop.iterations)
             return Solution(p, stop.iterations, gauge(p), np.nan, "iterations")
-        p, trace = problem.first_guess, self.blocks.majorant[self.row[self.system.unpinned]].sum()
-        floor = stop.floor * float(np.abs(p).max(initial=0.0)) * float(trace) ** 0.5
+        p = problem.first_guess
+        floor = stop.floor * float(np.abs(p).max(initial=0.0)) * self.trace**0.5
         yardstick = residual = gauge(problem.current)
         limit = stop.tolerance * yardstick
         for iteration in range(1, stop.iterations + 1):
@@ -142,6 +147,7 @@ class PreparedVertexBlockDescent:
         """What does a number of iterations, from where those before ended, and gives a copy of the positions."""
         pull = blocks.pull(replace(problem, force=self.parts.force(problem)))
         p, y = (self._rows(x) for x in (blocks.placed(problem.first_guess, problem), pull))
+        right, _ = self.blocks.bundles.right(self.held, y)
         spaces = self._spaces(contacts) if contacts else None
         p[-4] = _FAR
         entries = int(np.diff(self.blocks.bundles.start).max(initial=0))
@@ -149,7 +155,7 @@ class PreparedVertexBlockDescent:
         work = kernels.Work(p.copy(), p.copy(), np.zeros_like(p), scratch, np.zeros(1), np.full(1, np.nan))
 
         def advance(iterations: int) -> Positions:
-            kernels.iterate(self.blocks, spaces, y, self.spectral_radius, work, p, iterations)
+            kernels.iterate(self.blocks, spaces, right, self.spectral_radius, work, p, iterations)
             return p.reshape(-1, 4)[self.row, :3].copy()
 
         return advance

@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -20,39 +19,41 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner
 from solvers.intrinsics import unpacked
-from solvers.kernels.springs import TINY_SQUARED, Bundles, kinds, one_by_one
-from solvers.kernels.springs_vectors import F64, LANES, LEAST, MOST, WIDE, Vectors, constant
+from solvers.kernels.springs import TINY_SQUARED, Bundles, add_short, kinds
+from solvers.kernels.springs_vectors import F64, I64, LANES, LEAST, MOST, RIGHT, WIDE, Vectors, constant
 
 
 class Shares(NamedTuple):
     """What the objective needs beside the gradient's arrays.
 
     kind: where in `shares` each bundled entry has eight times 1/(4 k) [m/N], or 1/(2 k) where the other end is pinned
-    exactly and so has no entry; inverse: 1/(2 h) [m/N] of each row, 0 where h is; massless: the places of the rows
-    where it is; size: the sum of k r^2 [J].
+    exactly and so has no entry; inverse (8 b,): 1/(2 h) [m/N] of each lane, 0 where h is; massless (., 2): the places
+    of the rows where it is, and of their x in the right-hand side; size: the sum of k r^2 [J].
     """
 
     kind: NDArray[np.int32]
     shares: NDArray[np.float64]
     inverse: NDArray[np.float64]
-    massless: NDArray[np.int32]
+    massless: NDArray[np.int64]
     size: float
 
     @classmethod
     def of(cls, bundles: Bundles, held: NDArray[np.float64], pinned: NDArray[np.int64]) -> Shares:
         """The shares of springs in bundles, of which the rows `pinned` do not move."""
-        (pull, k), own = bundles.each(), bundles.own
+        pull, k = bundles.each()
         parts = np.where(np.isin(bundles.neighbour, 4 * pinned), 0.5, 0.25)
         share = np.divide(parts, k, out=np.zeros_like(k), where=k != 0.0)
         inverse = np.divide(0.5, held, out=np.zeros_like(held), where=held > 0.0)
-        return cls(*kinds(share), inverse, np.unique(own[held[own // 4] == 0.0]), 2.0 * float(share @ pull**2))
+        massless = np.unique(bundles.own[bundles.in_lanes(held) == 0.0])
+        places = np.column_stack([massless, bundles.right(held)[1][massless // 4]])
+        return cls(*kinds(share), bundles.in_lanes(inverse), places.astype(np.int64), 2.0 * float(share @ pull**2))
 
 
-def _bundle(typingctx, x, own, bundle, neighbour, kind, weights, part, shares, begin, end, y, held, inverse, out):
+def _bundle(typingctx, x, own, bundle, neighbour, kind, weights, part, shares, begin, end, right, inverse, out):
     """A bundle's code: writes its rows of `out`, returns its energy; -1, and writes none, if a spring is short."""
 
     def generate(context, builder: Any, signature, args):
-        x, own, bundle, neighbour, kind, weights, part, shares, begin, end, y, held, inverse, out = unpacked(
+        x, own, bundle, neighbour, kind, weights, part, shares, begin, end, right, inverse, out = unpacked(
             context, builder, signature, args
         )
         v = Vectors(context, builder)
@@ -84,20 +85,17 @@ def _bundle(typingctx, x, own, bundle, neighbour, kind, weights, part, shares, b
         *total, energy = [builder.load(accumulator) for accumulator in sums]
         short = v.any(builder.fcmp_ordered("<=", builder.load(shortest), constant(LEAST)))
         with builder.if_then(builder.not_(short), likely=True):
-            halves = []
-            for place, row in zip(v.places(own, bundle), v.rows(*total), strict=True):
-                here = v.load(builder.gep(x, [place]), row.type)
-                weight, half = (v.broadcast(builder.load(v.at(array, place))) for array in (held, inverse))
-                away = v.subtract_product(v.load(builder.gep(y, [place]), row.type), weight, here)
-                halves.append(builder.fmul(builder.fmul(half, away), away))
+            *constants, held = v.right(right, bundle)
+            away = [v.subtract_product(a, held, b) for a, b in zip(constants, centre, strict=True)]
+            half = v.load(builder.gep(inverse, [builder.mul(bundle, I64(LANES))]), WIDE)
+            builder.store(v.multiply_add(half, v.dot(away), energy), sums[3])
+            total = [builder.fadd(a, b) for a, b in zip(total, away, strict=True)]
+            for place, row in zip(v.places(own, bundle), v.rows(total), strict=True):
                 at = builder.bitcast(builder.gep(out, [place]), row.type.as_pointer())
-                builder.store(builder.fadd(row, away), at, align=8)
-            inertia = v.paired(halves)
-            builder.store(v.shuffle(inertia, ir.Constant(inertia.type, [0.0] * 4), list(range(LANES))), sums[0])
-        energy = v.total(builder.fadd(energy, builder.load(sums[0])))
-        return builder.select(short, F64(-1.0), energy)
+                builder.store(row, at, align=8)
+        return builder.select(short, F64(-1.0), v.total(builder.load(sums[3])))
 
-    arguments = x, own, bundle, neighbour, kind, weights, part, shares, begin, end, y, held, inverse, out
+    arguments = x, own, bundle, neighbour, kind, weights, part, shares, begin, end, right, inverse, out
     return types.float64(*arguments), generate
 
 
@@ -105,36 +103,37 @@ _descend: Any = intrinsic(_bundle)
 
 
 @inner
-def descend(bundles, shares, p, y, held, out):
+def descend(bundles, shares, p, right, out):
     """Write minus the gradient at p to the rows of `out`, and return the objective."""
     own, start, neighbour, kind, weights, _spring, _direction = bundles
     total = 0.0
     for b in range(len(start) - 1):
         energy = _descend(
             *(p, own, b, neighbour, kind, weights, shares.kind, shares.shares),
-            *(start[b], start[b + 1], y, held, shares.inverse, out),
+            *(start[b], start[b + 1], right, shares.inverse, out),
         )
         if energy < 0.0:
             for lane in range(LANES):
                 for c in range(4):
                     out[own[LANES * b + lane] + c] = 0.0
-            one_by_one(bundles, b, p, y, held, out, True)
-            energy = _short(bundles, shares, b, p, y, held)
+            add_short(bundles, b, p, right, out, True)
+            energy = _short(bundles, shares, b, p, right)
         total += energy
-    for i in shares.massless:
-        for k in range(i, i + 3):
-            total -= y[k] * p[k]
+    for k in range(len(shares.massless)):
+        for c in range(3):
+            total -= right[shares.massless[k, 1] + LANES * c] * p[shares.massless[k, 0] + c]
     return total
 
 
 @inner
-def _short(bundles, shares, b, p, y, held):
+def _short(bundles, shares, b, p, right):
     """The energy of a bundle in which a spring has no length."""
     total = 0.0
     for lane in range(LANES):
-        i = bundles.own[LANES * b + lane]
-        for k in range(i, i + 3):
-            total += shares.inverse[i // 4] * (y[k] - held[i // 4] * p[k]) ** 2
+        i, at = bundles.own[LANES * b + lane], RIGHT * b + lane
+        for c in range(3):
+            away = right[at + LANES * c] - right[at + 3 * LANES] * p[i + c]
+            total += shares.inverse[LANES * b + lane] * away**2
     for e in range(LANES * bundles.start[b], LANES * bundles.start[b + 1]):
         entry, lane = divmod(e, LANES)
         i, j, w = bundles.own[LANES * b + lane], bundles.neighbour[e], bundles.kind[entry] + lane

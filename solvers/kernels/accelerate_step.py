@@ -39,7 +39,7 @@ class Step(NamedTuple):
     form: Bundles
     shares: Shares
     rows: Rows
-    y: NDArray[np.float64]
+    right: NDArray[np.float64]
     x: NDArray[Any]
     e: NDArray[np.float64]
     objective: NDArray[np.float64]
@@ -48,7 +48,7 @@ class Step(NamedTuple):
 @kernel
 def start(step: Step, edges, window: Window, target, force, pin_targets, guess):
     """Begin a step's solve; edges: strain limits and dashpots, or None. Returns the guess's largest coordinate."""
-    state(step.rows, target, force, pin_targets, step.y)
+    state(step.rows, target, force, pin_targets, step.right)
     largest = place(step.rows, guess, pin_targets, window.trial)
     step.objective[0] = _evaluate(step, edges, window)
     size = step.shares.size
@@ -94,7 +94,7 @@ def run(step: Step, edges, window: Window, iterations, limit, floor, every, out)
 @inner
 def _evaluate(step, edges, window):
     rows = len(window.direction) // 4
-    total = descend(step.bundles, step.shares, window.trial, step.y, step.plan.held, window.descent_there)
+    total = descend(step.bundles, step.shares, window.trial, step.right, window.descent_there)
     add_edges(edges, 0, rows, window.trial, window.descent_there, 0, True)
     return total + energy(edges, rows, window.trial)
 

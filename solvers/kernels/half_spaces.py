@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner
 from solvers.kernels.springs import TINY_SQUARED
-from solvers.kernels.springs_vectors import LANES
+from solvers.kernels.springs_vectors import LANES, RIGHT
 
 _PASSES = 4
 _EXACT, _GRIPPED, _MAJORANT, _EVERYTHING = range(4)
@@ -196,19 +196,20 @@ def _rise(bundles, s, b, lane, i, p, x, d, held, load):
 
 
 @inner
-def move(bundles, s, b, unknowns, p, y, held, majorant):
+def move(bundles, s, b, unknowns, p, right, majorant):
     """Move the vertices of a bundle to lower energies, one after another: none is joined to another."""
     for lane in range(LANES):
         i = bundles.own[LANES * b + lane] // 4
         if i >= unknowns:
             continue
-        h = held[i]
+        at, most = RIGHT * b + lane, majorant[LANES * b + lane]
+        h = right[at + 3 * LANES]
         x = p[4 * i], p[4 * i + 1], p[4 * i + 2]
-        load = y[4 * i] - h * x[0], y[4 * i + 1] - h * x[1], y[4 * i + 2] - h * x[2]
+        load = right[at] - h * x[0], right[at + LANES] - h * x[1], right[at + 2 * LANES] - h * x[2]
         gradient, block = _springs(bundles, b, lane, p, x, h, load)
         for level in range(_EXACT, _EVERYTHING + 1):
             if level == _MAJORANT:
-                block = majorant[i], 0.0, 0.0, majorant[i], 0.0, majorant[i]
+                block = most, 0.0, 0.0, most, 0.0, most
             d, definite, before = (0.0, 0.0, 0.0), True, -1
             for _ in range(_PASSES):
                 slope, whole, who = _pushed(s, i, x, d, level, gradient, block)

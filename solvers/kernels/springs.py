@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from solvers.compiling import inner, kernel
 from solvers.energies.springs import TINY, Springs
 from solvers.kernels import springs_vectors as vectors
-from solvers.kernels.springs_vectors import LANES
+from solvers.kernels.springs_vectors import LANES, RIGHT
 from solvers.memory import aligned
 
 TINY_SQUARED = TINY * TINY
@@ -99,6 +99,30 @@ class Bundles(NamedTuple):
         pull, k = self.weights.reshape(-1, 2, LANES)[self.kind // (2 * LANES)].transpose(1, 0, 2)
         return pull.ravel(), k.ravel()
 
+    def in_lanes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of one number a row, those of the bundles' vertices (8 b,)."""
+        out = aligned(len(self.own))
+        out[:] = values[self.own // 4]
+        return out
+
+    def right(
+        self, held: NDArray[np.float64], y: NDArray[np.float64] | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """The constant right-hand side y of the bundles, with what holds each row [N/m]; and where each row's x is.
+
+        A bundle has RIGHT numbers: eight x, y and z each, and eight of `held`. Those of rows in no bundle lie behind.
+        y: in rows of four; zero, to be written to, where it is not given.
+        """
+        lane = np.arange(len(self.own))
+        out = aligned(4 * len(lane) + RIGHT)
+        bundles = out[:-RIGHT].reshape(-1, 4, LANES)
+        bundles[:, 3] = self.in_lanes(held).reshape(-1, LANES)
+        if y is not None:
+            bundles[:, :3] = y.reshape(-1, 4)[self.own // 4, :3].reshape(-1, LANES, 3).transpose(0, 2, 1)
+        at = np.full(len(held), 4 * len(lane))
+        at[self.own // 4] = RIGHT * (lane // LANES) + lane % LANES
+        return out, at
+
 
 def kinds(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Where each entry's numbers begin, and the numbers: eight of each array, kept once where entries have the same."""
@@ -113,39 +137,47 @@ def kinds(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.
 
 
 @inner
-def add_projection(bundles, begin, end, p, y, held, out, shift):
+def add_projection(bundles, begin, end, p, right, out, shift):
     """Add y + A'K d(p) of the bundles from `begin` to `end` to rows of `out`, moved by `shift`."""
     own, start, neighbour, kind, weights, _spring, _direction = bundles
     moved = out[4 * shift :]
     for b in range(begin, end):
-        if vectors.project(p, own, b, neighbour, kind, weights, start[b], start[b + 1], y, held, moved):
-            one_by_one(bundles, b, p, y, held, moved, False)
+        if vectors.project(p, own, b, neighbour, kind, weights, start[b], start[b + 1], right, moved):
+            add_short(bundles, b, p, right, moved, False)
 
 
 @inner
-def add_descent(bundles, begin, end, p, y, held, out, shift):
+def add_descent(bundles, begin, end, p, right, out, shift):
     """Add y - Q p + A'K d(p), minus the gradient, of the bundles from `begin` to `end` to rows of `out`."""
     own, start, neighbour, kind, weights, _spring, _direction = bundles
     moved = out[4 * shift :]
     for b in range(begin, end):
-        if vectors.correct(p, own, b, neighbour, kind, weights, start[b], start[b + 1], y, held, moved):
-            one_by_one(bundles, b, p, y, held, moved, True)
+        if vectors.correct(p, own, b, neighbour, kind, weights, start[b], start[b + 1], right, moved):
+            add_short(bundles, b, p, right, moved, True)
 
 
 @inner
-def one_by_one(bundles, b, p, y, held, out, correct):
-    """A bundle in which a spring has no length: that takes the direction of its rest shape."""
+def add_short(bundles, b, p, right, out, correct):
+    """The same of one bundle in which a spring has no length; correct: minus the gradient."""
+    one_by_one(bundles, b, p, out, correct)
+    for lane in range(LANES):
+        i, at = bundles.own[LANES * b + lane], RIGHT * b + lane
+        for c in range(3):
+            out[i + c] += right[at + LANES * c]
+            if correct:
+                out[i + c] -= right[at + 3 * LANES] * p[i + c]
+
+
+@inner
+def one_by_one(bundles, b, p, out, correct):
+    """Add a bundle's springs; one of no length takes the direction of its rest shape."""
     for lane in range(LANES):
         i = bundles.own[LANES * b + lane]
-        s0, s1, s2 = y[i], y[i + 1], y[i + 2]
-        x0, x1, x2 = p[i], p[i + 1], p[i + 2]
-        if correct:
-            h = held[i // 4]
-            s0, s1, s2 = s0 - h * x0, s1 - h * x1, s2 - h * x2
+        s0 = s1 = s2 = 0.0
         for entry in range(bundles.start[b], bundles.start[b + 1]):
             e, w = LANES * entry + lane, bundles.kind[entry] + lane
             j = bundles.neighbour[e]
-            v0, v1, v2 = x0 - p[j], x1 - p[j + 1], x2 - p[j + 2]
+            v0, v1, v2 = p[i] - p[j], p[i + 1] - p[j + 1], p[i + 2] - p[j + 2]
             if correct:
                 k = bundles.weights[w + LANES]
                 s0, s1, s2 = s0 - k * v0, s1 - k * v1, s2 - k * v2
@@ -163,24 +195,23 @@ def one_by_one(bundles, b, p, y, held, out, correct):
 
 @inner
 def squared_norm(bundles, begin, end, e, measure):
-    """|e|_Q^2 [J] of displacements in rows of four, half of each spring at each end and `measure` [N/m] of each row."""
+    """|e|_Q^2 [J] of displacements in rows of four: half of each spring at each end, `measure` [N/m] of each lane."""
     own, start, neighbour, kind, weights, _spring, _direction = bundles
     total = 0.0
     for b in range(begin, end):
-        total += vectors.energy(e, own, b, neighbour, kind, weights, start[b], start[b + 1], e, measure, e)
+        total += vectors.energy(e, own, b, neighbour, kind, weights, start[b], start[b + 1], measure, e)
     return total
 
 
 @kernel
 def project(bundles, p, y, x, b, zero, out):
-    """Write y + A'K d(p), all (n, 3), to `out`; x, b: scratch of n + 2 rows of four, zero: the same, of
-    zeros."""
+    """Write y + A'K d(p), all (n, 3), to `out`; x, b: scratch of n + 2 rows of four; zero: `right` of the bundles."""
     n = len(p)
     for i in range(n):
         for c in range(3):
             x[4 * i + c] = p[i, c]
             b[4 * i + c] = 0.0
-    add_projection(bundles, 0, len(bundles.start) - 1, x, zero, zero, b, 0)
+    add_projection(bundles, 0, len(bundles.start) - 1, x, zero, b, 0)
     for i in range(n):
         for c in range(3):
             out[i, c] = y[i, c] + b[4 * i + c]

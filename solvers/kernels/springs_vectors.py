@@ -24,6 +24,8 @@ from solvers.energies.springs import TINY
 from solvers.intrinsics import ask, unpacked
 
 LANES = 8
+RIGHT = 4 * LANES
+"""Numbers of a bundle's constant right-hand side: x, y and z of eight vertices, and what holds each [N/m]."""
 I32, I64, F64 = ir.IntType(32), ir.IntType(64), ir.DoubleType()
 ROW, WIDE = ir.VectorType(F64, 4), ir.VectorType(F64, LANES)
 I8, MASK = ir.IntType(8), ir.VectorType(ir.IntType(1), LANES)
@@ -70,12 +72,6 @@ class Vectors:
         first = b.mul(bundle, I64(LANES))
         return [b.zext(b.load(b.gep(indices, [b.add(first, I64(lane))])), I64) for lane in range(LANES)]
 
-    def at(self, array: Any, place: Any) -> Any:
-        """Where a row's number is in an array of one float64 a row."""
-        b = self.builder
-        byte = b.gep(b.bitcast(array, I8.as_pointer()), [b.mul(place, I64(2))])
-        return b.bitcast(byte, F64.as_pointer())
-
     def gather(self, array: Any, places: list[Any]) -> list[Any]:
         """x, y and z of eight rows."""
         rows = [self.load(self.builder.gep(array, [place]), ROW) for place in places]
@@ -118,16 +114,21 @@ class Vectors:
             for stage in stages[depth - 1 - k :]:
                 values = stage(values)
 
-    def rows(self, x: Any, y: Any, z: Any) -> list[Any]:
-        """Eight rows of x, y, z and zero."""
-        even, odd = [0, 8, 2, 10, 4, 12, 6, 14], [1, 9, 3, 11, 5, 13, 7, 15]
-        halves = [[self.shuffle(a, b, lanes) for a, b in ((x, y), (z, constant(0.0)))] for lanes in (even, odd)]
+    def rows(self, vectors: list[Any], element: ir.Type = F64) -> list[Any]:
+        """Eight rows of x, y, z and zero, rounded to float32 where that is the element."""
+        zero, pairs = ir.Constant(ir.VectorType(element, LANES), [0.0] * LANES), [0, 2, 4, 6]
+        if element != F64:
+            vectors = [self.builder.fptrunc(a, zero.type) for a in vectors]
+            pairs = [0, 1, 4, 5]  # so that shuffles stay within 128 bits
+        (x, y, z), apart, halves = vectors, pairs[1], []
+        for half in (0, 2 // apart):
+            lanes = [lane for k in pairs for lane in (k + half, k + half + LANES)]
+            halves.append((self.shuffle(x, y, lanes), self.shuffle(z, zero, lanes)))
         out: list[Any] = [None] * LANES
         for lane in range(LANES // 2):  # two rows at a time, four lanes apart
-            begin = lane - lane % 2
+            half, begin = (lane % 2, lane - lane % 2) if apart == 2 else (lane // 2, 2 * (lane % 2))
             places = [begin, begin + 1, begin + 8, begin + 9, begin + 4, begin + 5, begin + 12, begin + 13]
-            xy, z0 = halves[lane % 2]
-            both = self.shuffle(xy, z0, places)
+            both = self.shuffle(halves[half][0], halves[half][1], places)
             out[lane], out[lane + 4] = (self.shuffle(both, both, list(range(k, k + 4))) for k in (0, 4))
         return out
 
@@ -137,13 +138,6 @@ class Vectors:
         for component in a[1:]:
             squared = self.multiply_add(component, component, squared)
         return squared
-
-    def gathered(self, scalars: list[Any]) -> Any:
-        """Eight numbers as a vector."""
-        out: Any = constant(0.0)
-        for lane, scalar in enumerate(scalars):
-            out = self.builder.insert_element(out, scalar, I32(lane))
-        return out
 
     def total(self, a: Any) -> Any:
         """The sum of the lanes, taken pairwise."""
@@ -155,16 +149,9 @@ class Vectors:
             terms = [self.builder.fadd(p, q) for p, q in zip(terms[::2], terms[1::2], strict=True)]
         return terms[0]
 
-    def broadcast(self, scalar: Any) -> Any:
-        """A row of four times one number."""
-        single = self.builder.insert_element(ir.Constant(ROW, [0.0] * 4), scalar, I32(0))
-        return self.shuffle(single, single, [0] * 4)
-
     def add_to(self, pointer: Any, row: Any) -> None:
-        """Add a row to one in memory, rounded to its type first."""
-        if pointer.type.pointee != F64:
-            row = self.builder.fptrunc(row, ir.VectorType(pointer.type.pointee, 4))
-        size = 8 if pointer.type.pointee == F64 else 4
+        """Add a row to one in memory."""
+        size = 8 if row.type.element == F64 else 4
         total = self.builder.fadd(self.load(pointer, row.type, size), row)
         self.builder.store(total, self.builder.bitcast(pointer, row.type.as_pointer()), align=size)
 
@@ -176,14 +163,19 @@ class Vectors:
         """The lesser of two vectors' numbers, or the greater with the order ">="; a, where that is not a number."""
         return self.builder.select(self.builder.fcmp_ordered(order, b, a), b, a)
 
-    def ask_ahead(self, places: list[Any], entry: Any, rows: list[Any], numbers: Any, neighbour: Any) -> None:
-        """Ask for what a bundle reads AHEAD rows on, of arrays of rows, of numbers and of the entries' other ends."""
+    def right(self, array: Any, bundle: Any) -> list[Any]:
+        """The constant right-hand side of a bundle, and what holds its vertices."""
+        at = self.builder.gep(array, [self.builder.mul(bundle, I64(RIGHT))])
+        return [self.load(self.builder.gep(at, [I64(LANES * k)]), WIDE) for k in range(4)]
+
+    def ask_ahead(self, bundle: Any, places: list[Any], entry: Any, right: Any, out: Any, neighbour: Any) -> None:
+        """Ask for what a bundle reads AHEAD rows on."""
         b = self.builder
-        ahead = [b.add(place, I64(4 * AHEAD)) for place in places]
-        for array in rows:
-            for place in ahead[::2]:
-                ask(b, b.gep(array, [place]))
-        ask(b, self.at(numbers, ahead[0]))
+        first = b.mul(b.add(bundle, I64(AHEAD // LANES)), I64(RIGHT))
+        for k in range(4):
+            ask(b, b.gep(right, [b.add(first, I64(LANES * k))]))
+        for place in places[::2]:
+            ask(b, b.gep(out, [b.add(place, I64(4 * AHEAD))]))
         first = b.mul(b.add(entry, I64(AHEAD)), I64(LANES))  # about as many entries as rows
         for k in range(LANES // 2):
             ask(b, b.gep(neighbour, [b.add(first, I64(2 * LANES * k))]))
@@ -226,15 +218,16 @@ class Vectors:
 def _over_bundle(kind: Kind):
     """The code for a bundle: its eight vertices and their springs."""
 
-    def declare(typingctx, x, own, bundle, neighbour, kinds, weights, begin, end, y, held, out):
+    def declare(typingctx, x, own, bundle, neighbour, kinds, weights, begin, end, right, out):
         def generate(context, builder: Any, signature, args):
-            x, own, bundle, neighbour, kinds, weights, begin, end, y, held, out = unpacked(
+            x, own, bundle, neighbour, kinds, weights, begin, end, right, out = unpacked(
                 context, builder, signature, args
             )
             v = Vectors(context, builder)
             places = v.places(own, bundle)
             centre = v.gather(x, places)
-            v.ask_ahead(places, begin, [y, out], held, neighbour)
+            if kind != "energy":
+                v.ask_ahead(bundle, places, begin, right, out, neighbour)
             sums = [cgutils.alloca_once(builder, WIDE) for _ in range(3)]
             for accumulator in sums:
                 builder.store(constant(0.0), accumulator)
@@ -270,22 +263,22 @@ def _over_bundle(kind: Kind):
 
             v.over_entries(begin, end, read, *([add] if kind == "energy" else [scale, add]))
             total = [builder.load(accumulator) for accumulator in sums]
-            places = v.places(own, bundle)  # again: they would not stay in registers
-            held = [builder.load(v.at(held, place)) for place in places]
             if kind == "energy":
-                lanes = v.multiply_add(v.dot(centre), v.gathered(held), builder.fmul(constant(0.5), total[0]))
-                return v.total(lanes)
+                held = v.load(builder.gep(right, [builder.mul(bundle, I64(LANES))]), WIDE)
+                return v.total(v.multiply_add(v.dot(centre), held, builder.fmul(constant(0.5), total[0])))
             short = v.any(builder.fcmp_ordered("<=", builder.load(shortest), constant(LEAST)))
             with builder.if_then(builder.not_(short), likely=True):
-                for place, row, weight in zip(places, v.rows(*total), held, strict=True):
-                    row = builder.fadd(row, v.load(builder.gep(y, [place]), ROW))
-                    if kind == "correct":
-                        row = v.subtract_product(row, v.broadcast(weight), v.load(builder.gep(x, [place]), ROW))
+                *constants, held = v.right(right, bundle)
+                total = [builder.fadd(a, b) for a, b in zip(total, constants, strict=True)]
+                if kind == "correct":
+                    total = [v.subtract_product(a, held, b) for a, b in zip(total, centre, strict=True)]
+                places = v.places(own, bundle)  # again: they would not stay in registers
+                for place, row in zip(places, v.rows(total, out.type.pointee), strict=True):
                     v.add_to(builder.gep(out, [place]), row)
             return short
 
         returned = types.float64 if kind == "energy" else types.boolean
-        return returned(x, own, bundle, neighbour, kinds, weights, begin, end, y, held, out), generate
+        return returned(x, own, bundle, neighbour, kinds, weights, begin, end, right, out), generate
 
     return declare
 

@@ -39,9 +39,10 @@ class Plan(NamedTuple):
     top's rows, and the number of groups; blocks (b, 7): of each its first and last slot and bundle, its first chunk,
     and the last for the passes forwards and backwards; of_group (groups + 2,): the first block of each group and of the
     top; visits: twice the block that a group goes down to, or up from (one more), from visits_of (groups + 1,) on;
-    held: m/dt^2 + w [N/m] of each row, and what quadratic forms hold it with; measure: as held without pins, and half
-    of the springs to exactly pinned vertices, which no bundle counts from there; loose: 1 for the rows of vertices that
-    no pin holds, else 0; shift: by how many rows a vertex's right-hand side lies behind its position.
+    held: m/dt^2 + w [N/m] of each row, and what quadratic forms hold it with; measure: of each lane of the bundles of
+    |e|_Q^2, as held without pins, and half of the springs to exactly pinned vertices, which no bundle counts from
+    there; loose: 1 for the rows of vertices that no pin holds, else 0; shift: by how many rows a vertex's right-hand
+    side lies behind its position.
     """
 
     squares: NDArray[np.float64]
@@ -79,14 +80,14 @@ def _add(a, b):
 
 
 @inner
-def _up(plan, bundles, edges, block, x, y, p, out):
+def _up(plan, bundles, edges, block, x, right, p, out):
     """The local step of a block at x (at p, where that is given), and its pass forwards."""
     slot, slot_end, bundle, bundle_end, chunk, chunk_end, _ = plan.blocks[block]
     if p is None:
-        add_projection(bundles, bundle, bundle_end, x, y, plan.held, out, plan.shift)
+        add_projection(bundles, bundle, bundle_end, x, right, out, plan.shift)
         add_edges(edges, slot, slot_end, x, out, plan.shift, False)
     else:
-        add_descent(bundles, bundle, bundle_end, p, y, plan.held, out, plan.shift)
+        add_descent(bundles, bundle, bundle_end, p, right, out, plan.shift)
         add_edges(edges, slot, slot_end, p, out, plan.shift, True)
     forwards(plan.panels, plan.places, plan.chunks, chunk, chunk_end, out)
 
@@ -107,7 +108,7 @@ def _clear(plan, block, out):
 
 
 @inner
-def _group(plan, bundles, edges, group, x, y, p, out, down, up):
+def _group(plan, bundles, edges, group, x, right, p, out, down, up):
     """A group: down with the vector x, and up again with `out`, in the order of its visits."""
     top = 4 * plan.top[0]
     size = 4 * plan.top[1] - top
@@ -124,11 +125,11 @@ def _group(plan, bundles, edges, group, x, y, p, out, down, up):
             if up:
                 _clear(plan, block, out)
         elif up:
-            _up(plan, bundles, edges, block, x, y, p, out)
+            _up(plan, bundles, edges, block, x, right, p, out)
 
 
 @inner
-def _turn(plan, bundles, edges, x, y, p, out):
+def _turn(plan, bundles, edges, x, right, p, out):
     """The top: up at the positions x, and down again."""
     top, top_end, groups = plan.top
     size = 4 * (top_end - top)
@@ -139,7 +140,7 @@ def _turn(plan, bundles, edges, x, y, p, out):
         else:
             _add(out[begin : begin + size], out[4 * top : 4 * top_end])
     for block in range(plan.of_group[-2], plan.of_group[-1]):
-        _up(plan, bundles, edges, block, x, y, p, out)
+        _up(plan, bundles, edges, block, x, right, p, out)
         _down(plan, block, out, p)
 
 
@@ -163,14 +164,14 @@ def _squared(plan, form, part, e):
 
 
 @kernel
-def local(plan, bundles, edges, x, y, p, out):
+def local(plan, bundles, edges, x, right, p, out):
     """The local step alone, of all blocks."""
     for k in range(len(out)):
         out[k] = 0.0
     if p is None:
-        add_projection(bundles, 0, len(bundles.start) - 1, x, y, plan.held, out, plan.shift)
+        add_projection(bundles, 0, len(bundles.start) - 1, x, right, out, plan.shift)
     else:
-        add_descent(bundles, 0, len(bundles.start) - 1, p, y, plan.held, out, plan.shift)
+        add_descent(bundles, 0, len(bundles.start) - 1, p, right, out, plan.shift)
     for block in range(len(plan.blocks)):
         begin, end = plan.blocks[block, 0], plan.blocks[block, 1]
         if p is None:
@@ -180,7 +181,7 @@ def local(plan, bundles, edges, x, y, p, out):
 
 
 @inner
-def _share(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, team, first):
+def _share(plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, team, first):
     """A thread's share of the iterations: the groups from `first` on that no other thread does, and what follows them.
 
     Phase 2 k is iteration k, phase 2 k + 1 measures it where that is wanted.
@@ -201,7 +202,7 @@ def _share(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, 
                     _displace(plan, group, a, c, p, e)
                     team.sums[group] = _squared(plan, form, group, e)
                 else:
-                    _group(plan, bundles, edges, group, a, y, p, b, k > 0, k < iterations)
+                    _group(plan, bundles, edges, group, a, right, p, b, k > 0, k < iterations)
                 if last(team):
                     enough = k == iterations
                     if measures:
@@ -218,36 +219,37 @@ def _share(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, 
                         team.found[0] = k
                         finish(team)
                     else:
-                        _turn(plan, bundles, edges, a, y, p, b)
+                        _turn(plan, bundles, edges, a, right, p, b)
                         go_on(team, 2 * k + 2)
         phase = following(team, phase)
 
 
 @inner_in_parallel
-def _side_by_side(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, team, threads):
+def _side_by_side(plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, team, threads):
     for thread in prange(threads):
         _share(
-            plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, team,
+            plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, team,
             thread * plan.top[2] // threads,
         )  # fmt: skip
 
 
 @kernel
-def iterate(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, threads, team):
+def iterate(plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, threads, team):
     """Iterate from the positions in the first vector, or from p where that is given, which then takes the positions.
 
     edges: strain limits and dashpots, or None; form: the bundles of |e|_Q^2, with pairs for all that is not a spring;
-    vectors: three that take turns, and one for scratch, of float64; y: the constant right-hand side; every: whether the
-    iterations end once a residual is at most `limit` or `floor`; threads: None for one.
+    vectors: three that take turns, and one for scratch, of float64; right: the constant right-hand side (see
+    `Bundles.right`); every: whether the iterations end once a residual is at most `limit` or `floor`; threads: None
+    for one.
     Returns how many were done, the last one's residual |p^k - p^(k-1)|_Q [J^(1/2)] over the vertices that no pin
     holds (nan where none was wanted: limit is nan), and the last vector.
     """
     start(team)
     team.found[1] = np.nan
     if threads is None:
-        _share(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, team, 0)
+        _share(plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, team, 0)
     else:
-        _side_by_side(plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, team, threads)
+        _side_by_side(plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, team, threads)
     x0, x1, x2, _ = vectors
     done = int(team.found[0])
     return done, team.found[1], (x0, x1, x2)[done % 3]

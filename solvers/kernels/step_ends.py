@@ -9,18 +9,21 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 from solvers.intrinsics import ask_for
+from solvers.kernels.springs_vectors import LANES
 from solvers.kernels.step import iterate
 
 
 class Rows(NamedTuple):
     """Where vertices lie, and what is constant of their right-hand side.
 
-    row (n,): of each vertex; inertia: m/dt^2 (n,) [N/m]; weight: of each pin (q,) [N/m], infinite for an exact one;
-    pinned (q,): its vertex; coupling: Q's entries [N/m] between free and exactly pinned vertices, with the row of the
-    one (coupled) and the pin of the other (pin), none of them where corrections are solved for.
+    row (n,): of each vertex; right (n,): where its x is in the right-hand side; inertia: m/dt^2 (n,) [N/m]; weight: of
+    each pin (q,) [N/m], infinite for an exact one; pinned (q,): its vertex; coupling: Q's entries [N/m] between free
+    and exactly pinned vertices, the one (coupled) and the pin of the other (pin), none of them where corrections are
+    solved for.
     """
 
     row: NDArray[np.int64]
+    right: NDArray[np.int64]
     inertia: NDArray[np.float64]
     weight: NDArray[np.float64]
     pinned: NDArray[np.int64]
@@ -39,19 +42,19 @@ def _ask_ahead(rows, v, x):
 
 
 @kernel
-def state(rows, target, force, pin_targets, y):
+def state(rows, target, force, pin_targets, right):
     """y = M target/dt^2 + f + w C'C p_pin, with the exact pins' columns of Q moved to the right-hand side."""
     for v in range(len(target)):
-        _ask_ahead(rows, v, y)
+        ask_for(right, rows.right[min(v + _AHEAD, len(rows.right) - 1)])
         for c in range(3):
-            y[4 * rows.row[v] + c] = rows.inertia[v] * target[v, c] + force[v, c]
+            right[rows.right[v] + LANES * c] = rows.inertia[v] * target[v, c] + force[v, c]
     for q in range(len(rows.pinned)):
         if rows.weight[q] < np.inf:
             for c in range(3):
-                y[4 * rows.row[rows.pinned[q]] + c] += rows.weight[q] * pin_targets[q, c]
+                right[rows.right[rows.pinned[q]] + LANES * c] += rows.weight[q] * pin_targets[q, c]
     for k in range(len(rows.coupling)):
         for c in range(3):
-            y[4 * rows.coupled[k] + c] -= rows.coupling[k] * pin_targets[rows.pin[k], c]
+            right[rows.right[rows.coupled[k]] + LANES * c] -= rows.coupling[k] * pin_targets[rows.pin[k], c]
 
 
 @inner
@@ -100,17 +103,17 @@ def start(rows, vectors, p, positions, pin_targets):
 
 @kernel
 def solve(
-    plan, bundles, edges, form, rows, vectors, y, p, target, force, pin_targets, guess,
+    plan, bundles, edges, form, rows, vectors, right, p, target, force, pin_targets, guess,
     iterations, limit, floor, every, threads, team, out,
 ):  # fmt: skip
     """A whole step; `limit`, `floor` and `every` as in `iterate`, but `floor` for a largest coordinate of one.
 
     Returns the count of iterations, the residual [J^(1/2)], and whether it is at most `limit`, or `floor`.
     """
-    state(rows, target, force, pin_targets, y)
+    state(rows, target, force, pin_targets, right)
     floor *= start(rows, vectors, p, guess, pin_targets)
     count, residual, x = iterate(
-        plan, bundles, edges, form, vectors, y, p, iterations, limit, floor, every, threads, team
+        plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, threads, team
     )
     if p is None:
         fetch(rows, x, out)

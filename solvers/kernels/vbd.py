@@ -11,20 +11,20 @@ from solvers.compiling import inner, kernel
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.accelerate_springs import descend as objective
 from solvers.kernels.half_spaces import move, pressed
-from solvers.kernels.springs import Bundles, one_by_one
+from solvers.kernels.springs import Bundles, add_short
 from solvers.kernels.springs_vectors import LANES
 from solvers.kernels.vbd_vectors import descend
 
 
 class Blocks(NamedTuple):
-    """bundles: of the free vertices, by colour; shares: of the objective; unknowns: how many vertices are free; of each
-    row held [N/m], by inertia and pins, and majorant [N/m], that and the stiffness of its springs (1 where no vertex
-    is). Vectors have rows of four numbers, the unknowns first."""
+    """bundles: of the free vertices, by colour; shares: of the objective; unknowns: how many vertices are free;
+    majorant [N/m]: of each lane what holds its vertex, and the stiffness of its springs (1 where no vertex is).
+
+    Vectors have rows of four numbers, the unknowns first."""
 
     bundles: Bundles
     shares: Shares
     unknowns: int
-    held: NDArray[np.float64]
     majorant: NDArray[np.float64]
 
 
@@ -42,27 +42,25 @@ class Work(NamedTuple):
 
 
 @inner
-def _sweep(blocks, spaces, y, p, work):
+def _sweep(blocks, spaces, right, p, work):
     """Move every vertex once to a lower energy."""
     own, start, neighbour, kind, weights, _spring, _direction = blocks.bundles
     for b in range(len(start) - 1):
         if spaces is not None:  # noqa: SIM102 Numba leaves a branch out for None alone
             if spaces.near[b]:
-                move(blocks.bundles, spaces, b, blocks.unknowns, p, y, blocks.held, blocks.majorant)
+                move(blocks.bundles, spaces, b, blocks.unknowns, p, right, blocks.majorant)
                 continue
-        short = descend(
-            p, own, b, neighbour, kind, weights, start[b], start[b + 1], y, blocks.held, blocks.majorant, work.near
-        )
+        short = descend(p, own, b, neighbour, kind, weights, start[b], start[b + 1], right, blocks.majorant, work.near)
         if short:
             # A spring without length has no Hessian: the majorant's step takes it apart.
             for lane in range(LANES):
                 for k in range(4):
                     work.out[own[LANES * b + lane] + k] = 0.0
-            one_by_one(blocks.bundles, b, p, y, blocks.held, work.out, True)
+            add_short(blocks.bundles, b, p, right, work.out, True)
             for lane in range(LANES):
                 i = own[LANES * b + lane]
                 for k in range(i, i + 3):
-                    p[k] += work.out[k] / blocks.majorant[i // 4]
+                    p[k] += work.out[k] / blocks.majorant[LANES * b + lane]
                     work.out[k] = 0.0
 
 
@@ -73,16 +71,17 @@ def _copy(p, out):
 
 
 @inner
-def _level(blocks, spaces, p, y, out):
-    return objective(blocks.bundles, blocks.shares, p, y, blocks.held, out) + pressed(spaces, p)
+def _level(blocks, spaces, p, right, out):
+    return objective(blocks.bundles, blocks.shares, p, right, out) + pressed(spaces, p)
 
 
 @kernel
-def iterate(blocks, spaces, y, radius, work, p, iterations):
+def iterate(blocks, spaces, right, radius, work, p, iterations):
     """That many sweeps over all vertices from p, which takes the result.
 
-    spaces: half-spaces that vertices are kept in, or None; radius: of Chebyshev's extrapolation, 0 for none. An
-    extrapolation that raises the objective above that before the sweep is not taken, and they begin again.
+    spaces: half-spaces that vertices are kept in, or None; right: see `Bundles.right`; radius: of Chebyshev's
+    extrapolation, 0 for none. An extrapolation that raises the objective above that before the sweep is not taken, and
+    they begin again.
     """
     omega, level, older = work.omega, work.level, work.older
     for _ in range(iterations):
@@ -94,16 +93,16 @@ def iterate(blocks, spaces, y, radius, work, p, iterations):
             else 1.0
         )
         if w > 1.0 and np.isnan(level[0]):
-            level[0] = _level(blocks, spaces, p, y, work.out)
+            level[0] = _level(blocks, spaces, p, right, work.out)
         _copy(p, work.before)
-        _sweep(blocks, spaces, y, p, work)
+        _sweep(blocks, spaces, right, p, work)
         if radius == 0.0:
             continue
         omega[0] = w
         if w > 1.0:
             for k in range(4 * blocks.unknowns):
                 older[k] += w * (p[k] - older[k])
-            new = _level(blocks, spaces, older, y, work.out)
+            new = _level(blocks, spaces, older, right, work.out)
             if new <= level[0]:
                 _copy(older, p)
                 level[0] = new

@@ -43,25 +43,23 @@ def _newton(v: Vectors, block: list[Any], g: list[Any]) -> tuple[list[Any], Any]
     return [x0, x1, x2], builder.and_(builder.and_(large[0], large[1]), large[2])
 
 
-def _bundle(typingctx, x, own, bundle, neighbour, kind, weights, begin, end, y, held, majorant, near):
+def _bundle(typingctx, x, own, bundle, neighbour, kind, weights, begin, end, right, majorant, near):
     """A bundle's code: moves its vertices in x, and returns whether a spring is too short, when it moves none."""
 
     def generate(context, builder: Any, signature, args):
-        x, own, bundle, neighbour, kind, weights, begin, end, y, held, majorant, near = unpacked(
+        x, own, bundle, neighbour, kind, weights, begin, end, right, majorant, near = unpacked(
             context, builder, signature, args
         )
         v = Vectors(context, builder)
         places = v.places(own, bundle)
 
-        def at_vertices(array):
-            return v.gathered([builder.load(v.at(array, place)) for place in places])
-
         def kept(entry):
             begins = builder.mul(builder.sub(entry, begin), I64(LANES * NUMBERS))
             return [builder.gep(near, [builder.add(begins, I64(LANES * k))]) for k in range(NUMBERS)]
 
-        centre, weight = v.gather(x, places), at_vertices(held)
-        load = [v.subtract_product(here, weight, p) for here, p in zip(v.gather(y, places), centre, strict=True)]
+        centre = v.gather(x, places)
+        *constants, weight = v.right(right, bundle)
+        load = [v.subtract_product(here, weight, p) for here, p in zip(constants, centre, strict=True)]
         # Minus the gradient, then the block's upper triangle, row by row.
         first = [*load, weight, _ZERO, _ZERO, weight, _ZERO, weight]
         sums = [cgutils.alloca_once_value(builder, value) for value in first]
@@ -110,16 +108,16 @@ def _bundle(typingctx, x, own, bundle, neighbour, kind, weights, begin, end, y, 
             factor = builder.fsub(builder.fmul(_HALF, k), builder.fdiv(pull, both))
             builder.store(v.multiply_add(factor, change, builder.load(rises)), rises)
         better = builder.and_(definite, builder.fcmp_ordered("<=", builder.load(rises), _ZERO))
-        scale = builder.fdiv(_ONE, at_vertices(majorant))
+        scale = builder.fdiv(_ONE, v.load(builder.gep(majorant, [builder.mul(bundle, I64(LANES))]), WIDE))
         safe = [builder.fmul(scale, component) for component in force]
         ends = [builder.fadd(p, builder.select(better, a, b)) for p, a, b in zip(centre, d, safe, strict=True)]
         any_short = v.any(builder.load(short))
         with builder.if_then(builder.not_(any_short), likely=True):
-            for place, row in zip(places, v.rows(*ends), strict=True):
+            for place, row in zip(places, v.rows(ends), strict=True):
                 builder.store(row, builder.bitcast(builder.gep(x, [place]), row.type.as_pointer()), align=8)
         return any_short
 
-    arguments = x, own, bundle, neighbour, kind, weights, begin, end, y, held, majorant, near
+    arguments = x, own, bundle, neighbour, kind, weights, begin, end, right, majorant, near
     return types.boolean(*arguments), generate
 
 
