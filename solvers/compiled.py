@@ -249,8 +249,8 @@ class PreparedCompiled:
         def local() -> None:
             step.local(self.plan, self.bundles, edges, a, right, p, b)
 
-        right, out = self.base.system.inertia[:, None] * target + force, np.zeros_like(target)
-        return {"local": local, "global": lambda: self.base.correction(right, out)}
+        y, out = self.base.system.inertia[:, None] * target + force, np.zeros_like(target)
+        return {"local": local, "global": lambda: self.base.correction(y, out)}
 
     def _arrays(self, problem: StepProblem) -> list[Positions]:
         """The problem's arrays. The kernels are compiled for arrays that may be written to: what may not is copied."""
