@@ -169,7 +169,7 @@ class _Compiled:
         window = window_for(self._method, self._entries, whole, self._plan.squares.dtype)
         window.trial[4 * self._far] = FAR
         x = aligned(whole, self._plan.squares.dtype)
-        vectors = self._bundles.right(self._plan.held)[0], x, aligned(whole), np.zeros(3)
+        vectors = self._bundles.right(self._plan.held), x, aligned(whole), np.zeros(3)
         return accelerate_step.Step(self._plan, self._bundles, self._form, self._shares, self._rows, *vectors), window
 
     def begin(self, problem: StepProblem, guess: Positions) -> Run:

@@ -163,7 +163,7 @@ class PreparedCompiled:
             form,
             step_ends.Rows(
                 row,
-                bundles.right(held)[1][row],
+                bundles.in_right(len(held))[row],
                 inertia,
                 np.array(pins.weight),
                 np.array(pins.vertices),
@@ -272,7 +272,7 @@ class PreparedCompiled:
         p = None if dtype == np.float64 else aligned(4 * rows)
         for x in arrays[:3] if p is None else [p]:
             x[4 * self.far] = FAR
-        return _Work(arrays, self.bundles.right(self.plan.held)[0], p)
+        return _Work(arrays, self.bundles.right(self.plan.held), p)
 
     def _threads(self) -> int | None:
         """As many as are allowed and as there are groups of subtrees; None for one."""
@@ -285,7 +285,7 @@ def _projection(springs: Springs, n: int) -> Project:
     bundles, _ = kernels.Bundles.of(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
     x, b = (aligned(4 * (n + 2)) for _ in range(2))
     x[4 * (n + 1)] = FAR
-    zero, _ = bundles.right(np.zeros(n + 2))
+    zero = bundles.right(np.zeros(n + 2))
 
     def project(p: Positions, y: Positions, out: Positions) -> None:
         kernels.project(bundles, p, y, x, b, zero, out)

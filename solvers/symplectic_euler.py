@@ -112,7 +112,7 @@ class PreparedSymplecticEuler:
         p, v, force = (self._rows(x) for x in (start.positions, start.velocity, problem.force))
         v.reshape(-1, 4)[pins] = 0.0
         p[4 * (s.vertices + 1)] = _FAR
-        force, _ = self.bundles.right(np.zeros(s.vertices + 2), force)
+        force = self.bundles.right(np.zeros(s.vertices + 2), force)
         advance(self.bundles, pins.copy(), begin, end, force, rate, h, self.substeps, p, v, np.zeros_like(v))
         velocity = v.reshape(-1, 4)[: s.vertices, :3].copy()
         velocity[pins] = (end - begin) / s.time_step

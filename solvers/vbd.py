@@ -147,7 +147,7 @@ class PreparedVertexBlockDescent:
         """What does a number of iterations, from where those before ended, and gives a copy of the positions."""
         pull = blocks.pull(replace(problem, force=self.parts.force(problem)))
         p, y = (self._rows(x) for x in (blocks.placed(problem.first_guess, problem), pull))
-        right, _ = self.blocks.bundles.right(self.held, y)
+        right = self.blocks.bundles.right(self.held, y)
         spaces = self._spaces(contacts) if contacts else None
         p[-4] = _FAR
         entries = int(np.diff(self.blocks.bundles.start).max(initial=0))

@@ -45,7 +45,7 @@ class Shares(NamedTuple):
         share = np.divide(parts, k, out=np.zeros_like(k), where=k != 0.0)
         inverse = np.divide(0.5, held, out=np.zeros_like(held), where=held > 0.0)
         massless = np.unique(bundles.own[bundles.in_lanes(held) == 0.0])
-        places = np.column_stack([massless, bundles.right(held)[1][massless // 4]])
+        places = np.column_stack([massless, bundles.in_right(len(held))[massless // 4]])
         return cls(*kinds(share), bundles.in_lanes(inverse), places.astype(np.int64), 2.0 * float(share @ pull**2))
 
 

@@ -105,23 +105,25 @@ class Bundles(NamedTuple):
         out[:] = values[self.own // 4]
         return out
 
-    def right(
-        self, held: NDArray[np.float64], y: NDArray[np.float64] | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """The constant right-hand side y of the bundles, with what holds each row [N/m]; and where each row's x is.
+    def right(self, held: NDArray[np.float64], y: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """The constant right-hand side y of the bundles, with what holds each row [N/m].
 
         A bundle has RIGHT numbers: eight x, y and z each, and eight of `held`. Those of rows in no bundle lie behind.
         y: in rows of four; zero, to be written to, where it is not given.
         """
-        lane = np.arange(len(self.own))
-        out = aligned(4 * len(lane) + RIGHT)
+        out = aligned(4 * len(self.own) + RIGHT)
         bundles = out[:-RIGHT].reshape(-1, 4, LANES)
         bundles[:, 3] = self.in_lanes(held).reshape(-1, LANES)
         if y is not None:
             bundles[:, :3] = y.reshape(-1, 4)[self.own // 4, :3].reshape(-1, LANES, 3).transpose(0, 2, 1)
-        at = np.full(len(held), 4 * len(lane))
+        return out
+
+    def in_right(self, rows: int) -> NDArray[np.int64]:
+        """Where x of each of so many rows is in `right`."""
+        lane = np.arange(len(self.own))
+        at = np.full(rows, 4 * len(lane))
         at[self.own // 4] = RIGHT * (lane // LANES) + lane % LANES
-        return out, at
+        return at
 
 
 def kinds(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:

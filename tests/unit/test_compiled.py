@@ -53,7 +53,7 @@ def local(springs: Springs, p: Positions, y: Positions) -> Positions:
     bundles, _ = Bundles.of(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
     x, b = (aligned(4 * (n + 2)) for _ in range(2))
     x[4 * (n + 1)] = 1e100
-    zero, _ = bundles.right(np.zeros(n + 2))
+    zero = bundles.right(np.zeros(n + 2))
     out = np.empty_like(p)
     project(bundles, p, y, x, b, zero, out)
     return out
