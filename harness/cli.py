@@ -14,11 +14,11 @@ import typer
 from rich.table import Table
 from typer.core import TyperGroup
 
-from harness.ablate.command import ablate
-from harness.console import err, out, show_log
-from harness.console import say as _say
-from harness.errors import InputError, SpringbenchError
-from harness.gallery import gallery
+from harness.base.console import err, out, show_log
+from harness.base.console import say as _say
+from harness.base.errors import InputError, SpringbenchError
+from harness.experiments.ablation.command import ablate
+from harness.experiments.gallery import gallery
 
 
 class _Commands(TyperGroup):
@@ -73,10 +73,10 @@ def run(
     again: Annotated[bool, typer.Option("--again", help="Do all runs, also those that are there.")] = False,
 ) -> None:
     """Do what is missing of a sweep, or of the one scene in a file."""
-    from harness.load import load_any
-    from harness.progress import display
+    from harness.base.progress import display
+    from harness.config.load import load_any
+    from harness.experiments.sweep import failures, run_sweep
     from harness.report.timing_table import summary_table
-    from harness.sweep import failures, run_sweep
 
     options = {
         "frames": frames,
@@ -108,11 +108,11 @@ def speed(
     again: Annotated[bool, typer.Option("--again", help="Do all sizes, also those that are there.")] = False,
 ) -> None:
     """Time a sweep's solvers in turns, beside a yardstick in C++ and the machine's own limits."""
-    from harness.load import load_sweep
-    from harness.speed.figures import figures
-    from harness.speed.pictures import draw
-    from harness.speed.report import run_speed
-    from harness.speed.table import remarks, speed_table
+    from harness.config.load import load_sweep
+    from harness.experiments.speed.figures import figures
+    from harness.experiments.speed.pictures import draw
+    from harness.experiments.speed.report import run_speed
+    from harness.experiments.speed.table import remarks, speed_table
 
     sweep = load_sweep(config)
     folder = results / sweep.name
@@ -132,9 +132,9 @@ def accuracy(
     again: Annotated[bool, typer.Option("--again", help="Measure all again, also what is there.")] = False,
 ) -> None:
     """Measure what accuracy costs in time: convergence on frozen steps, and errors of whole simulations."""
-    from harness.accuracy.load import load_accuracy
-    from harness.accuracy.run import failures, run_accuracy
-    from harness.progress import display
+    from harness.base.progress import display
+    from harness.config.accuracy_load import load_accuracy
+    from harness.experiments.accuracy.run import failures, run_accuracy
     from harness.report.accuracy import draw
 
     asked = load_accuracy(config)
@@ -158,8 +158,8 @@ def recommend(
     results: Results = Path("results"),
 ) -> None:
     """Find the cheapest integrator, time step, tolerance and solver that keep to an error, and check them."""
-    from harness.accuracy.recommend import recommend as find
-    from harness.progress import display
+    from harness.base.progress import display
+    from harness.experiments.accuracy.recommend import recommend as find
 
     found = find(
         scene,
@@ -202,8 +202,8 @@ app.command()(gallery)
 @app.command("list")
 def list_runs(config: Config, results: Results = Path("results")) -> None:
     """Check a config, and show what would run and what is there already."""
-    from harness.load import load_any
-    from harness.sweep import plan
+    from harness.config.load import load_any
+    from harness.experiments.sweep import plan
 
     sweep = load_any(config)
     table = Table("run", "scene", "size", "solver", "iterations", "frames", "threads", "state")
@@ -231,7 +231,7 @@ def query(
     csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
 ) -> None:
     """Answer an SQL query over the rows of all sweeps."""
-    from harness.query import answer
+    from harness.report.query import answer
 
     found = answer(sql, results)
     if csv:
@@ -243,7 +243,7 @@ def query(
 @app.command()
 def schema() -> None:
     """Print the JSON Schema of scenes and sweeps."""
-    from harness.schema import schema as config_schema
+    from harness.config.schema import schema as config_schema
 
     print(json.dumps(config_schema(), indent=2))
 

@@ -6,19 +6,19 @@ from importlib import import_module
 from typing import Any
 
 SOLVERS = {
-    "dense": "solvers.local_global:DenseLocalGlobal",
-    "sparse": "solvers.local_global:SparseLocalGlobal",
-    "numba": "solvers.compiled:CompiledLocalGlobal",
-    "anderson": "solvers.anderson:Anderson",
-    "chebyshev": "solvers.chebyshev:Chebyshev",
-    "lbfgs": "solvers.lbfgs:Lbfgs",
-    "newton": "solvers.newton:Newton",
-    "newton-cg": "solvers.newton_cg:NewtonCG",
-    "hybrid": "solvers.hybrid:Hybrid",
-    "xpbd": "solvers.xpbd:Xpbd",
-    "xpbd-small-steps": "solvers.xpbd:XpbdSmallSteps",
-    "vbd": "solvers.vbd:VertexBlockDescent",
-    "symplectic-euler": "solvers.symplectic_euler:SymplecticEuler",
+    "dense": "solvers.methods.local_global:DenseLocalGlobal",
+    "sparse": "solvers.methods.local_global:SparseLocalGlobal",
+    "numba": "solvers.methods.local_global_compiled:CompiledLocalGlobal",
+    "anderson": "solvers.methods.anderson:Anderson",
+    "chebyshev": "solvers.methods.chebyshev:Chebyshev",
+    "lbfgs": "solvers.methods.lbfgs:Lbfgs",
+    "newton": "solvers.methods.newton:Newton",
+    "newton-cg": "solvers.methods.newton_cg:NewtonCG",
+    "hybrid": "solvers.methods.hybrid:Hybrid",
+    "xpbd": "solvers.methods.xpbd:Xpbd",
+    "xpbd-small-steps": "solvers.methods.xpbd:XpbdSmallSteps",
+    "vbd": "solvers.methods.vbd:VertexBlockDescent",
+    "symplectic-euler": "solvers.methods.symplectic_euler:SymplecticEuler",
 }
 
 

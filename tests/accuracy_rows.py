@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.rows import SCHEMA
 from harness.report.accuracy.paper import FIGURE_2, FIGURE_3, ITERATIONS
 
 # The gap falls by `rate` an iteration (Newton: squares); an iteration takes `cost` and preparing `setup` seconds a

@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from harness.effects.base import Effect
-from harness.effects.contact import Contact
-from harness.effects.gravity import Gravity
-from harness.effects.springs import Springs
-from harness.mesh.grid import Grid
-from harness.mesh.solids import Block
-from harness.scene import Scene
-from harness.simulate import Step, prepare, simulate
-from solvers.newton import Newton
+from harness.scenes.bind import Scene
+from harness.scenes.effects.base import Effect
+from harness.scenes.effects.contact import Contact
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.solids import Block
+from harness.simulation.step import Step, prepare, simulate
+from solvers.methods.newton import Newton
 from solvers.problem import Positions, Solver, StopRule
 from tests.scenes import scene
 

@@ -7,25 +7,25 @@ from dataclasses import replace
 
 import numpy as np
 
-from harness.effects.air_drag import AirDrag
-from harness.effects.attachments import Attachments
-from harness.effects.base import Effect
-from harness.effects.bending import Bending
-from harness.effects.contact import Contact
-from harness.effects.dashpots import Dashpots
-from harness.effects.gas import Gas
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.rayleigh import Rayleigh
-from harness.effects.springs import Springs
-from harness.effects.strain_limits import StrainLimits
-from harness.mesh.grid import Grid
-from harness.mesh.surfaces import Balloon
-from harness.motion import Key, Motion
-from harness.scene import Scene
-from harness.simulate import State, problem
+from harness.scenes.bind import Scene
+from harness.scenes.effects.air_drag import AirDrag
+from harness.scenes.effects.attachments import Attachments
+from harness.scenes.effects.base import Effect
+from harness.scenes.effects.bending import Bending
+from harness.scenes.effects.contact import Contact
+from harness.scenes.effects.dashpots import Dashpots
+from harness.scenes.effects.gas import Gas
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.rayleigh import Rayleigh
+from harness.scenes.effects.springs import Springs
+from harness.scenes.effects.strain_limits import StrainLimits
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.surfaces import Balloon
+from harness.scenes.motion import Key, Motion
+from harness.simulation.step import State, problem
 from solvers import integrators
-from solvers.newton import Newton
+from solvers.methods.newton import Newton
 from solvers.problem import Positions, Solver, StepProblem, StopRule
 from tests.scenes import scene
 

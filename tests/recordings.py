@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
-from harness.mesh.solids import Block
 from harness.record.base import Frame, RecordingInfo
 from harness.record.rerun import RerunRecorder
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.solids import Block
 
 TIME_STEP = 0.01
 MESHES = {"chain": Chain().build(9), "cloth": Grid().build(6), "block": Block().build(4)}

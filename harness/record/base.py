@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.mesh.base import Mesh
+from harness.scenes.mesh.base import Mesh
 from solvers.problem import Positions
 
 if TYPE_CHECKING:
-    from harness.obstacles import AnyObstacle
+    from harness.scenes.obstacles import AnyObstacle
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,9 +13,9 @@ import rerun as rr
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # a scene without obstacles imports none of them
-    from harness.effects.base import Effect
-    from harness.motion import Motion
-    from harness.obstacles import AnyObstacle, Box, Capsule, Plane, Sphere
+    from harness.scenes.effects.base import Effect
+    from harness.scenes.motion import Motion
+    from harness.scenes.obstacles import AnyObstacle, Box, Capsule, Plane, Sphere
 
 Array = NDArray[np.float64]
 

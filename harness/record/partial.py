@@ -15,7 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings
 
-from harness.errors import RunFailed
+from harness.base.errors import RunFailed
 from harness.record.reader import whole_messages
 
 _PATIENCE = 30

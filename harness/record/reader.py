@@ -23,7 +23,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from rerun.chunk import Chunk, LazyStore, RrdReader
 
-from harness.errors import InputError, Mistake
+from harness.base.errors import InputError, Mistake
 from harness.record.base import Replay
 
 _MAGIC, _HEADER, _END = b"RRF2", 12, 0

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.errors import RunFailed
-from harness.scene import Scene, build
-from harness.simulate import FIRST_GUESSES, State, Step, prepare, simulate
-from harness.spec import SceneSpec
+from harness.base.errors import RunFailed
+from harness.scenes.bind import Scene, build
+from harness.scenes.spec import SceneSpec
+from harness.simulation.step import FIRST_GUESSES, State, Step, prepare, simulate
 from solvers.integrators import Motion
 from solvers.problem import Pins, Solver, Start, StepProblem, StopRule
 
@@ -54,7 +54,7 @@ class Frozen:
         return State(self.after, Motion(begun.positions, begun.velocity), self.frame)
 
     def stated(self, first_guess: str) -> StepProblem:
-        """The problem with a first guess by name (`harness.simulate.FIRST_GUESSES`)."""
+        """The problem with a first guess by name (`harness.simulation.step.FIRST_GUESSES`)."""
         return FIRST_GUESSES[first_guess](self.problem)
 
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from harness.errors import RunFailed
-from harness.simulate import FIRST_GUESSES
+from harness.base.errors import RunFailed
+from harness.simulation.step import FIRST_GUESSES
 from solvers.linear.block import BlockCholesky
 from solvers.matrices import diagonal
 from solvers.problem import Positions, Solver, StepProblem, StopRule

@@ -15,13 +15,13 @@ from math import log
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.errors import RunFailed
-from harness.scene import Scene
-from harness.simulate import start
+from harness.base.errors import RunFailed
+from harness.scenes.bind import Scene
+from harness.simulation.step import start
 from solvers.compiling import kernel
+from solvers.contact.touching import without_contact
 from solvers.energies.springs import TINY, Springs
 from solvers.problem import LaggedEnergy, Positions, Start
-from solvers.touching import without_contact
 
 State = NDArray[np.float64]
 """Positions [m] and velocities [m/s] of the free vertices, one after the other, shape (6 f,)."""

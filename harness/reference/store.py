@@ -22,10 +22,10 @@ from harness.reference.frozen import Arrays, Frozen, agree, bind, freeze, moment
 from harness.reference.minimiser import Minimum, Reference, find_minima, polish
 from harness.reference.motion import Field
 from harness.reference.trajectory import Trajectory, integrate
-from harness.scene import Scene
-from harness.simulate import Step
-from harness.spec import IntegratorName, SceneSpec
-from solvers.newton import Newton
+from harness.scenes.bind import Scene
+from harness.scenes.spec import IntegratorName, SceneSpec
+from harness.simulation.step import Step
+from solvers.methods.newton import Newton
 from solvers.problem import Positions, Solver
 
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import ode, solve_ivp
 
-from harness.errors import RunFailed
+from harness.base.errors import RunFailed
 from harness.reference.motion import Field, State
-from harness.scene import Scene
+from harness.scenes.bind import Scene
 from solvers.problem import Positions
 
 RTOL = 1e-12

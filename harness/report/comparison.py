@@ -15,18 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from harness.record.base import Replay
-from harness.report.page import (
-    count,
-    header,
-    headline,
-    new_page,
-    paste,
-    quantity,
-    save,
-    shorten,
-    strain_scale,
-    text,
-)
+from harness.report.page import count, header, headline, new_page, paste, quantity, save, shorten, strain_scale, text
 from harness.report.render import (
     Studio,
     area_vectors,

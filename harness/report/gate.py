@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from harness.errors import InputError, Mistake
+from harness.base.errors import InputError, Mistake
 
 RATIO_MARGIN = 0.10
 """Beyond both intervals: those of two runs of the same code lay up to 4 % apart on a loaded machine."""

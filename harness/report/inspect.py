@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from harness.errors import InputError, Mistake, RunFailed
+from harness.base.errors import InputError, Mistake, RunFailed
 from harness.record.base import Replay
 from harness.record.reader import Summary, open_recording, read_replay, summary
 

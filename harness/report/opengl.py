@@ -7,7 +7,7 @@ import subprocess
 import sys
 from functools import cache
 
-from harness.errors import RunFailed
+from harness.base.errors import RunFailed
 
 _TRY = """
 from vtkmodules.vtkRenderingCore import vtkRenderWindow

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 
 from rich.table import Table
 
-from harness import rows
-from harness.errors import InputError
+from harness.base import rows
+from harness.base.errors import InputError
 from solvers.registry import SOLVERS
 
 SLACK = 1.1

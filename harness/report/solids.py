@@ -13,7 +13,7 @@ from harness.record.base import Replay
 from harness.record.obstacles import KEY
 
 if TYPE_CHECKING:  # a recording without obstacles imports none of them
-    from harness.obstacles import AnyObstacle, Box, Capsule, Plane, Sphere
+    from harness.scenes.obstacles import AnyObstacle, Box, Capsule, Plane, Sphere
 
 _LEVEL = 0.999
 """Planes whose normal is as upright as this are the ground, which pictures show by the shadow on it."""
@@ -23,7 +23,7 @@ def solids(replay: Replay, frame: int) -> list[pv.PolyData]:
     """The obstacles of a recording, where they are in a recorded frame."""
     if KEY not in replay.properties:
         return []
-    from harness.obstacles import from_json
+    from harness.scenes.obstacles import from_json
 
     time, seen = float(replay.times[frame]), replay.positions[frame]
     made = (solid(one, time, seen) for one in from_json(str(replay.properties[KEY])))

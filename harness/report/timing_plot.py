@@ -28,7 +28,7 @@ _DASHES = (DASHED, DOTTED, DASH_DOTTED)  # the further variants of one solver
 def draw_timing(table: pa.Table, path: Path, title: str) -> None:
     """Draw the times of a sweep's runs to `path`, WIDTH x HEIGHT pixels, PNG.
 
-    table: rows (schema: `harness.rows.SCHEMA`). Runs that failed are crosses at the upper edge, and words.
+    table: rows (schema: `harness.base.rows.SCHEMA`). Runs that failed are crosses at the upper edge, and words.
     """
     found = runs(table)
     names = labels(found)

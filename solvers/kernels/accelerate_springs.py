@@ -18,9 +18,9 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from solvers.compiling import inner
-from solvers.intrinsics import unpacked
 from solvers.kernels.springs import TINY_SQUARED, Bundles, add_short, kinds
-from solvers.kernels.springs_vectors import F64, I64, LANES, LEAST, MOST, RIGHT, WIDE, Vectors, constant
+from solvers.vectors.intrinsics import unpacked
+from solvers.vectors.springs import F64, I64, LANES, LEAST, MOST, RIGHT, WIDE, Vectors, constant
 
 
 class Shares(NamedTuple):

@@ -1,6 +1,6 @@
 """Conjugate gradients on the exact Hessian of springs, preconditioned by a factor of Q, without Python.
 
-H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r           see `solvers.newton_cg`
+H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r           see `solvers.methods.newton_cg`
 """
 
 from __future__ import annotations

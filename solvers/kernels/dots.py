@@ -15,8 +15,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from solvers.intrinsics import unpacked
-from solvers.kernels.springs_vectors import F64, I64, LANES, WIDE, Vectors, constant
+from solvers.vectors.intrinsics import unpacked
+from solvers.vectors.springs import F64, I64, LANES, WIDE, Vectors, constant
 
 _TOGETHER = 4
 """Vectors that are added to side by side."""

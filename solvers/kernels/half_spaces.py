@@ -1,6 +1,6 @@
 """Newton steps of vertices that half-spaces keep out of obstacles, one vertex after another.
 
-    k/2 min(0, n.x - d)^2 + F h(|u|),   u = (I - nn')(x - a)             a half-space (see `solvers.energies.contact`)
+    k/2 min(0, n.x - d)^2 + F h(|u|),   u = (I - nn')(x - a)             a half-space (see `solvers.contact.energy`)
 
 A vertex's block and gradient are those of its springs and of what presses and grips. What begins to press on the way is
 found by a few repetitions, each from the last one's end. A step that raises the energy gives way to one of a larger
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner
 from solvers.kernels.springs import TINY_SQUARED
-from solvers.kernels.springs_vectors import LANES, RIGHT
+from solvers.vectors.springs import LANES, RIGHT
 
 _PASSES = 4
 _EXACT, _GRIPPED, _MAJORANT, _EVERYTHING = range(4)

@@ -4,7 +4,7 @@
 
 A compressed spring (t < 0) has a negative lateral part. It is scaled by `keep`: 1 leaves the Hessian exact, 0 makes it
 positive semidefinite spring by spring (Teran et al. 2005). The tensions are given apart from the positions, for methods
-that have a better guess at what they will be (see `solvers.hybrid`).
+that have a better guess at what they will be (see `solvers.methods.hybrid`).
 """
 
 from __future__ import annotations

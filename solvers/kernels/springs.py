@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 from solvers.energies.springs import TINY, Springs
-from solvers.kernels import springs_vectors as vectors
-from solvers.kernels.springs_vectors import LANES, RIGHT
 from solvers.memory import aligned
+from solvers.vectors import springs as vectors
+from solvers.vectors.springs import LANES, RIGHT
 
 TINY_SQUARED = TINY * TINY
 WINDOW = 128

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
-from solvers.intrinsics import ask_for
-from solvers.kernels.springs_vectors import LANES
 from solvers.kernels.step import iterate
+from solvers.vectors.intrinsics import ask_for
+from solvers.vectors.springs import LANES
 
 
 class Rows(NamedTuple):

@@ -12,8 +12,8 @@ from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.accelerate_springs import descend as objective
 from solvers.kernels.half_spaces import move, pressed
 from solvers.kernels.springs import Bundles, add_short
-from solvers.kernels.springs_vectors import LANES
-from solvers.kernels.vbd_vectors import descend
+from solvers.vectors.springs import LANES
+from solvers.vectors.vbd import descend
 
 
 class Blocks(NamedTuple):

@@ -14,10 +14,10 @@ from scipy.sparse import csr_array
 
 from solvers import memory
 from solvers.linear.block_factor import Fronts, factorise, solve, whole
-from solvers.linear.block_vectors import ROWS, TILE
 from solvers.linear.ordering import nested_dissection
 from solvers.linear.symbolic import Symbolic, analyse
 from solvers.problem import Unsupported
+from solvers.vectors.block import ROWS, TILE
 
 _NOTHING = np.empty((0, 3))
 

@@ -17,16 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
-from solvers.linear.block_vectors import (
-    ROWS,
-    TILE,
-    add,
-    divide,
-    factorise_corner,
-    solve_columns,
-    solve_rows,
-    subtract_product,
-)
+from solvers.vectors.block import ROWS, TILE, add, divide, factorise_corner, solve_columns, solve_rows, subtract_product
 
 _NO_DIGITS = 4.0 * np.finfo(np.float64).eps
 """A pivot this small beside its entry of the matrix is round-off."""

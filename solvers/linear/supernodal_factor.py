@@ -15,8 +15,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from solvers.linear.supernodal_vectors import add_forward
 from solvers.linear.supernodes import WIDTH
+from solvers.vectors.supernodal import add_forward
 
 _NO_DIGITS = 4.0 * np.finfo(np.float64).eps
 """A pivot this small beside its entry of the matrix is round-off."""

@@ -19,9 +19,9 @@ from __future__ import annotations
 from numba import prange
 
 from solvers.compiling import inner, inner_in_parallel, kernel
-from solvers.intrinsics import ask_for
-from solvers.linear.supernodal_vectors import add_forward, set_backward
 from solvers.linear.team import claim, finish, following, go_on, last, start
+from solvers.vectors.intrinsics import ask_for
+from solvers.vectors.supernodal import add_forward, set_backward
 
 _AHEAD = 64
 """How many vertices ahead memory is asked for what lies in another order."""

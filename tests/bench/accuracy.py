@@ -20,15 +20,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.accuracy.run import references
-from harness.effects.gravity import Gravity
-from harness.effects.springs import Springs
-from harness.load import load_scene
+from harness.config.load import load_scene
+from harness.experiments.accuracy.run import references
 from harness.reference.frozen import bind
-from harness.simulate import prepare, simulate
-from harness.spec import IntegratorName, SceneSpec
-from solvers.newton import certified
-from solvers.objective import Objective, StepObjective
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.springs import Springs
+from harness.scenes.spec import IntegratorName, SceneSpec
+from harness.simulation.step import prepare, simulate
+from solvers.core.objective import Objective, StepObjective
+from solvers.methods.newton import certified
 from solvers.problem import Positions, StepProblem, StopRule
 from solvers.registry import SOLVERS, load
 from tests.bench.gates import STOP, Gate, Work

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from threadpoolctl import threadpool_info
 
-from harness import machine
+from harness.base import machine
 from tests.bench.gates import THREADS
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from harness.effects.contact import Contact
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.mesh.grid import Grid
-from harness.scene import build
-from harness.simulate import simulate
-from harness.spec import SceneSpec
+from harness.scenes.bind import build
+from harness.scenes.effects.contact import Contact
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.spec import SceneSpec
+from harness.simulation.step import simulate
 from tests.bench.gates import STOP, Gate, Work, last, prepare
 
 FAR = Contact.model_validate(

@@ -17,18 +17,18 @@ from time import perf_counter, process_time
 
 import numpy as np
 
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.measure import Settings
-from harness.mesh.grid import Grid
-from harness.observe import observe
 from harness.record.base import RecordingInfo
 from harness.record.rerun import RerunRecorder
-from harness.scene import Scene, build
-from harness.simulate import Step, simulate
-from harness.spec import SceneSpec
-from solvers.local_global import PreparedLocalGlobal
+from harness.scenes.bind import Scene, build
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.spec import SceneSpec
+from harness.simulation.measure import Settings
+from harness.simulation.observe import observe
+from harness.simulation.step import Step, simulate
+from solvers.methods.local_global import PreparedLocalGlobal
 from solvers.problem import Positions, Prepared, Solution, StopRule
 from solvers.registry import SOLVERS, load
 

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 from scipy.sparse import csr_array
 
-from harness.scene import Scene
-from harness.simulate import problem, start
+from harness.scenes.bind import Scene
+from harness.simulation.step import problem, start
 from solvers import matrices
-from solvers.compiled import CompiledLocalGlobal
 from solvers.linear.choice import Linear
 from solvers.linear.factors import Factor, SimplicialCholesky, SparseLU
 from solvers.linear.supernodal import Supernodal
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions
 from tests.bench.gates import STOP, Gate, Work, sheet
 

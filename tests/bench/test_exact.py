@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from harness.machine import pinned_threads
-from harness.scene import Scene
-from harness.simulate import simulate
+from harness.base.machine import pinned_threads
+from harness.scenes.bind import Scene
+from harness.simulation.step import simulate
 from solvers.linear.supernodal import Supernodal
 from solvers.problem import StopRule
 from tests.bench.gates import THREADS, prepare, record, sheet

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from harness.machine import pinned_threads
+from harness.base.machine import pinned_threads
 from tests.bench.accuracy import ACCURACY
 from tests.bench.contact import CONTACT
 from tests.bench.gates import GATES, THREADS, Gate

@@ -9,17 +9,17 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from harness.effects.base import Effect
-from harness.effects.constant_force import ConstantForce
-from harness.effects.ether_drag import EtherDrag
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.effects.wind import Wind
-from harness.mesh.grid import Grid
-from harness.scene import Scene
-from harness.simulate import prepare, simulate
-from solvers.local_global import SparseLocalGlobal
+from harness.scenes.bind import Scene
+from harness.scenes.effects.base import Effect
+from harness.scenes.effects.constant_force import ConstantForce
+from harness.scenes.effects.ether_drag import EtherDrag
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.effects.wind import Wind
+from harness.scenes.mesh.grid import Grid
+from harness.simulation.step import prepare, simulate
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Prepared, StopRule
 from tests.effects import ATTACHED, BEND, DASHPOTS, DRAG, LIMITS, RAYLEIGH
 from tests.scenes import scene

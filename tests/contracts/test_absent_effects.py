@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.effects.table import EFFECTS
-from harness.load import load_scene
-from harness.scene import build
+from harness.config.load import load_scene
+from harness.scenes.bind import build
+from harness.scenes.effects.table import EFFECTS
 from solvers.matrices import assemble
 from tests.effects import BEND, DASHPOTS, DRAG, LIMITS, cloth
 
@@ -24,7 +24,7 @@ ABSENT = sorted(set(EFFECTS) - LISTED)
 
 ENERGIES = {
     "bending": ["solvers.energies.bending", "solvers.energies.quadratic"],
-    "contact": ["solvers.energies.contact", "solvers.energies.contact_planes", "harness.obstacles"],
+    "contact": ["solvers.contact.energy", "solvers.contact.planes", "harness.scenes.obstacles"],
     "strain-limits": ["solvers.energies.strain_limits"],
     "dashpots": ["solvers.energies.dashpots"],
     "air-drag": ["solvers.energies.quadratic"],
@@ -46,14 +46,14 @@ class Hidden:
 sys.meta_path.insert(0, Hidden())
 import harness
 if {load}:
-    from harness.effects.table import EFFECTS
+    from harness.scenes.effects.table import EFFECTS
     from solvers.registry import load
     for target in EFFECTS.values():
         load(target)
-from harness.load import load_scene
-from harness.scene import build
-from harness.simulate import prepare, simulate
-from solvers.local_global import SparseLocalGlobal
+from harness.config.load import load_scene
+from harness.scenes.bind import build
+from harness.simulation.step import prepare, simulate
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule
 made = build(load_scene(Path({scene!r})), 10)
 steps = simulate(made, prepare(made, SparseLocalGlobal()), StopRule(10), first_guess="current", frames=5)

@@ -10,16 +10,16 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from harness import rows
-from harness.accuracy.load import load_accuracy
-from harness.accuracy.rows import SCHEMA
-from harness.accuracy.run import run_accuracy
+from harness.base import rows
+from harness.base.progress import Display
 from harness.cli import main
-from harness.progress import Display
+from harness.config.accuracy_load import load_accuracy
+from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.run import run_accuracy
 from harness.record.reader import read_replay
 from harness.reference import store
 from harness.reference.minimiser import Minimum, Reference
-from solvers.local_global import SparseLocalGlobal
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Positions, Prepared, System
 from solvers.registry import SOLVERS
 

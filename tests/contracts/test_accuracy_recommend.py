@@ -9,12 +9,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from harness import rows
-from harness.accuracy import recommend as module
-from harness.accuracy.recommend import Recommendation, recommend
-from harness.accuracy.rows import SCHEMA
+from harness.base import rows
+from harness.base.errors import InputError, RunFailed
 from harness.cli import main
-from harness.errors import InputError, RunFailed
+from harness.experiments.accuracy import recommend as module
+from harness.experiments.accuracy.recommend import Recommendation, recommend
+from harness.experiments.accuracy.rows import SCHEMA
 from tests.contracts.test_accuracy import Quiet
 
 SCENE = """

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.load import load_scene
-from harness.scene import build
+from harness.config.load import load_scene
+from harness.scenes.bind import build
 from tests.scenes import BACKENDS, trajectory
 
 FRAMES = 30

@@ -10,12 +10,12 @@ import numba
 import numpy as np
 import pytest
 
-from harness.load import scene_from_assignment
-from harness.scene import Scene, build
-from harness.simulate import FIRST_GUESSES
-from solvers.compiled import CompiledLocalGlobal
+from harness.config.load import scene_from_assignment
+from harness.scenes.bind import Scene, build
+from harness.simulation.step import FIRST_GUESSES
 from solvers.linear.choice import Linear
-from solvers.local_global import DenseLocalGlobal, only_springs
+from solvers.methods.local_global import DenseLocalGlobal, only_springs
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, Solver
 from tests.scenes import BACKENDS, SCENES, first_problem, random_problem, trajectory
 

@@ -9,10 +9,10 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from harness.effects.pins import Pins
-from harness.scene import Scene
-from harness.simulate import prepare, simulate
-from solvers import contact as method
+from harness.scenes.bind import Scene
+from harness.scenes.effects.pins import Pins
+from harness.simulation.step import prepare, simulate
+from solvers.contact import local_global as method
 from solvers.problem import Positions, Solver, StepProblem, StopRule, Unsupported
 from solvers.registry import SOLVERS, load
 from tests.contacts import OBSTACLES, contact, sheet, steps

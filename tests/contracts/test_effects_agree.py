@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from harness.simulate import prepare, simulate
-from solvers.local_global import SparseLocalGlobal
+from harness.simulation.step import prepare, simulate
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Positions, Solver, StepProblem, StopRule, Unsupported
 from solvers.registry import SOLVERS, load
 from tests.effects import SCENES, integrated, stepped

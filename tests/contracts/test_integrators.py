@@ -14,22 +14,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.effects.air_drag import AirDrag
-from harness.effects.base import Effect
-from harness.effects.dashpots import Dashpots
-from harness.effects.ether_drag import EtherDrag
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.rayleigh import Rayleigh
-from harness.effects.springs import Springs
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
 from harness.reference.trajectory import integrate
-from harness.scene import Scene, build
-from harness.simulate import State, prepare, simulate, start
-from harness.spec import MeshSource, SceneSpec
+from harness.scenes.bind import Scene, build
+from harness.scenes.effects.air_drag import AirDrag
+from harness.scenes.effects.base import Effect
+from harness.scenes.effects.dashpots import Dashpots
+from harness.scenes.effects.ether_drag import EtherDrag
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.rayleigh import Rayleigh
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.spec import MeshSource, SceneSpec
+from harness.simulation.step import State, prepare, simulate, start
 from solvers.integrators import INTEGRATORS, Motion
-from solvers.newton import Newton
+from solvers.methods.newton import Newton
 from solvers.problem import Positions, Solver, StopRule
 from solvers.registry import SOLVERS, load
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from harness import rows
+from harness.base import rows
 from harness.cli import main
 from harness.record.reader import read_replay
 from harness.report import opengl
@@ -46,7 +46,9 @@ options: {iterations: 10, rounds: 2, pictures: %s}
 
 # One process imports what the command needs, and a copy of it runs each command.
 PROCESSES = get_context("forkserver")
-PROCESSES.set_forkserver_preload(["harness.cli", "harness.load", "harness.sweep", "harness.report.timing_table"])
+PROCESSES.set_forkserver_preload(
+    ["harness.cli", "harness.config.load", "harness.experiments.sweep", "harness.report.timing_table"]
+)
 
 
 def command(arguments: list[str], told: Path) -> None:

@@ -8,16 +8,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from harness.effects.ether_drag import EtherDrag
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
-from harness.scene import Scene
-from harness.simulate import State, prepare, simulate
-from solvers.compiled import CompiledLocalGlobal
+from harness.scenes.bind import Scene
+from harness.scenes.effects.ether_drag import EtherDrag
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.simulation.step import State, prepare, simulate
 from solvers.integrators import Motion
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, StopRule
 from tests.scenes import BACKENDS, scene, static_shape, trajectory
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from solvers.compiled import CompiledLocalGlobal
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import StepProblem, StopRule
 from solvers.registry import SOLVERS, load
 from tests.scenes import cloth, first_problem, frozen, random_problem

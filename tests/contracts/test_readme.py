@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.load import load_any
-from harness.mesh.chain import Chain
+from harness.config.load import load_any
+from harness.scenes.mesh.chain import Chain
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -11,12 +11,12 @@ import pyarrow as pa
 import pytest
 from rerun.chunk import RrdReader
 
-from harness.errors import InputError, RunFailed
-from harness.mesh.grid import Grid
+from harness.base.errors import InputError, RunFailed
 from harness.record.base import Frame
 from harness.record.compare import side_by_side
 from harness.record.reader import open_recording, read_replay, summary
 from harness.record.rerun import SCALARS, RerunRecorder
+from harness.scenes.mesh.grid import Grid
 from tests.recordings import MESHES, foreign, info, record, waving
 
 

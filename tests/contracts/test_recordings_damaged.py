@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.errors import InputError
+from harness.base.errors import InputError
 from harness.record.reader import read_replay, summary
 from harness.record.rerun import FLUSH, SCALARS
 from tests.recordings import foreign, info, record, waving

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
 from solvers.problem import Positions
 from tests.scenes import scene, static_shape
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from harness.ablate.command import SOLVER, TOLERANCE
-from harness.ablate.run import ablate
-from harness.load import load_any
+from harness.config.load import load_any
+from harness.experiments.ablation.command import SOLVER, TOLERANCE
+from harness.experiments.ablation.run import ablate
 from harness.report.ablation import of_kind, read, verdict
 
 SCENES = Path(__file__).resolve().parents[2] / "configs" / "scenes"

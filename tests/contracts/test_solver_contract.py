@@ -8,15 +8,15 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from harness.trace import EnergyNorm, trace
-from solvers.compiled import CompiledLocalGlobal
+from harness.simulation.trace import EnergyNorm, trace
 from solvers.energies.springs import Springs
 from solvers.linear.factors import SparseLU
-from solvers.local_global import DenseLocalGlobal, SparseLocalGlobal
 from solvers.matrices import assemble, energy_norm
+from solvers.methods.local_global import DenseLocalGlobal, SparseLocalGlobal
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.methods.symplectic_euler import SymplecticEuler
 from solvers.problem import Positions, StepProblem, StopRule
 from solvers.registry import SOLVERS, load
-from solvers.symplectic_euler import SymplecticEuler
 from tests.scenes import cloth, first_problem, frozen, random_problem
 
 FORCED = {

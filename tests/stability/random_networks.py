@@ -9,9 +9,9 @@ import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from harness.mesh.network import Network
-from harness.scene import Scene
-from harness.simulate import State
+from harness.scenes.bind import Scene
+from harness.scenes.mesh.network import Network
+from harness.simulation.step import State
 from solvers.energies.springs import Springs
 from solvers.integrators import INTEGRATORS, Motion
 from solvers.problem import Pins, Positions, Start, StepProblem, System

@@ -9,19 +9,19 @@ import pytest
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.effects.gravity import Gravity
-from harness.judge import SLACK, Judge
-from harness.load import load_any, load_scene
-from harness.mesh.chain import Chain
+from harness.config.load import load_any, load_scene
+from harness.experiments.run import Files, execute
 from harness.record.reader import read_replay, summary
-from harness.run import Files, execute
-from harness.scene import Scene, build
-from harness.simulate import prepare, simulate, start
-from harness.spec import SceneSpec
-from solvers.newton import Newton
+from harness.reference.judge import SLACK, Judge
+from harness.scenes.bind import Scene, build
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.spec import SceneSpec
+from harness.simulation.step import prepare, simulate, start
+from solvers.methods.newton import Newton
+from solvers.methods.symplectic_euler import SymplecticEuler
 from solvers.problem import StopRule, Unsupported
 from solvers.registry import SOLVERS, load
-from solvers.symplectic_euler import SymplecticEuler
 
 FILE = Path(__file__).resolve().parents[2] / "configs" / "hard" / "motion-alternating-steps.yaml"
 LENGTHS = (1 / 3, 1 / 300)

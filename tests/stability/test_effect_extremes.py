@@ -5,26 +5,26 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.effects.air_drag import AirDrag
-from harness.effects.attachments import Attachments
-from harness.effects.base import Effect
-from harness.effects.bending import Bending
-from harness.effects.dashpots import Dashpots
-from harness.effects.gas import Gas
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.rayleigh import Rayleigh
-from harness.effects.springs import Springs
-from harness.effects.strain_limits import StrainLimits
-from harness.effects.wind import Wind
-from harness.mesh.grid import Grid
-from harness.mesh.surfaces import Balloon
-from harness.motion import Key, Motion
-from harness.scene import Scene
-from harness.simulate import prepare, simulate
-from solvers.lbfgs import Lbfgs
-from solvers.local_global import SparseLocalGlobal
+from harness.scenes.bind import Scene
+from harness.scenes.effects.air_drag import AirDrag
+from harness.scenes.effects.attachments import Attachments
+from harness.scenes.effects.base import Effect
+from harness.scenes.effects.bending import Bending
+from harness.scenes.effects.dashpots import Dashpots
+from harness.scenes.effects.gas import Gas
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.rayleigh import Rayleigh
+from harness.scenes.effects.springs import Springs
+from harness.scenes.effects.strain_limits import StrainLimits
+from harness.scenes.effects.wind import Wind
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.surfaces import Balloon
+from harness.scenes.motion import Key, Motion
+from harness.simulation.step import prepare, simulate
 from solvers.matrices import assemble
+from solvers.methods.lbfgs import Lbfgs
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import ProjectiveEnergy, Solver, StopRule
 from tests.scenes import scene
 

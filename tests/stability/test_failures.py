@@ -18,10 +18,10 @@ from typer.testing import CliRunner
 from harness.cli import app
 from harness.record.reader import read_replay
 from solvers.linear.factors import DenseCholesky
-from solvers.local_global import SparseLocalGlobal
+from solvers.methods.local_global import SparseLocalGlobal
+from solvers.methods.symplectic_euler import PreparedSymplecticEuler, SymplecticEuler
 from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System
 from solvers.registry import SOLVERS
-from solvers.symplectic_euler import PreparedSymplecticEuler, SymplecticEuler
 
 FRAMES, BROKEN = 20, 4
 """Frames of the run, and the one in which what is made to break does."""

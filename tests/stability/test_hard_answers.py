@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.judge import SLACK, Oracle
-from harness.simulate import prepare, problem, start
+from harness.reference.judge import SLACK, Oracle
+from harness.simulation.step import prepare, problem, start
 from solvers.problem import Solution, StepProblem, StopRule, Unsupported
 from tests.stability.test_hard_scenes import METHODS, cases, scene, spacing
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from harness.scene import Scene
-from harness.simulate import State, problem
+from harness.scenes.bind import Scene
+from harness.simulation.step import State, problem
 from solvers.integrators import Motion
 from solvers.problem import Pins, Positions, Solver, StopRule, System
 from tests.scenes import BACKENDS, SCENES, cloth, first_problem, static_shape, trajectory

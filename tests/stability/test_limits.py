@@ -21,8 +21,8 @@ import pytest
 from scipy.optimize import root
 
 from solvers.energies.springs import Springs
-from solvers.hybrid import Hybrid
-from solvers.newton import Newton
+from solvers.methods.hybrid import Hybrid
+from solvers.methods.newton import Newton
 from solvers.problem import Pins, Positions, Solver, StepProblem, StopRule, System
 from tests.scenes import begun
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.simulate import problem, simulate, start
+from harness.simulation.step import problem, simulate, start
+from solvers.methods.symplectic_euler import SymplecticEuler
+from solvers.methods.vbd import VertexBlockDescent
+from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
 from solvers.problem import Solver, StopRule, Unsupported
-from solvers.symplectic_euler import SymplecticEuler
-from solvers.vbd import VertexBlockDescent
-from solvers.xpbd import Xpbd, XpbdSmallSteps
 from tests.scenes import SCENES, cloth
 from tests.stability.test_hard_cases import CASES, STEPS, STOP, VALUE, Case, State, resting
 

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.load import load_scene
-from harness.scene import Scene, build
-from harness.simulate import prepare, simulate, start
-from solvers.compiled import CompiledLocalGlobal
-from solvers.hybrid import Hybrid
+from harness.config.load import load_scene
+from harness.scenes.bind import Scene, build
+from harness.simulation.step import prepare, simulate, start
 from solvers.integrators import Motion
-from solvers.lbfgs import Lbfgs
-from solvers.newton import Newton
+from solvers.methods.hybrid import Hybrid
+from solvers.methods.lbfgs import Lbfgs
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.methods.newton import Newton
 from solvers.problem import Solver, StopRule
 
 pytestmark = pytest.mark.long

@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from harness.base.errors import InputError
 from harness.cli import app
-from harness.effects.gravity import Gravity
-from harness.effects.springs import Springs
-from harness.errors import InputError
-from harness.mesh.chain import Chain
-from harness.mesh.generator import Generator
-from harness.mesh.grid import Grid, Net
-from harness.mesh.solids import Block, Tower
-from harness.mesh.star import Star
-from harness.mesh.surfaces import Balloon, Skirt
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.generator import Generator
+from harness.scenes.mesh.grid import Grid, Net
+from harness.scenes.mesh.solids import Block, Tower
+from harness.scenes.mesh.star import Star
+from harness.scenes.mesh.surfaces import Balloon, Skirt
 from solvers import memory
-from solvers.hybrid import Hybrid
 from solvers.linear.choice import factorise
-from solvers.local_global import DenseLocalGlobal
 from solvers.matrices import assemble
-from solvers.newton import Newton
+from solvers.methods.hybrid import Hybrid
+from solvers.methods.local_global import DenseLocalGlobal
+from solvers.methods.newton import Newton
 from solvers.problem import Solver, Unsupported
 from tests.networks import grid
 from tests.scenes import scene

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.judge import Oracle
+from harness.reference.judge import Oracle
 from solvers.problem import Positions, StepProblem, StopRule, System
 from tests.stability.random_networks import (
     ALL,

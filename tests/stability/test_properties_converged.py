@@ -16,10 +16,10 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from harness.reference.minimiser import free_hessian
-from harness.scene import Scene
-from harness.simulate import State, prepare, simulate
+from harness.scenes.bind import Scene
+from harness.simulation.step import State, prepare, simulate
 from solvers.integrators import INTEGRATORS, Motion
-from solvers.newton import Newton
+from solvers.methods.newton import Newton
 from solvers.problem import Positions, StepProblem, StopRule
 from tests.contracts.test_integrators import LAWS, energies
 from tests.stability.random_networks import (

@@ -12,15 +12,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.mesh.grid import Grid
-from harness.mesh.solids import Block
 from harness.reference.minimiser import certify
-from harness.scene import Scene
-from harness.simulate import State, prepare, problem, simulate
-from harness.start import AnyStart, Collapsed, Flattened, Random
+from harness.scenes.bind import Scene
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.solids import Block
+from harness.scenes.start import AnyStart, Collapsed, Flattened, Random
+from harness.simulation.step import State, prepare, problem, simulate
 from solvers.integrators import Motion
 from solvers.problem import Positions, StopRule
 from solvers.registry import SOLVERS, load

@@ -13,20 +13,20 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from harness.ablate.cases import Case, cases
-from harness.ablate.command import SOLVER
-from harness.ablate.rows import COLUMNS
-from harness.ablate.run import ablate
-from harness.ablate.suggest import Seen, suggestions
-from harness.ablate.turns import Turn, cost
+from harness.base.rows import COLUMNS as RUN_COLUMNS
+from harness.base.rows import Column
 from harness.cli import app
-from harness.effects.springs import Springs
-from harness.load import load_any, load_scene
-from harness.mesh.grid import Grid
+from harness.config.load import load_any, load_scene
+from harness.experiments.ablation.cases import Case, cases
+from harness.experiments.ablation.command import SOLVER
+from harness.experiments.ablation.rows import COLUMNS
+from harness.experiments.ablation.run import ablate
+from harness.experiments.ablation.suggest import Seen, suggestions
+from harness.experiments.ablation.turns import Turn, cost
 from harness.report.ablation import read, sentences, verdict
-from harness.rows import COLUMNS as RUN_COLUMNS
-from harness.rows import Column
-from harness.scene import Scene
+from harness.scenes.bind import Scene
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.grid import Grid
 from tests.effects import cloth
 from tests.scenes import scene
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, diags_array
 
-from solvers.accelerated import PreparedAccelerated
-from solvers.anderson import Anderson
-from solvers.chebyshev import Chebyshev
-from solvers.compiled import CompiledLocalGlobal
-from solvers.lbfgs import Lbfgs
+from solvers.methods.anderson import Anderson
+from solvers.methods.chebyshev import Chebyshev
+from solvers.methods.lbfgs import Lbfgs
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.methods.quasi_newton import PreparedAccelerated
 from solvers.problem import Positions, Solver, StepProblem, StopRule
 from tests.scenes import cloth, first_problem, random_problem
 

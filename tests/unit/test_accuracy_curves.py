@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.accuracy import curves
-from harness.accuracy.curves import Curve, kept, measure
-from harness.accuracy.oracle import Oracle
-from harness.errors import RunFailed
+from harness.base.errors import RunFailed
+from harness.experiments.accuracy import curves
+from harness.experiments.accuracy.curves import Curve, kept, measure
+from harness.experiments.accuracy.oracle import Oracle
 from harness.reference.minimiser import polish
-from harness.trace import EnergyNorm
-from solvers.local_global import SparseLocalGlobal
-from solvers.newton import Newton
+from harness.simulation.trace import EnergyNorm
+from solvers.methods.local_global import SparseLocalGlobal
+from solvers.methods.newton import Newton
 from solvers.problem import Positions, StepProblem
 from tests.scenes import cloth, first_problem
 

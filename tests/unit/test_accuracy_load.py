@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from harness.accuracy.load import Accuracy, load_accuracy
-from harness.errors import InputError
-from harness.load import load_any
-from harness.scene import build
+from harness.base.errors import InputError
+from harness.config.accuracy_load import Accuracy, load_accuracy
+from harness.config.load import load_any
+from harness.scenes.bind import build
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SHIPPED = [path for path in sorted(CONFIGS.glob("*.yaml")) if "\ncurves:" in path.read_text()]

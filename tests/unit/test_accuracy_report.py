@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.errors import InputError
+from harness.base.errors import InputError
 from harness.report.accuracy.findings import failures, findings, summary
 from harness.report.accuracy.growth import growths
 from harness.report.accuracy.paper import FIGURE_2, FIGURE_3, comparisons

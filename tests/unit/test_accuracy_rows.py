@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from harness import rows
-from harness.accuracy.rows import COLUMNS, SCHEMA
-from harness.query import answer
-from harness.rows import COLUMNS as RUN_COLUMNS
+from harness.base import rows
+from harness.base.rows import COLUMNS as RUN_COLUMNS
+from harness.experiments.accuracy.rows import COLUMNS, SCHEMA
+from harness.report.query import answer
 
 README = Path(__file__).resolve().parents[2] / "results" / "README.md"
 SHARED = {column.name for column in RUN_COLUMNS} - {"status", "seconds"}

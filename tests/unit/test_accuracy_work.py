@@ -9,19 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.accuracy.run import trajectory_of
-from harness.accuracy.spec import Case, How, WorkUnit
-from harness.accuracy.work import work_rows
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.mesh.chain import Chain
+from harness.config.accuracy import Case, How, WorkUnit
+from harness.config.sweep import SolverSpec
+from harness.experiments.accuracy.run import trajectory_of
+from harness.experiments.accuracy.work import work_rows
 from harness.reference.frozen import bind
 from harness.reference.store import Store
 from harness.reference.trajectory import Trajectory, Unpredictable
-from harness.simulate import prepare, simulate
-from harness.spec import SceneSpec, SolverSpec
-from solvers.local_global import SparseLocalGlobal
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.spec import SceneSpec
+from harness.simulation.step import prepare, simulate
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule
 
 CHAIN = SceneSpec(

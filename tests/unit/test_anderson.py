@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.linalg import cholesky
 
-from solvers.anderson import Anderson
 from solvers.matrices import assemble
+from solvers.methods.anderson import Anderson
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, StopRule, Unsupported
 from tests.scenes import cloth, first_problem, random_problem
 from tests.unit.test_accelerated import Barrier

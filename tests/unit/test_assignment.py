@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.assignment import FORCE, ITERATIONS, PIN_WEIGHT, TIME_STEP, read_assignment, voronoi_areas
-from harness.errors import InputError
+from harness.base.errors import InputError
+from harness.scenes.assignment import FORCE, ITERATIONS, PIN_WEIGHT, TIME_STEP, read_assignment, voronoi_areas
 
 SCENES = Path(__file__).resolve().parents[3] / "shared" / "scenes"
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n"

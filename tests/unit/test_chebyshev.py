@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from solvers.accelerated import PreparedAccelerated
-from solvers.chebyshev import Chebyshev
 from solvers.matrices import assemble
+from solvers.methods.chebyshev import Chebyshev
+from solvers.methods.quasi_newton import PreparedAccelerated
 from solvers.problem import ProjectiveEnergy, StepProblem, StopRule, Unsupported
 from tests.scenes import cloth, first_problem, random_problem
 from tests.unit.test_accelerated import Barrier

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from solvers import colouring
+from solvers.core import colouring
 from tests.networks import grid_springs
 from tests.scenes import SCENES, random_network
 

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import Field
 
-from harness.config import Document, Key, key_text, quote, read_yaml
-from harness.errors import InputError
-from harness.model import Model, Vector
+from harness.base.document import Document, Key, key_text, quote, read_yaml
+from harness.base.errors import InputError
+from harness.base.model import Model, Vector
 
 VALUES = {
     "1e5": 100_000,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.effects.contact import Contact
-from solvers.energies.contact import Contact as Energy
-from solvers.energies.contact import Obstacle
+from harness.scenes.effects.contact import Contact
+from solvers.contact.energy import Contact as Energy
+from solvers.contact.energy import Obstacle
 from solvers.problem import Positions, Start
 from tests.contacts import OBSTACLES, THICKNESS, contact
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.effects.bending import Bending
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.errors import InputError
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
-from harness.mesh.surfaces import Balloon
-from harness.selection import Box
+from harness.base.errors import InputError
+from harness.scenes.effects.bending import Bending
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.surfaces import Balloon
+from harness.scenes.selection import Box
 from solvers.energies.bending import Bending as Energy
 from solvers.energies.bending import flaps
 from tests.effects import at_rest

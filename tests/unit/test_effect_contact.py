@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.effects.contact import Contact
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.errors import InputError
-from harness.mesh.grid import Grid
-from harness.motion import Key, Motion
+from harness.base.errors import InputError
+from harness.scenes.effects.contact import Contact
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.motion import Key, Motion
 from solvers.problem import StopRule
 from tests.contacts import DT, OBSTACLES, THICKNESS, contact, depth, on_slope, sheet, steps
 from tests.effects import integrated

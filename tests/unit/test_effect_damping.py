@@ -5,22 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.effects.air_drag import AirDrag
-from harness.effects.base import Effect
-from harness.effects.bending import Bending
-from harness.effects.dashpots import Dashpots
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.rayleigh import Rayleigh
-from harness.effects.springs import Springs
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
-from harness.scene import Scene
-from harness.simulate import State, prepare, simulate
+from harness.scenes.bind import Scene
+from harness.scenes.effects.air_drag import AirDrag
+from harness.scenes.effects.base import Effect
+from harness.scenes.effects.bending import Bending
+from harness.scenes.effects.dashpots import Dashpots
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.rayleigh import Rayleigh
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.simulation.step import State, prepare, simulate
 from solvers.energies.quadratic import RayleighDamping
 from solvers.integrators import Motion
-from solvers.local_global import SparseLocalGlobal
-from solvers.newton import Newton
+from solvers.methods.local_global import SparseLocalGlobal
+from solvers.methods.newton import Newton
 from solvers.problem import Positions, StopRule
 from tests.effects import integrated
 from tests.scenes import scene

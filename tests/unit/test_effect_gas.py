@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from harness.effects.gas import Gas
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.errors import InputError
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
-from harness.mesh.surfaces import Balloon
-from harness.simulate import prepare, simulate
+from harness.base.errors import InputError
+from harness.scenes.effects.gas import Gas
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.surfaces import Balloon
+from harness.simulation.step import prepare, simulate
 from solvers.energies import gas
-from solvers.lbfgs import Lbfgs
-from solvers.local_global import SparseLocalGlobal
+from solvers.methods.lbfgs import Lbfgs
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule, Unsupported
 from tests.effects import at_rest
 from tests.scenes import scene

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from harness.effects.attachments import Attachments
-from harness.effects.ether_drag import EtherDrag
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.effects.wind import Wind
-from harness.errors import InputError
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
-from harness.motion import Key, Motion
-from harness.simulate import prepare, simulate
-from solvers.local_global import SparseLocalGlobal
+from harness.base.errors import InputError
+from harness.scenes.effects.attachments import Attachments
+from harness.scenes.effects.ether_drag import EtherDrag
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.effects.wind import Wind
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.motion import Key, Motion
+from harness.simulation.step import prepare, simulate
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule
 from tests.effects import at_rest, integrated
 from tests.scenes import scene

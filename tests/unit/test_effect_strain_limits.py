@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.effects.strain_limits import StrainLimits
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.effects.strain_limits import StrainLimits
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
 from solvers.energies import strain_limits
 from tests.effects import at_rest
 from tests.scenes import scene

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.effects.wind import Wind
-from harness.errors import InputError
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
-from harness.mesh.surfaces import Balloon
-from harness.simulate import prepare, simulate
-from solvers.local_global import SparseLocalGlobal
+from harness.base.errors import InputError
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.effects.wind import Wind
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.surfaces import Balloon
+from harness.simulation.step import prepare, simulate
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Positions, StopRule
 from tests.scenes import scene
 

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from harness.effects.base import Contribution
-from harness.effects.constant_force import ConstantForce
-from harness.effects.ether_drag import EtherDrag
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.effects.table import EFFECTS
-from harness.effects.wind import Wind
-from harness.errors import InputError
-from harness.material import spring_stiffness
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
+from harness.base.errors import InputError
+from harness.scenes.effects.base import Contribution
+from harness.scenes.effects.constant_force import ConstantForce
+from harness.scenes.effects.ether_drag import EtherDrag
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.effects.table import EFFECTS
+from harness.scenes.effects.wind import Wind
+from harness.scenes.material import spring_stiffness
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
 from solvers.energies.springs import Springs as SpringsEnergy
 from solvers.registry import load
 from tests.scenes import scene

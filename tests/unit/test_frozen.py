@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.effects.ether_drag import EtherDrag
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.errors import RunFailed
-from harness.mesh.grid import Grid
+from harness.base.errors import RunFailed
 from harness.reference.frozen import Frozen, bind, moment_frames, reference_run
 from harness.reference.store import Store
-from harness.simulate import prepare, simulate
-from harness.spec import IntegratorName, SceneSpec
+from harness.scenes.effects.ether_drag import EtherDrag
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.spec import IntegratorName, SceneSpec
+from harness.simulation.step import prepare, simulate
 from solvers.integrators import INTEGRATORS
-from solvers.local_global import SparseLocalGlobal
-from solvers.newton import Newton
+from solvers.methods.local_global import SparseLocalGlobal
+from solvers.methods.newton import Newton
 from solvers.problem import Start, StepProblem, StopRule, System
 
 FRAMES = 12

@@ -10,11 +10,11 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.motion import Key, Motion
-from harness.obstacles import Box, Capsule, Plane, Sphere
 from harness.report import opengl
 from harness.report.contact_sheet import COLUMNS
 from harness.report.solids import solid
+from harness.scenes.motion import Key, Motion
+from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
 
 needs_opengl = pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
 SEEN = np.random.default_rng(0).normal(size=(20, 3))

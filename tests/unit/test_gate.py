@@ -12,8 +12,8 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from harness.base.errors import InputError
 from harness.cli import app
-from harness.errors import InputError
 from harness.report.gate import compare
 
 ROOT = Path(__file__).resolve().parents[2]

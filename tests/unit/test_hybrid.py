@@ -8,9 +8,9 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from solvers.hybrid import Hybrid
-from solvers.lbfgs import Lbfgs
-from solvers.newton import Newton
+from solvers.methods.hybrid import Hybrid
+from solvers.methods.lbfgs import Lbfgs
+from solvers.methods.newton import Newton
 from solvers.problem import Pins, StepProblem, StopRule, System
 from tests.scenes import cloth, first_problem, random_problem
 

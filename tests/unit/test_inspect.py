@@ -15,7 +15,7 @@ import pytest
 import pyvista as pv
 from rich.console import Console
 
-from harness.errors import InputError, RunFailed
+from harness.base.errors import InputError, RunFailed
 from harness.record.compare import side_by_side
 from harness.record.reader import read_replay
 from harness.report import inspect as module

@@ -8,14 +8,14 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
-from harness.effects.constant_force import ConstantForce
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.mesh.chain import Chain
-from harness.scene import Scene
-from harness.simulate import State, prepare, simulate, start
+from harness.scenes.bind import Scene
+from harness.scenes.effects.constant_force import ConstantForce
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.simulation.step import State, prepare, simulate, start
 from solvers.integrators import INTEGRATORS, Motion
-from solvers.newton import Newton
+from solvers.methods.newton import Newton
 from solvers.problem import StopRule
 from tests.scenes import scene
 

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness import rows
-from harness.errors import InputError
-from harness.judge import Judge, Oracle, is_minimum, reference
-from harness.load import load_any
+from harness.base import rows
+from harness.base.errors import InputError
+from harness.config.load import load_any
+from harness.experiments.run import Files, execute
 from harness.record.reader import read_replay
+from harness.reference.judge import Judge, Oracle, is_minimum, reference
 from harness.report.robustness import (
     DIVERGED,
     OTHER,
@@ -28,11 +29,10 @@ from harness.report.robustness import (
     summary,
 )
 from harness.report.robustness_map import draw_map, headline, write_page
-from harness.run import Files, execute
-from harness.scene import Scene
-from harness.simulate import simulate
-from solvers.local_global import SparseLocalGlobal
-from solvers.newton import Newton
+from harness.scenes.bind import Scene
+from harness.simulation.step import simulate
+from solvers.methods.local_global import SparseLocalGlobal
+from solvers.methods.newton import Newton
 from solvers.problem import Positions, StepProblem, StopRule
 from tests.scenes import cloth, first_problem, random_problem
 
@@ -202,7 +202,7 @@ def test_a_run_that_fails_keeps_and_marks_its_recording_up_to_there(tmp_path: Pa
                 step.positions[1] = np.inf
             yield step
 
-    monkeypatch.setattr("harness.measure.simulate", burst)
+    monkeypatch.setattr("harness.simulation.measure.simulate", burst)
     (row,) = execute(spec, files, lambda phase: None)
     assert (row["status"], row["frame"]) == ("diverged", 3)
     assert "not finite" in row["reason"]

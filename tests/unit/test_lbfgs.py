@@ -7,8 +7,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from solvers.lbfgs import Lbfgs
 from solvers.matrices import assemble
+from solvers.methods.lbfgs import Lbfgs
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem
 from tests.scenes import random_problem
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from threadpoolctl import threadpool_info
 
-from harness import machine
-from harness.errors import InputError
+from harness.base import machine
+from harness.base.errors import InputError
 
 CORES = machine.describe().cores
 
@@ -120,7 +120,7 @@ def test_the_code_hash_follows_names_and_contents_of_the_sources(tmp_path: Path)
 
 
 PINNED = """
-from harness.machine import pinned_threads
+from harness.base.machine import pinned_threads
 from threadpoolctl import threadpool_info
 with pinned_threads({threads}):
     import numba, numpy, scipy.linalg

@@ -10,14 +10,14 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import spsolve
 
-from harness.errors import InputError
-from harness.material import RULES, spring_stiffness
-from harness.mesh.base import BEND, SHEAR, STRETCH, Mesh
-from harness.mesh.chain import Chain
-from harness.mesh.generator import Generator
-from harness.mesh.grid import Grid, Net
-from harness.mesh.solids import Block, Tower
-from harness.mesh.surfaces import Balloon, Skirt
+from harness.base.errors import InputError
+from harness.scenes.material import RULES, spring_stiffness
+from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.generator import Generator
+from harness.scenes.mesh.grid import Grid, Net
+from harness.scenes.mesh.solids import Block, Tower
+from harness.scenes.mesh.surfaces import Balloon, Skirt
 
 ROUND_OFF = 1e-9
 """Relative error of a sparse solve with a few thousand unknowns and a condition number below 1e6."""

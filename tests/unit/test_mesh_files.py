@@ -10,10 +10,10 @@ import meshio
 import numpy as np
 import pytest
 
-from harness.errors import InputError
-from harness.mesh import cells as cells_module
-from harness.mesh.base import SHEAR, STRETCH
-from harness.mesh.files import File
+from harness.base.errors import InputError
+from harness.scenes.mesh import cells as cells_module
+from harness.scenes.mesh.base import SHEAR, STRETCH
+from harness.scenes.mesh.files import File
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 SIDES = [[0, 1], [0, 3], [1, 2], [2, 3]]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from harness.errors import InputError
-from harness.mesh.base import BEND, SHEAR, STRETCH, Mesh
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid, Net
-from harness.mesh.solids import Block, Tower
-from harness.mesh.surfaces import Balloon, Skirt
+from harness.base.errors import InputError
+from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid, Net
+from harness.scenes.mesh.solids import Block, Tower
+from harness.scenes.mesh.surfaces import Balloon, Skirt
 
 ROUND_OFF = 1e-12
 """A few thousand additions of numbers of order one in float64."""

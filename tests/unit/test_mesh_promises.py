@@ -8,14 +8,14 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from harness.errors import InputError
-from harness.mesh.base import BEND, SHEAR, STRETCH, Mesh
-from harness.mesh.chain import Chain
-from harness.mesh.generator import MAX_VERTICES, Generator
-from harness.mesh.grid import Grid, Net
-from harness.mesh.solids import Block, Tower
-from harness.mesh.surfaces import Balloon, Skirt
-from harness.mesh.table import MESHES
+from harness.base.errors import InputError
+from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.generator import MAX_VERTICES, Generator
+from harness.scenes.mesh.grid import Grid, Net
+from harness.scenes.mesh.solids import Block, Tower
+from harness.scenes.mesh.surfaces import Balloon, Skirt
+from harness.scenes.mesh.table import MESHES
 from solvers import memory
 
 ROUND_OFF = 1e-12

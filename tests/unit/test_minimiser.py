@@ -14,7 +14,7 @@ from harness.reference.minimiser import Minimum, Reference, Uncertified, certify
 from harness.reference.store import Store
 from solvers.energies.springs import Springs
 from solvers.integrators import Motion
-from solvers.newton import Newton
+from solvers.methods.newton import Newton
 from solvers.problem import Pins, Positions, Solution, StepProblem, StopRule, System
 from tests.scenes import begun, cloth, first_problem, random_problem
 

@@ -8,18 +8,18 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from harness.effects.gas import Gas
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.mesh.surfaces import Balloon
-from solvers.descent import PreparedDescent
-from solvers.hybrid import Hybrid
-from solvers.newton import Newton
-from solvers.newton_cg import Method, NewtonCG
-from solvers.objective import Objective, StepObjective
+from harness.scenes.effects.gas import Gas
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.surfaces import Balloon
+from solvers.core.descent import PreparedDescent
+from solvers.core.objective import Objective, StepObjective
+from solvers.core.saddles import certified
+from solvers.methods.hybrid import Hybrid
+from solvers.methods.newton import Newton
+from solvers.methods.newton_cg import Method, NewtonCG
 from solvers.problem import StopRule
-from solvers.saddles import certified
 from tests.scenes import cloth, first_problem, random_problem, scene
 from tests.unit.test_objective import with_links
 

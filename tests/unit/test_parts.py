@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs as SpringsEffect
-from harness.mesh.chain import Chain
-from harness.scene import Scene
-from solvers.compiled import CompiledLocalGlobal, PreparedCompiled
+from harness.scenes.bind import Scene
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs as SpringsEffect
+from harness.scenes.mesh.chain import Chain
+from solvers.core.parts import split
 from solvers.energies.quadratic import Quadratic
 from solvers.energies.springs import Springs
-from solvers.lbfgs import Lbfgs
-from solvers.local_global import SparseLocalGlobal
-from solvers.parts import split
+from solvers.methods.lbfgs import Lbfgs
+from solvers.methods.local_global import SparseLocalGlobal
+from solvers.methods.local_global_compiled import CompiledLocalGlobal, PreparedCompiled
 from solvers.problem import Positions, Solver, StepProblem, StopRule
 from tests.effects import ATTACHED, BEND, DASHPOTS, DRAG, LIMITS, RAYLEIGH, cloth, stepped
 from tests.scenes import scene

@@ -8,7 +8,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from solvers.local_global import SparseLocalGlobal
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Pins, StepProblem, StopRule
 from tests.scenes import BACKENDS, cloth, first_problem, random_problem
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from harness import rows
-from harness.ablate.rows import SCHEMA
-from harness.errors import InputError
-from harness.query import answer
+from harness.base import rows
+from harness.base.errors import InputError
+from harness.experiments.ablation.rows import SCHEMA
+from harness.report.query import answer
 
 
 @pytest.fixture

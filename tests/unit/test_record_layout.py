@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.mesh.grid import Grid
 from harness.record.blueprint import Box, run_document, scale_name, spring_cadence
+from harness.scenes.mesh.grid import Grid
 from tests.recordings import info
 
 CORNER = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 2.0]])

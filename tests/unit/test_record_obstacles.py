@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.motion import Key, Motion
-from harness.obstacles import Box, Capsule, Plane, Sphere, from_json
 from harness.record.reader import open_recording, read_replay
 from harness.report.solids import seen, solids
+from harness.scenes.motion import Key, Motion
+from harness.scenes.obstacles import Box, Capsule, Plane, Sphere, from_json
 from tests.recordings import TIME_STEP, info, record
 
 RISES = Motion(keys=(Key(time=0.0), Key(time=10 * TIME_STEP, offset=(0.0, 2.0, 0.0), turn=90.0)), axis=(1.0, 2.0, 0.0))
@@ -98,5 +98,6 @@ def test_a_recording_without_obstacles_has_no_trace_of_any(tmp_path: Path):
 
 
 def test_who_records_and_draws_scenes_without_obstacles_does_not_import_them():
-    script = "import sys, harness.run, harness.report.run_picture; sys.exit('harness.obstacles' in sys.modules)"
+    imports = "import sys, harness.experiments.run, harness.report.run_picture"
+    script = f"{imports}; sys.exit('harness.scenes.obstacles' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

@@ -15,12 +15,12 @@ from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
+from harness.base.rows import SCHEMA
 from harness.report import page, timing_plot
 from harness.report.labels import LINE, spread
 from harness.report.style import HEIGHT, WIDTH, marks
 from harness.report.timing_plot import draw_timing
 from harness.report.timing_table import labels, runs, summary_table
-from harness.rows import SCHEMA
 from solvers.registry import SOLVERS
 
 POWERS = {"sparse": 1.0, "dense": 2.0, "xpbd": 1.5}  # of the vertices, in the times of each solver

@@ -5,7 +5,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from harness import rows
+from harness.base import rows
 
 ROOT = Path(__file__).resolve().parents[2]
 

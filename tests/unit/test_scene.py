@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.errors import InputError
-from harness.mesh.chain import Chain
-from harness.scene import build
-from harness.spec import SceneSpec
+from harness.base.errors import InputError
+from harness.scenes.bind import build
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.spec import SceneSpec
 from tests.scenes import scene
 
 

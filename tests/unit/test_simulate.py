@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from harness.effects.constant_force import ConstantForce
-from harness.effects.ether_drag import EtherDrag
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.mesh.chain import Chain
-from harness.simulate import FIRST_GUESSES, State, problem, simulate, start
+from harness.scenes.effects.constant_force import ConstantForce
+from harness.scenes.effects.ether_drag import EtherDrag
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.simulation.step import FIRST_GUESSES, State, problem, simulate, start
 from solvers.integrators import Motion
 from solvers.problem import Positions, Solution, StepProblem, StopRule
 from tests.scenes import BACKENDS, SCENES, scene, trajectory

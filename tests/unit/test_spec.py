@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.errors import InputError
-from harness.load import Sweep, load_any, load_scene, load_sweep
-from harness.scene import build
-from harness.schema import schema
-from harness.spec import RunSpec
+from harness.base.errors import InputError
+from harness.config.load import Sweep, load_any, load_scene, load_sweep
+from harness.config.schema import schema
+from harness.config.sweep import RunSpec
+from harness.scenes.bind import build
 
 ROOT = Path(__file__).resolve().parents[2]
 ASSIGNMENT = ROOT.parent / "shared" / "scenes"
@@ -214,13 +214,14 @@ def test_the_schema_describes_every_key_of_a_scene_and_a_sweep() -> None:
 
 def test_a_scene_imports_the_effects_that_it_names_and_no_others(folder: Path) -> None:
     code = (
-        "import json, sys; from pathlib import Path; from harness.load import load_scene;"
-        "load_scene(Path(sys.argv[1])); print(json.dumps([m for m in sys.modules if m.startswith('harness.effects.')]))"
+        "import json, sys; from pathlib import Path; from harness.config.load import load_scene;"
+        "load_scene(Path(sys.argv[1]));"
+        "print(json.dumps([m for m in sys.modules if m.startswith('harness.scenes.effects.')]))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(folder / "cloth.yaml")], capture_output=True, text=True, check=True, cwd=ROOT
     )
-    expected = {"harness.effects.base", "harness.effects.table", "harness.effects.springs"}
+    expected = {"harness.scenes.effects.base", "harness.scenes.effects.table", "harness.scenes.effects.springs"}
     assert set(json.loads(done.stdout)) == expected
 
 

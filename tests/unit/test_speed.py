@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.errors import InputError
-from harness.load import load_any, load_sweep
-from harness.rows import alone
-from harness.spec import RunSpec, SolverSpec
-from harness.speed import candidates, limits, turns, yardstick
-from harness.speed.candidates import Reading, average
-from harness.speed.figures import figures
-from harness.speed.report import run_speed
-from harness.speed.rest import apart, rest_of
-from harness.speed.table import remarks, speed_table
-from harness.speed.turns import PREPARES, Past, measure, name, predicted
-from harness.speed.work import count
-from solvers.compiled import CompiledLocalGlobal
+from harness.base.errors import InputError
+from harness.base.rows import alone
+from harness.config.load import load_any, load_sweep
+from harness.config.sweep import RunSpec, SolverSpec
+from harness.experiments.speed import candidates, limits, turns, yardstick
+from harness.experiments.speed.candidates import Reading, average
+from harness.experiments.speed.figures import figures
+from harness.experiments.speed.report import run_speed
+from harness.experiments.speed.rest import apart, rest_of
+from harness.experiments.speed.table import remarks, speed_table
+from harness.experiments.speed.turns import PREPARES, Past, measure, name, predicted
+from harness.experiments.speed.work import count
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Unsupported
 from tests.scenes import cloth, first_problem
 

@@ -8,10 +8,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from harness.rows import SCHEMA
-from harness.speed.figures import Figures, Machine, figures, interval
-from harness.speed.table import exponents, remarks
-from harness.speed.work import count
+from harness.base.rows import SCHEMA
+from harness.experiments.speed.figures import Figures, Machine, figures, interval
+from harness.experiments.speed.table import exponents, remarks
+from harness.experiments.speed.work import count
 
 
 def machine_row(phase: str, seconds: float, *, bytes: float = 0.0, flops: float = 0.0, working_set: float = 0.0):

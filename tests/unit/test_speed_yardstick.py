@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.errors import RunFailed
+from harness.base.errors import RunFailed
+from harness.experiments.speed import yardstick
+from harness.experiments.speed.yardstick import CHEAP_TEMPORARIES, Yardstick, build
 from harness.report.size_plot import Series, draw_by_size
 from harness.report.style import HEIGHT, WIDTH
-from harness.speed import yardstick
-from harness.speed.yardstick import CHEAP_TEMPORARIES, Yardstick, build
-from solvers.local_global import SparseLocalGlobal
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule, Unsupported
 from tests.scenes import cloth, first_problem
 

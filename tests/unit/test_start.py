@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from harness.effects.pins import Pins
-from harness.errors import InputError
-from harness.load import load_any, load_scene
-from harness.mesh.grid import Grid
-from harness.mesh.network import Network
-from harness.mesh.star import Star
-from harness.scene import build
-from harness.simulate import start
-from harness.start import AnyStart
+from harness.base.errors import InputError
+from harness.config.load import load_any, load_scene
+from harness.scenes.bind import build
+from harness.scenes.effects.pins import Pins
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.network import Network
+from harness.scenes.mesh.star import Star
+from harness.scenes.start import AnyStart
+from harness.simulation.step import start
 
 REST = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 4.0, 0.0], [0.0, 4.0, 8.0]])
 MEAN = [1.0, 2.0, 2.0]

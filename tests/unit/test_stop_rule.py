@@ -8,8 +8,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from harness.trace import EnergyNorm, trace
-from solvers.local_global import only_springs
+from harness.simulation.trace import EnergyNorm, trace
+from solvers.methods.local_global import only_springs
 from solvers.problem import StepProblem, StopRule
 from tests.scenes import BACKENDS, cloth, first_problem, random_problem
 

@@ -8,18 +8,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins as PinsEffect
-from harness.effects.springs import Springs as SpringsEffect
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
-from harness.scene import Scene
-from harness.simulate import State, simulate
+from harness.scenes.bind import Scene
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins as PinsEffect
+from harness.scenes.effects.springs import Springs as SpringsEffect
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.simulation.step import State, simulate
 from solvers.energies.springs import Springs
 from solvers.integrators import Motion
 from solvers.matrices import diagonal
+from solvers.methods.symplectic_euler import SymplecticEuler, frequency_bound
 from solvers.problem import Pins, StopRule, System, Unsupported
-from solvers.symplectic_euler import SymplecticEuler, frequency_bound
 from tests.scenes import SCENES, cloth, first_problem, random_network, random_problem, scene
 from tests.unit.test_xpbd import Other, without_mass
 

@@ -8,10 +8,10 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
-from harness.trace import EnergyNorm, trace
-from solvers.compiled import CompiledLocalGlobal
-from solvers.local_global import SparseLocalGlobal, only_springs
+from harness.simulation.trace import EnergyNorm, trace
 from solvers.matrices import assemble
+from solvers.methods.local_global import SparseLocalGlobal, only_springs
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from tests.scenes import cloth, first_problem, frozen, random_problem
 
 

@@ -8,27 +8,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.effects.air_drag import AirDrag
-from harness.effects.base import Effect
-from harness.effects.dashpots import Dashpots
-from harness.effects.ether_drag import EtherDrag
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins
-from harness.effects.springs import Springs
-from harness.effects.wind import Wind
-from harness.errors import RunFailed
-from harness.load import load_scene
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
+from harness.base.errors import RunFailed
+from harness.config.load import load_scene
 from harness.reference import store
 from harness.reference.frozen import bind
 from harness.reference.motion import Field, Unintegrable
 from harness.reference.store import Store
 from harness.reference.trajectory import Trajectory, Unpredictable, integrate
-from harness.scene import Scene
-from harness.simulate import prepare, simulate
-from harness.spec import MeshSource, SceneSpec
-from solvers.newton import Newton
+from harness.scenes.bind import Scene
+from harness.scenes.effects.air_drag import AirDrag
+from harness.scenes.effects.base import Effect
+from harness.scenes.effects.dashpots import Dashpots
+from harness.scenes.effects.ether_drag import EtherDrag
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.effects.wind import Wind
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.spec import MeshSource, SceneSpec
+from harness.simulation.step import prepare, simulate
+from solvers.methods.newton import Newton
 from solvers.problem import StopRule
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "scenes"

@@ -8,10 +8,10 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
-from harness.simulate import FIRST_GUESSES
-from solvers.compiled import CompiledLocalGlobal
+from harness.simulation.step import FIRST_GUESSES
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.methods.vbd import VertexBlockDescent
 from solvers.problem import NotPositiveDefinite, StepProblem, StopRule, Unsupported
-from solvers.vbd import VertexBlockDescent
 from tests.scenes import SCENES, cloth, first_problem, random_problem
 from tests.unit.test_xpbd import Other
 

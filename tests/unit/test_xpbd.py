@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins as PinsEffect
-from harness.effects.springs import Springs as SpringsEffect
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
-from harness.scene import Scene
-from harness.simulate import prepare, simulate
-from solvers.compiled import CompiledLocalGlobal
+from harness.scenes.bind import Scene
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins as PinsEffect
+from harness.scenes.effects.springs import Springs as SpringsEffect
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.simulation.step import prepare, simulate
 from solvers.energies.springs import Springs
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
 from solvers.problem import Pins, StepProblem, StopRule, System, Unsupported
-from solvers.xpbd import Xpbd, XpbdSmallSteps
 from tests.scenes import SCENES, cloth, first_problem, random_problem, scene
 
 G, DT = 9.81, 1 / 30

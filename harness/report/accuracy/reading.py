@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.errors import InputError, Mistake
+from harness.base.errors import InputError, Mistake
 from harness.report.accuracy.table import Curve, Problem, Table, Values, Work
 
 ROUND_OFF = 100 * float(np.finfo(np.float64).eps)

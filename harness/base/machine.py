@@ -1,0 +1,167 @@
+"""What a measurement ran on: the machine, the versions, the state of the code; and how many threads it may use."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import psutil
+from threadpoolctl import threadpool_limits
+
+from harness.base.errors import InputError, Mistake
+
+_ROOT = Path(__file__).resolve().parents[2]
+_PACKAGES = ("harness", "solvers")
+_LOOK, _NEARLY = 0.3, 0.25
+"""For how many seconds to look at what the cores do, and how busy one may be and still count as idle."""
+
+_LIBRARIES = ("numpy", "scipy", "numba", "llvmlite", "cholespy", "pyarrow", "rerun-sdk", "pyvista", "vtk")
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """The machine, as far as it decides about speed; it does not say whose it is.
+
+    cpu: the processor's name; cores: how many this process may use; memory_gib: memory [GiB], to one decimal;
+    system: operating system, release and architecture.
+    """
+
+    cpu: str
+    cores: int
+    memory_gib: float
+    system: str
+
+    @property
+    def id(self) -> str:
+        """12 hexadecimal digits, the same for the same processor, cores and memory (rounded to 1 GiB)."""
+        text = f"{self.cpu}|{self.cores}|{round(self.memory_gib)}"
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def describe() -> Machine:
+    """The machine that this process runs on, with the cores that it may use now."""
+    system = f"{platform.system()} {platform.release()} {platform.machine()}"
+    return Machine(_cpu(), _cores(), round(psutil.virtual_memory().total / 2**30, 1), system)
+
+
+@cache
+def _cpu() -> str:
+    # lscpu also names ARM processors, of which the kernel tells numbers only.
+    try:
+        told = subprocess.run(["lscpu"], env={**os.environ, "LC_ALL": "C"}, capture_output=True, text=True)
+    except OSError:
+        return platform.processor() or platform.machine()
+    fields = (line.partition(":") for line in told.stdout.splitlines())
+    names = [value.strip() for name, _, value in fields if name.strip() == "Model name"]
+    return names[0] if names else platform.machine()
+
+
+def _usable() -> int:
+    return min(_cores(), int(os.environ.get("NUMBA_NUM_THREADS") or _cores()))
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@cache
+def versions() -> dict[str, str]:
+    """The versions of Python and of the libraries that compute, store and draw; absent ones are left out."""
+    found = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+@cache
+def commit(root: Path = _ROOT) -> str:
+    """The commit of the checkout at `root`, with `-dirty` where tracked files differ; "unknown" outside one.
+
+    The default is the project's own checkout, wherever the process was started. Never fails.
+    """
+    # Naming the repository keeps git from answering for one that merely encloses the project.
+    git = ["git", "--no-optional-locks", f"--git-dir={root / '.git'}", f"--work-tree={root}"]
+    try:
+        told = subprocess.run(
+            [*git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
+            cwd=root,
+            capture_output=True,
+            text=True,
+        )
+    except OSError:
+        return "unknown"
+    return told.stdout.strip() if told.returncode == 0 else "unknown"
+
+
+@cache
+def code_hash(root: Path = _ROOT) -> str:
+    """12 hexadecimal digits of SHA-256 over the paths and contents of the project's Python sources."""
+    digest = hashlib.sha256()
+    sources = (path for package in _PACKAGES for path in (root / package).rglob("*.py"))
+    for name, path in sorted((path.relative_to(root).as_posix(), path) for path in sources):
+        content = path.read_bytes()
+        digest.update(f"{name}\0{len(content)}\0".encode() + content)
+    return digest.hexdigest()[:12]
+
+
+@dataclass(frozen=True, slots=True)
+class Threads:
+    """How many threads BLAS and Numba may use, and why, in words, where that was not said but chosen."""
+
+    number: int
+    why: str = ""
+
+
+def threads(asked: int | Literal["auto"]) -> Threads:
+    """The threads that were asked for; for "auto" as many as there are idle cores, the same all the process long."""
+    return _idle() if asked == "auto" else Threads(asked)
+
+
+@cache
+def _idle() -> Threads:
+    """A thread for each core that others leave idle while this process looks on; once, so that runs are alike."""
+    usable = _usable()
+    mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(usable)
+    busy = psutil.cpu_percent(_LOOK, percpu=True)
+    idle = sum(1.0 - busy[core] / 100 for core in mine if core < len(busy))
+    number = min(usable, max(1, int(idle + _NEARLY)))
+    load = os.getloadavg()[0]
+    return Threads(number, f"threads: {number} of {usable}, for {idle:.1f} cores were idle (load average {load:.1f})")
+
+
+@contextmanager
+def pinned_threads(threads: int) -> Iterator[None]:
+    """Let BLAS and Numba's parallel kernels use `threads` threads each, and restore their numbers afterwards.
+
+    Raises InputError where this process may not use as many.
+    """
+    # Loaded here: BLAS can only be limited once it is loaded, NumPy and SciPy bring one each, and a process
+    # that computes nothing should not wait for them.
+    import numba
+    import scipy.linalg  # noqa: F401
+
+    usable = _usable()
+    if not 1 <= threads <= usable:
+        wanted = f"should be from 1 to {usable}, the cores that this process may use, not {threads}"
+        raise InputError(Mistake(wanted, key="threads"))
+    before = numba.get_num_threads()
+    with threadpool_limits(threads, user_api="blas"):
+        numba.set_num_threads(threads)
+        try:
+            yield
+        finally:
+            numba.set_num_threads(before)

@@ -1,0 +1,156 @@
+"""The rows that a run leaves: one flat Parquet file a run, under `results/<sweep>/rows/`.
+
+`COLUMNS` is the schema and its documentation at once; `results/README.md` shows the same table.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from harness.base.errors import InputError, Mistake
+
+
+class Column(NamedTuple):
+    """One column: its name, Arrow type, unit ("" for none) and meaning."""
+
+    name: str
+    type: pa.DataType
+    unit: str
+    meaning: str
+
+
+_TEXT, _INT, _REAL = pa.string(), pa.int64(), pa.float64()
+
+COLUMNS = (
+    Column("run_id", _TEXT, "", "hash of all that determines the run's result and timing"),
+    Column("sweep", _TEXT, "", "name of the sweep, the stem of its file"),
+    Column("scene", _TEXT, "", "name of the scene, the stem of its file"),
+    Column("size", _INT, "", "mesh size of the sweep; 0 where the mesh comes from a file"),
+    Column("solver", _TEXT, "", "name of the solver"),
+    Column("parameters", _TEXT, "", "the solver's parameters, as JSON"),
+    Column("vertices", _INT, "", "vertices of the mesh"),
+    Column("springs", _INT, "", "springs of the mesh"),
+    Column("time_step", _REAL, "s", "the time step dt"),
+    Column("integrator", _TEXT, "", "how time is integrated: implicit-euler, bdf2 or midpoint"),
+    Column("first_guess", _TEXT, "", "where each step's iteration starts: assignment, current or inertial"),
+    Column("max_iterations", _INT, "", "the iteration limit of a step"),
+    Column("tolerance", _REAL, "", "relative tolerance of the stop rule; null: all iterations are done"),
+    Column("threads", _INT, "", "threads of Numba and of BLAS"),
+    Column("phase", _TEXT, "", "prepare, step, local, global or run (the run as a whole); of a machine its kernel"),
+    Column("frame", _INT, "", "the step, from 1; null where the phase has none"),
+    Column("round", _INT, "", "repetition of the measurement, from 0; prepare: 0 is cold, later ones are warm"),
+    Column("seconds", _REAL, "s", "wall time of the phase; local and global: of one such step"),
+    Column("iterations", _INT, "", "iterations done in the step"),
+    Column("stopped", _TEXT, "", "what ended the step's iterations: iterations, tolerance, floor or stalled"),
+    Column(
+        "residual",
+        _REAL,
+        "J^(1/2)",
+        "|Q^-1 grad g|_Q where the step's last iteration began or ended, unpinned vertices",
+    ),
+    Column("yardstick", _REAL, "J^(1/2)", "the residual at the step's start, which the tolerance refers to"),
+    Column(
+        "stationarity",
+        _REAL,
+        "",
+        "where judged, and the solver minimises: |Q^-1 grad g|_Q after the step, by the oracle, over the larger of "
+        "its value at the current positions and round-off",
+    ),
+    Column("attainable", _REAL, "", "where judged: the least stationarity that round-off lets anyone reach"),
+    Column("minimum", pa.bool_(), "", "where judged: whether the Hessian after the step is positive definite"),
+    Column(
+        "distance",
+        _REAL,
+        "",
+        "where judged: largest distance of a vertex from where a run of Newton's method to round-off has it in that "
+        "frame, over the rest shape's size; null from where that is lost",
+    ),
+    Column("energy_springs", _REAL, "J", "elastic energy of the springs after the step"),
+    Column("energy_inertia", _REAL, "J", "inertia term of the step's objective"),
+    Column("energy_force", _REAL, "J", "external forces' term of the step's objective"),
+    Column("energy_pins", _REAL, "J", "pin penalty of the step's objective"),
+    Column("energy_effects", _REAL, "J", "all other energies of the step's objective: bending, gas, damping and so on"),
+    Column("objective", _REAL, "J", "the step's objective, the sum of all terms"),
+    Column("largest_strain", _REAL, "", "largest |length / rest length - 1| of a spring after the step"),
+    Column("digest", _TEXT, "", "SHA-256 of the positions after the step (float64 bytes)"),
+    Column("nnz_system", _INT, "", "stored entries of the system matrix Q"),
+    Column("nnz_factor", _INT, "", "stored entries of its triangular factor, null where the library hides it"),
+    Column("nnz_hessian_factor", _INT, "", "stored entries of the triangular factor of Newton's Hessian"),
+    Column("panel_bytes", _INT, "", "bytes in which the prepared factor is stored"),
+    Column("flops_per_solve", _INT, "", "additions and multiplications of one global step, padding included"),
+    Column("choice", _TEXT, "", "what the solver chose by itself, and why"),
+    Column("apart", _REAL, "", "how far the precision of the factor moves converged positions, in the scene's size"),
+    Column("bytes", _REAL, "", "bytes that the phase touches, vectors and springs included, by count"),
+    Column("flops", _REAL, "", "additions and multiplications of the phase, by count"),
+    Column("working_set", _REAL, "", "bytes that the phase goes through again and again"),
+    Column("load", _REAL, "", "load average over a minute when the phase was timed"),
+    Column("status", _TEXT, "", "ok, unsupported, diverged, failed or skipped"),
+    Column("reason", _TEXT, "", "why the status is not ok"),
+    Column("machine", _TEXT, "", "id of the machine: hash of its processor, cores and memory"),
+    Column("cpu", _TEXT, "", "name of the processor"),
+    Column("cores", _INT, "", "cores this process may use"),
+    Column("memory_gib", _REAL, "GiB", "memory of the machine"),
+    Column("system", _TEXT, "", "operating system and its release"),
+    Column("versions", _TEXT, "", "versions of Python and the libraries, as JSON"),
+    Column("commit", _TEXT, "", "commit of the code, with -dirty where files differed from it"),
+    Column("code", _TEXT, "", "hash of the sources of solvers and harness: rows made by older code differ"),
+    Column("started", _TEXT, "", "when the run started, UTC, ISO 8601"),
+)
+
+
+def schema_of(columns: Iterable[Column]) -> pa.Schema:
+    """The Arrow schema of columns, in their order."""
+    return pa.schema([pa.field(c.name, c.type) for c in columns])
+
+
+SCHEMA = schema_of(COLUMNS)
+Row = Mapping[str, Any]
+
+
+def write(path: Path, rows: Iterable[Row], schema: pa.Schema = SCHEMA) -> None:
+    """Write one file's rows under a partial name and rename: a kill leaves the whole file or none."""
+    rows = list(rows)
+    unknown = {key for row in rows for key in row} - set(schema.names)
+    if unknown:
+        raise ValueError(f"rows have no columns {sorted(unknown)}")
+    partial = path.with_name(f".{path.name}.partial")
+    with partial.open("wb") as file:
+        pq.write_table(pa.Table.from_pylist(rows, schema=schema), file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+
+
+def read(paths: Iterable[Path], schema: pa.Schema = SCHEMA) -> pa.Table:
+    """All rows of the files, in the order of the paths; files of an older schema get nulls.
+
+    Raises InputError for a file that holds no rows.
+    """
+    tables = []
+    for path in paths:
+        try:
+            tables.append(pq.read_table(path))
+        except (pa.ArrowInvalid, OSError) as error:
+            raise InputError(Mistake(f"holds no rows ({error}); take it out of the results", path)) from error
+    return pa.concat_tables([schema.empty_table(), *tables], promote_options="default")
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Hold a folder of results for one process; whatever a killed one left half written is removed."""
+    with (folder / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(f"{folder}: another springbench is running this sweep; wait for it or stop it") from error
+        for partial in folder.glob("*/.*partial*"):
+            partial.unlink()
+        yield

@@ -1,0 +1,176 @@
+"""What an accuracy config asks, once it was checked: curves on frozen steps, and work of whole trajectories."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from harness.base.model import Many, Model
+from harness.config.sweep import Iterations, Rounds, SolverSpec, Threads, Tolerance
+from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, Size, TimeStep
+
+Moment = Literal["early", "middle", "violent"] | Frames
+"""A moment of the scene that is found from its own run, or the number of a frame."""
+
+TimeLimit = Annotated[float, Field(gt=0, le=1e5)]
+
+
+class Study(Model):
+    """What every study says: of its lists, all combinations are measured."""
+
+    scene: Many[str] = ()
+    """Names of scenes, the stems of their files; all of them if left out."""
+    size: Many[Size] = ()
+    """Mesh sizes; each scene's default if left out."""
+    solver: Many[str] = ()
+    """Names of solvers that the config lists; all of them if left out."""
+    integrator: Many[IntegratorName] = ("implicit-euler",)
+    """How time is integrated."""
+    time_step: Many[TimeStep | None] = (None,)
+    """Time step [s]; null takes the scene's."""
+    threads: Threads = 1
+    """Threads of Numba and of BLAS."""
+    rounds: Rounds = 3
+    """How often the timed part is repeated."""
+    time_limit: TimeLimit = 5.0
+    """Seconds that a solver may take for one curve, or one simulation."""
+
+
+class CurveStudy(Study):
+    """Convergence of the solvers that minimise, on frozen steps."""
+
+    moment: Many[Moment] = ("early", "middle", "violent")
+    """Which steps are frozen: moments found from the scene's run, or numbers of frames."""
+    first_guess: Many[FirstGuess] = ("current", "inertial")
+    """Where a solve starts: at the current positions (the assignment), at the inertial target (Liu et al. 2013)."""
+    iterations: Iterations = 2000
+    """Iteration limit; a curve ends before it where it has converged."""
+    recordings: bool = False
+    """Whether the solve from the first of the guesses is recorded, to scrub through its iterates beside the mesh."""
+
+
+class WorkStudy(Study):
+    """Error and wall time of whole trajectories."""
+
+    horizon: Annotated[float, Field(gt=0, le=1e4)] = 1.0
+    """Simulated time [s]; a multiple of every time step."""
+    first_guess: Many[FirstGuess] = ("current",)
+    """Where a step's iteration starts."""
+    iterations: Many[Iterations] = (50,)
+    """Iteration limits of a step."""
+    tolerance: Many[Tolerance] = (None,)
+    """Relative tolerances that end a step's iterations; null does all of them."""
+
+
+class AccuracyFields(Model):
+    """An accuracy config: scenes, solvers, and what to measure of them."""
+
+    description: str = Field(default="", max_length=1000)
+    """One sentence about what the config asks."""
+    scenes: tuple[str, ...] = Field(min_length=1)
+    """Scene files (*.yaml, or *.json of the assignment), relative to the config."""
+    solvers: tuple[str | dict[str, Any], ...] = Field(min_length=1)
+    """Solvers: a name, or a mapping of `name` and the solver's parameters."""
+    curves: tuple[CurveStudy, ...] = ()
+    """Studies of convergence; where two ask for the same solve, the first says how."""
+    work: tuple[WorkStudy, ...] = ()
+    """Studies of work; where two ask for the same simulation, the first says how."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A scene at a size, with an integrator and a time step (which is that of `scene`)."""
+
+    scene_name: str
+    scene: SceneSpec
+    size: int
+    integrator: IntegratorName
+
+    def identity(self) -> list[Any]:
+        """All that determines the motion, as plain data."""
+        return [self.scene.digest, self.size, self.integrator]
+
+    @property
+    def title(self) -> str:
+        """The case in words."""
+        return f"{self.scene_name} {self.size}" if self.size else self.scene_name
+
+
+@dataclass(frozen=True, slots=True)
+class How:
+    """How a unit is measured; see `Study`."""
+
+    threads: int
+    rounds: int
+    time_limit: float
+
+
+@dataclass(frozen=True, slots=True)
+class CurveUnit:
+    """The curves of one solver on one frozen step; `moment` as in the config."""
+
+    case: Case
+    moment: str | int
+    solver: SolverSpec
+    first_guesses: tuple[FirstGuess, ...]
+    iterations: int
+    recordings: bool
+    how: How
+
+    def point(self) -> list[Any]:
+        """What is measured, however it is; plain data."""
+        return ["curve", *self.case.identity(), self.moment, self.solver.name, dict(self.solver.parameters)]
+
+    def unit_id(self, machine: str) -> str:
+        """12 hex digits of all that determines result and timing."""
+        how = [asdict(self.how), self.first_guesses, self.iterations, self.recordings]
+        return _hash([machine, self.point(), how])
+
+    def label(self) -> str:
+        """The name of its file; measured otherwise, it takes the place of what was there."""
+        return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{self.solver.name}-{_hash(self.point())}"
+
+    def problem_label(self) -> str:
+        """The name of the file of the step itself."""
+        problem = [*self.case.identity(), self.moment]
+        return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{_hash(problem)}"
+
+
+@dataclass(frozen=True, slots=True)
+class WorkUnit:
+    """One simulation up to the horizon [s]."""
+
+    case: Case
+    horizon: float
+    solver: SolverSpec
+    first_guess: FirstGuess
+    iterations: int
+    tolerance: float | None
+    how: How
+
+    def point(self) -> list[Any]:
+        """What is measured, however it is; plain data."""
+        stop = [self.first_guess, self.iterations, self.tolerance, self.how.threads]
+        solver = [self.solver.name, dict(self.solver.parameters)]
+        return ["work", *self.case.identity(), self.horizon, *solver, *stop]
+
+    def unit_id(self, machine: str) -> str:
+        """12 hex digits of all that determines result and timing."""
+        return _hash([machine, self.point(), asdict(self.how)])
+
+    def label(self) -> str:
+        """The name of its file; measured otherwise, it takes the place of what was there."""
+        return f"{self.case.scene_name}-{self.case.size}-work-{self.solver.name}-{_hash(self.point())}"
+
+
+Unit = CurveUnit | WorkUnit
+"""What is measured at once, and stands in one file."""
+
+
+def _hash(content: Any) -> str:
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:12]

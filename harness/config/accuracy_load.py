@@ -1,0 +1,140 @@
+"""Accuracy configs from their files, and the units of work that they ask for; all mistakes are reported at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import TypeVar
+
+from harness.base.document import Document, Key, quote, read_yaml
+from harness.base.errors import InputError, Mistake, did_you_mean
+from harness.config.accuracy import AccuracyFields, Case, CurveStudy, CurveUnit, How, Study, WorkStudy, WorkUnit
+from harness.config.expand import check_size
+from harness.config.load import check_name, misfits, scenes_of, solvers_of
+from harness.config.sweep import SolverSpec
+from harness.scenes.mesh.generator import Generator
+from harness.scenes.spec import SceneSpec
+from solvers.registry import SOLVERS, load
+
+MAX_UNITS = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """A checked config: its name, and its units of work without duplicates."""
+
+    name: str
+    curves: tuple[CurveUnit, ...]
+    work: tuple[WorkUnit, ...]
+
+
+def load_accuracy(path: Path) -> Accuracy:
+    """The accuracy config in a YAML file. Raises InputError."""
+    document = read_yaml(path)
+    if not {"curves", "work"} & set(document.data):
+        problem = "is no accuracy config: it has neither `curves` nor `work`; `springbench run` does scenes and sweeps"
+        raise InputError(Mistake(problem, path))
+    check_name(document)
+    fields = document.check(AccuracyFields, document.data)
+    scenes, solvers = scenes_of(document), solvers_of(document)
+    if fields is None or document.mistakes:
+        raise document.error()
+    for scene in scenes.values():
+        scene.require_even_steps()
+    return expand(document, fields, scenes, solvers)
+
+
+def expand(
+    document: Document, fields: AccuracyFields, scenes: Mapping[str, SceneSpec], solvers: Sequence[SolverSpec]
+) -> Accuracy:
+    """The units that a config asks for; where two studies ask for the same, the first says how. Raises InputError."""
+    expansion = _Expansion(document, scenes, solvers)
+    curves = [unit for i, study in enumerate(fields.curves) for unit in expansion.curves(study, ("curves", i))]
+    work = [unit for i, study in enumerate(fields.work) for unit in expansion.work(study, ("work", i))]
+    if len(curves) + len(work) > MAX_UNITS:
+        document.report(f"asks for {len(curves) + len(work)} units of work; at most {MAX_UNITS} are allowed")
+    for name, scene in scenes.items():
+        sizes = [unit.case.size for unit in (*curves, *work) if unit.case.scene_name == name]
+        document.mistakes.extend(misfits(scene, sizes) if not document.mistakes else [])
+    if document.mistakes:
+        raise document.error()
+    return Accuracy(
+        document.path.stem,
+        _distinct(curves),
+        _distinct(work),
+    )
+
+
+U = TypeVar("U", CurveUnit, WorkUnit)
+
+
+def _distinct(units: Sequence[U]) -> tuple[U, ...]:
+    """The first of the units that measure the same."""
+    first: dict[str, U] = {}
+    for unit in units:
+        first.setdefault(unit.label(), unit)
+    return tuple(first.values())
+
+
+class _Expansion:
+    """Expands studies; mistakes are noted in the document."""
+
+    def __init__(self, document: Document, scenes: Mapping[str, SceneSpec], solvers: Sequence[SolverSpec]) -> None:
+        self.document, self.scenes, self.solvers = document, scenes, solvers
+
+    def curves(self, study: CurveStudy, at: Key) -> Iterator[CurveUnit]:
+        """One for each problem and solver; solvers that do not minimise have none."""
+        how = How(study.threads, study.rounds, study.time_limit)
+        solvers = [solver for solver in self._solvers(study, at) if load(SOLVERS[solver.name]).minimises]
+        for case, moment, solver in product(self._cases(study, at), study.moment, solvers):
+            if isinstance(moment, int) and moment > case.scene.frames:
+                problem = f"frame {moment} is not among the {case.scene.frames} frames of {case.scene_name}"
+                self.document.report(problem, (*at, "moment"))
+            recordings = study.recordings
+            yield CurveUnit(case, moment, solver, study.first_guess, study.iterations, recordings, how)
+
+    def work(self, study: WorkStudy, at: Key) -> Iterator[WorkUnit]:
+        how = How(study.threads, study.rounds, study.time_limit)
+        for case in self._cases(study, at):
+            dt = case.scene.time_step
+            steps = study.horizon / dt
+            if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:  # round-off of the quotient, and no more
+                problem = f"{study.horizon:g} s is no multiple of the time step {dt:.6g} s of {case.scene_name}"
+                self.document.report(problem, (*at, "horizon"))
+            settings = product(self._solvers(study, at), study.first_guess, study.iterations, study.tolerance)
+            for solver, first_guess, iterations, tolerance in settings:
+                yield WorkUnit(case, study.horizon, solver, first_guess, iterations, tolerance, how)
+
+    def _cases(self, study: Study, at: Key) -> list[Case]:
+        found = []
+        for name in self._named("scene", study.scene, list(self.scenes), at):
+            scene = self.scenes[name]
+            for size, integrator, time_step in product(self._sizes(name, study, at), study.integrator, study.time_step):
+                found.append(Case(name, scene.stepped(time_step or scene.time_step), size, integrator))
+        return found
+
+    def _sizes(self, name: str, study: Study, at: Key) -> Sequence[int]:
+        """The sizes of a scene: the study's, else the scene's default; 0 for a mesh from a file."""
+        scene = self.scenes[name]
+        if not isinstance(scene.mesh, Generator):
+            return (0,)
+        sizes = study.size or ((scene.default_size,) if scene.default_size else ())
+        if not sizes:
+            problem = f"is missing; the scene {name} needs a mesh size (or give it a default_size)"
+            self.document.report(problem, (*at, "size"))
+        for size in sizes:
+            check_size(self.document, name, scene, size, (*at, "size"))
+        return sizes
+
+    def _solvers(self, study: Study, at: Key) -> list[SolverSpec]:
+        names = self._named("solver", study.solver, [solver.name for solver in self.solvers], at)
+        return [solver for solver in self.solvers if solver.name in names]
+
+    def _named(self, key: str, asked: Sequence[str], known: Sequence[str], at: Key) -> list[str]:
+        """The names that a study asks for, all of them if it asks for none."""
+        for name in asked:
+            if name not in known:
+                self.document.report(f"came {quote(name)}; expected {did_you_mean(name, known)}", (*at, key))
+        return [name for name in known if name in asked or not asked]

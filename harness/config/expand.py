@@ -1,0 +1,152 @@
+"""From a sweep's lists to its runs: the grid of all combinations, less `exclude`, and `include`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
+from math import prod
+from typing import Any
+
+from harness.base.document import Document, Key, quote
+from harness.base.errors import did_you_mean
+from harness.config.sweep import Exclude, Grid, Include, RunSpec, SolverSpec, SweepFields
+from harness.scenes.mesh.generator import Generator
+from harness.scenes.spec import SceneSpec
+
+MAX_RUNS = 10_000
+
+GRID = tuple(Grid.model_fields)
+
+
+class Expansion:
+    """Expands one sweep; mistakes are noted in its document.
+
+    name: of the sweep; scenes: by name; solvers: in the order of the sweep.
+    """
+
+    def __init__(
+        self,
+        document: Document,
+        name: str,
+        fields: SweepFields,
+        scenes: Mapping[str, SceneSpec],
+        solvers: Sequence[SolverSpec],
+    ) -> None:
+        self.document, self.name, self.fields = document, name, fields
+        self.scenes, self.solvers = scenes, solvers
+
+    def runs(self) -> tuple[RunSpec, ...]:
+        """The runs without duplicates, the grid's first; empty after mistakes were noted."""
+        self._check_names()
+        options = self.fields.options.model_dump(include=set(GRID))
+        jobs = [(scene, self._sizes(scene), self.solvers, options) for scene in self.scenes]
+        extra = [job for i, entry in enumerate(self.fields.include) for job in self._included(i, entry, options)]
+        count = sum(len(s) * len(v) * prod(map(len, o.values())) for _, s, v, o in [*jobs, *extra])
+        if count > MAX_RUNS:
+            self.document.report(f"asks for {count} runs; at most {MAX_RUNS} are allowed", ("options",))
+        if self.document.mistakes:
+            return ()
+        grid = self._kept([run for job in jobs for run in self._product(*job)])
+        runs = [*grid, *(run for job in extra for run in self._product(*job))]
+        if not runs and not self.document.mistakes:
+            self.document.report("leaves no run", ("exclude",))
+        self._check_frames(runs)
+        return tuple({(run.scene_name, run.identity()): run for run in runs}.values())
+
+    def _product(
+        self,
+        scene_name: str,
+        sizes: Sequence[int],
+        solvers: Sequence[SolverSpec],
+        options: Mapping[str, Sequence[Any]],
+    ) -> Iterable[RunSpec]:
+        scene = self.scenes[scene_name]
+        fixed = {k: v for k, v in self.fields.options if k not in GRID}
+        usual = {"frames": scene.frames, "first_guess": scene.first_guess, "time_step": scene.time_step}
+        for size, solver, values in product(sizes, solvers, product(*options.values())):
+            chosen: dict[str, Any] = dict(zip(options, values, strict=True))
+            chosen |= {key: value for key, value in usual.items() if chosen[key] is None}
+            yield RunSpec(
+                sweep=self.name,
+                scene_name=scene_name,
+                scene=scene.stepped(chosen["time_step"]),
+                size=size,
+                solver=solver,
+                **chosen,
+                **fixed,
+            )
+
+    def _sizes(self, scene_name: str) -> Sequence[int]:
+        """The sizes of a scene: the sweep's, else the scene's default; 0 for a mesh from a file."""
+        scene = self.scenes[scene_name]
+        if not isinstance(scene.mesh, Generator):
+            return (0,)
+        sizes = self.fields.sizes or ((scene.default_size,) if scene.default_size else ())
+        if not sizes:
+            problem = f"is missing; the scene {scene_name} needs a mesh size (or give it a default_size)"
+            self.document.report(problem, ("sizes",))
+        for i, size in enumerate(sizes):
+            check_size(self.document, scene_name, self.scenes[scene_name], size, ("sizes", i))
+        return sizes
+
+    def _included(self, i: int, entry: Include, options: Mapping[str, Sequence[Any]]) -> Iterable[Any]:
+        chosen = {key: getattr(entry, key) or values[:1] for key, values in options.items()}
+        solvers = [s for s in self.solvers if s.name in (entry.solver or [s.name])]
+        for scene_name in entry.scene or self.scenes:
+            if scene_name not in self.scenes:
+                continue
+            sizes: Sequence[int] = (0,)
+            if isinstance(self.scenes[scene_name].mesh, Generator):
+                sizes = entry.size
+                for k, size in enumerate(sizes):
+                    check_size(self.document, scene_name, self.scenes[scene_name], size, ("include", i, "size", k))
+                if not sizes:
+                    self.document.report(f"is missing; the scene {scene_name} has one", ("include", i, "size"))
+            yield scene_name, sizes, solvers, chosen
+
+    def _kept(self, grid: Sequence[RunSpec]) -> list[RunSpec]:
+        """The grid points that no entry of `exclude` matches."""
+        kept = list(grid)
+        for i, entry in enumerate(self.fields.exclude):
+            if not any(_matches(entry, run) for run in grid):
+                self.document.report("matches no run of the grid; correct or remove it", ("exclude", i))
+            kept = [run for run in kept if not _matches(entry, run)]
+        return kept
+
+    def _check_names(self) -> None:
+        known = {"scene": list(self.scenes), "solver": [solver.name for solver in self.solvers]}
+        for part in ("exclude", "include"):
+            for i, entry in enumerate(getattr(self.fields, part)):
+                for key, names in known.items():
+                    for name in getattr(entry, key):
+                        if name not in names:
+                            problem = f"came {quote(name)}; expected {did_you_mean(name, names)}"
+                            self.document.report(problem, (part, i, key))
+
+    def _check_frames(self, runs: Sequence[RunSpec]) -> None:
+        for i, frame in enumerate(self.fields.options.convergence_frames or ()):
+            short = next((run for run in runs if run.frames < frame), None)
+            if short:
+                problem = f"frame {frame} is not among the {short.frames} frames of {short.scene_name}"
+                self.document.report(problem, ("options", "convergence_frames", i))
+
+
+def check_size(document: Document, scene_name: str, scene: SceneSpec, size: int, at: Key) -> None:
+    """Note a mistake where a generated mesh has no such size."""
+    mesh = scene.mesh
+    if not isinstance(mesh, Generator):
+        return
+    if size < mesh.SMALLEST:
+        document.report(f"{size} is too small for the scene {scene_name}: {mesh.SMALLEST} at least", at)
+    elif excess := mesh.excess(size):
+        document.report(f"{size} {excess} (scene {scene_name})", at)
+
+
+def _matches(entry: Exclude, run: RunSpec) -> bool:
+    named = {"scene": run.scene_name, "size": run.size, "solver": run.solver.name}
+    values = named | {key: getattr(run, key) for key in GRID}
+    return (
+        all(not getattr(entry, key) or value in getattr(entry, key) for key, value in values.items())
+        and (entry.size_above is None or run.size > entry.size_above)
+        and (entry.size_below is None or run.size < entry.size_below)
+    )

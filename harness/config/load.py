@@ -1,0 +1,260 @@
+"""Scenes and sweeps from their files; all mistakes of a sweep and its scenes are reported at once."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import MISSING, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, get_type_hints
+
+from pydantic import create_model
+
+from harness.base.document import Document, Key, key_text, quote, read_yaml
+from harness.base.errors import InputError, Mistake
+from harness.base.model import Model
+from harness.config.expand import Expansion
+from harness.config.sweep import AUTO, Options, RunSpec, SolverSpec, SweepFields
+from harness.scenes.assignment import FORCE, PIN_WEIGHT, TIME_STEP, read_assignment
+from harness.scenes.bind import build
+from harness.scenes.effects.table import EFFECTS
+from harness.scenes.mesh.base import Mesh
+from harness.scenes.mesh.generator import Generator
+from harness.scenes.mesh.table import MESHES
+from harness.scenes.spec import NAME, SceneFile, SceneSpec
+from solvers.registry import SOLVERS, load
+
+ASSIGNMENT_FRAMES = 30
+DEFAULT_SOLVER = "numba"
+
+
+class AssignmentMesh(Model):
+    """The mesh of an assignment's scene, with its masses."""
+
+    kind: Literal["assignment"] = "assignment"
+    path: Path
+
+    def build(self, size: int = 0) -> Mesh:
+        """The file's mesh, whatever the size; raises InputError."""
+        return read_assignment(self.path).mesh
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """A checked sweep: its name, its options and the runs that it asks for."""
+
+    name: str
+    options: Options
+    expanded: tuple[RunSpec, ...]
+
+    def runs(self) -> list[RunSpec]:
+        """The runs, without duplicates: scene by scene, size by size, solver by solver."""
+        return list(self.expanded)
+
+
+def load_any(path: Path, *, solvers: Sequence[str] = (), sizes: Sequence[int] = (), **options: Any) -> Sweep:
+    """The sweep in a file, or a sweep of the one scene in it.
+
+    For a scene, `solvers`, `sizes` and `options` (those of `harness.config.sweep.Options`, None for the default) say
+    what to run; a sweep says so itself. Raises InputError.
+    """
+    given = {key: value for key, value in options.items() if value is not None}
+    document = Document(path, {}) if _is_assignment(path) else read_yaml(path)
+    if {"curves", "work"} & set(document.data):
+        raise InputError(Mistake("is an accuracy config; run it with `springbench accuracy`", path))
+    if "scenes" in document.data:
+        if solvers or sizes or given:
+            raise InputError(Mistake("is a sweep, which says itself what to run; change the file instead", path))
+        return _sweep(document)
+    if not _is_assignment(path) and "mesh" not in document.data:
+        raise InputError(Mistake("is neither a scene (it has no `mesh`) nor a sweep (it has no `scenes`)", path))
+    scene = scene_from_assignment(path) if _is_assignment(path) else _scene(document)
+    keys = {"scenes": [path.name], "sizes": list(sizes), "solvers": list(solvers) or [DEFAULT_SOLVER]}
+    asked = Document(path, {**keys, "options": {"threads": AUTO, **given}})
+    return _expanded(asked, {path.stem: scene})
+
+
+def load_sweep(path: Path) -> Sweep:
+    """The sweep in a YAML file, its scenes checked and its grid expanded. Raises InputError."""
+    return _sweep(read_yaml(path))
+
+
+def load_scene(path: Path) -> SceneSpec:
+    """The scene in a YAML file, or in an assignment's JSON file. Raises InputError."""
+    return scene_from_assignment(path) if _is_assignment(path) else _scene(read_yaml(path))
+
+
+def scene_from_assignment(path: Path) -> SceneSpec:
+    """The scene that equals an assignment file: same springs, force, pins, time step. Raises InputError."""
+    document = Document(path, {})
+    check_name(document)
+    if document.mistakes:
+        raise document.error()
+    assignment = read_assignment(path)
+    k, pins, mesh = assignment.stiffness, assignment.pins.tolist(), AssignmentMesh(path=path)
+    effects = (
+        {"kind": "springs", "rule": "fixed", "stretch": k, "shear": k, "bend": k},
+        {"kind": "constant-force", "force": FORCE},
+        *([{"kind": "pins", "indices": pins, "weight": PIN_WEIGHT}] if pins else []),
+    )
+    return SceneSpec(
+        mesh=mesh,
+        mesh_digest=_digest(mesh),
+        time_step=TIME_STEP,
+        frames=ASSIGNMENT_FRAMES,
+        effects=tuple(load(EFFECTS[effect["kind"]])(**effect) for effect in effects),
+        first_guess="assignment",
+        path=path,
+    )
+
+
+def _scene(document: Document) -> SceneSpec:
+    data = document.data
+    if "scenes" in data and "mesh" not in data:
+        raise InputError(Mistake("is a sweep; a scene is wanted here", document.path))
+    check_name(document)
+    own = document.check(SceneFile, data)
+    mesh = _chosen(document, MESHES, data["mesh"], ("mesh",)) if "mesh" in data else None
+    listed = data.get("effects", [])
+    if not isinstance(listed, list):
+        document.report("should be a list of mappings, each with a `kind`", ("effects",))
+        listed = []
+    effects = tuple(_chosen(document, EFFECTS, effect, ("effects", i)) for i, effect in enumerate(listed))
+    if own is None or document.mistakes:
+        raise document.error()
+    return SceneSpec(
+        **vars(own) | {"mesh": mesh, "mesh_digest": _digest(mesh), "effects": effects},
+        path=document.path,
+        lines={key_text(key): line for key, line in document.lines.items()},
+    )
+
+
+def _digest(source: Any) -> str:
+    """SHA-256 of a mesh from a file; a generated mesh has none."""
+    if isinstance(source, Generator):
+        return ""
+    mesh: Mesh = source.build(0)
+    digest = hashlib.sha256()
+    arrays = {"rest": mesh.rest, "springs": mesh.springs, "triangles": mesh.triangles, "shares": mesh.shares}
+    for name, array in {**arrays, "mass": mesh.mass, **mesh.families}.items():
+        digest.update(f"{name} {None if array is None else array.shape} ".encode())
+        digest.update(b"" if array is None else array.tobytes())
+    return digest.hexdigest()
+
+
+def _chosen(document: Document, table: dict[str, str], data: Any, at: Key) -> Any:
+    """A mesh or an effect, checked by the class that its `kind` names; only that class is imported."""
+    chosen = document.choose(data, table, "kind", at)
+    if chosen is None:
+        return None
+    model = load(table[chosen[0]])
+    return document.check(model, _with_paths(document, model, data, at), at)
+
+
+def _with_paths(document: Document, model: type[Model], data: dict[str, Any], at: Key) -> dict[str, Any]:
+    """The data with its file names made relative to the config's folder; a missing file is a mistake."""
+    names = [k for k, f in model.model_fields.items() if f.annotation is Path and isinstance(data.get(k), str)]
+    for key in names:
+        data = data | {key: str(document.path.parent / data[key])}
+        if not os.path.isfile(data[key]):
+            document.report(f"there is no file {quote(data[key])}", (*at, key))
+    return data
+
+
+def _sweep(document: Document) -> Sweep:
+    """The sweep in a document, its scenes read from the files that it names."""
+    return _expanded(document, scenes_of(document))
+
+
+def scenes_of(document: Document) -> dict[str, SceneSpec]:
+    """The scenes by name, read from the files that the config lists under `scenes`; mistakes are noted."""
+    scenes: dict[str, SceneSpec] = {}
+    listed = document.data.get("scenes")
+    for i, entry in enumerate(listed if isinstance(listed, list) else []):
+        if not isinstance(entry, str):
+            continue  # the check of the whole sweep reports it
+        at, path = ("scenes", i), document.path.parent / entry
+        if not os.path.isfile(path):
+            document.report(f"there is no file {quote(str(path))}", at)
+        elif path.stem in scenes and not os.path.samefile(scenes[path.stem].path, path):
+            document.report(f"two scenes are named {path.stem}; rename one of the files", at)
+        else:
+            try:
+                scenes[path.stem] = load_scene(path)
+            except InputError as error:
+                document.mistakes.extend(error.mistakes)
+    return scenes
+
+
+def solvers_of(document: Document) -> list[SolverSpec]:
+    """The solvers that the config lists under `solvers`, with all of their parameters; mistakes are noted."""
+    listed = document.data.get("solvers")
+    found = [
+        _solver(document, entry, ("solvers", i))
+        for i, entry in enumerate(listed if isinstance(listed, list) else [])
+        if isinstance(entry, (str, dict))  # the check of the whole config reports others
+    ]
+    return [solver for solver in found if solver]
+
+
+def _expanded(document: Document, scenes: dict[str, SceneSpec]) -> Sweep:
+    check_name(document)
+    sweep = document.check(SweepFields, document.data)
+    solvers = solvers_of(document)
+    if sweep is None or document.mistakes:
+        raise document.error()
+    runs = Expansion(document, document.path.stem, sweep, scenes, solvers).runs()
+    for name, scene in scenes.items():
+        document.mistakes.extend(misfits(scene, [run.size for run in runs if run.scene_name == name]))
+    if document.mistakes:
+        raise document.error()
+    return Sweep(document.path.stem, sweep.options, runs)
+
+
+def misfits(scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:
+    """What keeps the parts of a scene from fitting together, found at the smallest of the sizes."""
+    try:
+        if sizes:
+            build(scene, min(sizes))
+    except InputError as error:
+        return [replace(m, file=m.file or scene.path, line=m.line or scene.lines.get(m.key)) for m in error.mistakes]
+    return []
+
+
+def _solver(document: Document, entry: str | dict[str, Any], at: Key) -> SolverSpec | None:
+    """A solver with all of its parameters; they are the fields of its dataclass."""
+    data = {"name": entry} if isinstance(entry, str) else entry
+    chosen = document.choose(data, SOLVERS, "name", at)
+    if chosen is None:
+        return None
+    name, given = chosen
+    solver = load(SOLVERS[name])
+    parameters = document.check(parameters_model(name, solver), given, at)
+    if parameters is None:
+        return None
+    try:
+        solver(**vars(parameters))
+    except ValueError as error:
+        document.report(str(error), at)
+    return SolverSpec(name, parameters.model_dump(mode="json"))
+
+
+def parameters_model(name: str, solver: type) -> type[Model]:
+    """The model of a solver's parameters, made of the fields of its frozen dataclass."""
+    hints = get_type_hints(solver, include_extras=True)
+    given: dict[str, Any] = {
+        f.name: (hints[f.name], ... if f.default is MISSING else f.default) for f in fields(solver)
+    }
+    return create_model(name, __base__=Model, __doc__=solver.__doc__, **given)
+
+
+def _is_assignment(path: Path) -> bool:
+    return path.suffix.lower() == ".json"
+
+
+def check_name(document: Document) -> None:
+    """Note a mistake where the file's name cannot name its results."""
+    if not NAME.fullmatch(document.path.stem):
+        wanted = "rename it to letters, digits, `.`, `_` and `-`, at most 64, the first a letter or a digit"
+        document.report(f"the file's name becomes the name of results; {wanted}")

@@ -1,0 +1,59 @@
+"""The JSON Schema (draft 2020-12) of scenes, sweeps and accuracy configs, for editors; made of the models that check
+them."""
+
+from __future__ import annotations
+
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, create_model
+from pydantic.json_schema import models_json_schema
+
+from harness.base.model import Model
+from harness.config.accuracy import AccuracyFields
+from harness.config.load import parameters_model
+from harness.config.sweep import SweepFields
+from harness.scenes.effects.table import EFFECTS
+from harness.scenes.mesh.table import MESHES
+from harness.scenes.spec import SceneFile
+from solvers.registry import SOLVERS, load
+
+
+def schema() -> dict[str, Any]:
+    """The schema of a config: a scene, a sweep or an accuracy config; it names every mesh, effect and solver."""
+    mesh = _one_of({kind: load(target) for kind, target in MESHES.items()}, "kind")
+    effect = _one_of({kind: load(target) for kind, target in EFFECTS.items()}, "kind")
+    solver = _one_of({name: parameters_model(name, load(target)) for name, target in SOLVERS.items()}, "name")
+    names: Any = Literal[tuple(SOLVERS)]
+    scene = create_model(
+        "Scene",
+        __base__=SceneFile,
+        mesh=(mesh, Field(description=SceneFile.model_fields["mesh"].description)),
+        effects=(
+            list[effect],  # pyright: ignore[reportInvalidTypeForm]
+            Field(default=[], description=SceneFile.model_fields["effects"].description),
+        ),
+    )
+    listed: Any = list[names | solver]  # pyright: ignore[reportInvalidTypeForm]
+    others = [
+        create_model(name, __base__=base, solvers=(listed, Field(description=base.model_fields["solvers"].description)))
+        for name, base in (("Sweep", SweepFields), ("Accuracy", AccuracyFields))
+    ]
+    models = (scene, *others)
+    _, document = models_json_schema([(model, "validation") for model in models])
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "springbench config",
+        "oneOf": [{"$ref": f"#/$defs/{model.__name__}"} for model in models],
+        **document,
+    }
+
+
+def _one_of(models: dict[str, type[Model]], tag: str) -> Any:
+    """The union of models, told apart by the key `tag`, which is required and holds the model's name."""
+    tagged = [
+        create_model(name, __base__=model, __doc__=model.__doc__, **{tag: (Literal[name], ...)})  # pyright: ignore[reportCallIssue, reportArgumentType]
+        for name, model in models.items()
+    ]
+    return Annotated[reduce(or_, tagged), Field(discriminator=tag)]

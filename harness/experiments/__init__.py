@@ -1,0 +1,1 @@
+"""What is run and kept: sweeps, accuracy, speed, ablation, galleries."""

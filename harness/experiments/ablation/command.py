@@ -1,0 +1,45 @@
+"""The command `springbench ablate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from harness.base.console import out, say
+
+SOLVER, TOLERANCE = "hybrid", 1e-4
+"""It takes all effects, and converges: what an effect changes is not to drown in the solver's own error."""
+
+
+def ablate(
+    scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
+    results: Annotated[Path, typer.Option(help="The folder that holds a folder for each scene.")] = Path("results"),
+    solver: Annotated[str | None, typer.Option(help=f"{SOLVER}, to {TOLERANCE:g}, if left out.")] = None,
+    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
+    frames: Annotated[int | None, typer.Option(help="How many steps; the scene's if left out.")] = None,
+    iterations: Annotated[int, typer.Option(help="Iteration limit of a step.")] = 50,
+    tolerance: Annotated[float | None, typer.Option(help="Relative tolerance of a step.")] = None,
+    rounds: Annotated[int, typer.Option(help="How often each step is timed.")] = 5,
+    pairs: Annotated[bool, typer.Option("--pairs", help="Leave out each pair of effects too.")] = False,
+) -> None:
+    """Leave out each effect of a scene: what it costs, what it changes, and which effects the motion calls for."""
+    from harness.config.load import load_any
+    from harness.experiments.ablation.run import ablate as run_ablation
+    from harness.report.ablation import ablation_table, read, sentences
+    from harness.report.ablation_plot import draw_ablation
+
+    if solver is None:
+        solver, tolerance = SOLVER, tolerance or TOLERANCE
+    options = {"frames": frames, "iterations": iterations, "tolerance": tolerance, "rounds": rounds, "threads": 1}
+    sweep = load_any(scene, solvers=[solver], sizes=[size] if size else [], **options)
+    folder = results / sweep.name
+    path = run_ablation(sweep, folder, pairs=pairs, tick=lambda phase: None)
+    rows, picture = read(path), folder / "pictures" / f"ablation-{path.stem}.png"
+    out.print(ablation_table(rows))
+    for line in sentences(rows):
+        say(line)
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    draw_ablation(rows, picture)
+    say(f"rows are in {path}, the picture is {picture}")

@@ -1,0 +1,38 @@
+"""How far two motions of one mesh lie apart, in mean rest lengths."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.scenes.bind import Scene
+
+Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Positions [m] and velocities [m/s], (frames, n, 3) each."""
+
+
+def difference(scene: Scene, a: Motion, b: Motion) -> dict[str, float]:
+    """The columns `largest`, `rms`, `energy`, `centre` of two motions; the scene is the whole one."""
+    (p, _), (q, _) = a, b
+    unit, mass = rest_length(scene), scene.system.mass
+    away = np.linalg.norm(p - q, axis=2)
+    centres = np.einsum("i,fix->fx", mass, p - q) / mass.sum()
+    energies = np.array([[_energy(scene, x, v) for x, v in zip(*motion, strict=True)] for motion in (a, b)])
+    most = float(np.abs(energies[0]).max())
+    return {
+        "largest": float(away.max()) / unit,
+        "rms": float(np.sqrt((away**2).mean())) / unit,
+        "energy": float(np.abs(energies[0] - energies[1]).max()) / most if most else 0.0,
+        "centre": float(np.linalg.norm(centres, axis=1).max()) / unit,
+    }
+
+
+def rest_length(scene: Scene) -> float:
+    """The mean rest length of the scene's springs [m]; the mesh's spacing where it has none."""
+    lengths = scene.springs.rest_length
+    return float(lengths.mean()) if lengths.any() else scene.mesh.spacing
+
+
+def _energy(scene: Scene, p: NDArray[np.float64], v: NDArray[np.float64]) -> float:
+    """Kinetic energy and that of the whole scene's springs [J]: the same yardstick for all motions."""
+    return 0.5 * float(scene.system.mass @ np.einsum("ij,ij->i", v, v)) + scene.springs.value(p)

@@ -1,0 +1,50 @@
+"""The rows of `springbench ablate`: one Parquet file for a scene, under `results/<scene>/ablation/`.
+
+One table holds all kinds of rows, which `kind` tells apart:
+
+    whole        the scene with all that it lists
+    without      the scene without some of its effects: what they cost, and what leaving them out changes
+    error        how far the whole scene is from a better answer: of its solver, or of its time step
+    suggestion   an effect that the scene does not list and its motion calls for, with the evidence
+"""
+
+from __future__ import annotations
+
+import pyarrow as pa
+
+from harness.base.rows import COLUMNS as RUN_COLUMNS
+from harness.base.rows import Column, schema_of
+
+_TEXT, _INT, _REAL = pa.string(), pa.int64(), pa.float64()
+_SHARED = {column.name: column for column in RUN_COLUMNS}
+
+
+def _as_in_runs(*names: str) -> tuple[Column, ...]:
+    return tuple(_SHARED[name] for name in names)
+
+
+COLUMNS = (
+    Column("kind", _TEXT, "", "whole, without, error or suggestion"),
+    Column("name", _TEXT, "", "the effects left out, joined by +; of an error `solver` or `time-step`"),
+    *_as_in_runs("scene", "size", "vertices", "springs", "solver", "parameters", "time_step", "integrator"),
+    *_as_in_runs("first_guess", "max_iterations", "tolerance", "threads"),
+    Column("frames", _INT, "", "steps simulated"),
+    Column("rounds", _INT, "", "how often each of them was timed"),
+    Column("status", _TEXT, "", "ok, impossible (the scene has no answer without them), or unknown (an error)"),
+    Column("reason", _TEXT, "", "why the status is not ok; of a suggestion the evidence"),
+    Column("seconds", _REAL, "s", "CPU time of a step, the mean over the frames of the median over the rounds"),
+    Column("cost", _REAL, "s", "what the effects cost a step: the same of the differences from the whole scene"),
+    Column("cost_low", _REAL, "s", "lower end of its 95 % interval"),
+    Column("cost_high", _REAL, "s", "upper end of its 95 % interval"),
+    Column("bytes", _INT, "B", "memory of the bound scene and the prepared solver, as Python's allocators see it"),
+    Column("nnz_system", _INT, "", "stored entries of the system matrix Q"),
+    Column("nnz_factor", _INT, "", "stored entries of the triangular factor L: of the Hessian's where one is made"),
+    Column("largest", _REAL, "", "largest displacement of a vertex in any frame, in mean rest lengths"),
+    Column("rms", _REAL, "", "root mean square of the displacements over vertices and frames, in mean rest lengths"),
+    Column("energy", _REAL, "", "largest difference of kinetic and elastic energy in any frame, over its largest"),
+    Column("centre", _REAL, "", "largest displacement of the centre of mass in any frame, in mean rest lengths"),
+    Column("extent", _REAL, "", "the diagonal of the rest shape's bounding box, in mean rest lengths"),
+    *_as_in_runs("machine", "cpu", "cores", "memory_gib", "system", "versions", "commit", "code", "started"),
+)
+
+SCHEMA = schema_of(COLUMNS)

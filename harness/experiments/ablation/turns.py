@@ -1,0 +1,137 @@
+"""What each scene costs and does: all of them take turns, step by step, in one process.
+
+In each round every scene is simulated from its start, one step of each after the other, so that a drift of the machine
+meets them all alike. Times are CPU times of the one thread that computes, which other programs hardly move. The cost
+of an effect is a difference of times of the same frame in the same round:
+
+    cost = mean over frames of the median over rounds of (whole - without)
+
+A percentile bootstrap (Efron 1979), which resamples the rounds of each frame, gives its 95 % interval.
+"""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from time import thread_time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.base.errors import InputError
+from harness.experiments.ablation.cases import Case
+from harness.scenes.bind import Scene, build
+from harness.simulation.measure import Settings, StepFailed, steps
+from harness.simulation.step import Step, prepare
+from solvers.problem import NotPositiveDefinite, Prepared, Solver, Unsupported
+
+RESAMPLES = 2000
+"""Resamples of the bootstrap: with so many, the ends of an interval repeat to a few per cent of its width."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(eq=False)
+class Turn:
+    """A case on its way. seconds: (rounds, frames); positions: (frames, n, 3) [m]; velocities likewise [m/s];
+    failure: why there is no answer, empty where there is one."""
+
+    case: Case
+    scene: Scene | None = None
+    prepared: Prepared | None = None
+    bytes: int = 0
+    failure: str = ""
+    seconds: list[list[float]] = field(default_factory=list)
+    positions: Array = field(default_factory=lambda: np.empty(0))
+    velocities: Array = field(default_factory=lambda: np.empty(0))
+
+
+def turns(
+    cases: Sequence[Case], size: int, integrator: str, solver: Solver, settings: Settings, tick: Callable[[str], None]
+) -> list[Turn]:
+    """Every case simulated `rounds` times, after a pass that warms up and keeps the motion.
+
+    Raises InputError and Unsupported for the first case, the whole scene; the others say so themselves.
+    """
+    _prepared(cases[0], size, integrator, solver)  # what is compiled and imported is not the scene's memory
+    found = [_prepared(case, size, integrator, solver) for case in cases]
+    for turn in found:
+        _keep_motion(turn, settings)
+        tick("motion")
+    for round in range(settings.rounds):
+        # The order turns from round to round: who comes first after a pause finds its caches cold.
+        alive = [turn for turn in found if not turn.failure]
+        alive = alive[round % len(alive) :] + alive[: round % len(alive)]
+        for turn in alive:
+            turn.seconds.append([])
+        running = [_steps(turn, settings) for turn in alive]
+        for _ in range(settings.frames):
+            for turn, run in zip(alive, running, strict=True):
+                began = thread_time()
+                next(run)
+                turn.seconds[-1].append(thread_time() - began)
+        tick("timed rounds")
+    return found
+
+
+def cost(whole: Turn, without: Turn) -> tuple[float, float, float]:
+    """What a step of the whole scene takes more of CPU time [s], and the ends of the 95 % interval.
+
+    The resampling is seeded, so the same times give the same interval.
+    """
+    more = np.array(whole.seconds) - np.array(without.seconds)
+    rounds = len(more)
+    rng, means = np.random.default_rng(0), np.empty(RESAMPLES)
+    for k in range(RESAMPLES):
+        means[k] = np.median(np.take_along_axis(more, rng.integers(rounds, size=more.shape), axis=0), axis=0).mean()
+    low, high = np.quantile(means, [0.025, 0.975])
+    return float(np.median(more, axis=0).mean()), float(low), float(high)
+
+
+def seconds(turn: Turn) -> float:
+    """CPU time of a step [s], the mean over the frames of the median over the rounds."""
+    return float(np.median(np.array(turn.seconds), axis=0).mean())
+
+
+def _prepared(case: Case, size: int, integrator: str, solver: Solver) -> Turn:
+    turn = Turn(case)
+    tracemalloc.start()
+    try:
+        turn.scene = build(case.scene, size, integrator)
+        turn.prepared = prepare(turn.scene, solver)
+        turn.bytes = tracemalloc.get_traced_memory()[0]
+    except (InputError, NotPositiveDefinite, Unsupported) as error:
+        if not case.left_out:
+            raise
+        turn.failure = str(error)
+    finally:
+        tracemalloc.stop()
+    return turn
+
+
+def _keep_motion(turn: Turn, settings: Settings) -> None:
+    """Simulate once, and keep positions and velocities."""
+    if turn.failure:
+        return
+    try:
+        kept = [(step.state.now.positions, step.state.now.velocity) for step in _steps(turn, settings)]
+    except StepFailed as error:
+        if not turn.case.left_out:
+            raise
+        turn.failure = f"{error}: {error.__cause__}"
+        return
+    turn.positions, turn.velocities = (np.array(part) for part in zip(*kept, strict=True))
+
+
+def _steps(turn: Turn, settings: Settings) -> Iterator[Step]:
+    assert turn.scene is not None
+    assert turn.prepared is not None
+    return steps(turn.scene, turn.prepared, settings)
+
+
+def motion(scene: Scene, solver: Solver, settings: Settings, *, every: int = 1) -> tuple[Array, Array]:
+    """Positions and velocities (frames, n, 3) of every so many-th step; raises what the solver and its steps raise."""
+    run = replace(settings, frames=settings.frames * every)
+    kept = [s.state.now for s in steps(scene, prepare(scene, solver), run) if s.index % every == 0]
+    return np.array([now.positions for now in kept]), np.array([now.velocity for now in kept])

@@ -1,0 +1,172 @@
+"""How a solver converges on one frozen step: errors and wall times of the same iterates, in passes of their own.
+
+The first pass keeps the iterates that are to be graded. It also looks at a clock, which ends it at the time limit and
+does no more. Each timed pass then takes as many iterates as the first, with a stamp after each and nothing else in
+between, and must end at the same positions to the last bit.
+
+A curve ends where it has converged (a stationarity of 1e-10, or an energy within 1e-9 of the gap at the current
+positions), where the iterates do not change any more, and at its limits.
+"""
+
+from __future__ import annotations
+
+import gc
+from dataclasses import dataclass
+from itertools import islice
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.base.errors import RunFailed
+from harness.experiments.accuracy.oracle import Oracle
+from solvers.problem import Positions, Prepared, StepProblem
+
+STATIONARY, GAP = 1e-10, 1e-9
+AT_REST = 1e-8
+"""Stationarity at which iterates that do not change any more count as converged: round-off holds them there."""
+
+STILL = 5
+"""Iterates in a row that do not differ before a solver counts as standing still: one that refuses its own step may
+go another way in the next."""
+
+PROGRESS = 1e-3
+"""The share of its gap by which a solver has to come nearer in the second half of its iterations."""
+
+EXPLODED = 1e6
+"""A gap of so many times that at the current positions is a divergence, finite as it may be."""
+
+WARM_UP = 2
+"""Iterates whose time does not count against the limit: they compile."""
+
+SHORT = 0.1
+"""Seconds of a solve below which one more comes before the timed ones: grading has filled the caches, and the first
+iterate of a small mesh would take three times as long."""
+
+_EACH = 50
+_MANTISSAS = (1.0, 1.2, 1.5, 1.8, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.5)
+
+
+def kept(iteration: int) -> bool:
+    """Whether an iterate is graded: each of the first 50, and then 12 a decade."""
+    if iteration <= _EACH:
+        return True
+    decade = 10 ** (len(str(iteration)) - 1)
+    return any(round(mantissa * decade) == iteration for mantissa in _MANTISSAS)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """The graded iterates: numbers (k,), 0 is the first guess; positions (k, n, 3) [m]; g (k,) [J]; stationarity (k,);
+    status and reason of the curve as a whole; seconds (k, rounds) since the solve began."""
+
+    numbers: list[int]
+    positions: list[Positions]
+    g: list[float]
+    stationarity: list[float]
+    status: str
+    reason: str
+    seconds: NDArray[np.float64]
+
+
+def measure(
+    prepared: Prepared,
+    problem: StepProblem,
+    oracle: Oracle,
+    lowest: float | None,
+    *,
+    iterations: int,
+    time_limit: float,
+    rounds: int,
+) -> Curve:
+    """The curve of a solve from the problem's first guess.
+
+    lowest: energy [J] of the lowest minimum known; time_limit: seconds of the solver's own.
+    Raises RunFailed where a timed pass ends at other positions.
+    """
+    grading = _Grading(oracle, lowest, iterations, time_limit)
+    p, spent, number, still = problem.first_guess.copy(), 0.0, 0, 0
+    grading.add(0, p)
+    iterates = prepared.iterates(problem)
+    while not grading.status:
+        began = perf_counter()
+        following = next(iterates)
+        if number >= WARM_UP:
+            spent += perf_counter() - began
+        number, still = number + 1, still + 1 if np.array_equal(following, p) else 0
+        np.copyto(p, following)
+        fixed = still == STILL
+        if kept(number) or fixed or spent > time_limit or number == iterations:
+            grading.add(number, p)
+            grading.judge(fixed, spent)
+    if spent < SHORT:
+        _timed(prepared, problem, number, p)
+    stamps = [_timed(prepared, problem, number, p) for _ in range(rounds)]
+    seconds = np.stack([stamp[grading.numbers] for stamp in stamps], axis=1)
+    return Curve(
+        grading.numbers, grading.positions, grading.g, grading.stationarity, grading.status, grading.reason, seconds
+    )
+
+
+class _Grading:
+    """The iterates graded so far, and what ends the curve."""
+
+    def __init__(self, oracle: Oracle, lowest: float | None, iterations: int, time_limit: float) -> None:
+        self._oracle, self._iterations, self._limit = oracle, iterations, time_limit
+        self._lowest = np.nan if lowest is None else lowest  # then no gap is small, and none is large
+        self._scale = max(oracle.g0 - self._lowest, oracle.round_off)
+        self.numbers: list[int] = []
+        self.positions: list[Positions] = []
+        self.g: list[float] = []
+        self.stationarity: list[float] = []
+        self.status = self.reason = ""
+
+    def add(self, number: int, p: Positions) -> None:
+        finite = bool(np.isfinite(p).all())
+        with np.errstate(over="ignore", invalid="ignore"):  # what explodes may overflow before it is not finite
+            self.g.append(self._oracle.problem.value(p) if finite else np.nan)
+            self.stationarity.append(self._oracle.stationarity(p) if finite else np.nan)
+        self.numbers.append(number)
+        self.positions.append(p.copy())
+
+    def judge(self, fixed: bool, spent: float) -> None:
+        """Set status and reason where the last iterate that was added ends the curve."""
+        number, stationarity = self.numbers[-1], self.stationarity[-1]
+        gap = (self.g[-1] - self._lowest) / self._scale
+        at = f"after {number} iterations, at a stationarity of {stationarity:.1e}"
+        if not np.isfinite(self.g[-1]) or gap > EXPLODED:
+            self.status, self.reason = "diverged", f"the energy exploded {at}"
+        elif stationarity <= STATIONARY or gap <= GAP:
+            self.status = "ok"
+        elif fixed:
+            self.status = "ok" if stationarity <= AT_REST else "no-progress"
+            self.reason = f"positions do not change any more {at}"
+        elif spent > self._limit:
+            self.status, self.reason = "time-limit", f"the limit of {self._limit:g} s was reached {at}"
+        elif number == self._iterations:
+            self.status = "ok" if self._progress() else "no-progress"
+            self.reason = f"the limit of iterations was reached {at}"
+
+    def _progress(self) -> bool:
+        """Whether the second half of the iterations came nearer; energy tells it, or a smaller stationarity."""
+        half = np.searchsorted(self.numbers, self.numbers[-1] / 2, side="right")
+        gaps, stationarity = np.array(self.g) - self._lowest, np.array(self.stationarity)
+        return any(np.min(s[half:]) < (1 - PROGRESS) * np.min(s[:half]) for s in (gaps, stationarity))
+
+
+def _timed(prepared: Prepared, problem: StepProblem, count: int, expected: Positions) -> NDArray[np.float64]:
+    """Wall seconds (count + 1,) from the start to the first guess (0), and to each iterate."""
+    stamps = np.zeros(count + 1)
+    p = problem.first_guess
+    gc.disable()  # a collection in the middle would be counted as the solver's
+    try:
+        began = perf_counter()
+        for number, following in enumerate(islice(prepared.iterates(problem), count), start=1):
+            stamps[number] = perf_counter()
+            p = following
+    finally:
+        gc.enable()
+    if not np.array_equal(p, expected, equal_nan=True):
+        raise RunFailed("a timed pass ended at other positions than the graded one")
+    stamps[1:] -= began
+    return stamps

@@ -1,0 +1,29 @@
+"""What ends a measurement early, as the status and the reason of its rows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from harness.experiments.run import failure
+from harness.reference.minimiser import Uncertified
+from harness.reference.motion import Unintegrable
+from harness.reference.trajectory import Unpredictable
+
+
+class OverTime(Exception):
+    """A simulation reached its time limit; the message says how far it came."""
+
+
+_STATUS: dict[type[Exception], str] = {
+    OverTime: "time-limit",
+    Uncertified: "uncertified",
+    Unintegrable: "uncertified",
+    Unpredictable: "uncertified",
+}
+
+
+def lost(error: Exception) -> dict[str, Any]:
+    """Status and reason of what ended with an error."""
+    told = failure(error)
+    reason = str(error) if type(error) in _STATUS else told["reason"]
+    return {"status": _STATUS.get(type(error), told["status"]), "reason": reason}

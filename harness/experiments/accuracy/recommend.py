@@ -1,0 +1,168 @@
+"""The cheapest way to simulate a scene up to an error: looked up among what was measured, or measured first.
+
+An error is that of a whole simulation up to a horizon (`harness.experiments.accuracy.work`), and a cost the wall
+seconds of a simulated second. The answer is the cheapest of those that were measured and keep to the error; one more
+simulation checks it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from harness.base import machine, rows
+from harness.base.document import Document
+from harness.base.errors import InputError, Mistake, RunFailed
+from harness.base.progress import Display
+from harness.config.accuracy import AccuracyFields, Case, How, WorkUnit
+from harness.config.accuracy_load import Accuracy, expand
+from harness.config.load import load_scene, solvers_of
+from harness.config.sweep import SolverSpec
+from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.run import references, run_accuracy, trajectory_of
+from harness.experiments.accuracy.work import work_rows
+from harness.reference.store import Store
+from harness.scenes.mesh.generator import Generator
+from harness.scenes.spec import SceneSpec
+from solvers.integrators import INTEGRATORS
+
+REFINEMENTS = (0.5, 1, 2, 4, 8)
+"""Steps in the horizon, relative to those of the scene's own time step."""
+
+IMPLICIT, EXPLICIT = ["numba", "lbfgs", "newton", "hybrid"], ["symplectic-euler", "xpbd-small-steps"]
+WAYS: list[dict[str, Any]] = [
+    {"solver": IMPLICIT, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": list(INTEGRATORS)},
+    {"solver": ["numba", *EXPLICIT], "iterations": 50},
+]
+"""What is measured where nothing was: steps solved to a tolerance, and steps of 50 iterations or substeps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A way to simulate the scene, its relative error, and its wall seconds per simulated second."""
+
+    unit: WorkUnit
+    error: float
+    cost: float
+
+    def __str__(self) -> str:
+        u = self.unit
+        stop = f"{u.iterations} iterations" if u.tolerance is None else f"tolerance {u.tolerance:g}"
+        return f"{u.case.integrator}, time step {u.case.scene.time_step:.6g} s, {stop}, solver {u.solver.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Recommendation:
+    """ways: all that were measured, the cheapest first; best: of those within the error; checked: that once more."""
+
+    ways: tuple[Way, ...]
+    best: Way
+    checked: Way
+
+
+def recommend(
+    path: Path,
+    error: float,
+    *,
+    size: int | None,
+    horizon: float,
+    time_limit: float,
+    results: Path,
+    display: Display,
+    say: Callable[[str], None],
+) -> Recommendation:
+    """The cheapest way to a relative `error` after `horizon` seconds of the scene in a file.
+
+    size: of the mesh, the scene's default if left out; time_limit: seconds that a simulation may take; results: the
+    folder that holds a folder for each config. Raises InputError; RunFailed where nothing keeps to the error.
+    """
+    for key, value in (("--error", error), ("--horizon", horizon), ("--time-limit", time_limit)):
+        if not 0 < value < math.inf:
+            raise InputError(Mistake(f"came {value:g}; wanted a number above 0", key=key))
+    scene = load_scene(path)
+    scene.require_even_steps()
+    size = (size or scene.default_size or 0) if isinstance(scene.mesh, Generator) else 0
+    try:
+        asked = _grid(path, scene, size, horizon, time_limit)
+    except InputError as refused:  # the studies are ours; what is wrong came with an option
+        raise InputError(list(dict.fromkeys(map(_of_option, refused.mistakes)))) from refused
+    ways, reasons = _known(path.stem, scene, size, horizon, results)
+    if not any(way.error <= error for way in ways):
+        say(f"nothing measured of {path.stem} {size or ''} keeps to an error of {error:g}: measuring")
+        run_accuracy(asked, results / asked.name, display, say)
+        ways, reasons = _known(path.stem, scene, size, horizon, results)
+    within = [way for way in ways if way.error <= error]
+    if not within:
+        raise RunFailed(_nothing(ways, reasons, error, horizon))
+    best = within[0]
+    return Recommendation(tuple(ways), best, _check(best, references(results)))
+
+
+def _grid(path: Path, scene: SceneSpec, size: int, horizon: float, time_limit: float) -> Accuracy:
+    """What is measured where nothing was."""
+    steps = max(1, round(horizon / scene.time_step))
+    time_steps = [horizon / round(steps * factor) for factor in REFINEMENTS if round(steps * factor)]
+    shared = {"horizon": horizon, "time_step": time_steps, "time_limit": time_limit} | ({"size": size} if size else {})
+    work = [shared | way for way in WAYS]
+    data = {"scenes": [path.name], "solvers": [*IMPLICIT, *EXPLICIT], "work": work}
+    document = Document(path, data)
+    fields = document.check(AccuracyFields, data)
+    solvers = solvers_of(document)
+    if fields is None or document.mistakes:
+        raise document.error()
+    return replace(expand(document, fields, {path.stem: scene}, solvers), name=f"recommend-{path.stem}")
+
+
+def _of_option(mistake: Mistake) -> Mistake:
+    """A mistake in a study as one in the option that its key came from."""
+    return Mistake(mistake.problem, key="--" + mistake.key.rpartition(".")[2].replace("_", "-"))
+
+
+def _known(
+    name: str, scene: SceneSpec, size: int, horizon: float, results: Path
+) -> tuple[list[Way], list[dict[str, Any]]]:
+    """What was measured of this scene on this machine: the ways that have an error, the cheapest first, and the rows
+    of those that have none."""
+    here, ways, without = machine.describe().id, [], []
+    for path in sorted(results.glob(f"*/accuracy/{name}-{size}-work-*.parquet")):
+        row = rows.read([path], SCHEMA).to_pylist()[0]
+        unit = _unit(row, name, scene)
+        if path.stem != unit.label() or row["machine"] != here or row["horizon"] != horizon:
+            continue  # the scene was another then, or the machine, or the question
+        if row["status"] == "ok":
+            ways.append(Way(unit, row["error"], row["seconds_per_simulated"]))
+        else:
+            without.append(row)
+    return sorted(ways, key=lambda way: way.cost), without
+
+
+def _unit(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkUnit:
+    """What a row was measured of, if the scene is still the same."""
+    case = Case(name, scene.stepped(row["time_step"]), row["size"], row["integrator"])
+    solver = SolverSpec(row["solver"], json.loads(row["parameters"]))
+    how = How(row["threads"], rounds=1, time_limit=float("inf"))
+    return WorkUnit(case, row["horizon"], solver, row["first_guess"], row["iterations"], row["tolerance"], how)
+
+
+def _check(best: Way, store: Store) -> Way:
+    """The same once more."""
+    row = work_rows(best.unit, trajectory_of(best.unit, store), lambda: None)[0]
+    if row["status"] != "ok":
+        raise RunFailed(f"the check of {best} ended otherwise than before: {row['status']}: {row['reason']}")
+    return Way(best.unit, row["error"], row["seconds_per_simulated"])
+
+
+def _nothing(ways: list[Way], without: list[dict[str, Any]], error: float, horizon: float) -> str:
+    """Why there is no answer, and what to do."""
+    if ways:
+        nearest = min(ways, key=lambda way: way.error)
+        return (
+            f"nothing that was measured keeps to an error of {error:g} over {horizon:g} s; the nearest is {nearest}, "
+            f"which errs by {nearest.error:.2g}: ask for a larger --error or a shorter --horizon"
+        )
+    reasons = {row["reason"] for row in without}
+    return f"no error over {horizon:g} s could be measured: {'; '.join(sorted(reasons)) or 'nothing was simulated'}"

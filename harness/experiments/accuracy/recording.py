@@ -1,0 +1,61 @@
+"""A solve as a recording: the mesh at each graded iterate, and how far the solve is from its minimum."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harness.base import machine
+from harness.config.accuracy import CurveUnit
+from harness.experiments.accuracy.curves import Curve
+from harness.record.base import Frame, RecordingInfo
+from harness.record.rerun import RerunRecorder
+
+if TYPE_CHECKING:
+    from harness.experiments.accuracy.solves import Graded
+
+
+def record(unit: CurveUnit, graded: Graded, first_guess: str, curve: Curve, folder: Path) -> Path:
+    """Write the recording of a curve under `folder`/recordings and return its path. Raises RunFailed."""
+    path = folder / "recordings" / f"{unit.label()}-{first_guess}.rrd"
+    problem, scene = graded.frozen.problem, graded.scene
+    info = RecordingInfo(
+        title=f"{unit.case.title}, {graded.moment}: {unit.solver.name} from the {first_guess} positions",
+        run_id=f"{unit.unit_id(machine.describe().id)}-{first_guess}",
+        mesh=scene.mesh,
+        springs=scene.springs.edges,
+        rest_lengths=scene.springs.rest_length,
+        pinned=problem.system.pins.vertices,
+        time_step=problem.system.time_step,
+        strain_range=0.1,
+        properties={
+            "scene": unit.case.scene_name,
+            "size": unit.case.size,
+            "solver": unit.solver.name,
+            "moment": graded.moment,
+            "step": graded.frozen.frame,
+            "problem": graded.frozen.digest,
+            "first_guess": first_guess,
+            "status": curve.status,
+        },
+        iterates=True,
+    )
+    recorder = RerunRecorder(path, info)
+    try:
+        for k, p in enumerate(curve.positions):
+            if np.isfinite(p).all():
+                terms = problem.terms(p)
+                number, stationarity = curve.numbers[k], curve.stationarity[k]
+                recorder.frame(Frame(number, problem.start.time, p, terms, stationarity, number))
+        best = graded.reference.minima[:1]
+        recorder.solve(curve.numbers, _curves(curve, graded, best[0].g if best else float("nan")))
+        return recorder.close({})
+    finally:
+        recorder.abandon()
+
+
+def _curves(curve: Curve, graded: Graded, lowest: float) -> dict[str, list[float]]:
+    gap = (np.array(curve.g) - lowest) / max(graded.oracle.g0 - lowest, graded.oracle.round_off)
+    return {"energy gap": gap.tolist(), "stationarity": curve.stationarity}

@@ -1,0 +1,74 @@
+"""The rows of `springbench accuracy`: one Parquet file for each unit of work, under `results/<name>/accuracy/`.
+
+One table holds all kinds of rows, which `kind` tells apart:
+
+    problem   a frozen step: what it is, its energy at the current positions and at Liu's inertial target
+    minimum   a minimum of it that is known; branch 0 is the lowest
+    prepare   the time in which a solver prepares for it
+    curve     an iterate of a solver on it: energy, errors, stationarity, and when it came
+    work      a simulation of the horizon: its error, and the wall time that it took
+
+Rows hold energies and errors of positions, never gaps: whoever reads them computes gaps from `g`, `g0` and the
+lowest `g` of the minima, so that a better minimum needs no new measurement.
+"""
+
+from __future__ import annotations
+
+import pyarrow as pa
+
+from harness.base.rows import COLUMNS as RUN_COLUMNS
+from harness.base.rows import Column, schema_of
+
+_TEXT, _INT, _REAL, _YES = pa.string(), pa.int64(), pa.float64(), pa.bool_()
+_SHARED = {column.name: column for column in RUN_COLUMNS}
+
+
+def _as_in_runs(*names: str) -> tuple[Column, ...]:
+    return tuple(_SHARED[name] for name in names)
+
+
+COLUMNS = (
+    Column("kind", _TEXT, "", "problem, minimum, prepare, curve or work"),
+    Column("unit", _TEXT, "", "hash of all that determines the unit's result and timing"),
+    *_as_in_runs("sweep", "scene", "size", "vertices", "springs", "solver", "parameters", "integrator", "time_step"),
+    *_as_in_runs("first_guess", "threads"),
+    Column(
+        "status", _TEXT, "", "ok, unsupported, diverged, no-progress, time-limit, failed or uncertified (the reference)"
+    ),
+    _SHARED["reason"],
+    Column("problem", _TEXT, "", "digest of the frozen step; of work the digest of the reference trajectory"),
+    Column("moment", _TEXT, "", "early, middle, violent, or frame-k"),
+    Column("frame", _INT, "", "the step that was frozen, from 1"),
+    Column("stiffness_ratio", _REAL, "", "k dt^2/m: median stiffness and mean mass of what is not pinned"),
+    Column("mean_rest_length", _REAL, "m", "of the springs that have stiffness"),
+    Column("g0", _REAL, "J", "the step's objective at the current positions"),
+    Column("g0_inertial", _REAL, "J", "the step's objective at the inertial target, pins on theirs"),
+    Column("magnitude", _REAL, "J", "sum of the absolute values of the objective's terms at the lowest minimum"),
+    Column("branch", _INT, "", "number of a minimum by its energy, 0 is the lowest; null where none was reached"),
+    Column("minimum", _TEXT, "", "name of a minimum, which stays; of a curve the one that its errors refer to"),
+    Column("g", _REAL, "J", "the step's objective, by the oracle"),
+    Column("stationarity", _REAL, "", "|Q^-1 grad g|_Q relative to its value at the current positions"),
+    Column("smallest_eigenvalue", _REAL, "N/m", "of the Hessian at the minimum"),
+    Column("certified", _YES, "", "whether the minimum is stationary to round-off and its Hessian is definite"),
+    Column("iteration", _INT, "", "number of the iterate, 0 is the first guess"),
+    Column("largest_error", _REAL, "m", "largest distance of a vertex from its place in the minimum `minimum`"),
+    Column("rms_error", _REAL, "m", "root mean square of these distances over the vertices that are not pinned"),
+    Column(
+        "seconds",
+        pa.list_(_REAL),
+        "s",
+        "one wall time a round: to prepare warm; since the solve began; of the whole horizon",
+    ),
+    Column("cold", _REAL, "s", "wall time of the first time that the solver was prepared"),
+    Column("recording", _TEXT, "", "the solve as a recording, relative to the results of this config"),
+    Column("iterations", _INT, "", "the iteration limit, of a step of work or of a curve"),
+    _SHARED["tolerance"],
+    Column("horizon", _REAL, "s", "simulated time"),
+    Column("seconds_per_simulated", _REAL, "", "median over the rounds of wall seconds per simulated second"),
+    Column("error", _REAL, "", "|p(T) - reference(T)| / |reference(T) - p(0)|, Frobenius norms, vertices not pinned"),
+    Column("error_rms_m", _REAL, "m", "root mean square distance of a vertex from the reference at the horizon"),
+    Column("iterations_done", _INT, "", "iterations done in all steps together"),
+    *_as_in_runs("machine", "cpu", "cores", "memory_gib", "system", "versions", "commit", "code", "started"),
+)
+
+SCHEMA = schema_of(COLUMNS)

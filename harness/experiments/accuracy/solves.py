@@ -1,0 +1,205 @@
+"""The rows of frozen steps: what a step is, its minima, and the curves of a solver on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from harness.base import machine
+from harness.config.accuracy import Case, CurveUnit
+from harness.experiments.accuracy.curves import AT_REST, Curve, measure
+from harness.experiments.accuracy.failures import lost
+from harness.experiments.accuracy.oracle import Oracle, stiffness_ratio
+from harness.experiments.accuracy.recording import record
+from harness.experiments.run import provenance
+from harness.reference.frozen import Frozen, bind
+from harness.reference.minimiser import Minimum, Reference
+from harness.reference.store import Store
+from harness.scenes.bind import Scene
+from harness.simulation.step import FIRST_GUESSES
+from solvers.problem import Positions, Prepared, Solver
+from solvers.registry import SOLVERS, load
+
+Row = dict[str, Any]
+
+CONVERGED = 1e-2
+"""Stationarity below which a solver counts as having reached the basin where its last iterate lies."""
+
+CLOSE = 1e-3
+"""Of the mean rest length: who ends so close to a minimum that is known, all over, has reached that one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Graded:
+    """A frozen step of a case, and what grades it. moment: as rows tell it; store: of the truth."""
+
+    case: Case
+    moment: str
+    frozen: Frozen
+    store: Store
+
+    @classmethod
+    def find(cls, case: Case, moment: str | int, store: Store) -> Graded:
+        """The step at a moment; finds its minima. Raises InputError, RunFailed."""
+        scene, size, integrator = case.scene, case.size, case.integrator
+        if isinstance(moment, int):
+            frozen = store.frames(scene, size, [moment], integrator)[moment]
+            moment = f"frame-{moment}"
+        else:
+            frozen = store.moments(scene, size, integrator)[moment]
+        return cls(case, moment, frozen, store)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene with all pins exact."""
+        return bind(self.case.scene, self.case.size, self.case.integrator)
+
+    @cached_property
+    def oracle(self) -> Oracle:
+        """What grades iterates."""
+        return Oracle(self.frozen.problem)
+
+    @property
+    def reference(self) -> Reference:
+        """The minima known by now."""
+        return self.store.reference(self.frozen)
+
+    @cached_property
+    def mean_rest_length(self) -> float:
+        """Of the springs [m]; nan without any."""
+        lengths = self.scene.springs.rest_length
+        return float(lengths.mean()) if len(lengths) else float("nan")
+
+    def common(self) -> Row:
+        """The columns of the step that all rows share which tell of it."""
+        return {
+            "vertices": self.frozen.problem.system.vertices,
+            "springs": len(self.scene.springs.edges),
+            "problem": self.frozen.digest,
+            "moment": self.moment,
+            "frame": self.frozen.frame,
+            "status": "ok",
+        }
+
+    def rows(self) -> list[Row]:
+        """The step's own row, and those of its minima; where no minimum is certified the first is `uncertified`."""
+        case, problem, reference = self.case, self.frozen.problem, self.reference
+        common = self.common() | provenance()
+        common |= {"scene": case.scene_name, "size": case.size, "integrator": case.integrator}
+        common["time_step"] = case.scene.time_step
+        best = reference.minima[0].positions if reference.minima else problem.current
+        row = common | {
+            "kind": "problem",
+            "stiffness_ratio": stiffness_ratio(problem.system, self.scene.springs.stiffness),
+            "mean_rest_length": self.mean_rest_length,
+            "g0": self.oracle.g0,
+            "g0_inertial": problem.value(FIRST_GUESSES["inertial"](problem).first_guess),
+            "magnitude": problem.magnitude(best),
+        }
+        if not reference.minima:
+            row |= {"status": "uncertified", "reason": reference.reason}
+        return [row, *(common | self._minimum(branch, m) for branch, m in enumerate(reference.minima))]
+
+    def _minimum(self, branch: int, minimum: Minimum) -> Row:
+        return {
+            "kind": "minimum",
+            "branch": branch,
+            "minimum": minimum.name,
+            "g": minimum.g,
+            "stationarity": self.oracle.stationarity(minimum.positions),
+            "smallest_eigenvalue": minimum.smallest_eigenvalue,
+            "certified": minimum.certified,
+        }
+
+    def reached(self, p: Positions, stationarity: float) -> Minimum | None:
+        """The minimum in whose basin p (n, 3) [m] lies, if p is near enough to tell."""
+        if not stationarity <= CONVERGED:
+            return None
+        for known in self.reference.minima:
+            if self.oracle.distances(p, known.positions)[0] <= CLOSE * self.mean_rest_length:
+                return known
+        found = self.store.classify(self.frozen, p)
+        return found if found.certified else None
+
+
+def curve_rows(unit: CurveUnit, graded: Graded, folder: Path, tick: Callable[[], None]) -> list[Row]:
+    """The rows of one solver on one step: its preparation, and a curve from each first guess.
+
+    folder: of the config's results; tick: called after each curve. What a solver raises is a row.
+    """
+    solver: Solver = load(SOLVERS[unit.solver.name])(**unit.solver.parameters)
+    shared = graded.common()
+    try:
+        with machine.pinned_threads(unit.how.threads):
+            prepared, row = _prepared(solver, graded, unit.how.rounds)
+            found = [shared | row]
+            for first_guess in unit.first_guesses:
+                found += [shared | row for row in _curve(unit, prepared, graded, first_guess, folder)]
+                tick()
+    except Exception as error:  # whatever a solver raises, the others go on
+        return [shared | lost(error) | {"kind": "curve", "first_guess": guess} for guess in unit.first_guesses]
+    return found
+
+
+def _prepared(solver: Solver, graded: Graded, rounds: int) -> tuple[Prepared, Row]:
+    system, seconds = graded.frozen.problem.system, []
+    began = perf_counter()
+    prepared = solver.prepare(system)
+    cold = perf_counter() - began
+    for _ in range(rounds):
+        began = perf_counter()
+        prepared = solver.prepare(system)
+        seconds.append(perf_counter() - began)
+    return prepared, {"kind": "prepare", "cold": cold, "seconds": seconds}
+
+
+def _curve(unit: CurveUnit, prepared: Prepared, graded: Graded, first_guess: str, folder: Path) -> list[Row]:
+    known = graded.reference.minima
+    curve = measure(
+        prepared,
+        graded.frozen.stated(first_guess),
+        graded.oracle,
+        known[0].g if known else None,
+        iterations=unit.iterations,
+        time_limit=unit.how.time_limit,
+        rounds=unit.how.rounds,
+    )
+    reached = graded.reached(curve.positions[-1], curve.stationarity[-1])
+    shared: Row = {
+        "kind": "curve",
+        "first_guess": first_guess,
+        "iterations": unit.iterations,
+        "status": curve.status,
+        "reason": curve.reason or None,
+    }
+    reference = graded.reference  # again: this solver may have found a minimum
+    if not reference.minima and curve.status == "ok":
+        shared |= {"status": "uncertified", "reason": reference.reason}
+    if reached:
+        shared["branch"] = reference.branch(reached)
+    elif curve.status == "ok" and curve.stationarity[-1] <= AT_REST:
+        shared["reason"] = "ended at a stationary point that is no minimum"
+    if unit.recordings and first_guess == unit.first_guesses[0]:
+        shared["recording"] = str(record(unit, graded, first_guess, curve, folder).relative_to(folder))
+    against = reached or next(iter(reference.minima), None)
+    return [shared | row for row in _points(curve, graded.oracle, against)]
+
+
+def _points(curve: Curve, oracle: Oracle, minimum: Minimum | None) -> list[Row]:
+    rows: list[Row] = []
+    for k, number in enumerate(curve.numbers):
+        row: Row = {
+            "iteration": number,
+            "g": curve.g[k],
+            "stationarity": curve.stationarity[k],
+            "seconds": curve.seconds[k].tolist(),
+        }
+        if minimum:
+            largest, rms = oracle.distances(curve.positions[k], minimum.positions)
+            row |= {"minimum": minimum.name, "largest_error": largest, "rms_error": rms}
+        rows.append(row)
+    return rows

@@ -1,0 +1,87 @@
+"""The work of whole trajectories: how far a simulation ends from the reference, and the wall time that it took.
+
+    error = |p(T) - reference(T)| / |reference(T) - p(0)|        Frobenius norms over the vertices that are not pinned
+
+Time stepping and solver err together, as they do for whoever uses them. Pins are exact here, as they are in the
+reference. An error that the reference could not tell from its own is no error: the row is `uncertified`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from harness.base import machine
+from harness.config.accuracy import WorkUnit
+from harness.experiments.accuracy.failures import OverTime, lost
+from harness.reference.frozen import bind
+from harness.reference.trajectory import Trajectory
+from harness.scenes.bind import Scene
+from harness.simulation.measure import Diverged
+from harness.simulation.step import prepare, simulate
+from solvers.problem import Positions, Prepared, Solver, StopRule
+from solvers.registry import SOLVERS, load
+
+Row = dict[str, Any]
+
+WARM_UP = 2
+"""Steps done before the clock counts: they compile, and touch memory for the first time."""
+
+
+def work_rows(unit: WorkUnit, trajectory: Trajectory | Exception, tick: Callable[[], None]) -> list[Row]:
+    """The row of one simulation; what it raises is told there.
+
+    trajectory: the reference up to the horizon, or why there is none; tick: called after each round.
+    """
+    shared: Row = {
+        "kind": "work",
+        "status": "ok",
+        "first_guess": unit.first_guess,
+        "iterations": unit.iterations,
+        "tolerance": unit.tolerance,
+        "horizon": unit.horizon,
+    }
+    try:
+        if isinstance(trajectory, Exception):
+            raise trajectory
+        with machine.pinned_threads(unit.how.threads):
+            return [shared | _simulated(unit, trajectory, tick)]
+    except Exception as error:  # whatever a solver raises, the others go on
+        return [shared | lost(error)]
+
+
+def _simulated(unit: WorkUnit, trajectory: Trajectory, tick: Callable[[], None]) -> Row:
+    case = unit.case
+    scene = bind(case.scene, case.size, case.integrator)
+    solver: Solver = load(SOLVERS[unit.solver.name])(**unit.solver.parameters)
+    prepared = prepare(scene, solver)
+    row: Row = {"vertices": scene.system.vertices, "springs": len(scene.springs.edges), "seconds": []}
+    frames = round(unit.horizon / case.scene.time_step)
+    p, *_ = _run(unit, scene, prepared, min(WARM_UP, frames))
+    for _ in range(unit.how.rounds):
+        p, seconds, row["iterations_done"] = _run(unit, scene, prepared, frames)
+        row["seconds"].append(seconds)
+        tick()
+    away = (p - trajectory.positions[-1])[scene.system.free]
+    row["error"] = trajectory.error(-1, p)
+    row["error_rms_m"] = float(np.sqrt(np.mean(np.einsum("ij,ij->i", away, away))))
+    row["seconds_per_simulated"] = float(np.median(row["seconds"])) / unit.horizon
+    trajectory.require(row["error"])
+    return row
+
+
+def _run(unit: WorkUnit, scene: Scene, prepared: Prepared, frames: int) -> tuple[Positions, float, int]:
+    """The last positions (n, 3) [m], the wall seconds of all steps, and the iterations done in them."""
+    stop, seconds, iterations = StopRule(unit.iterations, unit.tolerance), 0.0, 0
+    p = scene.mesh.rest
+    for step in simulate(scene, prepared, stop, first_guess=unit.first_guess, frames=frames):
+        p = step.positions
+        seconds += step.seconds
+        iterations += step.solution.iterations
+        if not np.isfinite(p).all():
+            raise Diverged(f"positions are not finite from frame {step.index} on")
+        if seconds > unit.how.time_limit and step.index < frames:
+            raise OverTime(f"the limit of {unit.how.time_limit:g} s was reached in frame {step.index} of {frames}")
+    return p, seconds, iterations

@@ -1,0 +1,72 @@
+"""`springbench gallery`: scenes simulated and drawn side by side on one sheet, as they are at their last frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from harness.base.console import say
+
+
+def gallery(
+    scenes: Annotated[list[Path], typer.Argument(help="Scenes (YAML), in the order of the sheet.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The picture to write (.png).")] = Path("scenes.png"),
+) -> None:
+    """Draw a sheet of scenes, each simulated at its default size up to its last frame."""
+    from harness.report.contact_sheet import draw_sheet
+
+    tiles = []
+    for path in scenes:
+        tiles.append(_tile(path))
+        say(f"[{len(tiles)}/{len(scenes)}] {tiles[-1].name}")
+    draw_sheet(tiles, output)
+    say(f"the sheet is {output}")
+
+
+def _tile(path: Path) -> Any:
+    """A scene's tile."""
+    from harness.base.machine import pinned_threads
+    from harness.config.load import load_any
+    from harness.record.base import Replay
+    from harness.record.obstacles import declared, listed
+    from harness.report.contact_sheet import Tile
+    from harness.scenes.bind import build
+    from harness.simulation.measure import Settings, steps
+    from harness.simulation.step import prepare
+    from solvers.problem import StopRule
+    from solvers.registry import SOLVERS, load
+
+    (run,) = load_any(path).runs()
+    scene = build(run.scene, run.size)
+    solver = load(SOLVERS["hybrid"])()
+    p = scene.mesh.rest
+    with pinned_threads(1):
+        settings = Settings(StopRule(200, 1e-4), run.first_guess, run.frames, 1)
+        for step in steps(scene, prepare(scene, solver), settings):
+            p = step.positions
+    replay = Replay(
+        title=run.scene_name,
+        run_id="",
+        frames=np.array([run.frames]),
+        times=np.array([scene.time(run.frames)]),
+        positions=p[None].astype(np.float32),
+        triangles=scene.mesh.triangles,
+        springs=scene.springs.edges,
+        rest_lengths=scene.springs.rest_length,
+        pinned=scene.system.pins.vertices,
+        strain_range=run.strain_range,
+        scalars={},
+        properties=declared(listed(run.scene.effects)),
+    )
+    kinds = dict.fromkeys(effect.kind for effect in run.scene.effects if effect.kind not in ("springs", "gravity"))
+    camera = run.scene.camera
+    return Tile(
+        replay=replay,
+        mass=scene.system.mass,
+        name=run.scene_name.replace("-", " "),
+        effects=", ".join(kinds).replace("-", " "),
+        angles=(camera.azimuth, camera.elevation) if camera else None,
+    )

@@ -1,0 +1,295 @@
+"""The composition root: turns the names of one run into objects, runs its passes, and leaves its files.
+
+The timed passes come first and record nothing. Recording, energies and pictures come from a second pass, whose
+final positions must equal the timed ones to the last bit. The rows are written last: where they are, all is.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import traceback
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.base import machine, rows
+from harness.base.errors import InputError, RunFailed
+from harness.config.sweep import RunSpec
+from harness.record.base import RecordingInfo
+from harness.record.obstacles import listed
+from harness.record.rerun import RerunRecorder
+from harness.reference.judge import Judge, reference
+from harness.scenes.bind import Scene, build
+from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, measure
+from harness.simulation.observe import observe
+from harness.simulation.step import prepare
+from solvers.problem import NotPositiveDefinite, Solver, StopRule, Unsupported
+from solvers.registry import SOLVERS, load
+
+Tick = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Files:
+    """Where a run leaves its files."""
+
+    rows: Path
+    recording: Path
+    picture: Path
+
+    @classmethod
+    def of(cls, run: RunSpec, folder: Path) -> Files:
+        """The files of a run in the folder of its sweep."""
+        label = run.label(machine.describe().id)
+        return cls(
+            folder / "rows" / f"{label}.parquet",
+            folder / "recordings" / f"{label}.rrd",
+            folder / "pictures" / f"{label}.png",
+        )
+
+
+def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = None) -> list[dict[str, Any]]:
+    """Do one run and write its files; a failure is a row with a status and a reason.
+
+    tick: told the name of the pass after each step; positions: where to store the positions after every step
+    (frames, n, 3) [m], float64. Returns the rows. Raises InputError for what the user can mend.
+    """
+    shared, threads = common(run), machine.threads(run.threads)
+    with machine.pinned_threads(threads.number):
+        try:
+            found = _passes(run, files, tick, positions)
+        except InputError:
+            raise
+        except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
+            found = [failure(error)]
+            for earlier in (files.recording, files.picture):  # of a time when it did not fail; they would hide this
+                earlier.unlink(missing_ok=True)
+            if run.record and "frame" in found[0]:
+                _record_until(run, files, found[0])
+    if threads.why:
+        for row in found:
+            row["choice"] = "; ".join(filter(None, [row.get("choice"), threads.why]))
+    result = [shared | row for row in found]
+    rows.write(files.rows, result)
+    return result
+
+
+_STATUS: dict[type[BaseException], str] = {Unsupported: "unsupported", Diverged: "diverged"}
+
+
+def failure(error: BaseException) -> dict[str, Any]:
+    """The row of a run that ended with an error, less what all its rows share; with the frame, where a step failed."""
+    if isinstance(error, StepFailed) and error.__cause__:
+        return failure(error.__cause__) | {"frame": error.frame}
+    return {"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error)}
+
+
+def _reason(error: BaseException) -> str:
+    """An error of ours speaks for itself; of any other the row also says what it was and where it came from."""
+    if isinstance(error, (Unsupported, NotPositiveDefinite, Diverged, RunFailed)):
+        return str(error)
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
+
+
+def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
+    scene = build(run.scene, run.size, run.integrator)
+    counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
+    settings = _settings(run)
+    measured = measure(scene, _solver(run), settings, tick)
+    by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
+    if by_frame[run.frames]["digest"] != measured.digest:
+        raise RunFailed("the recorded pass ended at other positions than the timed pass")
+    facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
+    facts["choice"] = measured.prepared.choice
+    return [
+        counts
+        | facts
+        | {"status": "ok", "phase": t.phase, "frame": t.frame, "round": t.round, "seconds": t.seconds}
+        | (by_frame[t.frame] if t.phase == "step" and t.frame else {})
+        for t in measured.timings
+    ]
+
+
+def _second_pass(
+    run: RunSpec,
+    files: Files,
+    scene: Scene,
+    measured: Measured,
+    settings: Settings,
+    tick: Tick,
+    positions: Path | None,
+) -> dict[int, dict[str, Any]]:
+    """Simulate again with everything that is looked at: energies, convergence, recording, positions."""
+    stored = np.empty((run.frames, len(scene.mesh.rest), 3)) if positions else None
+    with ExitStack() as cleanup:
+        recorder = None
+        if run.record:
+            seconds = [t.seconds for t in measured.timings if t.phase == "step"]
+            facts = {"status": "ok", "milliseconds_per_step": 1e3 * float(np.median(seconds))}
+            recorder = _recorder(run, files, scene, facts)
+            cleanup.callback(recorder.abandon)
+        found = observe(
+            scene,
+            measured.prepared,
+            settings,
+            recorder=recorder,
+            convergence={1, (run.frames + 1) // 2, run.frames}
+            if run.convergence_frames is None
+            else run.convergence_frames,
+            stored=stored,
+            judge=_judge(run, scene),
+            tick=lambda: tick("second pass"),
+        )
+        if recorder:
+            recorder.close(_milliseconds(measured, run.frames))
+    if positions and stored is not None:
+        save_positions(positions, stored)
+    return found
+
+
+def _record_until(run: RunSpec, files: Files, failed: dict[str, Any]) -> None:
+    """Record the frames before the one that failed, marked as what they are; nothing where they fail too."""
+    facts = {"status": failed["status"], "reason": failed["reason"], "failed_frame": failed["frame"]}
+    settings = replace(_settings(run), frames=failed["frame"] - 1)
+    with ExitStack() as cleanup, suppress(Exception):  # what went wrong is told already
+        scene = build(run.scene, run.size, run.integrator)
+        prepared = prepare(scene, _solver(run))
+        recorder = _recorder(run, files, scene, facts)
+        cleanup.callback(recorder.abandon)
+        observe(
+            scene, prepared, settings, recorder=recorder, convergence=(), stored=None, judge=None, tick=lambda: None
+        )
+        recorder.close({})
+
+
+def _settings(run: RunSpec) -> Settings:
+    return Settings(StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
+
+
+def _solver(run: RunSpec) -> Solver:
+    return load(SOLVERS[run.solver.name])(**run.solver.parameters)
+
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """A run's scene and what else determines its motion; two of one key are the same."""
+
+    key: tuple[str | int, ...]
+    run: RunSpec = field(compare=False)
+
+
+def _judge(run: RunSpec, scene: Scene) -> Judge | None:
+    if not run.judge:
+        return None
+    key = (run.scene.digest, run.size, run.integrator, run.first_guess, run.frames)
+    return Judge(scene, _reference(_Motion(key, run)), minimises=_solver(run).minimises)
+
+
+@lru_cache(maxsize=1)
+def _reference(motion: _Motion) -> NDArray[np.float64] | None:
+    """The reference motion of a scene, whose runs come one after the other; None where Newton's method fails."""
+    run = motion.run
+    scene = build(run.scene, run.size, run.integrator)
+    try:
+        return reference(scene, load(SOLVERS["newton"])(), first_guess=run.first_guess, frames=run.frames)
+    except Exception:  # the row of Newton's method itself says what it was
+        return None
+
+
+def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]) -> RerunRecorder:
+    """facts: how the run ended, among the recording's properties."""
+    files.recording.parent.mkdir(parents=True, exist_ok=True)
+    here = machine.describe()
+    properties = {
+        "sweep": run.sweep,
+        **asked(run),
+        "tolerance": run.tolerance or 0.0,  # a property has no null
+        "vertices": len(scene.mesh.rest),
+        "springs": len(scene.springs.edges),
+        "frames": run.frames,
+        **facts,
+        "cpu": here.cpu,
+        "cores": here.cores,
+        "memory_gib": here.memory_gib,
+        "system": here.system,
+        "commit": machine.commit(),
+        **{f"version_{name}": version for name, version in machine.versions().items()},
+    }
+    size = f" {run.size}" if run.size else ""
+    return RerunRecorder(
+        files.recording,
+        RecordingInfo(
+            title=f"{run.scene_name}{size} - {run.solver.name}",
+            run_id=run.run_id(here.id),
+            mesh=scene.mesh,
+            springs=scene.springs.edges,
+            rest_lengths=scene.springs.rest_length,
+            pinned=scene.system.pins.vertices,
+            time_step=run.scene.time_step,
+            strain_range=run.strain_range,
+            properties=properties,
+            obstacles=listed(run.scene.effects),
+        ),
+    )
+
+
+def _milliseconds(measured: Measured, frames: int) -> dict[str, list[float]]:
+    """The median over the rounds of each phase in each frame [ms]."""
+    by_phase: dict[str, list[list[float]]] = {}
+    for t in measured.timings:
+        if t.frame is not None:
+            by_phase.setdefault(t.phase, [[] for _ in range(frames)])[t.frame - 1].append(1e3 * t.seconds)
+    return {phase: [float(np.median(times)) for times in series] for phase, series in by_phase.items()}
+
+
+def save_positions(path: Path, positions: np.ndarray) -> None:
+    """Store positions (frames, n, 3) [m] under a partial name and rename."""
+    partial = path.with_name(f".{path.name}.partial.npz")
+    np.savez_compressed(partial, positions=positions)
+    os.replace(partial, path)
+
+
+def common(run: RunSpec) -> dict[str, Any]:
+    """The columns that are the same in all rows of a run."""
+    return {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep} | asked(run) | provenance()
+
+
+def asked(run: RunSpec) -> dict[str, Any]:
+    """The columns that tell what a run was asked to do."""
+    return {
+        "scene": run.scene_name,
+        "size": run.size,
+        "solver": run.solver.name,
+        "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
+        "time_step": run.scene.time_step,
+        "integrator": run.integrator,
+        "first_guess": run.first_guess,
+        "max_iterations": run.iterations,
+        "tolerance": run.tolerance,
+        "threads": machine.threads(run.threads).number,
+    }
+
+
+def provenance() -> dict[str, Any]:
+    """The columns that tell where, when and by which code something was measured."""
+    here = machine.describe()
+    return {
+        "machine": here.id,
+        "cpu": here.cpu,
+        "cores": here.cores,
+        "memory_gib": here.memory_gib,
+        "system": here.system,
+        "versions": json.dumps(machine.versions(), sort_keys=True),
+        "commit": machine.commit(),
+        "code": machine.code_hash(),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+    }

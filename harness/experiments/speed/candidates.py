@@ -1,0 +1,210 @@
+"""What takes turns: a solver, the yardstick in C++, the machine itself. Each is prepared once and then timed again
+and again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import ceil
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any, NamedTuple, Protocol
+
+from harness.config.sweep import RunSpec
+from harness.experiments.speed import limits, work
+from harness.experiments.speed.rest import Rest, apart, precision
+from harness.experiments.speed.yardstick import Yardstick
+from harness.scenes.bind import Scene
+from solvers.problem import Positions, Prepared, StepProblem, StopRule
+from solvers.registry import SOLVERS, load
+
+LEAST = 0.02
+"""Seconds that a phase is repeated for in each turn: a clock's overhead is nothing then, and a first call that finds
+the caches cold is one of many."""
+
+
+class Reading(NamedTuple):
+    """One phase in one turn: its seconds a call, and other columns of its row."""
+
+    phase: str
+    seconds: float
+    columns: dict[str, Any]
+
+
+class Candidate(Protocol):
+    """Anything that is timed. `columns` are those of all its rows."""
+
+    run: RunSpec
+    columns: dict[str, Any]
+
+    def prepare(self) -> float | None:
+        """Get ready, or do again what that takes; its seconds, None where there is nothing to do again."""
+        ...
+
+    def turn(self) -> list[Reading]:
+        """Time every phase once."""
+        ...
+
+    def close(self) -> Positions | None:
+        """Let go of everything; the positions after the last step (n, 3) [m], None where there are none."""
+        ...
+
+
+class SolverCandidate:
+    """A solver of the registry, asked for the same step each time.
+
+    Candidates that differ in their threads alone are timed on one factor, in `prepared`: large ones would not fit
+    into memory side by side.
+    """
+
+    def __init__(
+        self, run: RunSpec, scene: Scene, problem: StepProblem, prepared: dict[str, Prepared], rest: Rest | None = None
+    ) -> None:
+        self.run, self._shared, self._rest = run, prepared, rest
+        self.columns: dict[str, Any] = {}
+        self._scene, self._problem = scene, problem
+        self._solver = load(SOLVERS[run.solver.name])(**run.solver.parameters)
+        self._prepared: Prepared | None = None
+        self._positions: Positions | None = None
+        self._work: dict[str, work.Work] = {}
+
+    def prepare(self) -> float:
+        """See Candidate. Raises Unsupported, NotPositiveDefinite, MemoryError."""
+        began = perf_counter()
+        prepared = self._solver.prepare(self._scene.system)
+        seconds = perf_counter() - began
+        if self._prepared is None:
+            self._prepared = prepared = self._shared.setdefault(str(self._solver), prepared)
+            counts = self._scene.system.vertices, len(self._scene.springs.edges)
+            self._work = work.count(prepared.facts, *counts, precision(self.run))
+            self.columns = {name: int(value) for name, value in prepared.facts.items()}
+            self.columns["choice"] = prepared.choice
+            if self._rest and precision(self.run) != "float64":
+                self.columns["apart"] = apart(self._rest, prepared)
+        return seconds
+
+    def turn(self) -> list[Reading]:
+        """See Candidate."""
+        prepared = self._prepared
+        assert prepared is not None
+        readings = [Reading("step", average(self._step), self._columns("iteration", self.run.iterations))]
+        for phase, call in prepared.phases(self._problem).items():
+            readings.append(Reading(phase, average(repeated(call)), self._columns(phase, 1)))
+        return readings
+
+    def close(self) -> Positions | None:
+        """See Candidate."""
+        self._prepared = None
+        return self._positions
+
+    def _step(self, number: int) -> float:
+        assert self._prepared is not None
+        stop = StopRule(self.run.iterations, self.run.tolerance)
+        began = perf_counter()
+        for _ in range(number):
+            self._positions = self._prepared.solve(self._problem, stop).positions
+        return perf_counter() - began
+
+    def _columns(self, phase: str, times: int) -> dict[str, Any]:
+        done = {"iterations": times}
+        if phase not in self._work:
+            return done
+        counted = self._work[phase]
+        return done | {
+            "bytes": times * counted.bytes,
+            "flops": times * counted.flops,
+            "working_set": counted.working_set,
+        }
+
+
+class YardstickCandidate:
+    """The C++ program, asked for the same step."""
+
+    def __init__(
+        self, run: RunSpec, scene: Scene, problem: StepProblem, program: Callable[[], Path], tunables: str
+    ) -> None:
+        self.run, self.columns = run, {}
+        self._scene, self._problem, self._program, self._tunables = scene, problem, program, tunables
+        self._folder = TemporaryDirectory()
+        self._running: Yardstick | None = None
+
+    def prepare(self) -> float | None:
+        """See Candidate. Raises Unsupported, RunFailed."""
+        if self._running:
+            return None
+        folder = Path(self._folder.name)
+        self._running = Yardstick(self._program(), self._problem, self._scene.springs, folder, self._tunables)
+        return self._running.prepare_seconds
+
+    def turn(self) -> list[Reading]:
+        """See Candidate."""
+        running, iterations = self._running, self.run.iterations
+        assert running is not None
+        once = running.step(iterations)
+        number = _repeats(once[0])
+        answers = [running.step(iterations) for _ in range(number)] if number > 1 else [once]
+        step, local, global_ = (sum(column) / len(answers) for column in zip(*answers, strict=True))
+        return [
+            Reading("step", step, {"iterations": iterations}),
+            Reading("local", local / iterations, {"iterations": 1}),
+            Reading("global", global_ / iterations, {"iterations": 1}),
+        ]
+
+    def close(self) -> Positions | None:
+        """See Candidate."""
+        try:
+            return self._running.close() if self._running else None
+        finally:
+            if self._running:
+                self._running.kill()
+            self._folder.cleanup()
+
+
+class MachineCandidate:
+    """The machine's own limits with a number of threads."""
+
+    def __init__(self, run: RunSpec) -> None:
+        self.run, self.columns = run, {}
+
+    def prepare(self) -> None:
+        """See Candidate: compiles, which is not timed."""
+        for probe in limits.probes(limits.WORKING_SETS[:1]):
+            probe.call()
+
+    def turn(self) -> list[Reading]:
+        """See Candidate."""
+        return [
+            Reading(
+                probe.name,
+                average(repeated(probe.call), 0.0),
+                {"bytes": probe.bytes, "flops": probe.flops, "working_set": probe.working_set},
+            )
+            for probe in limits.probes()
+        ]
+
+    def close(self) -> None:
+        """See Candidate."""
+
+
+def repeated(call: Callable[[], object]) -> Callable[[int], float]:
+    """The seconds that some calls take, by their number."""
+
+    def seconds(number: int) -> float:
+        began = perf_counter()
+        for _ in range(number):
+            call()
+        return perf_counter() - began
+
+    return seconds
+
+
+def average(seconds: Callable[[int], float], least: float = LEAST) -> float:
+    """Seconds a call: of one that takes longer than `least`, else of as many as take that long, after a first one."""
+    once = seconds(1)
+    number = _repeats(once, least)
+    return seconds(number) / number if number > 1 else once
+
+
+def _repeats(once: float, least: float = LEAST) -> int:
+    return ceil(least / max(once, 1e-9))

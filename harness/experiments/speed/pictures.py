@@ -1,0 +1,55 @@
+"""The pictures of a speed report: each quantity against size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from harness.base import machine
+from harness.experiments.speed.figures import STEP, Figures
+from harness.report.size_plot import Series, draw_by_size
+
+
+class Picture(NamedTuple):
+    """One picture: the stem of its file, its title, what it shows of a candidate, whether that is a share."""
+
+    stem: str
+    title: str
+    value: Callable[[Figures], float | None]
+    share: bool = False
+
+
+PICTURES = (
+    Picture("step", f"Milliseconds a step of {STEP} iterations", lambda f: f.step),
+    Picture("global", "Milliseconds a global step: one solve, three right-hand sides", lambda f: f.global_),
+    Picture("local", "Milliseconds a local step", lambda f: f.local),
+    Picture("prepare", "Milliseconds to prepare, warm", lambda f: f.warm or f.cold),
+    Picture("limit", "Part of the limit that binds an iteration", lambda f: f.reached, share=True),
+)
+
+
+def draw(found: Sequence[Figures], folder: Path) -> None:
+    """Draw all pictures of each scene to `folder`, WIDTH x HEIGHT pixels, PNG."""
+    folder.mkdir(parents=True, exist_ok=True)
+    here = machine.describe()
+    loads = [f.load for f in found if f.load is not None]
+    facts = ["least of all rounds, candidates in turns", f"{here.cores} cores", here.cpu]
+    if loads:
+        facts.append(f"load {min(loads):.1f} to {max(loads):.1f}")
+    for scene in dict.fromkeys(f.scene for f in found):
+        members = [f for f in found if f.scene == scene]
+        for picture in PICTURES:
+            path = folder / f"{scene}-{picture.stem}.png"
+            draw_by_size(path, picture.title, [scene, *facts], _series(members, picture), share=picture.share)
+
+
+def _series(members: Sequence[Figures], picture: Picture) -> list[Series]:
+    """A line for each candidate of a scene."""
+    lines = []
+    for label in dict.fromkeys(f.label for f in members):
+        mine = [f for f in members if f.label == label]
+        points = sorted((f.vertices, value) for f in mine if (value := picture.value(f)) is not None)
+        family = label.removesuffix(f" x{mine[0].threads}")
+        lines.append(Series(label, family, [n for n, _ in points], [value for _, value in points]))
+    return lines

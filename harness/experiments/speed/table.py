@@ -1,0 +1,115 @@
+"""The table of a speed report: a line for each candidate at each size, and what the machine itself can do."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from itertools import groupby
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from harness.experiments.speed.figures import STEP, Figures, Interval
+from harness.report.page import count, quantity
+
+_NUMBERS = (
+    "prepare\ncold ms",
+    "\nwarm ms",
+    "local\nms",
+    "global\nms",
+    f"step of\n{STEP} ms",
+    "an iteration\ntouches MB",
+    "\nGB/s",
+    "what\nbinds",
+    "of that\nlimit",
+    "of two passes\nover L",
+    "step against eigen\ntimes faster",
+    "with cheap\ntemporaries",
+    "solve against\ncholespy",
+    "converged, apart\nfrom float64",
+    "load",
+)
+
+
+def speed_table(found: Sequence[Figures]) -> Table:
+    """A line for each candidate at each size; ratios with their 95 % intervals."""
+    table = Table(box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
+    table.add_column("scene", justify="right")
+    table.add_column("candidate", no_wrap=True)
+    for words in _NUMBERS:
+        table.add_column(words, justify="right", no_wrap=True)
+    where = _places(found)
+    for _, group in groupby(found, key=lambda f: (f.scene, f.size)):
+        for f in group:
+            if f.status == "ok":
+                table.add_row(where(f), _named(f), *_cells(f))
+            else:
+                table.add_row(where(f), f.label, f"[yellow]{f.status}[/]")
+        table.add_section()
+    return table
+
+
+def _places(found: Sequence[Figures]) -> Callable[[Figures], str]:
+    """How a scene of a size is called: by its size where there is one scene."""
+    if len({f.scene for f in found}) == 1:
+        return lambda f: count(f.size)
+    return lambda f: f"{f.scene} {count(f.size)}"
+
+
+def _named(f: Figures) -> str:
+    return f.label if f.iterations == STEP else f"{f.label} ({f.iterations} of {STEP})"
+
+
+def _cells(f: Figures) -> list[str]:
+    return [
+        *(_number(value) for value in (f.cold, f.warm, f.local, f.global_, f.step)),
+        _number(f.bytes and f.bytes / 1e6),
+        _number(f.touched and f.touched / 1e9),
+        f.binds or "–",
+        _share(f.reached),
+        _share(f.passes),
+        *(_ratio(interval) for interval in (f.faster, f.cheap_faster, f.solves_faster)),
+        "–" if f.apart is None else f"{f.apart:.0e}",
+        _number(f.load),
+    ]
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else quantity(value)
+
+
+def _share(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.0f} %"
+
+
+def _ratio(interval: Interval | None) -> str:
+    return "–" if interval is None else f"{interval.ratio:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
+
+
+def remarks(found: Sequence[Figures]) -> list[str]:
+    """What was left out or failed and why, what the solvers chose, and how the cost of a solve grows."""
+    where = _places(found)
+    told: dict[str, list[str]] = defaultdict(list)
+    for f in sorted(found, key=lambda f: f.status == "ok"):
+        if f.status != "ok":
+            told[f"{f.label}: {f.status}: {f.reason}"].append(where(f))
+        elif f.choice and "auto" in f.label.split():
+            told[f"{f.label} chose {f.choice}"].append(where(f))
+    said = [f"{words} (at {', '.join(sizes)})" for words, sizes in told.items()]
+    entries = exponents(found, "entries")
+    for (scene, label), exponent in exponents(found).items():
+        factor = f", its factor has n^{entries[scene, label]:.2f} entries" if (scene, label) in entries else ""
+        said.append(f"{label}: from 10,000 vertices of {scene} on a solve costs n^{exponent:.2f}{factor}")
+    return said
+
+
+def exponents(found: Sequence[Figures], figure: str = "global_", least: int = 10_000) -> dict[tuple[str, str], float]:
+    """The power of n by which a figure grows, that of a solve's time, by scene and label, from `least` vertices on."""
+    by_label: dict[tuple[str, str], list[tuple[int, float]]] = defaultdict(list)
+    for f in found:
+        value = getattr(f, figure)
+        if value and f.vertices >= least:
+            by_label[f.scene, f.label].append((f.vertices, value))
+    logarithms = {label: np.log(np.array(points)).T for label, points in by_label.items() if len(points) > 1}
+    return {label: float(np.polyfit(n, values, 1)[0]) for label, (n, values) in logarithms.items()}

@@ -1,0 +1,145 @@
+"""Candidates of one mesh size take turns, A B C A B C ..., so that whatever slows the machine slows all of them.
+
+First each is prepared (round 0, cold), then prepared again, then timed in as many rounds as the sweep says. Their final
+positions are compared before any time is believed. A candidate that would take too long, as its own smaller sizes
+predict, is left out with a row that says so.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from math import exp, log
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from harness.base import machine
+from harness.base.errors import RunFailed
+from harness.config.sweep import RunSpec
+from harness.experiments.run import common, failure
+from harness.experiments.speed.candidates import Candidate, Reading
+from harness.simulation.measure import digest
+from solvers.problem import Positions
+
+PREPARES = 3
+"""How often each is prepared, the first time included."""
+
+LONG = 3.0
+"""Seconds of a preparation that is not repeated: that of a large mesh, which nothing is cold for any more."""
+
+AGREEMENT = {"float64": 1e-9, "float32": 1e-5, "float16": 1e-2}
+"""How far final positions may lie apart, in the scene's size: round-off of 50 iterations, that of float64 in 1e10 : 1
+stiffnesses; below float64 the iterates differ by the precision of the factor until they converge."""
+
+Row = dict[str, Any]
+
+
+class Past(NamedTuple):
+    """What a candidate took at a smaller size: seconds to prepare, warm, and an iteration."""
+
+    vertices: int
+    prepare: float
+    iteration: float
+
+
+def measure(
+    candidates: Sequence[Candidate], counts: Row, past: Mapping[str, list[Past]], budget: float
+) -> list[list[Row]]:
+    """The rows of each candidate.
+
+    counts: columns that all share; past: by `name` of a run, smaller sizes first; budget: seconds a candidate.
+    """
+    rows: dict[Candidate, list[Row]] = {}
+    alive: list[Candidate] = []
+    with ExitStack() as cleanup:
+        for candidate in candidates:
+            cleanup.callback(_closed, candidate)
+            rows[candidate] = []
+            wanted = predicted(past.get(name(candidate.run), ()), counts["vertices"], candidate.run)
+            if wanted > budget:
+                said = f"would take {wanted:.0f} s by its smaller sizes; the budget of each candidate is {budget:.0f} s"
+                rows[candidate].append({"phase": "run", "status": "skipped", "reason": said})
+            else:
+                alive.append(candidate)
+        for round in range(PREPARES):
+            for candidate in list(alive):
+                if rows[candidate] and rows[candidate][-1]["seconds"] > LONG:
+                    continue
+                with _guarded(candidate, rows[candidate], alive):
+                    seconds = candidate.prepare()
+                    if seconds is not None:
+                        rows[candidate].append(_row(Reading("prepare", seconds, {}), round))
+        for round in range(max((candidate.run.rounds for candidate in alive), default=0)):
+            for candidate in list(alive):
+                with _guarded(candidate, rows[candidate], alive):
+                    rows[candidate] += [_row(reading, round) for reading in candidate.turn()]
+        _compare(rows, alive)
+        for candidate in alive:
+            rows[candidate] = [candidate.columns | {"status": "ok"} | row for row in rows[candidate]]
+        return [[common(candidate.run) | counts | row for row in found] for candidate, found in rows.items()]
+
+
+def name(run: RunSpec) -> str:
+    """What stays the same of a run over the mesh sizes."""
+    return f"{run.scene_name} {run.solver.name} {sorted(run.solver.parameters.items())} {run.threads}"
+
+
+def predicted(past: Sequence[Past], vertices: int, run: RunSpec) -> float:
+    """The seconds that a run will take, by a power law through the last two smaller sizes; 0 without any."""
+    known = [p for p in past if p.vertices < vertices]
+    if not known:
+        return 0.0
+
+    def at(field: str) -> float:
+        last = getattr(known[-1], field)
+        if len(known) == 1:
+            return last * vertices / known[-1].vertices
+        grown = log(known[-1].vertices / known[-2].vertices)
+        power = max(1.0, log(last / getattr(known[-2], field)) / grown)
+        return last * exp(power * log(vertices / known[-1].vertices))
+
+    return PREPARES * at("prepare") + run.rounds * run.iterations * at("iteration")
+
+
+@contextmanager
+def _guarded(candidate: Candidate, rows: list[Row], alive: list[Candidate]) -> Iterator[None]:
+    """With the candidate's threads; what it raises is its only row, and it is out."""
+    try:
+        with machine.pinned_threads(machine.threads(candidate.run.threads).number):
+            yield
+    except Exception as error:  # whatever one of them raises, the others go on
+        rows[:] = [failure(error)]
+        alive.remove(candidate)
+
+
+def _row(reading: Reading, round: int) -> Row:
+    found = {"phase": reading.phase, "seconds": reading.seconds, "round": round, "load": os.getloadavg()[0]}
+    if reading.phase == "step":
+        found["frame"] = 1
+    return found | reading.columns
+
+
+def _compare(rows: dict[Candidate, list[Row]], alive: list[Candidate]) -> None:
+    """Close all; whose positions differ from those of the first is out, and digests go to the rows of steps."""
+    reference: Positions | None = None
+    for candidate in list(alive):
+        with _guarded(candidate, rows[candidate], alive):
+            p = candidate.close()
+            if p is None:
+                continue
+            reference = p if reference is None else reference
+            apart = float(np.abs(p - reference).max()) / float(np.ptp(reference, axis=0).max())
+            limit = AGREEMENT[candidate.run.solver.parameters.get("precision", "float64")]
+            if not apart <= limit:
+                raise RunFailed(f"its positions lie {apart:.1e} of the scene's size from the others'; wanted {limit}")
+            for row in rows[candidate]:
+                if row["phase"] == "step":
+                    row["digest"] = digest(p)
+
+
+def _closed(candidate: Candidate) -> None:
+    """Close one that may have been closed, or that cannot answer any more."""
+    with suppress(RunFailed, OSError):
+        candidate.close()

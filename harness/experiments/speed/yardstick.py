@@ -1,0 +1,129 @@
+"""The yardstick in C++, `yardstick.cpp`: compiled where a compiler and Eigen are, and asked for one step at a time.
+
+The scene goes to it in a file: int64 n, m, q; float64 dt; int64 edges (m, 2), pinned (q,); float64 stiffness, rest
+length (m,), mass (n,), pin weight (q,), target, force, first guess (n, 3), pin targets (q, 3).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+
+from harness.base.errors import RunFailed
+from solvers.energies.springs import Springs
+from solvers.problem import Positions, StepProblem, Unsupported
+
+SOURCE = Path(__file__).with_name("yardstick.cpp")
+FLAGS = ("-O3", "-march=native", "-DNDEBUG", "-std=c++17")
+EIGEN = "/usr/include/eigen3"
+"""Where Debian's libeigen3-dev is; one that the compiler finds by itself (CPATH) will do as well."""
+
+CHEAP_TEMPORARIES = ":".join(
+    f"glibc.malloc.{setting}"
+    for setting in ("hugetlb=1", "mmap_threshold=1073741824", "trim_threshold=4294967296", "top_pad=67108864")
+)
+"""Settings of the GNU C library that make temporaries cheap: transparent huge pages, and freed memory is kept."""
+
+MALFORMED = {2: "wanted a scene and a file for positions", 3: "the scene's file is too short", 4: "Q has no factor"}
+
+
+def build(folder: Path) -> Path:
+    """The compiled yardstick in `folder`, made anew when its source has changed. Raises Unsupported: why not."""
+    compiler = next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), "c++", "g++", "clang++"))), None)
+    if compiler is None:
+        raise Unsupported("there is no C++ compiler (c++, g++, clang++, or CXX)")
+    name = hashlib.sha256(" ".join([compiler, *FLAGS]).encode() + SOURCE.read_bytes()).hexdigest()[:12]
+    program = folder.resolve() / f"yardstick-{name}"
+    if not program.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        partial = program.with_suffix(".partial")
+        command = [compiler, *FLAGS, "-isystem", EIGEN, str(SOURCE), "-o", str(partial)]
+        told = subprocess.run(command, capture_output=True, text=True)
+        if told.returncode:
+            first = next((line for line in told.stderr.splitlines() if "error" in line), "no message")
+            wanted = "it needs Eigen 3.4 (Debian: libeigen3-dev) and C++17"
+            raise Unsupported(f"the yardstick does not compile: {first.strip()}; {wanted}")
+        os.replace(partial, program)
+    return program
+
+
+class Yardstick:
+    """The running program, with one step problem of springs."""
+
+    def __init__(self, program: Path, problem: StepProblem, springs: Springs, folder: Path, tunables: str) -> None:
+        """Start it and factorise; folder: for its files; tunables: of the C library. Raises Unsupported, RunFailed."""
+        if problem.system.pins.exact.any():
+            raise Unsupported("the yardstick knows pins by penalty only")
+        scene, self._positions = folder / "scene.bin", folder / "positions.bin"
+        write(scene, problem, springs)
+        self._shape = problem.target.shape
+        self._process = subprocess.Popen(
+            [program, scene, self._positions],
+            env={**os.environ, "GLIBC_TUNABLES": tunables},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.prepare_seconds = self._answer()[0]
+        scene.unlink()
+
+    def step(self, iterations: int) -> list[float]:
+        """Do one step of so many iterations from the first guess.
+
+        Its wall seconds: in all, in the local steps, in the global steps. Raises RunFailed.
+        """
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{iterations}\n")
+            self._process.stdin.flush()
+        except OSError:  # it has ended; its exit code says why
+            pass
+        return self._answer()
+
+    def close(self) -> Positions:
+        """End the program; the positions (n, 3) [m] of its last step. Raises RunFailed."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        if self._process.wait():
+            raise self._failed()
+        p = np.fromfile(self._positions).reshape(self._shape)
+        self._positions.unlink()
+        return p
+
+    def kill(self) -> None:
+        """End the program, whatever it is doing."""
+        self._process.kill()
+        self._process.wait()
+
+    def _answer(self) -> list[float]:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            self._process.wait()
+            raise self._failed()
+        return [float(word) for word in line.split()]
+
+    def _failed(self) -> RunFailed:
+        code = self._process.returncode
+        return RunFailed(f"the yardstick ended with {code}: {MALFORMED.get(code, 'out of memory or killed')}")
+
+
+def write(path: Path, problem: StepProblem, springs: Springs) -> None:
+    """Write a step problem of springs in the form that the program reads."""
+    system = problem.system
+    parts = [
+        np.array([system.vertices, len(springs.edges), len(system.pins.vertices)], np.int64),
+        np.array([system.time_step]),
+        springs.edges.astype(np.int64),
+        system.pins.vertices.astype(np.int64),
+        *(springs.stiffness, springs.rest_length, system.mass, system.pins.weight),
+        *(problem.target, problem.force, problem.first_guess, problem.pin_targets),
+    ]
+    with path.open("wb") as file:
+        for part in parts:
+            np.ascontiguousarray(part).tofile(file)

@@ -1,0 +1,190 @@
+"""Sweeps: does the runs that are missing, and only those, then draws what compares them.
+
+A run is complete when its rows, its recording and its picture are in place. Rows are written after the recording,
+and a picture is drawn from the recording alone, so what a kill leaves undone is told from the files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from harness.base import machine, rows
+from harness.base.errors import InputError
+from harness.base.progress import Display
+from harness.config.sweep import RunSpec
+from harness.experiments.run import Files, execute
+from harness.record.compare import side_by_side
+from harness.record.reader import read_replay
+from harness.report import opengl
+from harness.report.comparison import draw_comparison
+from harness.report.run_picture import draw_run
+from harness.report.timing_plot import draw_timing
+
+DONE, MISSING = "done", "missing"
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A run of a sweep, its files, and its state: done, missing, or the status of a run that failed.
+
+    older: whether its rows were made by other code than today's.
+    """
+
+    run: RunSpec
+    files: Files
+    state: str
+    older: bool
+
+    @property
+    def title(self) -> str:
+        """The run in words."""
+        size = f" {self.run.size}" if self.run.size else ""
+        return f"{self.run.scene_name}{size} {self.run.solver.name}"
+
+
+def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
+    """Each run with its files and what is there already."""
+    code = machine.code_hash()
+    planned = []
+    for run in runs:
+        files = Files.of(run, folder)
+        state, older = MISSING, False
+        if files.rows.exists():
+            there = pq.read_table(files.rows, columns=["status", "code"]).slice(0, 1).to_pylist()[0]
+            state = DONE if there["status"] == "ok" else there["status"]
+            older = there["code"] != code
+            if state == DONE and run.record and not files.recording.exists():
+                state = MISSING
+        planned.append(Planned(run, files, state, older))
+    return planned
+
+
+def run_sweep(
+    name: str,
+    runs: Sequence[RunSpec],
+    folder: Path,
+    display: Display,
+    say: Callable[[str], None],
+    *,
+    again: bool = False,
+    positions: Path | None = None,
+) -> pa.Table:
+    """Do what is missing of a sweep (all of it with `again` or `positions`) and return all its rows.
+
+    say: prints a remark; positions: where to store the positions of the sweep's only run. Raises InputError.
+    """
+    if positions and len(runs) != 1:
+        raise InputError(f"--positions stores the positions of one run; this is {len(runs)} runs")
+    for threads in {machine.threads(run.threads).number for run in runs}:
+        with machine.pinned_threads(threads):  # refuses what this machine cannot do before anything starts
+            pass
+    for part in ("rows", "recordings", "pictures"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    with rows.alone(folder):
+        planned = plan(runs, folder)
+        todo = [p for p in planned if p.state == MISSING or again or positions]
+        if len(todo) < len(planned):
+            say(f"{len(planned) - len(todo)} of {len(planned)} runs are there already")
+        display.begin(len(todo), sum(map(_work, todo)))
+        try:
+            for p in todo:
+                ticks = p.run.frames * (p.run.rounds + 2)
+                display.run(p.title, ticks, _work(p))
+                display.finished(_outcome(execute(p.run, p.files, display.tick, positions=positions)))
+        finally:
+            display.end()
+        table = rows.read(p.files.rows for p in planned)
+        _draw(name, planned, folder, table, say)
+    return table
+
+
+def _work(p: Planned) -> float:
+    """A rough measure of a run's effort, for the time left."""
+    return (p.run.size or 32) ** 2 * p.run.frames * p.run.iterations * (p.run.rounds + 2)
+
+
+def _outcome(found: list[dict[str, Any]]) -> str:
+    if found[0]["status"] != "ok":
+        return f"{found[0]['status']}: {found[0]['reason']}"
+    best = min(row["seconds"] for row in found if row["phase"] == "step")
+    return f"{1e3 * best:.3g} ms a step"
+
+
+def _draw(
+    name: str,
+    planned: list[Planned],
+    folder: Path,
+    table: pa.Table,
+    say: Callable[[str], None],
+) -> None:
+    """Pictures of runs, and what compares runs, where it is missing or older than a recording that it shows."""
+    drawn = [p for p in planned if p.run.record and p.files.recording.exists()]
+    missing = opengl.problem() if any(p.run.pictures for p in drawn) else None
+    if missing:
+        say(missing)
+    wanting = [p for p in drawn if p.run.pictures and _stale(p.files.picture, [p.files.recording])]
+    if wanting and not missing:
+        say(f"drawing the pictures of {len(wanting)} runs")
+        for p in wanting:
+            camera = p.run.scene.camera
+            angles = (camera.azimuth, camera.elevation) if camera else None
+            draw_run(read_replay(p.files.recording), p.files.picture, camera=angles)
+    for label, group in _groups(drawn).items():
+        recordings = {_distinct(p, group): p.files.recording for p in group}
+        recording = folder / "recordings" / f"{label}-solvers.rrd"
+        picture = folder / "pictures" / f"{label}-solvers.png"
+        if _stale(recording, recordings.values()):
+            side_by_side(recording, recordings, label.replace("-", " "))
+        if group[0].run.pictures and not missing and _stale(picture, recordings.values()):
+            draw_comparison({key: read_replay(path) for key, path in recordings.items()}, picture)
+    if any(p.run.pictures for p in planned):
+        draw_timing(table, folder / "pictures" / "timing.png", name)
+
+
+def _stale(made: Path, sources: Iterable[Path]) -> bool:
+    """Whether a file is missing, or older than one of those it was made from."""
+    return not made.exists() or any(made.stat().st_mtime_ns < source.stat().st_mtime_ns for source in sources)
+
+
+def _groups(drawn: list[Planned]) -> dict[str, list[Planned]]:
+    """Runs that differ in nothing but their solver or its settings, by scene and size."""
+    groups: dict[str, list[Planned]] = {}
+    for p in drawn:
+        groups.setdefault(f"{p.run.scene_name}-{p.run.size}", []).append(p)
+    return {label: group for label, group in groups.items() if len(group) > 1}
+
+
+def _distinct(p: Planned, group: list[Planned]) -> str:
+    """The solver's name, with the parameters and options in which the group's runs of this solver differ."""
+
+    def settings(run: RunSpec) -> dict[str, Any]:
+        return {**run.solver.parameters, **{option: getattr(run, option) for option in _SHORT}}
+
+    own = [settings(other.run) for other in group if other.run.solver.name == p.run.solver.name]
+    varied = [(k, v) for k, v in settings(p.run).items() if any(other[k] != v for other in own)]
+    return ", ".join([p.run.solver.name, *(_SHORT.get(k, f"{k} {{}}").format(v) for k, v in varied)])
+
+
+_SHORT = {
+    "iterations": "{} it.",
+    "tolerance": "tol. {}",
+    "integrator": "{}",
+    "time_step": "dt {:.3g}",
+    "first_guess": "{}",
+    "threads": "{} thr.",
+    "frames": "{} frames",
+    "rounds": "{} rounds",
+}
+"""How an option's value is named where space is short."""
+
+
+def failures(table: pa.Table) -> list[str]:
+    """Scene, size, solver, status and reason of the runs that failed."""
+    failed = [row for row in table.to_pylist() if row["status"] != "ok"]
+    return [f"{r['scene']} {r['size']} {r['solver']}: {r['status']}: {r['reason']}" for r in failed]

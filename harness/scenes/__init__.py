@@ -1,0 +1,1 @@
+"""What a scene declares: mesh, material, effects, start and motion, bound to a mesh size."""

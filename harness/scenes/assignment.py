@@ -1,0 +1,102 @@
+"""Scenes of the University of Toronto mass-spring assignment, read as its own code reads them.
+
+Springs: each `f` line where all name two vertices, in file order; otherwise the unique pairs of vertices
+that share a face, before triangulation, so that a quad has both diagonals. Mass: one value `m` for all
+vertices, or the mixed Voronoi areas of the faces, triangulated as fans, at density 1 (Meyer et al. 2003 in
+libigl's form): a triangle of area T gives each corner the part of it that is nearest to that corner,
+
+    (|e_j|^2 cot a_j + |e_k|^2 cot a_k) / 8,
+
+except that an obtuse corner gets T/2 and the two others T/4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.base.errors import InputError, Mistake
+from harness.scenes.mesh.base import Mesh
+from harness.scenes.mesh.cells import network
+from harness.scenes.mesh.obj import read_obj
+from harness.scenes.mesh.scene_json import line_of, read_scene_json
+from harness.scenes.mesh.topology import NO_PAIRS, Indices, Points
+
+TIME_STEP = 1 / 30
+"""dt [s]."""
+ITERATIONS = 50
+"""Local-global iterations a step; there is no other stop rule."""
+PIN_WEIGHT = 1e10
+"""Penalty weight of a pin [N/m]; pins hold vertices at rest positions."""
+FORCE = (0.0, -9.8, 0.0)
+"""External force on every vertex [N], whatever its mass."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assignment:
+    """A scene. obj: the mesh file; mesh: with `mass` (n,) [kg]; stiffness: of every spring [N/m];
+    pins: the pinned vertices, (q,), from 0, in the order of the file.
+    """
+
+    obj: Path
+    mesh: Mesh
+    stiffness: float
+    pins: NDArray[np.int64]
+
+
+def read_assignment(path: Path) -> Assignment:
+    """The scene of a JSON file and of the OBJ file that it names.
+
+    A vertex that no face uses stays, with no mass unless `m` gives it one. Raises InputError with the file,
+    line and key of each mistake.
+    """
+    scene = read_scene_json(path)
+    obj = path.parent / scene.obj
+    cells = replace(read_obj(obj), segments=NO_PAIRS)
+    if not cells.polygons:
+        raise InputError(Mistake("has no faces (f lines), so there are no springs", obj))
+    mesh = network(cells, "face_pairs", obj)
+    pins = _pins(scene.b, len(mesh.rest), path)
+    if scene.m is None:
+        mass = voronoi_areas(mesh.rest, mesh.triangles)
+        if not mass.any():
+            problem = "is missing, and the faces of the OBJ file have no area to take masses from"
+            raise InputError(Mistake(problem, path, key="m"))
+    else:
+        mass = np.full(len(mesh.rest), float(scene.m))
+    return Assignment(obj, replace(mesh, mass=mass, shares=mass / mass.sum()), scene.k, pins)
+
+
+def voronoi_areas(rest: Points, triangles: Indices) -> Points:
+    """The mixed Voronoi area of each vertex, (n,) [m^2]; triangles (f, 3) without area give none."""
+    corners = rest[triangles]
+    edges = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)  # edge k lies opposite corner k
+    squared = np.einsum("fkx,fkx->fk", edges, edges)
+    doubled = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)[:, None]
+    dots = -np.einsum("fkx,fkx->fk", np.roll(edges, -1, axis=1), np.roll(edges, 1, axis=1))
+    flat = doubled == 0
+    nearest = squared * dots / np.where(flat, 1, doubled) / 8
+    share = np.roll(nearest, 1, axis=1) + np.roll(nearest, -1, axis=1)
+    obtuse = np.where(dots < 0, doubled / 4, doubled / 8)
+    share = np.where(np.any(dots < 0, axis=1, keepdims=True), obtuse, share)
+    share = np.where(flat, 0.0, share)
+    return np.bincount(triangles.ravel(), share.ravel(), minlength=len(rest)).astype(np.float64, copy=False)
+
+
+def _pins(one_based: list[int], n: int, path: Path) -> NDArray[np.int64]:
+    """Vertices from 0; refuses those that do not exist, and repetitions, which would double a penalty."""
+    seen: set[int] = set()
+    mistakes = []
+    for position, vertex in enumerate(one_based):
+        if not 1 <= vertex <= n:
+            mistakes.append((position, f"vertex {vertex} does not exist; vertices are counted from 1 to {n}"))
+        elif vertex in seen:
+            mistakes.append((position, f"vertex {vertex} is pinned twice; name each vertex once"))
+        seen.add(vertex)
+    if mistakes:
+        line = line_of(path, "b")
+        raise InputError([Mistake(problem, path, line, f"b.{at}") for at, problem in mistakes[:20]])
+    return np.array(one_based, np.int64) - 1

@@ -1,0 +1,174 @@
+"""A scene bound to a mesh size: what the step formula needs, and nothing that the scene does not call for."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.base.errors import InputError, Mistake
+from harness.scenes.effects.base import Contribution, Force, Pin, Steady, VelocityFilter
+from harness.scenes.mesh.base import Mesh
+from harness.scenes.motion import Motion
+from harness.scenes.spec import SceneSpec
+from harness.scenes.start import Rest
+from solvers.energies.springs import Springs
+from solvers.integrators import IMPLICIT_EULER, INTEGRATORS, Integrator
+from solvers.matrices import assemble
+from solvers.problem import NotPositiveDefinite, Pins, Positions, ProjectiveEnergy, System
+
+_LOG = logging.getLogger("springbench")
+AT_REST = Rest()
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is simulated.
+
+    mesh: at rest; start: how the start differs from that; system: what is factorised; load: the sum of the forces
+    that never change, (n, 3) [N], read-only; forces: those that change; filters: of the velocity;
+    pin_targets: (q, 3) [m], in the order of `system.pins`; moving: which of them move, and how;
+    velocity: of every vertex at the start [m/s], less the start's spin; integrator: its factor is the system's;
+    alternate: the same in every second step, where that is of another length.
+    """
+
+    mesh: Mesh
+    system: System
+    load: Positions
+    forces: tuple[Force, ...]
+    filters: tuple[VelocityFilter, ...]
+    pin_targets: Positions
+    velocity: tuple[float, float, float]
+    integrator: Integrator = IMPLICIT_EULER
+    moving: tuple[tuple[NDArray[np.int64], Motion], ...] = ()
+    start: Rest = AT_REST
+    alternate: Scene | None = None
+
+    def at(self, index: int) -> Scene:
+        """The scene in the step that follows step `index`."""
+        return self.alternate if self.alternate and index % 2 else self
+
+    def time(self, index: int) -> float:
+        """When step `index` ends, and the next begins [s]; 0 is the start."""
+        if not self.alternate:
+            return index * self.system.time_step
+        return (index + 1) // 2 * self.system.time_step + index // 2 * self.alternate.system.time_step
+
+    def pins_at(self, time: float) -> Positions:
+        """Where the pins want their vertices at a time [s], (q, 3) [m]."""
+        if not self.moving:
+            return self.pin_targets
+        targets = self.pin_targets.copy()
+        for rows, motion in self.moving:
+            targets[rows] = motion.moved(self.pin_targets[rows], time)
+        return targets
+
+    @cached_property
+    def springs(self) -> Springs:
+        """All springs that have stiffness: effect by effect, each in the mesh's order."""
+        return Springs.joined([energy for energy in self.system.energies if isinstance(energy, Springs)])
+
+
+def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Scene:
+    """Bind a scene to a mesh of one size, which means nothing to a mesh from a file, and to an integrator by name.
+
+    Raises InputError where the scene's parts do not fit together.
+    """
+    mesh = spec.mesh.build(size)
+    mass = _mass(spec, mesh)
+    parts = [_bound(spec, i, mesh, mass) for i in range(len(spec.effects))]
+    pins, targets, moving = _pins(parts)
+    energies = tuple(energy for part in parts for energy in part.energies)
+    energies += tuple(energy for part in parts for derive in part.derived for energy in derive(energies))
+    forces = [force for part in parts for force in part.forces]
+    load = np.zeros_like(mesh.rest)
+    for force in forces:
+        if isinstance(force, Steady):
+            load += force.force
+    load.flags.writeable = False
+    system = System(mass, spec.time_step, energies, pins, INTEGRATORS[integrator].factor)
+    _require_determined(system)
+    start = spec.start or AT_REST
+    _check(parts, start.positions(mesh.rest))
+    other = spec.alternate_time_step
+    return Scene(
+        mesh=mesh,
+        system=system,
+        load=load,
+        forces=tuple(force for force in forces if not isinstance(force, Steady)),
+        filters=tuple(one for part in parts for one in part.filters),
+        pin_targets=targets,
+        velocity=spec.velocity,
+        integrator=INTEGRATORS[integrator],
+        moving=moving,
+        start=start,
+        alternate=None if other in (None, spec.time_step) else build(spec.stepped(other), size, integrator),
+    )
+
+
+def _bound(spec: SceneSpec, i: int, mesh: Mesh, mass: NDArray[np.float64]) -> Contribution:
+    try:
+        bound = spec.effects[i].bind(mesh, mass, spec.time_step)
+    except InputError as error:
+        raise InputError([replace(mistake, key=f"effects[{i}]") for mistake in error.mistakes]) from error
+    if bound.empty:
+        _LOG.info("effects[%d] (%s) does nothing with these parameters and is left out", i, spec.effects[i].kind)
+    return bound
+
+
+def _check(parts: list[Contribution], start: Positions) -> None:
+    """Raise InputError where an effect does not fit the start (n, 3) [m] or the pins."""
+    pins = [pin for part in parts for pin in part.pins]
+    for i, part in enumerate(parts):
+        try:
+            for check in part.checks:
+                check(start, pins)
+        except InputError as error:
+            raise InputError([replace(mistake, key=f"effects[{i}]") for mistake in error.mistakes]) from error
+
+
+def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
+    if spec.mass is not None:
+        return spec.mass * mesh.shares
+    if mesh.mass is None:
+        raise InputError(Mistake("is missing; this mesh brings no masses, so give the total [kg]", key="mass"))
+    return mesh.mass
+
+
+def _require_determined(system: System) -> None:
+    """Raise InputError where nothing determines the position of a vertex without mass."""
+    if system.mass.all():
+        return
+    try:
+        assemble(system, [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)])
+    except NotPositiveDefinite as error:
+        raise InputError(Mistake(str(error), key="mesh")) from error
+
+
+def _pins(parts: list[Contribution]) -> tuple[Pins, Positions, tuple[tuple[NDArray[np.int64], Motion], ...]]:
+    """All pins by vertex, their targets, and which move; a vertex may be named twice if both times mean the same."""
+    pins: list[Pin] = [pin for part in parts for pin in part.pins]
+    if not pins:
+        return Pins(), np.empty((0, 3)), ()
+    vertices = np.concatenate([pin.vertices for pin in pins])
+    weight = np.concatenate([np.full(len(pin.vertices), pin.weight) for pin in pins])
+    targets = np.concatenate([pin.targets for pin in pins])
+    unique, first, back = np.unique(vertices, return_index=True, return_inverse=True)
+    motions = list(dict.fromkeys(pin.motion for pin in pins))
+    motion, owner = (
+        np.repeat(of, [len(pin.vertices) for pin in pins])
+        for of in ([motions.index(pin.motion) for pin in pins], [i for i, part in enumerate(parts) for _ in part.pins])
+    )
+    clash = (weight != weight[first][back]) | (targets != targets[first][back]).any(axis=1)
+    clash |= motion != motion[first][back]
+    if clash.any():
+        one, two = owner[first][back][clash][0], owner[clash][0]
+        raise InputError(
+            f"pins: vertex {vertices[clash][0]} is pinned twice, by effects[{one}] and effects[{two}], to different "
+            "places, with different weights or with different motions"
+        )
+    moving = ((np.flatnonzero(motion[first] == k), path) for k, path in enumerate(motions) if path is not None)
+    return Pins(unique, weight[first]), targets[first], tuple(moving)

@@ -1,0 +1,46 @@
+"""Attachments: springs of zero rest length from vertices to points that may move, E = sum_i k_i/2 |p_i - q_i(t)|^2."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import NonNegativeFloat
+
+from harness.base.errors import InputError
+from harness.base.model import Vector
+from harness.scenes.effects.base import Contribution
+from harness.scenes.mesh.base import Mesh
+from harness.scenes.motion import Motion
+from harness.scenes.selection import Selection
+from solvers.energies.attachments import Attachments as Energy
+from solvers.problem import Positions
+
+
+class Attachments(Selection):
+    """Ties every vertex that any of its selectors names to a point of its own, softly, unlike pins."""
+
+    kind: Literal["attachments"] = "attachments"
+    stiffness: NonNegativeFloat
+    """The stiffness of all the springs together [N/m], shared equally, so that it means the same at every mesh size."""
+    to: tuple[Vector, ...] | None = None
+    """The points [m]: one for all of the vertices, or one for each in their order; left out, their rest positions."""
+    motion: Motion | None = None
+    """Key frames that take the points along, all together."""
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        """The springs as one energy, none for a stiffness of zero; raises InputError where they do not fit the mesh."""
+        vertices = self.chosen(mesh, self.kind)
+        if self.to and len(self.to) not in (1, len(vertices)):
+            raise InputError(
+                f"attachments: to: came {len(self.to)} points for {len(vertices)} vertices; give one or all"
+            )
+        if not self.stiffness:
+            return Contribution()
+        fixed = np.broadcast_to(self.to, (len(vertices), 3)) if self.to else mesh.rest[vertices]
+        motion = self.motion
+
+        def points(time: float) -> Positions:
+            return motion.moved(fixed, time) if motion else fixed
+
+        k = np.full(len(vertices), self.stiffness / len(vertices))
+        return Contribution(energies=(Energy.of(vertices, k, points, len(mesh.rest)),))

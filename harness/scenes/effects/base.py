@@ -1,0 +1,112 @@
+"""The interface of an effect: what a scene declares, bound to a mesh, contributes to the step's formula.
+
+An absent effect is an empty tuple: no flag, no branch, no allocation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.scenes.mesh.base import Mesh
+from harness.scenes.motion import Motion
+from solvers.problem import Energy, Positions
+
+
+class Force(Protocol):
+    """An external force, folded into the right-hand side once a step."""
+
+    def __call__(self, p: Positions, v: Positions, t: float) -> Positions:
+        """The force [N], shape (n, 3), at positions p [m], velocities v [m/s] and time t [s] of the step's start."""
+        ...
+
+
+class VelocityFilter(Protocol):
+    """A change of the velocity at the start of a step."""
+
+    def __call__(self, v: Positions) -> Positions:
+        """The changed velocity [m/s], shape (n, 3)."""
+        ...
+
+
+class Derived(Protocol):
+    """Energies that follow from those of a scene's other effects."""
+
+    def __call__(self, energies: Sequence[Energy]) -> tuple[Energy, ...]:
+        """The energies to be added to these."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pin:
+    """Vertices (q,) held at targets (q, 3) [m] with a penalty weight [N/m]; an infinite weight is exact.
+
+    motion: takes the targets along, where they move.
+    """
+
+    vertices: NDArray[np.int64]
+    targets: Positions
+    weight: float
+    motion: Motion | None = None
+
+
+class Check(Protocol):
+    """What an effect asks of a scene's other parts."""
+
+    def __call__(self, start: Positions, pins: Sequence[Pin]) -> None:
+        """Raise InputError where the effect does not fit the start (n, 3) [m], or the pins."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contribution:
+    """The places that the step formula has, and no others."""
+
+    energies: tuple[Energy, ...] = field(default=())
+    forces: tuple[Force, ...] = field(default=())
+    pins: tuple[Pin, ...] = field(default=())
+    filters: tuple[VelocityFilter, ...] = field(default=())
+    derived: tuple[Derived, ...] = field(default=())
+    checks: tuple[Check, ...] = field(default=())
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing in any place."""
+        return not (self.energies or self.forces or self.pins or self.filters or self.derived)
+
+
+class Effect(Protocol):
+    """A pydantic model with a literal `kind`."""
+
+    @property
+    def kind(self) -> str:
+        """The effect's name in `harness.scenes.effects.table`."""
+        ...
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        """What the effect contributes on this mesh with these vertex masses [kg] and dt [s], once a scene.
+
+        Raises InputError when the effect does not fit the mesh.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Steady:
+    """A force (n, 3) [N] that never changes; a scene adds all of these up once."""
+
+    force: Positions
+
+    def __call__(self, p: Positions, v: Positions, t: float) -> Positions:
+        """The same force at all times."""
+        return self.force
+
+
+def steady(force: Positions) -> tuple[Steady, ...]:
+    """A force (n, 3) [N] that never changes; none at all where it is zero everywhere."""
+    force.flags.writeable = False
+    return (Steady(force),) if force.any() else ()

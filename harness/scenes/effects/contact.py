@@ -1,0 +1,103 @@
+"""Contact with obstacles, and Coulomb friction; vertices meet obstacles, not each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
+
+from harness.base.errors import InputError
+from harness.base.model import Model
+from harness.scenes.effects.base import Contribution, Pin
+from harness.scenes.mesh.base import Mesh
+from harness.scenes.obstacles import AnyObstacle
+from solvers.contact.energy import Contact as Energy
+from solvers.matrices import assemble
+from solvers.problem import Energy as AnyEnergy
+from solvers.problem import Pins, Positions, ProjectiveEnergy, System
+
+_SAFETY = 4.0
+"""How much stiffer contact is than one collision at full speed needs: neighbours that are stopped one after another
+pull as well."""
+
+_MARGIN = 0.1
+"""How far forces alone may bring a vertex in one step, as a part of the mesh's size."""
+
+
+class Contact(Model):
+    """Keeps the mesh's vertices out of obstacles: what crosses one within a step, however thin, is stopped too.
+
+    The stiffness k of contact follows from the depth tolerance. A vertex that arrives with the speed v ends at most
+    v dt Q_ii / k deep, with Q_ii all that inertia and springs resist with, so k_i = 4 Q_ii max(1, v dt / tolerance).
+    """
+
+    kind: Literal["contact"] = "contact"
+    obstacles: tuple[AnyObstacle, ...] = Field(min_length=1)
+    """What vertices are kept out of."""
+    thickness: Annotated[PositiveFloat, Field(le=1e9)] = 0.005
+    """How far from an obstacle's surface vertices stay [m]; shorter than every spring at rest."""
+    friction: NonNegativeFloat = 0.0
+    """Coulomb's coefficient mu, the same at rest and in motion."""
+    tolerance: PositiveFloat | None = None
+    """How much nearer than `thickness` vertices may end a step [m]; a tenth of it if left out."""
+    speed: PositiveFloat = 10.0
+    """The largest speed [m/s] at which the tolerance is kept."""
+    creep: PositiveFloat = 2e-7
+    """How far a vertex that sticks may creep in a step, at most, as a part of the mean spacing."""
+
+    @model_validator(mode="after")
+    def _within(self) -> Contact:
+        if not self.depth < self.thickness:
+            raise ValueError(f"the tolerance of {self.depth:g} m should be less than the thickness")
+        return self
+
+    @property
+    def depth(self) -> float:
+        """The tolerance [m]."""
+        return self.thickness / 10.0 if self.tolerance is None else self.tolerance
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        """The contact as one energy, its stiffness by the other effects'; raises InputError for a mesh too fine."""
+        lengths = mesh.rest_lengths
+        if len(lengths) and not self.thickness < lengths.min():
+            raise InputError(
+                f"contact: came a thickness of {self.thickness:g} m, which is not below the shortest of the springs "
+                f"at rest, {lengths.min():.3g} m; take a smaller thickness, or a coarser mesh"
+            )
+        obstacles = tuple(one.obstacle() for one in self.obstacles)
+
+        def derived(energies: Sequence[AnyEnergy]) -> tuple[AnyEnergy, ...]:
+            projective = [energy for energy in energies if isinstance(energy, ProjectiveEnergy)]
+            everything = np.arange(len(mass))
+            held = System(mass, time_step, pins=Pins(everything, np.full(len(mass), np.inf)))
+            resists = np.asarray(assemble(held, projective).diagonal(), np.float64)
+            stiffness = _SAFETY * max(1.0, self.speed * time_step / self.depth) * resists
+            slip, margin = self.creep * mesh.spacing, _MARGIN * mesh.size
+            return (Energy(obstacles, self.thickness, self.friction, stiffness, slip, margin, time_step),)
+
+        return Contribution(derived=(derived,), checks=(self._check,))
+
+    def _check(self, start: Positions, pins: Sequence[Pin]) -> None:
+        """Raise InputError for pins or a start (n, 3) [m] inside an obstacle."""
+        for k, given in enumerate(self.obstacles):
+            obstacle, moves = given.obstacle(), given.motion.times if given.motion else ()
+            for pin in pins:
+                for time in sorted({0.0, *moves, *(pin.motion.times if pin.motion else ())}):
+                    targets = pin.motion.moved(pin.targets, time) if pin.motion else pin.targets
+                    self._refuse(
+                        f"pins hold vertex {{}} at {time:g} s", k, obstacle.distance(targets, time), pin.vertices
+                    )
+            self._refuse("vertex {} starts", k, obstacle.distance(start, 0.0), np.arange(len(start)))
+
+    def _refuse(self, who: str, k: int, distance: NDArray[np.float64], vertices: NDArray[np.int64]) -> None:
+        near = np.flatnonzero(distance < self.thickness - self.depth)
+        if len(near):
+            worst = near[distance[near].argmin()]
+            raise InputError(
+                f"contact: {who.format(vertices[worst])} {distance[worst]:.3g} m from the surface of obstacles[{k}] "
+                f"({self.obstacles[k].kind}), which is nearer than the thickness of {self.thickness:g} m; move one of "
+                "them" + (" (negative distances are inside)" if distance[worst] < 0.0 else "")
+            )

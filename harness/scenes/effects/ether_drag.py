@@ -1,0 +1,32 @@
+"""Ether drag (Liu et al. 2013, section 5): before each step the velocity decays, v <- exp(-c dt) v."""
+
+from math import exp
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import NonNegativeFloat
+
+from harness.base.model import Model
+from harness.scenes.effects.base import Contribution
+from harness.scenes.mesh.base import Mesh
+from solvers.problem import Positions
+
+
+class EtherDrag(Model):
+    """Damping of the velocity relative to space at rest, the same at any time step."""
+
+    kind: Literal["ether-drag"] = "ether-drag"
+    rate: NonNegativeFloat
+    """The rate of decay c [1/s]; the paper's factor a step is exp(-c dt)."""
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        """A filter that scales the velocity; none at all for a rate of zero."""
+        if self.rate == 0.0:
+            return Contribution()
+        kept = exp(-self.rate * time_step)
+
+        def decay(v: Positions) -> Positions:
+            return kept * v
+
+        return Contribution(filters=(decay,))

@@ -1,0 +1,54 @@
+"""Gas: a fixed amount of it in a closed mesh, E = -p0 V0 ln(V/V0)."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import NonNegativeFloat
+
+from harness.base.errors import InputError
+from harness.base.model import Model
+from harness.scenes.effects.base import Contribution
+from harness.scenes.mesh.base import Mesh
+from solvers.energies import gas
+
+
+class Gas(Model):
+    """Gas at constant temperature in a closed mesh, with nothing outside: p V stays what it is at rest."""
+
+    kind: Literal["gas"] = "gas"
+    pressure: NonNegativeFloat
+    """The pressure p0 in the rest shape, above that outside [Pa]."""
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        """The energy, none for a pressure of zero; raises InputError for a mesh that is not closed."""
+        if not self.pressure:
+            return Contribution()
+        triangles = mesh.triangles
+        if not len(triangles):
+            raise InputError("gas: needs a closed surface of triangles, and this mesh has no triangles")
+        sides = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
+        _check_closed(sides, len(mesh.rest))
+        volume = gas.Gas(triangles, self.pressure, 1.0).volume_at(mesh.rest)
+        if not abs(volume) > 1e-9 * mesh.size**3:
+            raise InputError(f"gas: the mesh encloses no volume (came {volume:.3g} m^3)")
+        outwards = triangles if volume > 0.0 else triangles[:, ::-1]
+        return Contribution(energies=(gas.Gas(outwards, self.pressure, abs(volume)),))
+
+
+def _check_closed(sides: NDArray[np.int64], n: int) -> None:
+    """Raise InputError unless each side (3 f, 2) of a triangle is that of one other, which goes along it backwards."""
+    forth, back = sides[:, 0] * n + sides[:, 1], sides[:, 1] * n + sides[:, 0]
+    code, count = np.unique(forth, return_counts=True)
+    if (count > 1).any():
+        i, j = divmod(int(code[count > 1][0]), n)
+        raise InputError(
+            f"gas: two triangles go the same way along the edge from vertex {i} to {j}; let all triangles face outwards"
+        )
+    alone = ~np.isin(forth, back)
+    if alone.any():
+        i, j = sides[alone][0].tolist()
+        raise InputError(
+            f"gas: needs a closed mesh; {alone.sum()} edges belong to one triangle only, the first from vertex {i} to "
+            f"{j}; close the holes, join vertices that lie in one place"
+        )

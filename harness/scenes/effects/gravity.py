@@ -1,0 +1,22 @@
+"""Gravity: f_i = m_i g."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.base.model import Model, Vector
+from harness.scenes.effects.base import Contribution, steady
+from harness.scenes.mesh.base import Mesh
+
+
+class Gravity(Model):
+    """Weight on every vertex: its mass times one acceleration."""
+
+    kind: Literal["gravity"] = "gravity"
+    acceleration: Vector = (0.0, -9.81, 0.0)
+    """The acceleration of gravity [m/s^2]."""
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        """m g on every vertex."""
+        return Contribution(forces=steady(mass[:, None] * np.array(self.acceleration)))

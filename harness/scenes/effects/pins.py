@@ -1,0 +1,29 @@
+"""Pins: chosen vertices are held at their rest positions, which may move, by a penalty w/2 |p - q|^2 or exactly."""
+
+from math import inf
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PositiveFloat
+
+from harness.scenes.effects.base import Contribution, Pin
+from harness.scenes.mesh.base import Mesh
+from harness.scenes.motion import Motion
+from harness.scenes.selection import Selection
+
+
+class Pins(Selection):
+    """Holds every vertex that any of its selectors names."""
+
+    kind: Literal["pins"] = "pins"
+    weight: PositiveFloat | Literal["exact"] = Field(default=1e10)
+    """The penalty's weight w [N/m], or `exact`: the vertices are no unknowns any more."""
+    motion: Motion | None = None
+    """Key frames that take the pinned vertices along, all together."""
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        """The chosen vertices at rest; raises InputError for parts and vertices that the mesh does not have."""
+        vertices = self.chosen(mesh, self.kind)
+        weight = inf if self.weight == "exact" else float(self.weight)
+        return Contribution(pins=(Pin(vertices, mesh.rest[vertices], weight, self.motion),))

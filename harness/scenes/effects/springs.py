@@ -1,0 +1,42 @@
+"""Springs: one linear spring for each of the mesh's, its stiffness by a rule of `harness.scenes.material`."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import NonNegativeFloat, PositiveInt
+
+from harness.base.model import Model
+from harness.scenes.effects.base import Contribution
+from harness.scenes.material import spring_stiffness
+from harness.scenes.mesh.base import Mesh
+from solvers.energies import springs
+
+
+class Springs(Model):
+    """Springs k/2 (length - rest length)^2 along the mesh's edges; those of no stiffness are left out."""
+
+    kind: Literal["springs"] = "springs"
+    rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
+    """What the numbers below mean when the mesh size changes. `continuum`: the material stays the same;
+    `fixed`: each spring has the stiffness given [N/m]; `liu2013`: stiffness in proportion to resolution,
+    given at the size `reference`."""
+    stretch: NonNegativeFloat
+    """Along the mesh's lines. Continuum: EA [N] for chains and trusses, [N/m] for cloth, [Pa] for solids."""
+    shear: NonNegativeFloat | None = None
+    """Across the mesh's cells, in the same unit; as `stretch` if left out."""
+    bend: NonNegativeFloat = 0.0
+    """From a vertex to the next but one. Continuum: bending stiffness [N m]; else [N/m]."""
+    reference: PositiveInt | None = None
+    """liu2013: the mesh size at which the stiffnesses above hold."""
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        """The springs as one energy; none at all where no spring has stiffness."""
+        shear = self.stretch if self.shear is None else self.shear
+        k = spring_stiffness(
+            mesh, rule=self.rule, stretch=self.stretch, shear=shear, bend=self.bend, reference=self.reference
+        )
+        stiff = np.flatnonzero(k)
+        if not len(stiff):
+            return Contribution()
+        return Contribution(energies=(springs.Springs.at_rest(mesh.rest, mesh.springs[stiff], k[stiff]),))

@@ -1,0 +1,47 @@
+"""Strain limits: springs that resist only beyond a shortest and a longest length (Bouaziz et al. 2014)."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
+
+from harness.base.model import Model
+from harness.scenes.effects.base import Contribution
+from harness.scenes.material import spring_stiffness
+from harness.scenes.mesh.base import Mesh
+from solvers.energies import strain_limits
+from solvers.energies.edges import rest_directions
+
+
+class StrainLimits(Model):
+    """Limits how far the mesh's springs along and across its cells stretch and shrink, with a stated stiffness."""
+
+    kind: Literal["strain-limits"] = "strain-limits"
+    longest: float = Field(default=1.1, ge=1.0, le=1e6)
+    """The largest length, as a multiple of the rest length."""
+    shortest: float = Field(default=0.0, ge=0.0, le=1.0)
+    """The smallest length, as a multiple of the rest length; 0 lets springs shrink freely."""
+    stiffness: NonNegativeFloat
+    """What a spring resists with beyond its limits, in the unit of the `stretch` of springs by the same rule."""
+    rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
+    """What the stiffness means when the mesh size changes, as for springs."""
+    reference: PositiveInt | None = None
+    """liu2013: the mesh size at which the stiffness holds."""
+
+    @model_validator(mode="after")
+    def _limits(self) -> "StrainLimits":
+        if self.shortest == self.longest:
+            raise ValueError("leave no length but one; use springs")
+        return self
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        """The limits as one energy; none at all for a stiffness of zero."""
+        s = self.stiffness
+        k = spring_stiffness(mesh, rule=self.rule, stretch=s, shear=s, bend=0.0, reference=self.reference)
+        edges = mesh.springs[k > 0.0]
+        if not len(edges):
+            return Contribution()
+        rest, direction = rest_directions(mesh.rest, edges)
+        limits = self.shortest * rest, self.longest * rest
+        return Contribution(energies=(strain_limits.StrainLimits(edges, k[k > 0.0], *limits, direction),))

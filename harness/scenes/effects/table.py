@@ -1,0 +1,18 @@
+"""The effects by name. A new one is one file and one line here; a scene imports only those that it names."""
+
+EFFECTS = {
+    "air-drag": "harness.scenes.effects.air_drag:AirDrag",
+    "attachments": "harness.scenes.effects.attachments:Attachments",
+    "bending": "harness.scenes.effects.bending:Bending",
+    "constant-force": "harness.scenes.effects.constant_force:ConstantForce",
+    "contact": "harness.scenes.effects.contact:Contact",
+    "dashpots": "harness.scenes.effects.dashpots:Dashpots",
+    "ether-drag": "harness.scenes.effects.ether_drag:EtherDrag",
+    "gas": "harness.scenes.effects.gas:Gas",
+    "gravity": "harness.scenes.effects.gravity:Gravity",
+    "pins": "harness.scenes.effects.pins:Pins",
+    "rayleigh": "harness.scenes.effects.rayleigh:Rayleigh",
+    "springs": "harness.scenes.effects.springs:Springs",
+    "strain-limits": "harness.scenes.effects.strain_limits:StrainLimits",
+    "wind": "harness.scenes.effects.wind:Wind",
+}

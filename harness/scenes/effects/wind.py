@@ -1,0 +1,183 @@
+"""Wind: a field of forces on the vertices, or of air that drags and lifts the triangles.
+
+On triangles (Keckeisen et al. 2004), by the air's velocity u relative to the triangle, its area A and its normal n on
+the side that the air leaves by, with the air's density rho:
+
+    f = rho/2 A |u| (n.u) (C_D u/|u| + C_L (n - (n.u) u/|u|^2))
+
+They are taken at the step's start. No triangle is given more than brings it to the speed of the air in one step,
+f dt <= m |u|: nothing else keeps light cloth in a storm stable. The field is one of
+
+    constant    the same everywhere and always
+    gusts       the constant one, and waves that it carries along (after Kraichnan 1970): each component varies by the
+                fraction `gustiness` of the mean's size (root mean square), at 16 frequencies around `frequency`
+    assignment  the University of Toronto assignment's, with t the simulated time [s], b the length of the diagonal of
+                the rest bounding box and phi = x / b + t at the current x:
+
+                    (3 + 1.5 (1 + cos 5 phi),  1 + cos(0.3 + phi),  sin phi)
+
+                (it adds its gravity of -9.8 newtons to the second component; here that is an effect of its own)
+
+in newtons, or in metres a second on triangles.
+"""
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, model_validator
+
+from harness.base.errors import InputError
+from harness.base.model import Model, Vector
+from harness.scenes.effects.base import Contribution, Force, steady
+from harness.scenes.mesh.base import Mesh
+from solvers.problem import Positions
+
+Field = Callable[[Positions, float], Positions]
+"""(places (k, 3) [m], time [s]) -> the field there, (k, 3) or (3,)."""
+
+_WAVES = 16
+
+
+class Wind(Model):
+    """A field that blows on the mesh."""
+
+    kind: Literal["wind"] = "wind"
+    field: Literal["constant", "gusts", "assignment"] = "constant"
+    """How the field varies: not at all, by random gusts, or by the assignment's, which travel along x."""
+    per: Literal["vertex", "share", "triangle"] = "share"
+    """What it acts on. `vertex`: the force acts on every vertex, as the assignment has it, so a finer mesh feels more
+    of it; `share`: it is the total, spread over the vertices as the mass is, the same at every mesh size; `triangle`:
+    the field is the air's velocity, which drags and lifts triangles."""
+    force: Vector = (1.0, 0.0, 0.0)
+    """The constant field and the gusts' mean, on vertices [N]."""
+    velocity: Vector = (1.0, 0.0, 0.0)
+    """The constant field and the gusts' mean, on triangles [m/s]; zero is air at rest, which drags."""
+    strength: float = 1.0
+    """A factor on the field; zero takes the wind away, and the drag with it."""
+    gustiness: NonNegativeFloat = 0.3
+    """gusts: by what fraction of the mean each component of the field varies."""
+    frequency: PositiveFloat = 1.0
+    """gusts: the middle of their frequencies [1/s], which reach from a quarter to four times of it."""
+    seed: NonNegativeInt = 0
+    """gusts: which of them; the same seed has the same at all times and mesh sizes."""
+    density: NonNegativeFloat = 1.2
+    """triangle: of the air [kg/m^3]."""
+    drag: NonNegativeFloat = 1.0
+    """triangle: the drag coefficient C_D."""
+    lift: NonNegativeFloat = 0.0
+    """triangle: the lift coefficient C_L."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> "Wind":
+        unused = {"triangle": {"force"}}.get(self.per, {"velocity", "density", "drag", "lift"})
+        if self.field != "gusts":
+            unused = unused | {"gustiness", "frequency", "seed"}
+        if self.field == "assignment":
+            unused = unused | {"force", "velocity"}
+        for key in sorted(unused & self.model_fields_set):
+            raise ValueError(f"`{key}` has no meaning for the field {self.field} per {self.per}; leave it out")
+        return self
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        """The constant field, (3,) [N] or [m/s], strength included."""
+        return self.strength * np.array(self.velocity if self.per == "triangle" else self.force)
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        """The field as one force, none at all for a strength of zero; raises InputError where triangles are missing."""
+        if not self.strength:
+            return Contribution()
+        if self.per == "triangle":
+            return Contribution(forces=_on_triangles(self, mesh, mass, time_step))
+        weight = np.ones(len(mass)) if self.per == "vertex" else mesh.shares
+        return Contribution(forces=_on_vertices(self, mesh, weight[:, None]))
+
+
+def _on_vertices(wind: Wind, mesh: Mesh, weight: NDArray[np.float64]) -> tuple[Force, ...]:
+    """The field times weights (n, 1)."""
+    if wind.field == "constant" or (wind.field == "gusts" and not wind.mean.any()):
+        return steady(weight * wind.mean)
+    field = _FIELDS[wind.field](wind, mesh)
+
+    def force(p: Positions, v: Positions, t: float) -> Positions:
+        return weight * field(p, t)
+
+    return (force,)
+
+
+def _on_triangles(wind: Wind, mesh: Mesh, mass: NDArray[np.float64], dt: float) -> tuple[Force, ...]:
+    triangles, field = mesh.triangles, _FIELDS[wind.field](wind, mesh)
+    if not len(triangles):
+        raise InputError("wind: per: triangle needs triangles, and this mesh has none; let it act per share")
+    if not wind.density or not (wind.drag or wind.lift):
+        return ()
+    limit = _masses(mesh, mass) / dt
+
+    def force(p: Positions, v: Positions, t: float) -> Positions:
+        a, b, c = (p[corner] for corner in triangles.T)
+        u = field((a + b + c) / 3.0, t) - v[triangles].mean(axis=1)
+        area = 0.5 * np.cross(b - a, c - a)  # times the normal
+        speed = np.linalg.norm(u, axis=1)
+        wide = np.einsum("ij,ij->i", area, u)  # the area that faces the air, times the speed
+        ahead = np.divide(u, speed[:, None], out=np.zeros_like(u), where=speed[:, None] > 0.0)
+        size = np.linalg.norm(area, axis=1)[:, None]
+        normal = np.sign(wide)[:, None] * np.divide(area, size, out=np.zeros_like(area), where=size > 0.0)
+        across = normal - np.einsum("ij,ij->i", normal, ahead)[:, None] * ahead
+        f = 0.5 * wind.density * (np.abs(wide) * speed)[:, None] * (wind.drag * ahead + wind.lift * across)
+        most, asked = limit * speed, np.linalg.norm(f, axis=1)
+        f *= np.divide(most, asked, out=np.ones_like(asked), where=asked > most)[:, None]
+        out = np.zeros_like(p)
+        for corner in triangles.T:
+            np.add.at(out, corner, f / 3.0)
+        return out
+
+    return (force,)
+
+
+def _masses(mesh: Mesh, mass: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The mass that moves with each triangle, (f,) [kg]: each vertex's is dealt out by the triangles' areas at rest."""
+    a, b, c = (mesh.rest[corner] for corner in mesh.triangles.T)
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    around = np.bincount(mesh.triangles.ravel(), np.repeat(area, 3), minlength=len(mass))
+    dealt = np.divide(mass, around, out=np.zeros_like(mass), where=around > 0.0)
+    return area * dealt[mesh.triangles].sum(axis=1)
+
+
+def _constant(wind: Wind, mesh: Mesh) -> Field:
+    return lambda x, t: wind.mean
+
+
+def _gusts(wind: Wind, mesh: Mesh) -> Field:
+    rng, mean = np.random.default_rng(wind.seed), wind.mean
+    size = float(np.linalg.norm(mean))
+    turns = 2.0 * np.pi * wind.frequency * np.exp(rng.uniform(np.log(0.25), np.log(4.0), _WAVES))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (_WAVES, 3))
+    height = wind.gustiness * size * (2.0 / _WAVES) ** 0.5  # a cosine's mean square is 1/2
+    # Air that moves carries its gusts along; a field of forces has no speed, and passes the mesh in a second.
+    carried = mean / size**2 if wind.per == "triangle" else mean / size / (mesh.size or 1.0)
+
+    def field(x: Positions, t: float) -> Positions:
+        late = (t - x @ carried)[:, None]
+        return mean + height * sum(np.cos(w * late + phi) for w, phi in zip(turns, phase, strict=True))
+
+    return field if size else _constant(wind, mesh)
+
+
+def _assignment(wind: Wind, mesh: Mesh) -> Field:
+    diagonal = mesh.size or 1.0
+
+    def field(x: Positions, t: float) -> Positions:
+        phi = x[:, 0] / diagonal + t
+        f = np.stack([3.0 + 1.5 * (1.0 + np.cos(5.0 * phi)), 1.0 + np.cos(0.3 + phi), np.sin(phi)], axis=1)
+        return wind.strength * f
+
+    return field
+
+
+_FIELDS: dict[str, Callable[[Wind, Mesh], Field]] = {
+    "assignment": _assignment,
+    "constant": _constant,
+    "gusts": _gusts,
+}

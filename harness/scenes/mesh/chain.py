@@ -1,0 +1,54 @@
+"""A chain: vertices on a straight line, a spring from each to the next."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import AfterValidator
+
+from harness.scenes.mesh.base import STRETCH, Mesh
+from harness.scenes.mesh.generator import Generator, Metres
+from harness.scenes.mesh.topology import assemble, by_length, offset_pairs
+
+
+def _not_zero(direction: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(direction):
+        raise ValueError("a direction needs a component that is not zero")
+    return direction
+
+
+class Chain(Generator):
+    """`size` vertices from the origin along `direction`, numbered along the line; so are the springs.
+
+    Parts: first, last, ends. Mass goes by length. Dimension 1: every spring is a piece of the same rope.
+    """
+
+    kind: Literal["chain"] = "chain"
+    length: Metres = 1.0
+    """From the first vertex to the last [m]."""
+    direction: Annotated[tuple[float, float, float], AfterValidator(_not_zero)] = (1.0, 0.0, 0.0)
+    """Where the chain points; its length does not matter."""
+
+    COUNTS: ClassVar[str] = "vertices along the chain"
+    SPRINGS: ClassVar[int] = 1
+
+    def count(self, size: int) -> int:
+        """See Generator."""
+        return size
+
+    def generate(self, size: int) -> Mesh:
+        """See Generator."""
+        direction = np.array(self.direction) / np.max(np.abs(self.direction))
+        direction /= np.linalg.norm(direction)
+        rest = np.linspace(0.0, self.length, size)[:, None] * direction
+        pairs = offset_pairs(np.arange(size), (1,))
+        return assemble(
+            rest=rest,
+            springs={STRETCH: pairs},
+            weights=by_length(rest, pairs),
+            dimension=1,
+            spacing=self.length / (size - 1),
+            resolution=size,
+            parts={"first": [0], "last": [size - 1], "ends": [0, size - 1]},
+        )

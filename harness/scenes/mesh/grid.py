@@ -1,0 +1,141 @@
+"""Rectangular sheets: a cloth on a square grid (Liu et al. 2013's curtain) and an open net of ropes."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
+from harness.scenes.mesh.generator import Generator, Metres, cells
+from harness.scenes.mesh.topology import Indices, Points, assemble, by_area, by_length, lattice_triangles, offset_pairs
+
+_DIAGONALS: dict[str, tuple[tuple[int, int], ...]] = {"none": (), "one": ((1, 1),), "both": ((1, 1), (1, -1))}
+
+
+class _Sheet(Generator):
+    """A rectangle, centred on the vertical axis x = z = 0; row 0 is its top."""
+
+    width: Metres = 1.0
+    """Along x [m]."""
+    height: Metres = 1.0
+    """From the top row to the bottom row [m]."""
+    plane: Literal["horizontal", "vertical"] = "horizontal"
+    """Lying at y = 0 with its top towards -z, or hanging from y = 0 in the plane z = 0."""
+
+    def _place(self, across: Points, down: Points) -> Points:
+        """Positions (n, 3) [m] from fractions of the width and of the height, (n,) each."""
+        x, zero = self.width * (across - 0.5), np.zeros_like(across)
+        if self.plane == "vertical":
+            return np.stack([x, -self.height * down, zero], axis=1)
+        return np.stack([x, zero, self.height * (down - 0.5)], axis=1)
+
+
+def _parts(top: Indices, bottom: Indices, left: Indices, right: Indices) -> dict[str, Indices]:
+    """The sides of a sheet, each in order along it, and what they make together."""
+    return {
+        "top": top,
+        "bottom": bottom,
+        "left": left,
+        "right": right,
+        "boundary": np.concatenate([top, bottom, left, right]),
+        "top_corners": top[[0, -1]],
+        "corners": np.concatenate([top[[0, -1]], bottom[[0, -1]]]),
+    }
+
+
+class Grid(_Sheet):
+    """A cloth of near-square cells, `size` vertices along its width, numbered row by row from the top.
+
+    Springs: along rows, along columns (STRETCH); the diagonals down to the right, then down to the left
+    (SHEAR); from a vertex to the next but one along rows, then along columns (BEND). 81 x 81 vertices with
+    one diagonal and skip-one springs have the 32,158 springs of the curtain of Liu et al. 2013.
+    Parts: top, bottom, left, right, boundary, corners, top_corners. Mass goes by area. Dimension 2.
+    """
+
+    kind: Literal["grid"] = "grid"
+    diagonals: Literal["none", "one", "both"] = "both"
+    """Diagonal springs in each cell, against shear."""
+    skip_one: bool = False
+    """Springs from a vertex to the next but one, against bending."""
+
+    COUNTS: ClassVar[str] = "vertices along its width"
+    SPRINGS: ClassVar[int] = 4
+
+    def count(self, size: int) -> int:
+        """See Generator."""
+        return size * self._rows(size)
+
+    def _rows(self, size: int) -> int:
+        return cells(self.height, self.width / (size - 1)) + 1
+
+    def generate(self, size: int) -> Mesh:
+        """See Generator."""
+        rows = self._rows(size)
+        index = np.arange(rows * size).reshape(rows, size)
+        down, across = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, size), indexing="ij")
+        rest = self._place(across.ravel(), down.ravel())
+        triangles = lattice_triangles(index)
+        return assemble(
+            rest=rest,
+            springs={
+                STRETCH: offset_pairs(index, (0, 1), (1, 0)),
+                SHEAR: offset_pairs(index, *_DIAGONALS[self.diagonals]),
+                BEND: offset_pairs(index, *(((0, 2), (2, 0)) if self.skip_one else ())),
+            },
+            triangles=triangles,
+            weights=by_area(rest, triangles),
+            dimension=2,
+            spacing=math.sqrt(self.width / (size - 1) * self.height / (rows - 1)),
+            resolution=size,
+            parts=_parts(index[0], index[-1], index[:, 0], index[:, -1]),
+        )
+
+
+class Net(_Sheet):
+    """A net of ropes: square meshes that stand on a corner, and a rope around; no triangles.
+
+    `size` knots along its top. Rows of `size` knots alternate with rows of `size - 1` knots half a mesh
+    lower; knots are numbered row by row. Springs, all STRETCH: from each knot of the short rows up
+    left, up right, down left, down right (one direction after another), then along top, bottom, left, right.
+    Parts: top, bottom, left, right, boundary, corners, top_corners. Mass goes by length. Dimension 2, since
+    a net with finer meshes is to stretch as much: its ropes are thinner.
+    """
+
+    kind: Literal["net"] = "net"
+
+    COUNTS: ClassVar[str] = "knots along its top"
+    SPRINGS: ClassVar[int] = 2
+
+    def count(self, size: int) -> int:
+        """See Generator."""
+        meshes = self._meshes(size)
+        return size * (meshes + 1) + (size - 1) * meshes
+
+    def _meshes(self, size: int) -> int:
+        """How many meshes are stacked from top to bottom."""
+        return cells(self.height, self.width / (size - 1))
+
+    def generate(self, size: int) -> Mesh:
+        """See Generator."""
+        meshes, period = self._meshes(size), 2 * size - 1
+        full = period * np.arange(meshes + 1)[:, None] + np.arange(size)
+        short = period * np.arange(meshes)[:, None] + np.arange(size, period)
+        rest = np.empty((self.count(size), 3))
+        for knots, shift in ((full, 0.0), (short, 0.5)):
+            down, across = np.indices(knots.shape) + shift
+            rest[knots.ravel()] = self._place(across.ravel() / (size - 1), down.ravel() / meshes)
+        ends = (full[:-1, :-1], full[:-1, 1:], full[1:, :-1], full[1:, 1:])
+        ropes = np.concatenate([np.stack([short.ravel(), end.ravel()], axis=1) for end in ends])
+        around = [full[0], full[-1], full[:, 0], full[:, -1]]
+        pairs = np.concatenate([ropes, *(offset_pairs(side, (1,)) for side in around)])
+        return assemble(
+            rest=rest,
+            springs={STRETCH: pairs},
+            weights=by_length(rest, pairs),
+            dimension=2,
+            spacing=0.5 * math.hypot(self.width / (size - 1), self.height / meshes),
+            resolution=size,
+            parts=_parts(*around),
+        )

@@ -1,0 +1,74 @@
+"""A spring network written out in the scene: vertices, springs and masses one by one."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, ValidationInfo, field_validator
+
+from harness.base.model import Model
+from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
+from harness.scenes.mesh.cells import MAX_COORDINATE
+from harness.scenes.mesh.topology import NO_TRIANGLES
+
+Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
+Pairs = tuple[tuple[NonNegativeInt, NonNegativeInt], ...]
+
+
+class Network(Model):
+    """Vertices, and springs between pairs of them; two vertices may be joined more than once. Dimension 1."""
+
+    kind: Literal["network"] = "network"
+    positions: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = Field(min_length=1)
+    """The rest position of each vertex [m]."""
+    springs: Pairs = ()
+    """The springs along the lines (stretch), as pairs of vertices counted from zero."""
+    shear: Pairs = ()
+    """The springs across cells."""
+    bend: Pairs = ()
+    """The springs from a vertex to the next but one."""
+    mass: tuple[NonNegativeFloat, ...] | None = None
+    """The mass of each vertex [kg]; where left out, all carry the same share of the scene's."""
+
+    @field_validator("springs", "shear", "bend")
+    @classmethod
+    def _join_vertices(cls, pairs: Pairs, info: ValidationInfo) -> Pairs:
+        n = len(info.data.get("positions", ())) or np.inf  # refused positions are told of by themselves
+        for k, (i, j) in enumerate(pairs):
+            if i == j:
+                raise ValueError(f"spring {k} joins the vertex {i} to itself; remove it or name another vertex")
+            if max(i, j) >= n:
+                raise ValueError(f"spring {k} names the vertex {max(i, j)}; the vertices are 0 to {n - 1}")
+        return pairs
+
+    @field_validator("mass")
+    @classmethod
+    def _one_each(cls, mass: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
+        n = len(info.data.get("positions", ()))
+        if mass is not None and n and len(mass) != n:
+            raise ValueError(f"has {len(mass)} masses for {n} vertices; give each vertex one")
+        if mass is not None and not any(mass):
+            raise ValueError("is zero at every vertex; give some vertex a mass")
+        return mass
+
+    def build(self, size: int = 0) -> Mesh:
+        """The network as it stands, whatever the size."""
+        rest = np.array(self.positions, float)
+        mass = None if self.mass is None else np.array(self.mass, float)
+        families = {STRETCH: self.springs, SHEAR: self.shear, BEND: self.bend}
+        springs = np.concatenate([np.array(pairs, np.int64).reshape(-1, 2) for pairs in families.values()])
+        ends = np.cumsum([0, *map(len, families.values())]).tolist()
+        i, j = springs.T
+        lengths = np.linalg.norm(rest[i] - rest[j], axis=1)
+        return Mesh(
+            rest=rest,
+            springs=springs,
+            families={name: np.arange(a, b) for name, (a, b) in zip(families, pairwise(ends), strict=True)},
+            triangles=NO_TRIANGLES,
+            shares=np.full(len(rest), 1.0 / len(rest)) if mass is None else mass / mass.sum(),
+            dimension=1,
+            spacing=float(np.median(lengths[lengths > 0.0])) if lengths.any() else 1.0,
+            mass=mass,
+        )

@@ -1,0 +1,139 @@
+"""A strict reader of Wavefront OBJ: vertices, polygons of any number of corners, lines.
+
+Vertex tokens are `v`, `v/vt`, `v//vn` or `v/vt/vn`, counted from 1, or from -1 backwards from the last
+vertex read so far. An `f` line of two vertices is a spring (scenes of the Toronto assignment use it so), an
+`l` line is a polyline. Texture, normals, groups and materials are passed over; anything else is a mistake.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from harness.base.errors import InputError, Mistake
+from harness.scenes.mesh.cells import MAX_COORDINATE, Cells, check_file
+from harness.scenes.mesh.generator import MAX_VERTICES
+from harness.scenes.mesh.topology import NO_PAIRS
+
+_PASSED_OVER = {"vt", "vn", "vp", "p", "g", "o", "s", "mg", "mtllib", "usemtl", "maplib", "usemap", "lod"}
+_PASSED_OVER |= {"bevel", "c_interp", "d_interp", "shadow_obj", "trace_obj"}
+_TOKEN = re.compile(r"([+-]?[0-9]+)(/[+-]?[0-9]*(/[+-]?[0-9]*)?)?")
+_MOST_MISTAKES = 20
+
+
+def read_obj(path: Path) -> Cells:
+    """The points, polygons (`f`) and segments (`l`) of an OBJ file, in file order.
+
+    Raises InputError, with the lines, for what cannot be read, numbers that are not finite, indices out of
+    range, faces that name a vertex twice, and files that are empty or too large.
+    """
+    check_file(path)
+    reader = _Reader(path)
+    try:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            for number, text in enumerate(file, 1):
+                reader.read(number, text)
+                if len(reader.mistakes) >= _MOST_MISTAKES:
+                    break
+                if len(reader.points) > MAX_VERTICES:
+                    raise InputError(Mistake(f"has more than {MAX_VERTICES:,} vertices", path, number))
+    except OSError as error:
+        raise InputError(Mistake(f"cannot be read ({error.strerror})", path)) from None
+    return reader.cells()
+
+
+class _Reader:
+    """Collects lines; all mistakes are reported together at the end."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.points: list[tuple[float, float, float]] = []
+        self.polygons: dict[int, list[list[int]]] = defaultdict(list)
+        self.lines: dict[int, list[int]] = defaultdict(list)
+        self.segments: list[list[int]] = []
+        self.segment_lines: list[int] = []
+        self.mistakes: list[Mistake] = []
+
+    def read(self, number: int, text: str) -> None:
+        """Take in one line."""
+        keyword, *words = text.split("#", 1)[0].split() or [""]
+        try:
+            if keyword == "v":
+                self.points.append(_point(words))
+            elif keyword == "f":
+                corners = self._corners(words)
+                if len(set(corners)) < len(corners):
+                    raise ValueError("a face names a vertex twice; each corner must be another vertex")
+                self.polygons[len(corners)].append(corners)
+                self.lines[len(corners)].append(number)
+            elif keyword == "l":
+                corners = self._corners(words)
+                segments = [[a, b] for a, b in pairwise(corners)]
+                if any(a == b for a, b in segments):
+                    raise ValueError("a line joins a vertex to itself; its ends must differ")
+                self.segments += segments
+                self.segment_lines += [number] * len(segments)
+            elif keyword and keyword not in _PASSED_OVER:
+                raise ValueError(f"unknown keyword {keyword[:40]!r}; wanted v, f, l or what OBJ files may carry")
+        except ValueError as error:
+            self.mistakes.append(Mistake(str(error), self.path, number))
+
+    def _corners(self, words: list[str]) -> list[int]:
+        """Zero-based vertices; whether they exist is known only at the end of the file."""
+        if len(words) < 2:
+            raise ValueError(f"a face or line needs at least 2 vertices, came {len(words)}")
+        corners = []
+        for word in words:
+            match = _TOKEN.fullmatch(word)
+            index = int(match[1][:20]) if match else 0
+            if not index:
+                raise ValueError(f"{word[:40]!r} is no vertex; wanted v, v/vt, v//vn or v/vt/vn, counted from 1")
+            corners.append(index - 1 if index > 0 else len(self.points) + index)
+            if corners[-1] < 0:
+                raise ValueError(f"vertex {index} lies before the first; only {len(self.points)} came so far")
+        return corners
+
+    def cells(self) -> Cells:
+        """What was read; raises InputError with all mistakes."""
+        if not self.mistakes and not self.points:
+            self.mistakes.append(Mistake("has no vertices (v lines)", self.path))
+        if not self.mistakes:
+            for corners, polygons in self.polygons.items():
+                self._check_range(polygons, self.lines[corners])
+            self._check_range(self.segments, self.segment_lines)
+        if self.mistakes:
+            raise InputError(sorted(self.mistakes, key=lambda m: m.line or 0)[:_MOST_MISTAKES])
+        return Cells(
+            points=np.array(self.points, np.float64),
+            polygons={k: np.array(self.polygons[k], np.int64) for k in sorted(self.polygons)},
+            segments=np.array(self.segments, np.int64) if self.segments else NO_PAIRS,
+        )
+
+    def _check_range(self, groups: list[list[int]], lines: list[int]) -> None:
+        n = len(self.points)
+        for corners, line in zip(groups, lines, strict=True):
+            if max(corners) >= n:
+                problem = f"vertex {max(corners) + 1} does not exist; the file has {n} vertices, counted from 1"
+                self.mistakes.append(Mistake(problem, self.path, line))
+
+
+def _point(words: list[str]) -> tuple[float, float, float]:
+    """The position on a `v` line; a weight or a colour may follow it."""
+    if not 3 <= len(words) <= 7:
+        raise ValueError(f"a vertex needs 3 coordinates (and at most a weight and a colour), came {len(words)}")
+    x, y, z = map(_coordinate, words[:3])
+    return x, y, z
+
+
+def _coordinate(word: str) -> float:
+    try:
+        value = float(word.replace("_", "?"))  # Python would read 1_0 as ten
+    except ValueError:
+        raise ValueError(f"{word[:40]!r} is no number; wanted a coordinate in metres") from None
+    if not abs(value) <= MAX_COORDINATE:
+        raise ValueError(f"{word[:40]!r} is no position; wanted a finite number up to {MAX_COORDINATE:g} m")
+    return value

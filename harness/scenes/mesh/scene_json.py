@@ -1,0 +1,74 @@
+"""The JSON scenes of the University of Toronto mass-spring assignment, as they are written."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, ValidationError
+
+from harness.base.errors import InputError, Mistake, did_you_mean
+from harness.base.model import Model
+from harness.scenes.mesh.cells import check_file
+
+
+class SceneJson(Model):
+    """The keys of a scene. `b` counts vertices from 1."""
+
+    obj: str = Field(min_length=1)
+    """The OBJ file, relative to the JSON file."""
+    k: float = Field(ge=0)
+    """Stiffness of every spring [N/m]."""
+    m: float | None = Field(default=None, gt=0)
+    """Mass of every vertex [kg]; if absent, the faces are weighed at density 1."""
+    b: list[int]
+    """Pinned vertices, each once."""
+    png: str | None = None
+    """A texture, for viewers."""
+
+
+def read_scene_json(path: Path) -> SceneJson:
+    """The scene that a JSON file describes; raises InputError with file, line and key of each mistake."""
+    check_file(path)
+    try:
+        data = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_once)
+    except json.JSONDecodeError as error:
+        raise InputError(Mistake(f"is no JSON: {error.msg}", path, error.lineno)) from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(Mistake(f"cannot be read as JSON: {error}", path)) from None
+    if not isinstance(data, dict):
+        problem = f"a scene is a JSON object with the keys obj, k and b, came a {type(data).__name__}"
+        raise InputError(Mistake(problem, path))
+    try:
+        return SceneJson.model_validate(data, strict=True)
+    except ValidationError as error:
+        raise InputError([_mistake(path, detail) for detail in error.errors()[:20]]) from None
+
+
+def line_of(path: Path, key: str) -> int | None:
+    """The line of a key in a file of one flat JSON object, for messages."""
+    text = path.read_text(encoding="utf-8-sig")
+    match = re.search(rf'"{re.escape(key)}"\s*:', text)
+    return text.count("\n", 0, match.start()) + 1 if match else None
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object whose keys differ."""
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        twice = next(key for k, (key, _) in enumerate(pairs) if key in dict(pairs[:k]))
+        raise ValueError(f"the key {twice!r} comes twice")
+    return result
+
+
+def _mistake(path: Path, detail: Any) -> Mistake:
+    """A pydantic error as a mistake."""
+    key = str(detail["loc"][0])
+    problem = f"{detail['msg']}, came {str(detail['input'])[:80]!r}"
+    if detail["type"] == "extra_forbidden":
+        problem = f"unknown key; wanted {did_you_mean(key, SceneJson.model_fields)}"
+    elif detail["type"] == "missing":
+        problem = f"is missing: {SceneJson.model_fields[key].description}"
+    return Mistake(problem, path, line_of(path, key), ".".join(map(str, detail["loc"])))

@@ -1,0 +1,133 @@
+"""Solid bodies: a truss tower and a soft block."""
+
+from __future__ import annotations
+
+import math
+from functools import reduce
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from harness.scenes.mesh.base import SHEAR, STRETCH, Mesh
+from harness.scenes.mesh.generator import Generator, Metres, cells
+from harness.scenes.mesh.topology import Points, assemble, box_parts, by_length, lattice_triangles, offset_pairs
+
+
+class Tower(Generator):
+    """A truss tower of square, tapering cross-section on the ground y = 0, `size` storeys high.
+
+    Vertices are numbered ring by ring from the base, four a ring, counter-clockwise seen from above.
+    Members: rings, then legs (STRETCH); both diagonals of each face, then one diagonal across each ring
+    (SHEAR). Members are bars, hence dimension 1 (stiffness EA / length). No triangles: wind blows through a
+    truss. Parts: base, top. Mass goes by length.
+    """
+
+    kind: Literal["tower"] = "tower"
+    height: Metres = 3.0
+    """From the base to the top [m]."""
+    base_width: Metres = 1.0
+    """Side of the base [m]."""
+    top_width: Metres = 0.4
+    """Side of the top [m]."""
+
+    SMALLEST: ClassVar[int] = 1
+    COUNTS: ClassVar[str] = "storeys"
+    SPRINGS: ClassVar[int] = 4
+
+    def count(self, size: int) -> int:
+        """See Generator."""
+        return 4 * (size + 1)
+
+    def generate(self, size: int) -> Mesh:
+        """See Generator."""
+        index = np.arange(4 * (size + 1)).reshape(size + 1, 4)
+        closed = np.column_stack([index, index[:, 0]])
+        up = np.linspace(0, 1, size + 1)[:, None]
+        half = (self.base_width + (self.top_width - self.base_width) * up) / 2
+        x, y, z = np.broadcast_arrays(half * [1, 1, -1, -1], self.height * up, half * [1, -1, -1, 1])
+        rest = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+        springs = {
+            STRETCH: np.concatenate([offset_pairs(closed, (0, 1)), offset_pairs(index, (1, 0))]),
+            SHEAR: np.concatenate([offset_pairs(closed, (1, 1), (1, -1)), index[:, [0, 2]]]),
+        }
+        members = np.concatenate([*springs.values()])
+        return assemble(
+            rest=rest,
+            springs=springs,
+            weights=by_length(rest, members),
+            dimension=1,
+            spacing=float(np.mean(np.linalg.norm(rest[members[:, 0]] - rest[members[:, 1]], axis=1))),
+            resolution=size,
+            parts={"base": index[0], "top": index[-1]},
+        )
+
+
+_FACES = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1), (0, 1, 1), (0, 1, -1))
+_DIAGONALS: dict[str, tuple[tuple[int, int, int], ...]] = {
+    "one": _FACES[::2],
+    "all": (*_FACES, (1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)),
+}
+
+
+class Block(Generator):
+    """A soft block of near-cubic cells on the ground y = 0, `size` vertices along its longest side.
+
+    Vertices are numbered with z fastest and x slowest. Springs: along x, y, z (STRETCH); the diagonals of
+    the faces in x-y, x-z and y-z, then the four diagonals through each cell (SHEAR). Triangles: the surface,
+    facing outwards. Parts: left, right, bottom, top, back, front, corners. Mass goes by the volume of the
+    cells. Dimension 3.
+    """
+
+    kind: Literal["block"] = "block"
+    length: Metres = 1.0
+    """Along x [m]."""
+    height: Metres = 0.5
+    """Along y [m]."""
+    depth: Metres = 0.5
+    """Along z [m]."""
+    diagonals: Literal["one", "all"] = "all"
+    """Diagonal springs: one on each face, which is just enough to be rigid, or all on faces and through cells."""
+
+    COUNTS: ClassVar[str] = "vertices along its longest side"
+    SPRINGS: ClassVar[int] = 12
+
+    def count(self, size: int) -> int:
+        """See Generator."""
+        return math.prod(self._shape(size))
+
+    def _sides(self) -> tuple[float, float, float]:
+        return self.length, self.height, self.depth
+
+    def _shape(self, size: int) -> tuple[int, int, int]:
+        """Vertices along x, y and z."""
+        spacing = max(self._sides()) / (size - 1)
+        x, y, z = (cells(side, spacing) + 1 for side in self._sides())
+        return x, y, z
+
+    def generate(self, size: int) -> Mesh:
+        """See Generator."""
+        shape = self._shape(size)
+        index = np.arange(math.prod(shape)).reshape(shape)
+        along = [np.linspace(0, 1, n) for n in shape]
+        x, y, z = (side * axis for side, axis in zip(self._sides(), along, strict=True))
+        grid = np.meshgrid(x - self.length / 2, y, z - self.depth / 2, indexing="ij")
+        rest = np.stack([axis.ravel() for axis in grid], axis=1)
+        surface = (index[0].T, index[-1], index[:, 0], index[:, -1].T, index[:, :, 0].T, index[:, :, -1])
+        return assemble(
+            rest=rest,
+            springs={
+                STRETCH: offset_pairs(index, (1, 0, 0), (0, 1, 0), (0, 0, 1)),
+                SHEAR: offset_pairs(index, *_DIAGONALS[self.diagonals]),
+            },
+            triangles=np.concatenate([lattice_triangles(side) for side in surface]),
+            weights=reduce(np.multiply.outer, map(_owned, shape)).ravel(),
+            dimension=3,
+            spacing=math.prod(side / (n - 1) for side, n in zip(self._sides(), shape, strict=True)) ** (1 / 3),
+            resolution=size,
+            parts={**box_parts(rest), "corners": index[:: 1 - shape[0], :: 1 - shape[1], :: 1 - shape[2]]},
+        )
+
+
+def _owned(n: int) -> Points:
+    """How much of the cells beside it each vertex on a line owns; the product over the axes is its volume."""
+    return np.where((np.arange(n) == 0) | (np.arange(n) == n - 1), 0.5, 1.0)

@@ -1,0 +1,46 @@
+"""A star: a hub, and springs from it to vertices on a circle around it."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from harness.scenes.mesh.base import STRETCH, Mesh
+from harness.scenes.mesh.generator import Generator, Metres
+from harness.scenes.mesh.topology import assemble, by_length
+
+
+class Star(Generator):
+    """The hub, vertex 0, in the origin, and `size` vertices on a level circle; a spring from the hub to each.
+
+    Parts: hub, rim. Mass goes by length, so that the hub has half of it. Dimension 1.
+    """
+
+    kind: Literal["star"] = "star"
+    radius: Metres = 1.0
+    """Of the circle [m]."""
+
+    COUNTS: ClassVar[str] = "vertices around the hub"
+    SPRINGS: ClassVar[int] = 1
+
+    def count(self, size: int) -> int:
+        """See Generator."""
+        return size + 1
+
+    def generate(self, size: int) -> Mesh:
+        """See Generator."""
+        angle = 2.0 * np.pi * np.arange(size) / size
+        circle = self.radius * np.stack([np.cos(angle), np.zeros(size), np.sin(angle)], axis=1)
+        rest = np.concatenate([np.zeros((1, 3)), circle])
+        rim = np.arange(1, size + 1)
+        pairs = np.stack([np.zeros(size, np.int64), rim], axis=1)
+        return assemble(
+            rest=rest,
+            springs={STRETCH: pairs},
+            weights=by_length(rest, pairs),
+            dimension=1,
+            spacing=self.radius,
+            resolution=size,
+            parts={"hub": [0], "rim": rim},
+        )

@@ -1,0 +1,14 @@
+"""The kinds of mesh that a scene may name, as `module:Class`, so that a run imports the one it uses."""
+
+MESHES: dict[str, str] = {
+    "chain": "harness.scenes.mesh.chain:Chain",
+    "grid": "harness.scenes.mesh.grid:Grid",
+    "net": "harness.scenes.mesh.grid:Net",
+    "skirt": "harness.scenes.mesh.surfaces:Skirt",
+    "balloon": "harness.scenes.mesh.surfaces:Balloon",
+    "tower": "harness.scenes.mesh.solids:Tower",
+    "block": "harness.scenes.mesh.solids:Block",
+    "star": "harness.scenes.mesh.star:Star",
+    "network": "harness.scenes.mesh.network:Network",
+    "file": "harness.scenes.mesh.files:File",
+}

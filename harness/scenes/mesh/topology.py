@@ -1,0 +1,132 @@
+"""What the meshes are put together from: pairs on lattices and polygons, triangles, lumped weights, parts.
+
+Vertices are numbered through index arrays: `index[r, c]` is the vertex in row r and column c of a lattice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
+
+Points = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+NO_PAIRS: Indices = np.empty((0, 2), np.int64)
+NO_TRIANGLES: Indices = np.empty((0, 3), np.int64)
+
+
+def offset_pairs(index: Indices, *offsets: tuple[int, ...]) -> Indices:
+    """The pairs (v, v + offset) of a lattice, (k, 2): offset by offset, each in the order of v."""
+    pairs = [NO_PAIRS]
+    for offset in offsets:
+        steps = list(zip(offset, index.shape, strict=True))
+        first = index[tuple(slice(max(0, -o), n - max(0, o)) for o, n in steps)]
+        second = index[tuple(slice(max(0, o), n - max(0, -o)) for o, n in steps)]
+        pairs.append(np.stack([first.ravel(), second.ravel()], axis=1))
+    return np.concatenate(pairs)
+
+
+def lattice_triangles(index: Indices) -> Indices:
+    """Two triangles a cell, (f, 3), split from [r, c] to [r+1, c+1]; their normals are rows x columns."""
+    a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
+    return np.stack([a, c, d, a, d, b], axis=1).reshape(-1, 3)
+
+
+def unique_pairs(pairs: Indices) -> Indices:
+    """Each unordered pair once, the lower vertex first, in lexicographic order, (k, 2)."""
+    if not len(pairs):
+        return NO_PAIRS
+    i, j = pairs.T
+    base = int(pairs.max()) + 1
+    codes = np.sort(np.minimum(i, j) * base + np.maximum(i, j))  # np.unique hashes them, ten times slower
+    return np.stack(np.divmod(codes[np.diff(codes, prepend=-1) > 0], base), axis=1)
+
+
+def sides(polygons: Indices) -> Indices:
+    """The sides of polygons of k corners, (f, k), as pairs (f k, 2), repetitions included."""
+    return np.stack([polygons, np.roll(polygons, -1, axis=1)], axis=2).reshape(-1, 2)
+
+
+def corner_pairs(polygons: Indices) -> Indices:
+    """All pairs of corners of polygons of k corners, (f, k), as (f k (k-1)/2, 2), repetitions included."""
+    i, j = np.triu_indices(polygons.shape[1], 1)
+    return np.stack([polygons[:, i], polygons[:, j]], axis=2).reshape(-1, 2)
+
+
+def fan(polygons: Indices) -> Indices:
+    """Polygons of k corners, (f, k), as fans of triangles from their first corner, (f (k-2), 3)."""
+    k = np.arange(1, polygons.shape[1] - 1)
+    first = np.repeat(polygons[:, :1], len(k), axis=1)
+    return np.stack([first, polygons[:, k], polygons[:, k + 1]], axis=2).reshape(-1, 3)
+
+
+def lump(cells: Indices, measure: Points, n: int) -> Points:
+    """Each cell's measure, (f,), dealt out equally to its corners, (f, k): weights of the vertices, (n,)."""
+    corners = cells.shape[1]
+    weights = np.bincount(cells.ravel(), np.repeat(measure / corners, corners), minlength=n)
+    return weights.astype(np.float64, copy=False)
+
+
+def by_length(rest: Points, pairs: Indices) -> Points:
+    """Half the length of its springs for each vertex, (n,) [m]."""
+    return lump(pairs, np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1), len(rest))
+
+
+def by_area(rest: Points, triangles: Indices) -> Points:
+    """A third of the area of its triangles for each vertex (barycentric lumping), (n,) [m^2]."""
+    a, b, c = (rest[triangles[:, k]] for k in range(3))
+    return lump(triangles, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2, len(rest))
+
+
+def by_volume(rest: Points, tetrahedra: Indices) -> Points:
+    """A quarter of the volume of its tetrahedra for each vertex, (n,) [m^3]."""
+    return lump(tetrahedra, np.abs(signed_volumes(rest, tetrahedra)), len(rest))
+
+
+def signed_volumes(rest: Points, tetrahedra: Indices) -> Points:
+    """The volume of each tetrahedron, (t,) [m^3], positive where corner 3 sees 0, 1, 2 counter-clockwise."""
+    a, b, c, d = (rest[tetrahedra[:, k]] for k in range(4))
+    return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6
+
+
+def box_parts(rest: Points) -> dict[str, Indices]:
+    """The vertices on the sides of the bounding box; within a millionth of its diagonal counts as on it."""
+    low, high = rest.min(axis=0), rest.max(axis=0)
+    near = 1e-6 * np.linalg.norm(high - low)
+    names = (("left", "right"), ("bottom", "top"), ("back", "front"))
+    parts = {}
+    for axis, (lower, upper) in enumerate(names):
+        parts[lower] = np.flatnonzero(rest[:, axis] <= low[axis] + near)
+        parts[upper] = np.flatnonzero(rest[:, axis] >= high[axis] - near)
+    return parts
+
+
+def assemble(
+    *,
+    rest: Points,
+    springs: Mapping[str, Indices],
+    triangles: Indices = NO_TRIANGLES,
+    weights: Points,
+    dimension: int,
+    spacing: float,
+    resolution: int,
+    parts: Mapping[str, ArrayLike],
+) -> Mesh:
+    """A mesh of springs given by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND."""
+    blocks = [springs.get(family, NO_PAIRS) for family in (STRETCH, SHEAR, BEND)]
+    ends = np.cumsum([0, *map(len, blocks)])
+    return Mesh(
+        rest=np.ascontiguousarray(rest, np.float64),
+        springs=np.concatenate(blocks),
+        families={f: np.arange(ends[k], ends[k + 1]) for k, f in enumerate((STRETCH, SHEAR, BEND))},
+        triangles=triangles.copy(),
+        shares=weights / weights.sum(),
+        dimension=dimension,
+        spacing=spacing,
+        resolution=resolution,
+        parts={name: np.unique(np.asarray(part, np.int64)) for name, part in parts.items()},
+    )

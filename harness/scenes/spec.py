@@ -1,0 +1,147 @@
+"""A scene as its file declares it, once it was checked."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from fractions import Fraction
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Protocol
+
+from pydantic import BeforeValidator, ConfigDict, Field, SkipValidation, WithJsonSchema
+
+from harness.base.errors import InputError, Mistake
+from harness.base.model import Model
+from harness.scenes.effects.base import Effect
+from harness.scenes.mesh.base import Mesh
+from harness.scenes.mesh.generator import MAX_VERTICES
+from harness.scenes.start import AnyStart
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+"""Names of scenes and sweeps; they become names of files in the results."""
+
+FirstGuess = Literal["assignment", "current", "inertial"]
+IntegratorName = Literal["implicit-euler", "bdf2", "midpoint"]
+
+
+def _seconds(value: Any) -> Any:
+    """A fraction such as "1/30" as a number."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return float(Fraction(value))
+    except (ValueError, ZeroDivisionError, OverflowError) as error:
+        raise ValueError(f'should be a number or a fraction such as "1/30", not {value[:40]!r}') from error
+
+
+TimeStep = Annotated[
+    float,
+    Field(ge=1e-9, le=1e3),
+    BeforeValidator(_seconds),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "number", "minimum": 1e-9, "maximum": 1e3},
+                {"type": "string", "pattern": r"^[0-9]+(/[0-9]+)?$"},
+            ]
+        }
+    ),
+]
+Speed = Annotated[float, Field(ge=-1e6, le=1e6)]
+Size = Annotated[int, Field(ge=2, le=MAX_VERTICES)]
+Frames = Annotated[int, Field(ge=1, le=1_000_000)]
+
+
+class Camera(Model):
+    """Where pictures look from; the camera aims at the mesh's middle."""
+
+    azimuth: float = Field(default=0.0, ge=-360, le=360)
+    """Angle around the vertical axis [degrees], 0 looks along -z."""
+    elevation: float = Field(default=0.0, ge=-90, le=90)
+    """Angle above the horizon [degrees]."""
+
+
+class SceneFields(Model):
+    """The keys of a scene that mean the same in its file and in memory."""
+
+    description: str = Field(default="", max_length=1000)
+    """One sentence about the scene."""
+    mass: float | None = Field(default=None, gt=0, le=1e12)
+    """Total mass [kg]; may be left out where the mesh brings masses of its own."""
+    time_step: TimeStep
+    """Time step [s], a number or a fraction such as "1/30"."""
+    alternate_time_step: TimeStep | None = None
+    """Time step [s] of every second step; that of all others if left out."""
+    frames: Frames
+    """Number of steps to simulate."""
+    velocity: tuple[Speed, Speed, Speed] = (0.0, 0.0, 0.0)
+    """Velocity of every vertex at the start [m/s]."""
+    start: AnyStart | None = None
+    """How the start differs from the rest shape."""
+    default_size: Size | None = None
+    """Mesh size where neither a sweep nor the command line gives sizes."""
+    camera: Camera | None = None
+    """Where pictures look from; chosen by the mesh's shape if left out."""
+
+
+class SceneFile(SceneFields):
+    """A scene: a mesh, its mass and time step, and the effects that act on it."""
+
+    mesh: Any  # checked, like the effects, by the class that its kind names
+    """The mesh; its `kind` says which."""
+    effects: Any = ()
+    """What acts on the mesh; only what is listed is simulated."""
+
+
+class MeshSource(Protocol):
+    """A mesh as a scene declares it: a pydantic model with a literal `kind`."""
+
+    def build(self, size: int) -> Mesh:
+        """The mesh of this size; raises InputError when it has no such size."""
+        ...
+
+
+class SceneSpec(SceneFields):
+    """A checked scene."""
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+
+    mesh: SkipValidation[MeshSource]
+    """The mesh; its `kind` says which."""
+    mesh_digest: str = ""
+    """SHA-256 of a mesh from a file; empty for a generated mesh, which its parameters and its size determine."""
+    effects: SkipValidation[tuple[Effect, ...]] = ()
+    """What acts on the mesh; only what is listed is simulated."""
+    first_guess: FirstGuess = "current"
+    """Where a step's iteration starts if a sweep does not say."""
+    path: Path
+    """The file that the scene was read from, for messages."""
+    lines: SkipValidation[Mapping[str, int]] = Field(default_factory=dict)
+    """The lines of the keys in that file, for messages."""
+
+    def stepped(self, time_step: float) -> SceneSpec:
+        """The same scene with another time step [s], the same in all steps."""
+        if time_step == self.time_step:
+            return self
+        values: dict[str, Any] = {key: getattr(self, key) for key in SceneSpec.model_fields}
+        return SceneSpec.model_construct(None, **values | {"time_step": time_step, "alternate_time_step": None})
+
+    def require_even_steps(self) -> None:
+        """Raise InputError for a scene whose steps differ in length."""
+        if self.alternate_time_step is not None:
+            key, wanted = "alternate_time_step", "what is measured here depends on one time step; leave it out"
+            raise InputError(Mistake(wanted, self.path, self.lines.get(key), key))
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of all that determines a run of the scene; mesh files count by content, not by name."""
+        content = self.model_dump(mode="json", include={"mass", "time_step", "velocity", "camera", "mesh", "effects"})
+        content["mesh"] = self.mesh_digest or content["mesh"]
+        if self.start:
+            content["start"] = self.start.model_dump(mode="json")
+        if self.alternate_time_step is not None:
+            content["alternate_time_step"] = self.alternate_time_step
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,1 @@
+"""One run: steps through time, their measurement, and what is looked at in them."""

@@ -1,0 +1,88 @@
+"""The second pass of a run: the same steps again, with everything that is looked at.
+
+A thread beside the solver looks at each step while the solver does the next, one step behind at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.record.base import Frame, Recorder
+from harness.record.shading import strains
+from harness.scenes.bind import Scene
+from harness.simulation.measure import Settings, digest, steps
+from harness.simulation.step import Step, start
+from harness.simulation.trace import EnergyNorm, trace
+from solvers.problem import Positions, Prepared
+
+_OWN = ("springs", "inertia", "force", "pins")
+"""Terms of the objective that have a column of their own."""
+
+
+def observe(
+    scene: Scene,
+    prepared: Prepared,
+    settings: Settings,
+    *,
+    recorder: Recorder | None,
+    convergence: Collection[int],
+    stored: NDArray[np.float64] | None,
+    judge: Callable[[Step], dict[str, Any]] | None,
+    tick: Callable[[], None],
+) -> dict[int, dict[str, Any]]:
+    """Simulate a run's frames and return, by frame, the columns of its rows that tell of the solution.
+
+    recorder: takes every frame, and how the solve converged in the frames `convergence`; stored: where to put the
+    positions after each step, (frames, n, 3) [m]; judge: adds what an oracle says of each step; tick: called after
+    each step.
+    """
+    found: dict[int, dict[str, Any]] = {}
+
+    def look(step: Step) -> None:
+        p, s = step.positions, step.solution
+        terms = step.problem.terms(s.positions)
+        found[step.index] = {
+            **{f"energy_{name}": terms[name] for name in _OWN if name in terms},
+            "energy_effects": sum(value for name, value in terms.items() if name not in _OWN),
+            "objective": sum(terms.values()),
+            "largest_strain": largest_strain(scene, p),
+            "iterations": s.iterations,
+            "stopped": s.stopped,
+            "residual": s.residual,
+            "yardstick": s.yardstick,
+            "digest": digest(p),
+            **(judge(step) if judge else {}),
+        }
+        if stored is not None:
+            stored[step.index - 1] = p
+        if recorder:
+            recorder.frame(Frame(step.index, scene.time(step.index), p, terms, s.residual, s.iterations))
+
+    with ThreadPoolExecutor(1) as beside:
+        looked: Future[None] | None = None
+        if recorder:
+            looked = beside.submit(recorder.frame, Frame(0, 0.0, start(scene).now.positions, {}, float("nan"), 0))
+        for step in steps(scene, prepared, settings):
+            if looked:
+                looked.result()  # raises here what went wrong there
+            looked = beside.submit(look, step)
+            if recorder and step.index in convergence:
+                norm = EnergyNorm(step.problem.system)
+                curve = trace(prepared, step.problem, norm, step.solution.iterations)
+                looked.result()
+                recorder.convergence(step.index, curve.residuals, curve.objective)
+            tick()
+        if looked:
+            looked.result()
+    return found
+
+
+def largest_strain(scene: Scene, p: Positions) -> float:
+    """The largest |length / rest length - 1| of a spring at p (n, 3) [m]; 0 without springs."""
+    of_spring, _ = strains(p, scene.springs.edges, scene.springs.rest_length)
+    return float(np.abs(of_spring).max(initial=0.0))

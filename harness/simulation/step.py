@@ -1,0 +1,158 @@
+"""Steps through time: an integrator makes the step's problem, a prepared solver its minimiser, and that the motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import reduce
+from time import perf_counter
+
+from harness.scenes.bind import Scene
+from solvers.integrators import IMPLICIT_EULER, Motion
+from solvers.problem import Positions, Prepared, Solution, Solver, Start, StepProblem, StopRule, System, Unsupported
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """now, the motion at the start of the next step; before, one step earlier and filtered, None where there is none;
+    index of the last step, 0 at the start."""
+
+    now: Motion
+    before: Motion | None
+    index: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """One step that was done: its problem, its solution, the state after it, its wall seconds."""
+
+    problem: StepProblem
+    solution: Solution
+    state: State
+    seconds: float
+
+    @property
+    def index(self) -> int:
+        """Counted from 1."""
+        return self.state.index
+
+    @property
+    def positions(self) -> Positions:
+        """Where the vertices are after the step, (n, 3) [m]: not the solution, which may lie in the step's middle."""
+        return self.state.now.positions
+
+
+def start(scene: Scene) -> State:
+    """The scene's start, moving with its velocity and its spin."""
+    p = scene.start.positions(scene.mesh.rest)
+    return State(Motion(p, scene.velocity + scene.start.velocity(p)), None, 0)
+
+
+def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
+    """The next step's problem from a state; `first_guess` is a key of `FIRST_GUESSES`."""
+    scene, time = scene.at(state.index), scene.time(state.index)
+    dt = scene.system.time_step
+    # `before` was filtered when it was `now`. Filtered once more it has decayed as long as `now` has (an integrating
+    # factor); without that, BDF2 would decay at twice the rate.
+    now, before = (_filtered(scene, motion) for motion in (state.now, state.before or state.now))
+    starts = scene.integrator.history and state.before is None
+    method, system = (IMPLICIT_EULER, _first(scene)) if starts else (scene.integrator, scene.system)
+    target, origin = method.predict(now, before, dt)
+    when, ahead = time + method.when * dt, method.ahead * dt
+    begun = Start(now.positions, now.velocity, time, origin, system.rate, when, ahead)
+    force = scene.load
+    if scene.forces:
+        a = method.ahead
+        p, v = (x + a * (x - y) for x, y in zip(now, before, strict=True)) if a and state.before else now
+        force = reduce(lambda total, effect: total + effect(p, v, time + a * dt), scene.forces, force)
+    held = scene.pins_at(time + dt)
+    if method.when < 1.0:
+        held = now.positions[system.pins.vertices] + method.when * (held - now.positions[system.pins.vertices])
+    current = _pinned(system, now.positions, held)
+    stated = StepProblem(system, target, force, held, current, current, begun)
+    return FIRST_GUESSES[first_guess](stated)
+
+
+def prepare(scene: Scene, solver: Solver) -> Prepared:
+    """The solver, ready for all of the scene's steps; raises what `solver.prepare` raises, and Unsupported where steps
+    differ in length and the integrator goes by two of them."""
+    history, alternate = scene.integrator.history, scene.alternate
+    if history and alternate:
+        raise Unsupported("the integrator's formula holds for steps of one length, and the scene alternates two")
+    prepared, other = solver.prepare(scene.system), alternate.system if alternate else _first(scene)
+    return _Turns(prepared, solver.prepare(other), other.rate) if history or alternate else prepared
+
+
+def simulate(
+    scene: Scene, prepared: Prepared, stop: StopRule, *, first_guess: str, frames: int, state: State | None = None
+) -> Iterator[Step]:
+    """The steps from a state (the scene's start if it is left out), one more each time it is asked, up to the frame
+    `frames`; the clock stands still in between. prepared: by `prepare`."""
+    state = state or start(scene)
+    while state.index < frames:
+        began = perf_counter()
+        stated = problem(scene, state, first_guess)
+        solution = prepared.solve(stated, stop)
+        method = IMPLICIT_EULER if stated.system.factor == IMPLICIT_EULER.factor else scene.integrator
+        before = Motion(stated.start.positions, stated.start.velocity)
+        state = State(method.advance(stated.start, solution), before, state.index + 1)
+        seconds = perf_counter() - began
+        yield Step(stated, solution, state, seconds)
+
+
+class _Turns:
+    """Prepared for two systems of one scene, which differ in their rate."""
+
+    def __init__(self, usual: Prepared, other: Prepared, rate: float) -> None:
+        """rate: of the other [1/s]."""
+        self._usual, self._other, self._rate = usual, other, rate
+        self.choice, self.facts = usual.choice, usual.facts
+
+    def _of(self, problem: StepProblem) -> Prepared:
+        return self._other if problem.system.rate == self._rate else self._usual
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        return self._of(problem).iterates(problem)
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        return self._of(problem).solve(problem, stop)
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        return self._of(problem).phases(problem)
+
+
+def _filtered(scene: Scene, motion: Motion) -> Motion:
+    return Motion(motion.positions, reduce(lambda v, filtered: filtered(v), scene.filters, motion.velocity))
+
+
+def _first(scene: Scene) -> System:
+    """The system of the first step of an integrator that needs a history."""
+    return replace(scene.system, factor=IMPLICIT_EULER.factor)
+
+
+def _pinned(system: System, p: Positions, targets: Positions) -> Positions:
+    """A copy of p with its pinned vertices on their targets."""
+    placed = p.copy()
+    placed[system.pins.vertices] = targets
+    return placed
+
+
+def _assignment(stated: StepProblem) -> StepProblem:
+    """The current positions as they are, pinned vertices where the penalty left them."""
+    return replace(stated, first_guess=stated.start.positions)
+
+
+def _current(stated: StepProblem) -> StepProblem:
+    return stated
+
+
+def _inertial(stated: StepProblem) -> StepProblem:
+    """Where the vertices would go by inertia alone (Liu et al. 2013)."""
+    return replace(stated, first_guess=_pinned(stated.system, stated.target, stated.pin_targets))
+
+
+FIRST_GUESSES: dict[str, Callable[[StepProblem], StepProblem]] = {
+    "assignment": _assignment,
+    "current": _current,
+    "inertial": _inertial,
+}

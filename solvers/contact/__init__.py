@@ -1,0 +1,1 @@
+"""Contact: its energy, and what the prefactored methods make of it."""

@@ -1,0 +1,29 @@
+"""The half-spaces of contact in the order in which blocks go through them (see `solvers.kernels.half_spaces`)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.contact.energy import Contact
+from solvers.contact.touching import ContactEnergy
+from solvers.kernels.half_spaces import HalfSpaces
+from solvers.kernels.springs import Bundles
+from solvers.vectors.springs import LANES
+
+
+def half_spaces(contacts: list[ContactEnergy], row: NDArray[np.int64], bundles: Bundles, unknowns: int) -> HalfSpaces:
+    """Those of a step that has begun, by the rows of their vertices, of which the first ones are unknowns."""
+    known = [contact for contact in contacts if isinstance(contact, Contact)]
+    fields = [np.concatenate(field) for field in zip(*(contact.planes for contact in known), strict=True)]
+    slip = np.concatenate([np.full(len(contact.planes.vertices), contact.slip) for contact in known])
+    vertices, normal, offset, anchor, stiffness, grip = fields
+    rows = row[vertices]
+    order = np.argsort(rows, kind="stable")
+    order = order[rows[order] < unknowns]
+    count = np.bincount(rows[order], minlength=len(row) + 2)
+    near = count[bundles.own // 4].reshape(-1, LANES).max(axis=1, initial=0) > 0
+    first = np.concatenate([[0], np.cumsum(count)])
+    return HalfSpaces(
+        first, near, *(np.ascontiguousarray(x[order]) for x in (normal, anchor, offset, stiffness, grip, slip))
+    )

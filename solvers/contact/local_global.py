@@ -1,0 +1,224 @@
+"""Contact for the prefactored methods: what presses and grips is a small change W of Q, and Q stays factorised.
+
+    p <- p + x,   x = -(Q + W)^-1 (grad g(p) + U w gap),   W = U diag(w) U',  one column of U a row of contact
+
+by Woodbury's formula while there are few rows, with the columns of Q^-1 that belong to their vertices, else by
+conjugate gradients that Q^-1 preconditions (a few of them: they descend in the model wherever they are stopped). Which
+vertices begin to press is found by a few repetitions, each from the last one's end. Then x minimises a majorant of the
+objective, friction aside, whose second derivatives are exact first; a step that raises the objective nevertheless is
+repeated with all of the majorant, and shortened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import coo_array, csr_array
+
+from solvers.contact.touching import ContactEnergy, Rows, touching, without_contact
+from solvers.core.objective import Objective, StepObjective
+from solvers.methods.local_global import PreparedLocalGlobal
+from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule, System
+
+_FEW = 900
+"""Rows up to which their matrix is factorised: 300 vertices that stick. It takes as long as conjugate gradients do."""
+
+_PASSES = 4
+_HALVINGS = 12
+_ITERATIONS, _TOLERANCE = 60, 1e-3
+"""Of conjugate gradients, in the norm of Q^-1."""
+
+
+def local_global(solver: Solver, system: System) -> PreparedContact:
+    """A local-global method with contact; raises what the solver raises for the system without it."""
+    idle = solver.prepare(without_contact(system))
+    base = idle if isinstance(idle, PreparedLocalGlobal) else idle.base  # pyright: ignore[reportAttributeAccessIssue]
+    return PreparedContact(replace(base, system=system), idle, Objective(system), Corrections(base))
+
+
+class Corrections:
+    """Minimisers of quadratic models with Q + W, over a factor of Q."""
+
+    def __init__(self, base: PreparedLocalGlobal) -> None:
+        self._base = base
+        self._free = np.zeros(base.system.vertices, bool)
+        self._free[base.system.free] = True
+        self._columns: dict[int, NDArray[np.float64]] = {}
+
+    def plain(self, gradient: Positions) -> Positions:
+        """Q^-1 gradient, (n, 3), zero at exactly pinned vertices; of a rounded factor refined once, for which vertices
+        touch is decided by the last digits."""
+        out = np.zeros_like(gradient)
+        self._base.correction(gradient, out)
+        if self._base.rounded is not None:
+            self._base.toward(gradient, out.copy(), out)
+        return out
+
+    def residual(self, plain: Positions) -> float:
+        """|plain|_Q [J^(1/2)] over the unpinned vertices."""
+        e = plain.copy()
+        e[self._base.system.pins.vertices] = 0.0
+        return self._base.norm(e)
+
+    def around(
+        self, contacts: list[ContactEnergy], p: Positions, gradient: Positions, plain: Positions, *, cautious: bool
+    ) -> tuple[Positions, Rows]:
+        """The displacement from p, and the rows that were found for it; plain: Q^-1 gradient."""
+        x, rows = -plain, None
+        for _ in range(_PASSES):
+            found = self._joined([contact.rows(p, p + x, cautious=cautious) for contact in contacts])
+            if rows is not None and np.array_equal(found.vertices, rows.vertices):
+                break
+            rows = found
+            x = self.displacement(rows, gradient, plain)
+        assert rows is not None
+        return x, rows
+
+    def displacement(self, rows: Rows, gradient: Positions, plain: Positions) -> Positions:
+        """x of the model with these rows."""
+        if not len(rows.vertices):
+            return -plain
+        return (self._woodbury if len(rows.vertices) <= _FEW else self._iterated)(rows, gradient, plain)
+
+    def _joined(self, parts: list[Rows]) -> Rows:
+        """All rows of free vertices that resist."""
+        vertices, direction, weight, gap = (np.concatenate(field) for field in zip(*parts, strict=True))
+        kept = self._free[vertices] & (weight > 0.0)
+        return Rows(vertices[kept], direction[kept], weight[kept], gap[kept])
+
+    def _woodbury(self, rows: Rows, gradient: Positions, plain: Positions) -> Positions:
+        vertices, place = np.unique(rows.vertices, return_inverse=True)
+        columns = self._inverse(vertices)
+        K = columns[vertices][np.ix_(place, place)] * (rows.direction @ rows.direction.T)
+        K[np.diag_indices(len(K))] += 1.0 / rows.weight
+        along = np.einsum("ij,ij->i", rows.direction, plain[rows.vertices])
+        force = cho_solve(cho_factor(K, lower=True), rows.gap - along)
+        pushed = np.zeros((len(vertices), 3))
+        np.add.at(pushed, place, force[:, None] * rows.direction)
+        return -plain - columns @ pushed
+
+    def _inverse(self, vertices: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The columns (n, k) of Q^-1 of some vertices, three a solve; they are kept, for they press again."""
+        missing = [v for v in vertices.tolist() if v not in self._columns]
+        if len(self._columns) > 4 * _FEW:
+            self._columns, missing = {}, vertices.tolist()
+        for k in range(0, len(missing), 3):
+            some = missing[k : k + 3]
+            unit = np.zeros((len(self._free), 3))
+            unit[some, np.arange(len(some))] = 1.0
+            self._columns.update(zip(some, self.plain(unit).T.copy(), strict=False))
+        return np.array([self._columns[v] for v in vertices.tolist()]).T
+
+    def _iterated(self, rows: Rows, gradient: Positions, plain: Positions) -> Positions:
+        """Conjugate gradients; Q times a direction follows from the residuals that Q^-1 was asked for."""
+        U = _columns(rows, len(plain))
+        pulls = csr_array(U * rows.weight) @ U.T
+        residual = -gradient - (U @ (rows.weight * rows.gap)).reshape(-1, 3)
+        z = self.plain(residual)
+        x, along, image = np.zeros_like(z), z.copy(), residual.copy()
+        left = first = float(np.vdot(residual, z))
+        for _ in range(_ITERATIONS):
+            if left <= _TOLERANCE**2 * first:
+                break
+            product = image + (pulls @ along.ravel()).reshape(-1, 3)
+            length = left / float(np.vdot(along, product))
+            x += length * along
+            residual -= length * product
+            z = self.plain(residual)
+            before, left = left, float(np.vdot(residual, z))
+            along, image = z + left / before * along, residual + left / before * image
+        return x
+
+
+def _columns(rows: Rows, n: int) -> csr_array:
+    """U (3n, r): the direction of each row, at its vertex."""
+    places = (3 * rows.vertices[:, None] + np.arange(3)).ravel(), np.repeat(np.arange(len(rows.vertices)), 3)
+    return csr_array(coo_array((rows.direction.ravel(), places), shape=(3 * n, len(rows.vertices))))
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedContact:
+    """Local-global iterations with contact. base: the prefactored Q; idle: the method while nothing is touched."""
+
+    base: PreparedLocalGlobal
+    idle: Prepared
+    objective: Objective
+    corrections: Corrections
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """Exact counts of what was built."""
+        return self.idle.facts
+
+    @property
+    def choice(self) -> str:
+        """The linear solver in words."""
+        return f"{self.idle.choice}; contact by Woodbury's formula, beyond {_FEW} rows by conjugate gradients"
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """The iterates from `problem.first_guess`."""
+        contacts = touching(problem)
+        return (p for p, _ in self._points(problem, contacts)) if contacts else self.idle.iterates(problem)
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """Iterate until `stop` says so; the residual is that before the last iteration."""
+        contacts = touching(problem)
+        if not contacts:
+            return self.idle.solve(problem, stop)
+        limit, yardstick, every = 0.0, float("nan"), stop.tolerance is not None
+        if stop.tolerance is not None:
+            yardstick = self.gauge(problem)(problem.current)
+            limit = stop.tolerance * yardstick
+        floor = stop.floor * float(np.abs(problem.first_guess).max(initial=0.0)) * self.base.trace**0.5
+        points, residual, iteration, stopped = self._points(problem, contacts), float("nan"), 0, "iterations"
+        p = problem.first_guess
+        for iteration in range(1, stop.iterations + 1):
+            p, plain = next(points)
+            if every or iteration == stop.iterations:
+                residual = self._residual(plain)
+            if every and residual <= max(limit, floor):
+                stopped = "tolerance" if residual <= limit else "floor"
+                break
+        return Solution(p, iteration, residual, yardstick, stopped)
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """Those of the method while nothing is touched; with contact an iteration has no parts that stand alone."""
+        return {} if touching(problem) else self.idle.phases(problem)
+
+    def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
+        """What tells the residual [J^(1/2)] at positions (n, 3)."""
+        step = StepObjective(self.objective, problem)
+        return lambda p: self._residual(self.corrections.plain(step.gradient(p)))
+
+    def _residual(self, plain: Positions) -> float:
+        return self.corrections.residual(plain)
+
+    def _points(self, problem: StepProblem, contacts: list[ContactEnergy]) -> Iterator[tuple[Positions, Positions]]:
+        """The iterates, each with Q^-1 grad g at the one before."""
+        step = StepObjective(self.objective, problem)
+        p = step.placed(problem.first_guess)
+        while True:
+            gradient = step.gradient(p)
+            plain = self.corrections.plain(gradient)
+            p = self._following(step, contacts, p, gradient, plain)
+            yield p, plain
+
+    def _following(
+        self, step: StepObjective, contacts: list[ContactEnergy], p: Positions, gradient: Positions, plain: Positions
+    ) -> Positions:
+        """A position that is no higher than p: p itself where round-off lets nothing descend."""
+        x, length = np.zeros_like(p), 1.0
+        for attempt in range(2 + _HALVINGS):
+            if attempt < 2:
+                x, _ = self.corrections.around(contacts, p, gradient, plain, cautious=attempt > 0)
+            else:
+                length *= 0.5
+            q = step.placed(p + length * x)
+            rise, noise = step.rise(p, q)
+            if rise <= noise:
+                return q
+        return p

@@ -1,0 +1,83 @@
+"""Contact for the accelerated methods: their plain correction is that of `contact.local_global`, with Q + W for Q.
+
+A window's pairs belong to one W. It is kept while the same vertices press and grip, about as hard; where that
+changes, the window begins anew with another W. While nothing is touched the method is what it is without contact.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.contact.local_global import Corrections
+from solvers.contact.touching import ContactEnergy, Rows, touching
+from solvers.core.objective import Objective, StepObjective
+from solvers.kernels import accelerate
+from solvers.kernels.accelerate import Window
+from solvers.methods.local_global import PreparedLocalGlobal
+from solvers.methods.quasi_newton import Engine, InterpretedRun, Method, Run, window_for
+from solvers.problem import Positions, StepProblem
+
+_ALIKE = 2.0
+"""Weights that differ by no more than this factor may stand for each other."""
+
+
+class Touching:
+    """See Engine. idle: the engine while nothing is touched."""
+
+    def __init__(self, method: Method, base: PreparedLocalGlobal, idle: Engine) -> None:
+        self._method, self._base, self._idle = method, base, idle
+        self._objective, self._corrections = Objective(base.system), Corrections(base)
+
+    def begin(self, problem: StepProblem, guess: Positions) -> Run:
+        """See Engine."""
+        contacts = touching(problem)
+        if not contacts:
+            return self._idle.begin(problem, guess)
+        window = window_for(self._method, guess.size, guess.size)
+        step = StepObjective(self._objective, problem)
+        return _ContactRun(self._base, window, step, guess, contacts, self._corrections)
+
+
+class _ContactRun(InterpretedRun):
+    def __init__(
+        self,
+        base: PreparedLocalGlobal,
+        window: Window,
+        step: StepObjective,
+        guess: Positions,
+        contacts: list[ContactEnergy],
+        corrections: Corrections,
+    ) -> None:
+        self._contacts, self._corrections = contacts, corrections
+        self._rows: Rows | None = None
+        self._begun = True
+        super().__init__(base, window, step, guess)
+
+    def _solved(self) -> NDArray[np.float64]:
+        """The correction at the trial point, by the rows of before where they will do."""
+        super()._solved()
+        self._plain = -self._image
+        gradient, at = -self._there, (self._contacts, self._trial)
+        x, rows = self._corrections.around(*at, gradient, self._plain, cautious=True)
+        self._begun = self._rows is None or not _alike(self._rows, rows)
+        if self._begun or self._rows is None:
+            self._rows = rows
+        else:
+            x = self._corrections.displacement(self._rows, gradient, self._plain)
+        self._image[:] = x
+        return self._image.ravel()
+
+    def _accept(self) -> None:
+        correction = self._solved()
+        (accelerate.begin if self._begun else accelerate.accept)(self._window, correction)
+
+    def _residual(self) -> float:
+        return self._corrections.residual(self._plain)
+
+
+def _alike(one: Rows, other: Rows) -> bool:
+    """Whether the rows of one point serve another as well: what begins to press belongs to one point alone."""
+    if not np.array_equal(one.vertices, other.vertices) or one.gap.any() or other.gap.any():
+        return False
+    return bool((np.maximum(one.weight, other.weight) <= _ALIKE * np.minimum(one.weight, other.weight)).all())

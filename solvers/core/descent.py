@@ -1,0 +1,182 @@
+"""What methods with exact gradients share: the stop rule, and a line search that tells a descent from round-off.
+
+The line search halves a step until the objective falls by at least DECREASE of what the slope promises (Armijo 1966).
+The rise is computed from differences (see `solvers.kernels.objective`), so that this works until the gradient itself
+is round-off. What other energies' values lose to round-off is allowed for; there the slope has to shrink as well (the
+approximate Wolfe condition of Hager and Zhang 2005).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from solvers import matrices
+from solvers.core.objective import Objective, StepObjective
+from solvers.linear.choice import factorise
+from solvers.linear.factors import DenseCholesky
+from solvers.problem import Positions, ProjectiveEnergy, Solution, StepProblem, StopRule, System
+
+DECREASE = 1e-4
+"""Of what the slope promises, the least that a step must bring."""
+
+_HALVINGS = 60
+"""A step so often halved has no digit left."""
+
+_CLOSE = 1e-5
+"""A tolerance from which on the last point should be a minimum; a greater one asks for less than that."""
+
+
+class Point(NamedTuple):
+    """Where a method is: positions and gradient, (n, 3); stalled: whether round-off lets nothing descend from here;
+    left: whether the point before was a saddle.
+    """
+
+    positions: Positions
+    gradient: Positions
+    stalled: bool = False
+    left: bool = False
+
+
+class Method(Protocol):
+    """One iteration after another from a point; the last point, at which the method stalls, is its last."""
+
+    def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
+        """The points after `start`."""
+        ...
+
+    def certifies(self, step: StepObjective, at: Point) -> bool:
+        """Whether a stationary point is a minimum, for all that the method can tell: it may be the last."""
+        ...
+
+    def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
+        """What its iterations are made of, by name, at a point."""
+        ...
+
+
+def search(
+    step: StepObjective, at: Point, direction: Positions, *, first: float = 1.0, curvature: float = 0.0
+) -> Point | None:
+    """The first point of those at `first`, first/2, first/4, ... of a direction that descends enough; None for none.
+
+    curvature [J]: the second derivative along the direction, where it is what promises a descent.
+    """
+    slope = dot(at.gradient, direction)
+    t = first
+    for _ in range(_HALVINGS if slope + curvature < 0.0 else 0):
+        p = step.placed(at.positions + t * direction)
+        rise, noise = step.rise(at.positions, p)
+        if rise <= DECREASE * t * (slope + 0.5 * t * curvature):
+            return Point(p, step.gradient(p))
+        if rise <= noise and 0.0 < noise < np.inf:
+            gradient = step.gradient(p)
+            if abs(dot(gradient, direction)) <= (1.0 - 2.0 * DECREASE) * -slope:
+                return Point(p, gradient)
+        t *= 0.5
+    return None
+
+
+def dot(a: Positions, b: Positions) -> float:
+    """The scalar product of two fields, (n, 3)."""
+    return float(np.einsum("ij,ij->", a, b))
+
+
+class Metric:
+    """Q of a system's projective energies, factorised: what residuals are measured by.
+
+    trace: of its unpinned part [N/m]; inner: its free part (f, f); diagonal: of that (f,) [N/m]; factor: of that;
+    choice: the linear solver in words.
+    """
+
+    def __init__(self, system: System) -> None:
+        """Raises NotPositiveDefinite, and Unsupported where no linear solver fits in memory."""
+        self.system = system
+        self._Q = matrices.assemble(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
+        free = system.free
+        inner = csr_array(csr_array(self._Q[free])[:, free])
+        self.inner = inner
+        self.factor, self.choice = factorise(inner) if len(free) else (DenseCholesky(np.eye(0)), "nothing to solve for")
+        self.diagonal: NDArray[np.float64] = np.asarray(inner.diagonal(), np.float64)
+        self.trace = float(self._Q.diagonal()[system.unpinned].sum())
+        factor = {} if self.factor.nonzeros is None else {"nnz_factor": float(self.factor.nonzeros)}
+        self.facts = {"nnz_system": float(self._Q.nnz)} | factor
+
+    def round_off(self, p: Positions) -> float:
+        """g H^-1 g [J] of a gradient that is round-off of the positions p (n, 3), at most."""
+        return float(np.finfo(np.float64).eps * np.abs(p).max(initial=0.0)) ** 2 * self.trace
+
+    def solve(self, b: Positions) -> Positions:
+        """Q^-1 b, (n, 3), zero at exactly pinned vertices."""
+        out, free = np.zeros_like(b), self.system.free
+        x = np.empty((len(free), 3))
+        self.factor.solve(np.ascontiguousarray(b[free]), x)
+        out[free] = x
+        return out
+
+    def residual(self, gradient: Positions) -> float:
+        """|Q^-1 g|_Q [J^(1/2)] over the unpinned vertices, of a gradient g (n, 3)."""
+        e, pins = self.solve(gradient), self.system.pins
+        if pins.exact.all():  # then |Q^-1 g|_Q is what g does along it
+            return max(0.0, dot(e, gradient)) ** 0.5
+        e[pins.vertices] = 0.0
+        return matrices.energy_norm(self._Q, e)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedDescent:
+    """A method, ready for a system."""
+
+    objective: Objective
+    metric: Metric
+    method: Method
+    choice: str
+    facts: dict[str, float]
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """The iterates from `problem.first_guess`; where the method stalls it stays."""
+        step, start = self._begin(problem)
+        point = start
+        for point in self.method.points(step, start):
+            yield point.positions
+        while True:
+            yield point.positions
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """Iterate until `stop` says so, or until nothing descends any more."""
+        step, start = self._begin(problem)
+        point = start
+        every, limit, yardstick = stop.tolerance is not None, 0.0, float("nan")
+        if stop.tolerance is not None:
+            yardstick = self.metric.residual(step.gradient(problem.current))
+            limit = stop.tolerance * yardstick
+        close = stop.tolerance is not None and stop.tolerance <= _CLOSE
+        floor = stop.floor * float(np.abs(point.positions).max(initial=0.0)) * self.metric.trace**0.5
+        residual, iteration, stopped = float("nan"), 0, "iterations"
+        for point in islice(self.method.points(step, start), stop.iterations):
+            iteration += 1
+            if every:
+                residual = self.metric.residual(point.gradient)
+                if residual <= max(limit, floor) and (not close or self.method.certifies(step, point)):
+                    stopped = "tolerance" if residual <= limit else "floor"
+                    break
+            if point.stalled:
+                stopped = "stalled"
+                break
+        if not every:
+            residual = self.metric.residual(point.gradient)
+        return Solution(point.positions.copy(), iteration, residual, yardstick, stopped)
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """What iterations are made of, at the first guess."""
+        return self.method.phases(*self._begin(problem))
+
+    def _begin(self, problem: StepProblem) -> tuple[StepObjective, Point]:
+        step = StepObjective(self.objective, problem)
+        p = step.placed(problem.first_guess)
+        return step, Point(p, step.gradient(p))

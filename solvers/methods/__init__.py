@@ -1,0 +1,1 @@
+"""Methods that minimise a step's objective, or step without one: one a file."""

@@ -1,0 +1,35 @@
+"""Anderson acceleration of local-global, safeguarded by the energy (Peng, Deng, Zhang, Geng, Qin, Liu 2018, "Anderson
+Acceleration for Geometry Optimization and Physics Simulation"; Anderson 1965).
+
+    p_(k+1) = LG(p_k) - sum_j theta_j (LG(p_(j+1)) - LG(p_j)),   theta = argmin |F_k - sum_j theta_j (F_(j+1) - F_j)|_Q
+
+with F = LG(p) - p over the last iterations. Residuals are compared in the norm of Q, in which F is the gradient and the
+scalar products are those that the iteration has anyway. An iterate that does not lower the objective is replaced by the
+plain LG(p_k), whose residual joins the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from solvers.kernels.accelerate_coefficients import ANDERSON
+from solvers.linear.choice import Linear, Precision
+from solvers.methods.quasi_newton import Method, PreparedAccelerated, prepare
+from solvers.problem import System
+
+
+@dataclass(frozen=True)
+class Anderson:
+    """pairs: differences kept of the latest iterations; linear, precision: the solver of Q x = b and of its entries."""
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+
+    pairs: int = 5
+    linear: Linear = "auto"
+    precision: Precision = "float64"
+
+    def prepare(self, system: System) -> PreparedAccelerated:
+        """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
+        return prepare(system, Method("anderson", ANDERSON, self.pairs, 0, True), self.linear, self.precision)

@@ -1,0 +1,39 @@
+"""Chebyshev semi-iterative acceleration of local-global (Wang 2015, "A Chebyshev Semi-Iterative Approach for
+Accelerating Projective and Position-Based Dynamics"; Golub and Varga 1961).
+
+    p_(k+1) = omega_(k+1) (gamma (LG(p_k) - p_k) + p_k - p_(k-1)) + p_(k-1)
+    omega_1 = 1,   omega_2 = 2 / (2 - sigma^2),   omega_(k+1) = 4 / (4 - sigma^2 omega_k)
+
+The plain iteration multiplies errors by I - Q^-1 H, whose eigenvalues lie in [0, rho]: Q majorises the Hessian H. So
+the polynomials are those of [0, rho] instead of Wang's [-rho, rho]: gamma = 2 / (2 - rho) and sigma = rho / (2 - rho).
+
+rho is estimated while running (Hageman and Young 1981, chapters 5 and 6): at first it is the ratio of two residuals of
+the plain iteration. Where the residuals shrink more slowly than the polynomial of the present rho promises, an
+eigenvalue lies beyond it, and the ratio of the two tells where; with that a new polynomial begins. An iterate that
+would raise the objective is replaced by the plain LG(p_k), and a new polynomial begins there too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from solvers.kernels.accelerate_coefficients import CHEBYSHEV
+from solvers.linear.choice import Linear, Precision
+from solvers.methods.quasi_newton import Method, PreparedAccelerated, prepare
+from solvers.problem import System
+
+
+@dataclass(frozen=True)
+class Chebyshev:
+    """linear, precision: the solver of Q x = b and of its stored entries."""
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+
+    linear: Linear = "auto"
+    precision: Precision = "float64"
+
+    def prepare(self, system: System) -> PreparedAccelerated:
+        """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
+        return prepare(system, Method("chebyshev", CHEBYSHEV, 1, 0, True), self.linear, self.precision)

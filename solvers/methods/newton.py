@@ -1,0 +1,90 @@
+"""Newton's method with the exact Hessian and a direct factorisation (Nocedal and Wright 2006, section 3.4).
+
+    p <- p - t (H + E)^-1 grad g(p)
+
+The Hessian of compressed springs may be indefinite. It is left exact wherever it has a Cholesky factor, which keeps the
+convergence quadratic; where it has none, more and more is taken from the springs' negative lateral parts, and in the
+end a multiple of the diagonal of Q is added. Clamping those parts everywhere (Teran et al. 2005) would converge
+linearly. A point where the gradient vanishes but the exact Hessian has no factor is left (`solvers.core.saddles`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
+from solvers.core.objective import Objective, StepObjective
+from solvers.core.saddles import certified, leave
+from solvers.problem import System
+
+_LEVELS = ((1.0, 0.0), (0.9, 0.0), (0.5, 0.0), (0.0, 0.0), *((0.0, 10.0**k) for k in range(-4, 9, 2)))
+"""What is kept of negative lateral parts, and what multiple of Q's diagonal is added: the first that factorises."""
+
+_SLIGHT = 1e-12
+"""Of the steepest slope of a solve, what tells of a saddle where the exact Hessian has no factor."""
+
+
+@dataclass(frozen=True)
+class Newton:
+    """Newton's method. Where it ends by a close tolerance, or stalls, no curvature is negative but by round-off."""
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+
+    def prepare(self, system: System) -> PreparedDescent:
+        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
+        metric, objective = Metric(system), Objective(system)
+        factor = objective.matrix.factor
+        facts = metric.facts | {"nnz_hessian_factor": float(factor.nonzeros)}
+        choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; residuals by {metric.choice}"
+        return PreparedDescent(objective, metric, NewtonMethod(metric), choice, facts)
+
+
+class NewtonMethod:
+    """The iteration of Newton's method for one system."""
+
+    def __init__(self, metric: Metric) -> None:
+        self._metric = metric
+        self._diagonal: NDArray[np.float64] = np.repeat(metric.diagonal, 3)
+
+    def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
+        """The points after `start`."""
+        point, steepest = start, 0.0
+        while not point.stalled:
+            point, steepest = self._next(step, point, steepest)
+            yield point
+
+    def certifies(self, step: StepObjective, at: Point) -> bool:
+        """See Method."""
+        return certified(step, at.positions)
+
+    def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
+        """The gradient, the Hessian with its factorisation, and a solve with it."""
+        hessian, (keep, by) = step.hessian(at.positions), _LEVELS[-1]  # any other may have no factor to solve with
+        hessian.factorise(keep, by * self._diagonal)
+        return {
+            "gradient": lambda: step.gradient(at.positions),
+            "factor": lambda: hessian.factorise(keep, by * self._diagonal),
+            "solve": lambda: hessian.solve(at.gradient),
+        }
+
+    def _next(self, step: StepObjective, at: Point, steepest: float) -> tuple[Point, float]:
+        """The point after `at`, and the steepest slope so far [J]."""
+        hessian = step.hessian(at.positions)
+        level = next((k for k, (keep, by) in enumerate(_LEVELS) if hessian.factorise(keep, by * self._diagonal)), None)
+        if level is None:
+            return at._replace(stalled=True), steepest
+        direction = -hessian.solve(at.gradient)
+        fall = -dot(at.gradient, direction)
+        steepest = max(fall, steepest)
+        known = fall > self._metric.round_off(at.positions)
+        slight = fall <= _SLIGHT * steepest
+        found = search(step, at, direction) if known and not (slight and level > 0) else None
+        if found is None and level > 0:
+            found = leave(step, at, hessian, self._diagonal) or (search(step, at, direction) if known else None)
+        return found or at._replace(stalled=True), steepest

@@ -1,0 +1,182 @@
+"""Vertex block descent (Chen, Liu, Yang and Yuksel 2024): one vertex after another takes a Newton step of its own.
+
+    B_i d_i = -grad_i g(p),   p_i += d_i,   B_i = held_i I + sum over its springs of k (nn' + max(0, 1 - r/l) (I - nn'))
+
+with n the direction and l the length of a spring; compressed springs lose their negative lateral curvature, so B_i is
+positive definite. A quadratic form adds its own entry of the diagonal, and contact its exact second derivatives: it
+acts on single vertices. The paper skips the line search. Here a step that would raise the energy gives way to that of
+the majorant (held_i + sum of k) I, which cannot: so no sweep raises the objective.
+Vertices go by colour: none is joined by a spring or a form to another of its colour.
+
+Sweeps are accelerated by Chebyshev's semi-iteration with the spectral radius rho (Wang 2015),
+
+    p_{k+1} = w_{k+1} (sweep(p_k) - p_{k-1}) + p_{k-1},    w_1 = 1,  w_2 = 2/(2 - rho^2),  w_{k+1} = 4/(4 - rho^2 w_k),
+
+safeguarded: an extrapolation that would raise the objective above that of p_k is not taken, and the factors begin
+again at w_1. With these restarts rho needs no tuning: too large a one is no worse than the right one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.contact.touching import ContactEnergy, touching, without_contact
+from solvers.core import colouring
+from solvers.core import vertex_terms as blocks
+from solvers.core.parts import Parts, split
+from solvers.kernels import vbd as kernels
+from solvers.kernels.accelerate_springs import Shares
+from solvers.kernels.half_spaces import HalfSpaces
+from solvers.kernels.springs import Bundles
+from solvers.memory import aligned
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System, Unsupported
+from solvers.vectors.springs import LANES
+from solvers.vectors.vbd import NUMBERS
+
+_FAR = 1e100
+"""Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
+
+
+@dataclass(frozen=True)
+class VertexBlockDescent:
+    """Vertex block descent over springs, quadratic forms and contact.
+
+    spectral_radius: rho of the acceleration, at least 0 and less than 1; 0 does not accelerate.
+    """
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+
+    spectral_radius: float = 0.999
+
+    def __post_init__(self) -> None:
+        """Raises ValueError."""
+        if not 0.0 <= self.spectral_radius < 1.0:
+            raise ValueError(f"spectral_radius: should be at least 0 and less than 1, not {self.spectral_radius}")
+
+    def prepare(self, system: System) -> PreparedVertexBlockDescent:
+        """Raises Unsupported for other energies, NotPositiveDefinite."""
+        bare, n = without_contact(system), system.vertices
+        parts = split(bare)
+        unknown = {*parts.unknown, *(type(energy).__name__ for energy in (*parts.limits, *parts.dashpots))}
+        if unknown:
+            raise Unsupported(f"vbd: knows springs, quadratic forms and contact, not {', '.join(sorted(unknown))}")
+        measure = CompiledLocalGlobal().prepare(system)
+        coloured = colouring.of_vertices(parts.whole.edges, n)
+        colour = np.empty(n, np.int64)
+        colour[coloured.order] = np.repeat(np.arange(coloured.colours), np.diff(coloured.start))
+        pinned = system.pins.vertices[system.pins.exact]
+        order = coloured.order[~np.isin(coloured.order, pinned)]
+        row = np.empty(n, np.int64)
+        row[order], row[pinned] = np.arange(len(order)), np.arange(len(order), n)
+        colour[pinned] = -1
+        bundles, _ = Bundles.of(parts.whole, row, colour, coloured.colours, n, n + 1)
+        held, majorant = np.zeros(n + 2), np.ones(n + 2)
+        held[: len(order)] = majorant[: len(order)] = (blocks.held(system) + parts.held)[order]
+        ends = np.repeat(bundles.own.reshape(-1, LANES), np.diff(bundles.start), axis=0)
+        np.add.at(majorant, ends.ravel() // 4, bundles.each()[1])
+        shares = Shares.of(bundles, held, row[pinned])
+        return PreparedVertexBlockDescent(
+            system,
+            parts,
+            self.spectral_radius,
+            kernels.Blocks(bundles, shares, len(order), bundles.in_lanes(majorant)),
+            row,
+            held,
+            float(majorant[row[system.unpinned]].sum()),
+            measure,
+            f"vertices in {coloured.colours} colours; for the residual alone {measure.choice}",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedVertexBlockDescent:
+    """parts: of the energies; blocks: of the free vertices; row (n,): where each vertex is in them; held: what
+    inertia and pins hold each row with [N/m]; trace: of the majorant, over vertices that no pin holds [N/m]; measure:
+    one iteration of local-global from p tells the residual at p, and is asked for nothing else."""
+
+    system: System
+    parts: Parts
+    spectral_radius: float
+    blocks: kernels.Blocks
+    row: NDArray[np.int64]
+    held: NDArray[np.float64]
+    trace: float
+    measure: Prepared
+    choice: str
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """Exact counts of what was built."""
+        return self.measure.facts
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """The iterates from `problem.first_guess`."""
+        advance = self._begin(problem, touching(problem))
+        while True:
+            yield advance(1)
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """Iterate until `stop` says so; the residual is that of the positions."""
+        contacts = touching(problem)
+        advance, gauge = self._begin(problem, contacts), self._gauge(problem, contacts)
+        if stop.tolerance is None:
+            p = advance(stop.iterations)
+            return Solution(p, stop.iterations, gauge(p), np.nan, "iterations")
+        p = problem.first_guess
+        floor = stop.floor * float(np.abs(p).max(initial=0.0)) * self.trace**0.5
+        yardstick = residual = gauge(problem.current)
+        limit = stop.tolerance * yardstick
+        for iteration in range(1, stop.iterations + 1):
+            p = advance(1)
+            residual = gauge(p)
+            if residual <= max(limit, floor):
+                return Solution(p, iteration, residual, yardstick, "tolerance" if residual <= limit else "floor")
+        return Solution(p, stop.iterations, residual, yardstick, "iterations")
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """None: an iteration has no parts."""
+        return {}
+
+    def _begin(self, problem: StepProblem, contacts: list[ContactEnergy]) -> Callable[[int], Positions]:
+        """What does a number of iterations, from where those before ended, and gives a copy of the positions."""
+        pull = blocks.pull(replace(problem, force=self.parts.force(problem)))
+        p, y = (self._rows(x) for x in (blocks.placed(problem.first_guess, problem), pull))
+        right = self.blocks.bundles.right(self.held, y)
+        spaces = self._spaces(contacts) if contacts else None
+        p[-4] = _FAR
+        entries = int(np.diff(self.blocks.bundles.start).max(initial=0))
+        scratch = aligned(NUMBERS * LANES * entries)
+        work = kernels.Work(p.copy(), p.copy(), np.zeros_like(p), scratch, np.zeros(1), np.full(1, np.nan))
+
+        def advance(iterations: int) -> Positions:
+            kernels.iterate(self.blocks, spaces, right, self.spectral_radius, work, p, iterations)
+            return p.reshape(-1, 4)[self.row, :3].copy()
+
+        return advance
+
+    def _rows(self, x: Positions) -> NDArray[np.float64]:
+        """x (n, 3) in rows of four, and the two rows that fill up bundles."""
+        out = aligned(4 * (len(x) + 2))
+        out.reshape(-1, 4)[self.row, :3] = x
+        return out
+
+    def _spaces(self, contacts: list[ContactEnergy]) -> HalfSpaces:
+        from solvers.contact.bundles import half_spaces  # for those who need it
+
+        return half_spaces(contacts, self.row, self.blocks.bundles, self.blocks.unknowns)
+
+    def _gauge(self, problem: StepProblem, contacts: list[ContactEnergy]) -> Callable[[Positions], float]:
+        """What tells |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices."""
+        if contacts:
+            from solvers.contact.local_global import PreparedContact
+
+            assert isinstance(self.measure, PreparedContact)
+            return self.measure.gauge(problem)
+        return lambda p: self.measure.solve(replace(problem, first_guess=p), StopRule(1)).residual

@@ -1,0 +1,289 @@
+"""The springs of eight vertices at a time, in LLVM vectors that a compiler does not find by itself.
+
+Positions have rows of four numbers, x, y, z and padding: one load brings a vertex, and eight loaded rows are transposed
+into vectors of x, y and z. Lane l holds a spring of vertex l, so that no two lanes add to one place. A row is named by
+the place of its first number: processors add that to an address for nothing, and instructions are what these loops
+take time for.
+
+    1/|v|   from a guess, e = 1 - s y^2, y <- y (1 - e)^(-1/2) by its series, to about one unit in the last place:
+            from AVX-512's estimate, 2^-14 off, by a step of degree 3;
+            from one by Lomont's trick (2003), 3.4 % off, by a step of degree 4 and one of degree 2
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from solvers.energies.springs import TINY
+from solvers.vectors.intrinsics import ask, unpacked
+
+LANES = 8
+RIGHT = 4 * LANES
+"""Numbers of a bundle's constant right-hand side: x, y and z of eight vertices, and what holds each [N/m]."""
+I32, I64, F64 = ir.IntType(32), ir.IntType(64), ir.DoubleType()
+ROW, WIDE = ir.VectorType(F64, 4), ir.VectorType(F64, LANES)
+I8, MASK = ir.IntType(8), ir.VectorType(ir.IntType(1), LANES)
+BITS = ir.VectorType(I64, LANES)
+_GUESS, _ESTIMATE = 0x5FE6EB50C7B537A9, "llvm.x86.avx512.rsqrt14.pd.512"
+LEAST, MOST = TINY * TINY, 1.7e308
+"""Between these, a squared length has a guess that is finite."""
+
+AHEAD = 128
+"""How many rows ahead memory is asked for what is read once an iteration: of large meshes it is in no cache by then."""
+
+Kind = Literal["project", "correct", "energy"]
+
+
+def constant(value: float) -> ir.Constant:
+    """Eight times one number."""
+    return ir.Constant(WIDE, [value] * LANES)
+
+
+class Vectors:
+    """Vectors of eight float64, written with a builder. estimates: whether the processor estimates inverse roots."""
+
+    def __init__(self, context: Any, builder: Any) -> None:
+        self.builder = builder
+        self.estimates = "+avx512f" in context.codegen().magic_tuple()[2]
+
+    def shuffle(self, a: ir.Value, b: ir.Value, lanes: list[int]) -> Any:
+        return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))
+
+    def load(self, pointer: Any, kind: ir.Type, align: int = 8) -> ir.Value:
+        return self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()), align=align)
+
+    def multiply_add(self, a: Any, b: Any, c: Any) -> Any:
+        """a b + c; `contract` lets the target fuse them where it can."""
+        return self.builder.fadd(self.builder.fmul(a, b, flags=("contract",)), c, flags=("contract",))
+
+    def subtract_product(self, c: Any, a: Any, b: Any) -> Any:
+        """c - a b."""
+        return self.builder.fsub(c, self.builder.fmul(a, b, flags=("contract",)), flags=("contract",))
+
+    def places(self, indices: Any, bundle: Any) -> list[Any]:
+        """The places of eight rows, the bundle's of those that are listed, int32."""
+        b = self.builder
+        first = b.mul(bundle, I64(LANES))
+        return [b.zext(b.load(b.gep(indices, [b.add(first, I64(lane))])), I64) for lane in range(LANES)]
+
+    def gather(self, array: Any, places: list[Any]) -> list[Any]:
+        """x, y and z of eight rows."""
+        rows = [self.load(self.builder.gep(array, [place]), ROW) for place in places]
+        pairs = [self.shuffle(rows[lane], rows[lane + 2], list(range(8))) for lane in (0, 1, 4, 5)]
+        low = [0, 8, 2, 10, 4, 12, 6, 14]
+        xz = [self.shuffle(pairs[i], pairs[i + 1], low) for i in (0, 2)]
+        y = [self.shuffle(pairs[i], pairs[i + 1], [k + 1 for k in low]) for i in (0, 2)]
+        first, second = [0, 1, 4, 5, 8, 9, 12, 13], [2, 3, 6, 7, 10, 11, 14, 15]
+        return [self.shuffle(a[0], a[1], lanes) for a, lanes in ((xz, first), (y, first), (xz, second))]
+
+    def eights(self, table: Any, kind: Any, entry: Any, many: int = 2) -> list[Any]:
+        """The vectors of an entry's kind (see `kinds`)."""
+        b = self.builder
+        begin = b.zext(b.load(b.gep(kind, [entry])), I64)
+        return [self.load(b.gep(table, [b.add(begin, I64(LANES * k))]), WIDE) for k in range(many)]
+
+    def over_entries(
+        self, begin: Any, end: Any, read: Callable[[Any], list[Any]], *stages: Callable[[list[Any]], Any]
+    ) -> None:
+        """Read one entry while each stage is at one of those before it: none waits long for what it needs. There are
+        as many entries as stages at least."""
+        b, depth = self.builder, len(stages)
+        waiting: list[list[Any]] = []  # for each stage, the last one first
+        for k in range(depth):
+            values = read(b.add(begin, I64(k)))
+            for stage in stages[: depth - 1 - k]:
+                values = stage(values)
+            waiting.append([cgutils.alloca_once(b, value.type) for value in values])
+            for value, place in zip(values, waiting[-1], strict=True):
+                b.store(value, place)
+        with cgutils.for_range_slice(b, b.add(begin, I64(depth)), end, I64(1), I64) as (entry, _):
+            fresh = read(entry)
+            for stage, places in zip(stages, reversed(waiting), strict=True):
+                values = [b.load(place) for place in places]
+                for value, place in zip(fresh, places, strict=True):
+                    b.store(value, place)
+                fresh = stage(values)
+        for k, places in enumerate(waiting):
+            values = [b.load(place) for place in places]
+            for stage in stages[depth - 1 - k :]:
+                values = stage(values)
+
+    def rows(self, vectors: list[Any], element: ir.Type = F64) -> list[Any]:
+        """Eight rows of x, y, z and zero, rounded to float32 where that is the element."""
+        zero, pairs = ir.Constant(ir.VectorType(element, LANES), [0.0] * LANES), [0, 2, 4, 6]
+        if element != F64:
+            vectors = [self.builder.fptrunc(a, zero.type) for a in vectors]
+            pairs = [0, 1, 4, 5]  # so that shuffles stay within 128 bits
+        (x, y, z), apart, halves = vectors, pairs[1], []
+        for half in (0, 2 // apart):
+            lanes = [lane for k in pairs for lane in (k + half, k + half + LANES)]
+            halves.append((self.shuffle(x, y, lanes), self.shuffle(z, zero, lanes)))
+        out: list[Any] = [None] * LANES
+        for lane in range(LANES // 2):  # two rows at a time, four lanes apart
+            half, begin = (lane % 2, lane - lane % 2) if apart == 2 else (lane // 2, 2 * (lane % 2))
+            places = [begin, begin + 1, begin + 8, begin + 9, begin + 4, begin + 5, begin + 12, begin + 13]
+            both = self.shuffle(halves[half][0], halves[half][1], places)
+            out[lane], out[lane + 4] = (self.shuffle(both, both, list(range(k, k + 4))) for k in (0, 4))
+        return out
+
+    def dot(self, a: list[Any]) -> Any:
+        """|a|^2 of eight vectors."""
+        squared = self.builder.fmul(a[0], a[0], flags=("contract",))
+        for component in a[1:]:
+            squared = self.multiply_add(component, component, squared)
+        return squared
+
+    def total(self, a: Any) -> Any:
+        """The sum of the lanes, taken pairwise."""
+        return self.paired([self.builder.extract_element(a, I32(lane)) for lane in range(LANES)])
+
+    def paired(self, terms: list[Any]) -> Any:
+        """The sum of as many terms as a power of two, taken pairwise."""
+        while len(terms) > 1:
+            terms = [self.builder.fadd(p, q) for p, q in zip(terms[::2], terms[1::2], strict=True)]
+        return terms[0]
+
+    def add_to(self, pointer: Any, row: Any) -> None:
+        """Add a row to one in memory."""
+        size = 8 if row.type.element == F64 else 4
+        total = self.builder.fadd(self.load(pointer, row.type, size), row)
+        self.builder.store(total, self.builder.bitcast(pointer, row.type.as_pointer()), align=size)
+
+    def clamped(self, s: Any) -> Any:
+        """s, between LEAST and MOST."""
+        return self.least(self.least(s, constant(LEAST), ">="), constant(MOST))
+
+    def least(self, a: Any, b: Any, order: str = "<=") -> Any:
+        """The lesser of two vectors' numbers, or the greater with the order ">="; a, where that is not a number."""
+        return self.builder.select(self.builder.fcmp_ordered(order, b, a), b, a)
+
+    def right(self, array: Any, bundle: Any) -> list[Any]:
+        """The constant right-hand side of a bundle, and what holds its vertices."""
+        at = self.builder.gep(array, [self.builder.mul(bundle, I64(RIGHT))])
+        return [self.load(self.builder.gep(at, [I64(LANES * k)]), WIDE) for k in range(4)]
+
+    def ask_ahead(self, bundle: Any, places: list[Any], entry: Any, right: Any, out: Any, neighbour: Any) -> None:
+        """Ask for what a bundle reads AHEAD rows on."""
+        b = self.builder
+        first = b.mul(b.add(bundle, I64(AHEAD // LANES)), I64(RIGHT))
+        for k in range(4):
+            ask(b, b.gep(right, [b.add(first, I64(LANES * k))]))
+        for place in places[::2]:
+            ask(b, b.gep(out, [b.add(place, I64(4 * AHEAD))]))
+        first = b.mul(b.add(entry, I64(AHEAD)), I64(LANES))  # about as many entries as rows
+        for k in range(LANES // 2):
+            ask(b, b.gep(neighbour, [b.add(first, I64(2 * LANES * k))]))
+
+    def any(self, mask: Any) -> Any:
+        """Whether one of eight is true."""
+        return self.builder.icmp_unsigned("!=", self.builder.bitcast(mask, I8), I8(0))
+
+    def guess(self, s: Any) -> tuple[Any, Any]:
+        """y, nearly 1/sqrt(s), and 1 - s y^2, for s between LEAST and MOST; `correction` does the rest."""
+        b = self.builder
+        if self.estimates:
+            kind = ir.FunctionType(WIDE, [WIDE, WIDE, I8])
+            estimate = b.module.globals.get(_ESTIMATE) or ir.Function(b.module, kind, _ESTIMATE)
+            y = b.call(estimate, [s, constant(0.0), I8(-1)])
+        else:
+            half = b.lshr(b.bitcast(s, BITS), ir.Constant(BITS, [1] * LANES))
+            y = b.bitcast(b.sub(ir.Constant(BITS, [_GUESS] * LANES), half), WIDE)
+            e = self.subtract_product(constant(1.0), b.fmul(s, y), y)
+            y = self.multiply_add(b.fmul(y, e), self.series(e, 35 / 128, 5 / 16, 3 / 8, 1 / 2), y)
+        return y, self.subtract_product(constant(1.0), b.fmul(s, y), y)
+
+    def correction(self, e: Any) -> Any:
+        """((1 - e)^(-1/2) - 1)/e, as far as a guess needs it."""
+        return self.series(e, *(5 / 16, 3 / 8, 1 / 2) if self.estimates else (3 / 8, 1 / 2))
+
+    def series(self, e: Any, *coefficients: float) -> Any:
+        """The polynomial in e with these coefficients, the highest power's first."""
+        first, *others = map(constant, coefficients)
+        for c in others:
+            first = self.multiply_add(first, e, c)
+        return first
+
+    def inverse_root(self, s: Any) -> Any:
+        """1/sqrt(s), for s between LEAST and MOST."""
+        y, e = self.guess(s)
+        return self.multiply_add(self.builder.fmul(y, e), self.correction(e), y)
+
+
+def _over_bundle(kind: Kind):
+    """The code for a bundle: its eight vertices and their springs."""
+
+    def declare(typingctx, x, own, bundle, neighbour, kinds, weights, begin, end, right, out):
+        def generate(context, builder: Any, signature, args):
+            x, own, bundle, neighbour, kinds, weights, begin, end, right, out = unpacked(
+                context, builder, signature, args
+            )
+            v = Vectors(context, builder)
+            places = v.places(own, bundle)
+            centre = v.gather(x, places)
+            if kind != "energy":
+                v.ask_ahead(bundle, places, begin, right, out, neighbour)
+            sums = [cgutils.alloca_once(builder, WIDE) for _ in range(3)]
+            for accumulator in sums:
+                builder.store(constant(0.0), accumulator)
+            shortest = cgutils.alloca_once(builder, WIDE)
+            builder.store(constant(MOST), shortest)
+
+            def read(entry):
+                """What an entry's springs need: k r, k, and the vector from their other ends with its square."""
+                others = v.gather(x, v.places(neighbour, entry))
+                arrow = [builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
+                return [*v.eights(weights, kinds, entry), v.dot(arrow), *arrow]
+
+            def scale(values):
+                """What the vectors are multiplied by, as a guess and what is to be added to it."""
+                pull, stiffness, squared, *arrow = values
+                builder.store(v.least(builder.load(shortest), squared), shortest)
+                y, e = v.guess(squared)
+                guess = builder.fmul(pull, y)
+                short = builder.fmul(guess, e)
+                if kind == "correct":
+                    guess = builder.fsub(guess, stiffness)
+                return [guess, short, e, *arrow]
+
+            def add(values):
+                """Add an entry's springs to the sums."""
+                if kind == "energy":
+                    _, factor, *terms = values[:3]
+                else:
+                    guess, short, e, *terms = values
+                    factor = v.multiply_add(short, v.correction(e), guess)
+                for term, accumulator in zip(terms, sums, strict=False):
+                    builder.store(v.multiply_add(factor, term, builder.load(accumulator)), accumulator)
+
+            v.over_entries(begin, end, read, *([add] if kind == "energy" else [scale, add]))
+            total = [builder.load(accumulator) for accumulator in sums]
+            if kind == "energy":
+                held = v.load(builder.gep(right, [builder.mul(bundle, I64(LANES))]), WIDE)
+                return v.total(v.multiply_add(v.dot(centre), held, builder.fmul(constant(0.5), total[0])))
+            short = v.any(builder.fcmp_ordered("<=", builder.load(shortest), constant(LEAST)))
+            with builder.if_then(builder.not_(short), likely=True):
+                *constants, held = v.right(right, bundle)
+                total = [builder.fadd(a, b) for a, b in zip(total, constants, strict=True)]
+                if kind == "correct":
+                    total = [v.subtract_product(a, held, b) for a, b in zip(total, centre, strict=True)]
+                places = v.places(own, bundle)  # again: they would not stay in registers
+                for place, row in zip(places, v.rows(total, out.type.pointee), strict=True):
+                    v.add_to(builder.gep(out, [place]), row)
+            return short
+
+        returned = types.float64 if kind == "energy" else types.boolean
+        return returned(x, own, bundle, neighbour, kinds, weights, begin, end, right, out), generate
+
+    return declare
+
+
+# Numba passes the first argument itself, which type checkers do not know.
+project: Any = intrinsic(_over_bundle("project"))
+correct: Any = intrinsic(_over_bundle("correct"))
+energy: Any = intrinsic(_over_bundle("energy"))

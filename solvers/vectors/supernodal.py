@@ -1,0 +1,212 @@
+"""A panel times four interleaved right-hand sides, both ways, in LLVM vectors that a compiler does not find by itself.
+
+A panel W has 4 m columns (m = 1 to 4), and its rows by fours, tiles, each of them column by column: a lane of four
+numbers is a column of a tile. A work vector has rows of 4: x, y, z and zero. What an entry of W is multiplied by is the
+same in all of a lane's places or in all lanes, so that W is loaded as it lies, and no padding is multiplied:
+
+    forwards    x, y and z of a column's row, four times each, are held for all tiles; the lanes of the products are
+                summed, transposed, and added to the rows of y that `index` names
+    backwards   x, y and z of the four rows of y that `index` names, transposed, are the same for all lanes; sums over
+                all tiles are held, and in the end those of a lane are added up
+
+What fills up the last tile is zero, and names a row of its own panel. Panels have the work vector's type, or are
+float16, seen as uint16, beside float32.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from solvers.vectors.intrinsics import ask, signature, unpacked
+
+_I32 = ir.IntType(32)
+_I64 = ir.IntType(64)
+_AHEAD = 4096
+"""How many bytes ahead a panel is asked for on the way down, which the hardware's own guess follows less well."""
+
+
+class _Tiles:
+    """Tiles of 4 m columns in vectors of 512 bits, written with a builder; `element` is the work vector's type."""
+
+    def __init__(self, context: Any, builder: Any, element: types.Float, m: int) -> None:
+        self.builder = builder
+        self.element = context.get_value_type(element)
+        self.size = element.bitwidth // 8
+        self.lanes = 16 // self.size  # of a vector
+        self.vectors = 4 * m // self.lanes  # of a tile
+        self.entries = 16 * m  # of a tile
+
+    def zero(self, lanes: int) -> ir.Constant:
+        return ir.Constant(ir.VectorType(self.element, 4 * lanes), [0.0] * (4 * lanes))
+
+    def load(self, pointer: Any, lanes: int = 1) -> Any:
+        kind = ir.VectorType(self.element, 4 * lanes)
+        return self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()), align=self.size)
+
+    def store(self, value: Any, pointer: Any) -> None:
+        self.builder.store(value, self.builder.bitcast(pointer, value.type.as_pointer()), align=self.size)
+
+    def panel(self, tile: Any, kind: types.Array, z: int) -> Any:
+        """Vector z of a tile of a panel of this kind; float16 is widened."""
+        at = self.builder.gep(tile, [_I64(4 * self.lanes * z)])
+        if kind.dtype != types.uint16:
+            return self.load(at, self.lanes)
+        half, wide = (ir.VectorType(e, 4 * self.lanes) for e in (ir.HalfType(), self.element))
+        return self.builder.fpext(self.builder.load(self.builder.bitcast(at, half.as_pointer()), align=2), wide)
+
+    def shuffle(self, a: Any, b: Any, places: Any) -> Any:
+        places = list(places)
+        return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(places)), places))
+
+    def picked(self, a: Any, b: Any, lanes: list[int]) -> Any:
+        """These lanes of two vectors, counted through both."""
+        return self.shuffle(a, b, [4 * lane + i for lane in lanes for i in range(4)])
+
+    def mixed(self, a: Any, b: Any, places: tuple[int, ...]) -> Any:
+        """Lane by lane the numbers in these places, counted through both vectors' lanes."""
+        n = a.type.count
+        return self.shuffle(a, b, [n * (i // 4) + lane + i % 4 for lane in range(0, n, 4) for i in places])
+
+    def joined(self, rows: list[Any]) -> Any:
+        """One vector of one, two or four."""
+        while len(rows) > 1:
+            many = rows[0].type.count // 4
+            rows = [self.picked(a, b, list(range(2 * many))) for a, b in zip(rows[::2], rows[1::2], strict=True)]
+        return rows[0]
+
+    def spread(self, vector: Any, c: int) -> Any:
+        """Of each lane its number c, four times."""
+        return self.shuffle(vector, vector, [i // 4 * 4 + c for i in range(vector.type.count)])
+
+    def add(self, a: Any, b: Any) -> Any:
+        return self.builder.fadd(a, b)
+
+    def multiply_add(self, a: Any, b: Any, c: Any) -> Any:
+        """a b + c; a b for no c. `contract` lets the target fuse them where it can."""
+        product = self.builder.fmul(a, b, flags=("contract",))
+        return product if c is None else self.builder.fadd(product, c, flags=("contract",))
+
+    def rows(self, totals: list[Any]) -> list[Any]:
+        """The lanes of each of three or four vectors summed, and the four rows, filled up with zero, that they are."""
+        vectors, even = [*totals, self.zero(self.lanes)][:4], list(range(0, 2 * self.lanes, 2))
+        for _ in range(self.lanes // 2):  # until a lane is a sum
+            vectors = [
+                self.add(self.picked(a, b, even), self.picked(a, b, [lane + 1 for lane in even]))
+                for a, b in zip(vectors[::2], vectors[1::2], strict=True)
+            ]
+        whole = self.joined(vectors)
+        turned = self.shuffle(whole, whole, [4 * c + r for r in range(4) for c in range(4)])
+        return [self.picked(turned, turned, [r]) for r in range(4)]
+
+    def transposed(self, rows: list[Any]) -> list[Any]:
+        """x, y and z of four rows, in each lane of a vector."""
+        if self.lanes == 2:
+            whole = self.joined(rows)
+            return [self.shuffle(whole, whole, [4 * r + c for r in range(4)] * 2) for c in range(3)]
+        rows = [self.picked(row, row, [0] * 4) for row in rows]  # so that all that follows stays within lanes
+        (xy01, z01), (xy23, z23) = (
+            [self.mixed(a, b, at) for at in ((0, 4, 1, 5), (2, 6, 3, 7))] for a, b in (rows[:2], rows[2:])
+        )
+        x, y = (self.mixed(xy01, xy23, at) for at in ((0, 1, 4, 5), (2, 3, 6, 7)))
+        return [x, y, self.mixed(z01, z23, (0, 1, 4, 5))]
+
+    def summed(self, x: Any, y: Any, z: Any) -> Any:
+        """Each lane's sums of x, y and z, and zero."""
+        xy, z0 = (
+            self.add(self.mixed(a, b, (0, 4, 1, 5)), self.mixed(a, b, (2, 6, 3, 7)))
+            for a, b in ((x, y), (z, self.zero(self.lanes)))
+        )
+        return self.add(self.mixed(xy, z0, (0, 1, 4, 5)), self.mixed(xy, z0, (2, 3, 6, 7)))
+
+    def ask(self, tile: Any, kind: Any) -> None:
+        """Ask for the cache lines that lie _AHEAD bytes before those of a tile of a panel of this kind."""
+        for line in reversed(range(0, self.entries * kind.dtype.bitwidth // 8, 64)):
+            ask(self.builder, tile, line - _AHEAD)
+
+
+def _named(builder: Any, index: Any, first: Any, rows: Any) -> list[Any]:
+    """Where the four rows are that `index` names from `first` on."""
+    names = [builder.zext(builder.load(builder.gep(index, [builder.add(first, _I64(r))])), _I64) for r in range(4)]
+    return [builder.gep(rows, [builder.mul(name, _I64(4))]) for name in names]
+
+
+def _add_forward(typingctx, panel, offset, index, at, count, x, x_row, y, y_row, numbers, quads):
+    """y[y_row + index[at + r]] += sum_j W[r, j] x[x_row + j] for r < count, a multiple of four; W from `offset` on.
+
+    numbers: how many of a row of x are not zero, 3 or 4."""
+    declared = signature(panel, offset, index, at, count, x, x_row, y, y_row, numbers, quads, compiled_in=2)
+
+    def generate(context, builder, signature, args):
+        panel, offset, index, at, count, x, x_row, y, y_row, numbers, m = unpacked(context, builder, signature, args)
+        kind = signature.args[0]
+        t = _Tiles(context, builder, signature.args[7].dtype, m)
+        panel, index = builder.gep(panel, [offset]), builder.gep(index, [at])
+        x, y = (builder.gep(rows, [builder.mul(first, _I64(4))]) for rows, first in ((x, x_row), (y, y_row)))
+        columns = [t.load(builder.gep(x, [_I64(4 * j)])) for j in range(4 * m)]
+        held = [t.joined(columns[j : j + t.lanes]) for j in range(0, 4 * m, t.lanes)]
+        factors = [[t.spread(vector, c) for c in range(numbers)] for vector in held]
+        with cgutils.for_range(builder, builder.lshr(count, _I64(2))) as loop:
+            first = builder.mul(loop.index, _I64(4))
+            tile = builder.gep(panel, [builder.mul(loop.index, _I64(t.entries))])
+            sums: list[Any] = [None] * numbers
+            for z, three in enumerate(factors):
+                w = t.panel(tile, kind, z)
+                sums = [t.multiply_add(w, factor, total) for factor, total in zip(three, sums, strict=True)]
+            for row, place in zip(t.rows(sums), _named(builder, index, first, y), strict=True):
+                t.store(t.add(row, t.load(place)), place)
+        return context.get_dummy_value()
+
+    return declared, generate
+
+
+def _set_backward(typingctx, square, start, own, panel, offset, index, at, below, y, x_row, quads):
+    """y[x_row + j] = sum over r < 4 quads of S[r, j] y[x_row + r] + sum over r < below of W[r, j] y[index[at + r]];
+    S from `start` on, and none where `own` is zero; W from `offset` on, `below` a multiple of four."""
+    declared = signature(square, start, own, panel, offset, index, at, below, y, x_row, quads)
+
+    def generate(context, builder, signature, args):
+        square, start, own, panel, offset, index, at, below, y, x_row, m = unpacked(context, builder, signature, args)
+        square_kind, panel_kind = signature.args[0], signature.args[3]
+        t = _Tiles(context, builder, signature.args[8].dtype, m)
+        square, panel, index = (builder.gep(a, [begin]) for a, begin in ((square, start), (panel, offset), (index, at)))
+        out = builder.gep(y, [builder.mul(x_row, _I64(4))])
+        vector = t.zero(t.lanes)
+        sums = [[cgutils.alloca_once(builder, vector.type) for _ in range(3)] for _ in range(t.vectors)]
+        for total in (total for three in sums for total in three):
+            builder.store(vector, total)
+
+        def add(tile, kind, places):
+            t.ask(tile, kind)
+            factors = t.transposed([t.load(place) for place in places])
+            for z, three in reversed(list(enumerate(sums))):
+                w = t.panel(tile, kind, z)
+                for factor, total in zip(factors, three, strict=True):
+                    builder.store(t.multiply_add(w, factor, builder.load(total)), total)
+
+        # From the last row to the first: the panels are then read strictly downwards, as they were read upwards before,
+        # so that what is still in the cache is read first.
+        tiles = builder.lshr(below, _I64(2))
+        with cgutils.for_range(builder, tiles) as loop:
+            k = builder.sub(builder.sub(tiles, _I64(1)), loop.index)
+            tile = builder.gep(panel, [builder.mul(k, _I64(t.entries))])
+            add(tile, panel_kind, _named(builder, index, builder.mul(k, _I64(4)), y))
+        with builder.if_then(builder.icmp_signed(">", own, _I64(0)), likely=True):
+            for k in reversed(range(m)):
+                places = [builder.gep(out, [_I64(4 * (4 * k + r))]) for r in range(4)]
+                add(builder.gep(square, [_I64(t.entries * k)]), square_kind, places)
+        done = [t.summed(*(builder.load(total) for total in three)) for three in sums]
+        for z, rows in enumerate(done):
+            t.store(rows, builder.gep(out, [_I64(4 * t.lanes * z)]))
+        return context.get_dummy_value()
+
+    return declared, generate
+
+
+# Numba passes the first argument itself, which type checkers do not know.
+add_forward: Any = intrinsic(_add_forward)
+set_backward: Any = intrinsic(_set_backward)
