@@ -12,7 +12,7 @@ import numpy as np
 from harness.report.accuracy import work_plot
 from harness.report.accuracy.convergence import GUESSES, remarks
 from harness.report.accuracy.growth import TARGET, growths
-from harness.report.accuracy.paper import FAR, comparisons
+from harness.report.accuracy.paper import FAR, FIGURE_2, ITERATIONS, Comparison, comparisons
 from harness.report.accuracy.profiles import least_ratios
 from harness.report.accuracy.table import Curve, Table, without_short
 from harness.report.accuracy.times import STEPS, TARGETS, crossings, power, races, reach, seconds_to
@@ -55,7 +55,7 @@ def write_findings(path: Path, title: str, chapters: Chapters, failed: list[dict
     """Write the chapters and the failures as Markdown."""
     lines = [f"# {title}", ""]
     for chapter, sentences in chapters.items():
-        lines += [f"## {chapter}", "", *(f"- {sentence}" for sentence in sentences), ""]
+        lines += [f"## {chapter}", "", *(s if s.startswith("|") else f"- {s}" for s in sentences), ""]
     if failed:
         lines += ["## What did not succeed", "", "| where | solver | status | reason |", "|---|---|---|---|"]
         lines += [
@@ -152,6 +152,22 @@ def _growth(table: Table) -> Iterator[str]:
 
 
 def _paper(table: Table) -> Iterator[str]:
+    """Every curve of both figures as a row of one table: our error over the paper's, bold where it is far off."""
+    by_curve: dict[str, dict[int, Comparison]] = {}
     for found in comparisons(table):
-        far = max(found.ratio, 1 / found.ratio) > FAR
-        yield f"{found.sentence}{': differs by more than a factor of 2' if far else ''}."
+        by_curve.setdefault(found.curve, {})[found.iterations] = found
+    if not by_curve:
+        return
+    counts = sorted({*FIGURE_2, *ITERATIONS})
+    yield "| curve | frames | " + " | ".join(f"after {n}" for n in counts) + " |"
+    yield "|---|---|" + "---|" * len(counts)
+    for curve, points in by_curve.items():
+        frames = next(iter(points.values())).frames
+        cells = (_cell(points[n]) if n in points else "" for n in counts)
+        yield f"| {curve} | {frames} | " + " | ".join(cells) + " |"
+
+
+def _cell(found: Comparison) -> str:
+    """Ours, theirs and the ratio."""
+    far = "**" if max(found.ratio, 1 / found.ratio) > FAR else ""
+    return f"{found.ours:.2g} / {found.theirs:.2g} = {far}{found.ratio:.2g}{far}"
