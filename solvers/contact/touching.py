@@ -39,9 +39,11 @@ class ContactEnergy(LaggedEnergy, Protocol):
         ...
 
     def rows(self, p: Positions, trial: Positions, *, cautious: bool) -> Rows:
-        """What resists displacements from p, (n, 3): all that does at p, and what begins to at the trial position.
+        """The rows that resist a displacement from p to `trial`, both (n, 3) [m]: contacts that press at p, and those
+        that begin to press on the way.
 
-        With the energy's exact second derivatives, or with larger ones that majorise it where `cautious`.
+        Their stiffness is the energy's exact second derivative; where `cautious`, a larger one that majorises the
+        energy.
         """
         ...
 

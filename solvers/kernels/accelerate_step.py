@@ -21,7 +21,8 @@ from solvers.kernels.step_ends import Rows, fetch, place, state
 from solvers.linear.supernodal_solve import backwards, forwards
 
 NOISE = 4.0 * np.finfo(np.float64).eps
-"""Of the rounding below: what is measured is less by the root of the number of terms."""
+"""The relative rounding error of one term of a sum. Errors of many terms partly cancel, so the sum of all bounds is
+above what is measured, by about the root of their number."""
 
 
 class Step(NamedTuple):

@@ -39,9 +39,9 @@ class Plan(NamedTuple):
     top's rows, and the number of groups; blocks (b, 7): of each its first and last slot and bundle, its first chunk,
     and the last for the passes forwards and backwards; of_group (groups + 2,): the first block of each group and of the
     top; visits: twice the block that a group goes down to, or up from (one more), from visits_of (groups + 1,) on;
-    held: m/dt^2 + w [N/m] of each row, and what quadratic forms hold it with; measure: of each lane of the bundles of
-    |e|_Q^2, as held without pins, and half of the springs to exactly pinned vertices, which no bundle counts from
-    there; loose: 1 for the rows of vertices that no pin holds, else 0; shift: by how many rows a vertex's right-hand
+    held: m/dt^2 + w [N/m] of each row, plus what quadratic forms add to its diagonal; measure: the diagonal part of
+    |e|_Q^2 in each lane of the bundles: `held` without the pins, and half of each spring to an exactly pinned vertex,
+    because no bundle of that vertex counts the other half; loose: 1 for the rows of vertices that no pin holds, else 0; shift: by how many rows a vertex's right-hand
     side lies behind its position.
     """
 

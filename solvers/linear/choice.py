@@ -51,9 +51,10 @@ _BYTES_PER_VERTEX = 200
 """Of the structure of a factor: 180 on a sheet of 512 vertices a side."""
 
 _BYTES_READ, _BYTES_KEPT = 70, 60
-"""Of an entry of Q by an iteration (with the coarse levels), and in memory at most while they are made; a vertex
-counts as four entries, for its vectors. The first fits sheets and solids of 1e6 vertices to a tenth, the second is
-over what was allocated for sheets (38), solids (31), chains (50) and stiffnesses over six decades (50)."""
+"""Bytes for each entry of Q: what one iteration of multigrid reads, coarse levels included, and the most that is
+allocated while the levels are made. A vertex counts as four entries, for its vectors. The first is within a tenth of
+what sheets and solids of 1e6 vertices read; the second is above what was measured: 38 for sheets, 31 for solids, 50
+for chains and for stiffnesses over six decades."""
 
 
 @dataclass(frozen=True, slots=True)

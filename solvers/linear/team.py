@@ -22,7 +22,8 @@ _PHASE, _DONE, _CLAIMS = 0, 8, 16
 
 _OVER = -1
 _SPINS = 2000
-"""Looks at the phase before a thread offers its core: about what an iteration takes of a mesh that is worth two."""
+"""How often a waiting thread looks at the phase before it offers its core to others. So many looks take about as long
+as one iteration on the smallest mesh for which two threads are faster than one."""
 
 _offer_core: Any = types.ExternalFunction("sched_yield", types.intc())
 

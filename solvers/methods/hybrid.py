@@ -50,7 +50,8 @@ _LEVELS = ((1.0, 0.0), (1.0, 0.1), (1.0, 1.0), (1.0, 10.0), (0.0, 0.0))
 """What is kept of negative lateral parts, and what multiple of inertia is added. The last one is positive definite."""
 
 _FLOPS_PER_ENTRY = 270.0
-"""Of a factorisation, what takes as long as an entry of Q's factor does in a round, with all that belongs to either."""
+"""Flops of a factorisation that take as long as one entry of Q's factor takes in a round of L-BFGS, both measured with
+all the work around them."""
 
 
 @dataclass(frozen=True)

@@ -185,7 +185,7 @@ class PreparedCompiled:
         allowed, used = numba.get_num_threads(), self._threads() or 1
         if used == allowed:
             return self.base.choice
-        why = "the system is too small to gain by a second" if used == 1 else f"its factor comes in {used} parts"
+        why = "the system is too small for a second thread to pay" if used == 1 else f"its factor comes in {used} parts"
         return f"{self.base.choice}; {used} of {allowed} threads: {why}"
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:

@@ -145,7 +145,7 @@ class PreparedVertexBlockDescent:
         return {}
 
     def _begin(self, problem: StepProblem, contacts: list[ContactEnergy]) -> Callable[[int], Positions]:
-        """What does a number of iterations, from where those before ended, and gives a copy of the positions."""
+        """A function that does the given number of iterations more and returns a copy of the positions it reached."""
         pull = blocks.pull(replace(problem, force=self.parts.force(problem)))
         p, y = (self._rows(x) for x in (blocks.placed(problem.first_guess, problem), pull))
         right = self.blocks.bundles.right(self.held, y)

@@ -204,7 +204,7 @@ def test_the_bits_do_not_depend_on_the_number_of_threads(solver, stop):
 def test_a_small_system_keeps_to_one_thread_and_says_so(monkeypatch):
     monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
     small, large = (CompiledLocalGlobal().prepare(cloth(size).system).choice for size in (12, 60))
-    assert small.endswith("; 1 of 2 threads: the system is too small to gain by a second")
+    assert small.endswith("; 1 of 2 threads: the system is too small for a second thread to pay")
     assert "threads" not in large
 
 

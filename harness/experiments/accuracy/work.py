@@ -2,8 +2,8 @@
 
     error = |p(T) - reference(T)| / |reference(T) - p(0)|        Frobenius norms over the vertices that are not pinned
 
-Time stepping and solver err together, as they do for whoever uses them. Pins are exact here, as they are in the
-reference. An error that the reference could not tell from its own is no error: the row is `uncertified`.
+The error is that of time stepping and solver together, which is what a user gets. Pins are exact here, as they are in
+the reference. Where the error is smaller than the reference's own, nothing can be said: the row is `uncertified`.
 """
 
 from __future__ import annotations
