@@ -41,8 +41,8 @@ class Plan(NamedTuple):
     top; visits: twice the block that a group goes down to, or up from (one more), from visits_of (groups + 1,) on;
     held: m/dt^2 + w [N/m] of each row, plus what quadratic forms add to its diagonal; measure: the diagonal part of
     |e|_Q^2 in each lane of the bundles: `held` without the pins, and half of each spring to an exactly pinned vertex,
-    because no bundle of that vertex counts the other half; loose: 1 for the rows of vertices that no pin holds, else 0; shift: by how many rows a vertex's right-hand
-    side lies behind its position.
+    because no bundle of that vertex counts the other half; loose: 1 for the rows of vertices that no pin holds, else 0;
+    shift: by how many rows a vertex's right-hand side lies behind its position.
     """
 
     squares: NDArray[np.float64]

@@ -5,8 +5,8 @@ A step from one first guess is a problem of its own. With t the time of a solver
     performance profile  rho(tau)  = share of the problems with t <= tau * (the least t of all solvers)
     data profile         d(kappa)  = share of the problems with t <= kappa * (one iteration of the yardstick)
 
-the yardstick being the plain local-global iteration. What is not reached, or failed, counts as infinite time. Only solvers that
-were tried on as many problems as any are compared: the others' shares would tell what was tried.
+the yardstick being the plain local-global iteration. What is not reached, or failed, counts as infinite time. Only
+solvers that were tried on as many problems as any are compared: the others' shares would tell what was tried.
 """
 
 from __future__ import annotations
