@@ -29,7 +29,7 @@ import llvmlite
 import numba
 import numpy as np
 from numba.core import config
-from numba.core.caching import NullCache
+from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
@@ -44,7 +44,14 @@ _SETTINGS = ("OPT", "BOUNDSCHECK", "LOOP_VECTORIZE", "SLP_VECTORIZE", "DEBUGINFO
 """Of Numba's environment, what alters the code."""
 
 
-class KernelCache(NullCache):
+_CONFIG: Any = config
+"""Its names come from the environment."""
+
+_CACHE: Any = _Cache
+"""Its signatures tell what its subclasses do not do."""
+
+
+class KernelCache(_CACHE):
     """What one kernel was compiled to, by signature."""
 
     def __init__(self, function: Any, options: Mapping[str, Any]) -> None:
@@ -58,7 +65,7 @@ class KernelCache(NullCache):
             hashlib.sha256(function.__code__.co_code).digest(),
             hashlib.sha256(dumps(cells)).digest() if cells else b"",
             (sys.version, numba.__version__, llvmlite.__version__, np.__version__),
-            tuple(str(getattr(config, name, "")) for name in _SETTINGS),
+            tuple(str(getattr(_CONFIG, name, "")) for name in _SETTINGS),
         )
 
     @property
@@ -91,6 +98,16 @@ class KernelCache(NullCache):
                 _clear(path.parent, self._module)
             _write(path, dumps((key, data._reduce())))
 
+    def enable(self) -> None:
+        """It always is."""
+
+    def disable(self) -> None:
+        """Nothing asks for that."""
+
+    def flush(self) -> None:
+        """Forget what is kept; `recompile` of a kernel asks for that."""
+        shutil.rmtree(self.cache_path, ignore_errors=True)
+
     def _path(self, key: Any) -> Path:
         name = self._name.replace("<", "").replace(">", "")
         return Path(self.cache_path) / f"{name}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
@@ -104,7 +121,7 @@ def _folder(home: Path, module: str, digest: str) -> Path:
 def _home(source: str) -> Path:
     """The first folder that can be written to; source: the folder of the source."""
     users = Path(AppDirs("springbench", appauthor=False).user_cache_dir)
-    for folder in (Path(config.CACHE_DIR or os.path.join(source, "__pycache__")), users):
+    for folder in (Path(_CONFIG.CACHE_DIR or os.path.join(source, "__pycache__")), users):
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()

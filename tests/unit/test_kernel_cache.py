@@ -153,7 +153,7 @@ def test_every_import_of_the_project_is_followed():
 
 
 OUTSIDE = {
-    "own.py": "import numpy\nfrom helper import (\n    A,  # a comment, with a comma\n    B,\n)\nfrom pack import part\n",
+    "own.py": "import numpy\nfrom helper import (\n    A,  # one, with a comma\n    B,\n)\nfrom pack import part\n",
     "helper.py": "import json\nimport solvers.memory as memory, unused\n",
     "unused.py": "",
     "json.py": "",
@@ -231,7 +231,7 @@ def test_code_of_other_sources_goes_when_new_comes_and_nobody_has_used_it(home: 
 def test_sources_that_cannot_be_written_beside_are_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "__pycache__").write_text("a file, where a folder would have to be")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "users"))
-    monkeypatch.setattr(caching.config, "CACHE_DIR", "")
+    monkeypatch.setattr(caching._CONFIG, "CACHE_DIR", "")
     assert caching._home(str(tmp_path)).is_relative_to(tmp_path / "users")
 
 
