@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import sys
 import sysconfig
 from collections.abc import Iterable, Iterator
 from functools import cache
@@ -70,6 +71,28 @@ def reached(source: str) -> frozenset[str]:
         found |= new
         todo += new
     return frozenset(found)
+
+
+def of_class(made: type) -> set[Path]:
+    """The files that a class is written in, wherever they lie, and those of what it inherits, libraries apart."""
+    files = _written_in(made) | {file for base in made.__mro__ for file in _written_in(base) if not _library(file)}
+    return {path.resolve() for path in files}
+
+
+def _written_in(made: type) -> set[Path]:
+    """The files of a class's module and of its functions, which a module loaded by hand may be known by alone."""
+    codes = (getattr(value, "__code__", None) for value in vars(made).values())
+    files = {code.co_filename for code in codes if code} | {getattr(sys.modules.get(made.__module__), "__file__", None)}
+    return {Path(file) for file in files if file and file.endswith(".py") and os.path.isfile(file)}
+
+
+def known(path: str) -> bool:
+    """Whether a file is of this project or of an installed library, and not somebody's own."""
+    return _own(path) or _library(Path(path)) or path.startswith("<")
+
+
+def _library(path: Path) -> bool:
+    return not _own(str(path)) and any(folder in _INSTALLED for folder in map(str, path.resolve().parents))
 
 
 def _name(path: str) -> str:
