@@ -75,15 +75,14 @@ def reached(source: str) -> frozenset[str]:
 
 def of_class(made: type) -> set[Path]:
     """The files that a class is written in, wherever they lie, and those of what it inherits, libraries apart."""
-    files = _written_in(made) | {file for base in made.__mro__ for file in _written_in(base) if not _library(file)}
-    return {path.resolve() for path in files}
-
-
-def _written_in(made: type) -> set[Path]:
-    """The files of a class's module and of its functions, which a module loaded by hand may be known by alone."""
-    codes = (getattr(value, "__code__", None) for value in vars(made).values())
-    files = {code.co_filename for code in codes if code} | {getattr(sys.modules.get(made.__module__), "__file__", None)}
-    return {Path(file) for file in files if file and file.endswith(".py") and os.path.isfile(file)}
+    own = {getattr(sys.modules.get(made.__module__), "__file__", None)}
+    for base in made.__mro__:
+        # A module that was loaded by hand may be known by its functions alone.
+        codes = (getattr(value, "__code__", None) for value in vars(base).values())
+        files = {code.co_filename for code in codes if code}
+        files.add(getattr(sys.modules.get(base.__module__), "__file__", None))
+        own |= {file for file in files if file and not _library(Path(file))}
+    return {Path(file).resolve() for file in own if file and file.endswith(".py") and os.path.isfile(file)}
 
 
 def known(path: str) -> bool:
