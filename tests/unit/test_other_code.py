@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import sys
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -86,3 +88,17 @@ def test_pictures_are_drawn_later_without_a_run_done_again(tmp_path: Path, monke
     assert "2 of 2 runs are there already" in told
     assert started(made) == before
     assert len([*(tmp_path / "r" / "sweep" / "pictures").glob("scene-4-*-????????????.png")]) == 2
+
+
+def test_the_file_of_a_class_is_known_however_its_module_was_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "by_hand.py"
+    path.write_text("class Mine:\n    def prepare(self, system):\n        return None\n")
+    by_hand = spec_from_file_location("by_hand", path)
+    assert by_hand
+    assert by_hand.loader
+    module = module_from_spec(by_hand)
+    by_hand.loader.exec_module(module)
+    assert sources.of_class(module.Mine) == {path}
+    monkeypatch.setitem(sys.modules, "by_hand", module)
+    monkeypatch.setattr(sources, "_INSTALLED", {str(tmp_path)})  # as a package that brings a solver is
+    assert sources.of_class(module.Mine) == {path}
