@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.load import load_any
-from harness.spec import RunSpec
+from harness.config.load import load_any
+from harness.config.sweep import RunSpec
 from solvers.registry import SOLVERS
 
 SOURCE = '''"""Local-global, by the tree's own."""
@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from solvers.local_global import SparseLocalGlobal
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Solution
 
 

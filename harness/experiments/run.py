@@ -25,10 +25,10 @@ from harness.config.sweep import RunSpec
 from harness.record.base import RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
+from harness.reference.grade import Graded
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
 from harness.simulation.contract import where
-from harness.simulation.grade import Graded
 from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, measure
 from harness.simulation.observe import observe
 from harness.simulation.step import prepare

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.errors import RunFailed
+from harness.base.errors import RunFailed
 from solvers import sources
 from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule, System
 

@@ -12,8 +12,8 @@ import pytest
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.load import load_any
-from harness.run import Files, code, parts
+from harness.config.load import load_any
+from harness.experiments.run import Files, code, parts
 from solvers import sources
 from solvers.registry import SOLVERS, load
 from tests.own_solvers import OPTIONS, Own, own

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import pytest
 from scipy.sparse import csr_array
 
-from solvers.anderson import Anderson
-from solvers.chebyshev import Chebyshev
-from solvers.compiled import CompiledLocalGlobal
 from solvers.energies.springs import Springs
-from solvers.lbfgs import Lbfgs
+from solvers.methods.anderson import Anderson
+from solvers.methods.chebyshev import Chebyshev
+from solvers.methods.lbfgs import Lbfgs
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, Solver, System
 from tests.scenes import cloth, first_problem
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from harness import run as runs
-from harness.run import Files, execute
+from harness.experiments import run as runs
+from harness.experiments.run import Files, execute
 from tests.own_solvers import OPTIONS, Own, own
 
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.errors import RunFailed
-from harness.judge import Oracle
+from harness.base.errors import RunFailed
+from harness.reference.judge import Oracle
 from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule, minimises
 
 SLACK = 10.0
