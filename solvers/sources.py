@@ -104,10 +104,14 @@ def _own(path: str) -> bool:
 
 
 def _content(path: str) -> bytes:
-    """What a source holds, as a digest; one of its own where that was changed since it was first seen."""
-    first = _FIRST.setdefault(path, _stamp(path))
-    held = _held(path)
-    return held if _stamp(path) == first else hashlib.sha256(_SALT + held).digest()
+    """What a source holds, as a digest; one that only this process has where it was changed since it was first seen."""
+    try:
+        first, held = _FIRST.setdefault(path, _stamp(path)), _held(path)
+        if _stamp(path) == first:
+            return held
+    except OSError:  # it was removed
+        held = b""
+    return hashlib.sha256(_SALT + held).digest()
 
 
 @cache
@@ -118,7 +122,10 @@ def _held(path: str) -> bytes:
 @cache
 def _imported(source: str) -> set[str]:
     """The paths of the sources that a source imports, and of the packages that they lie in."""
-    text = Path(source).read_text(encoding="utf-8", errors="replace")
+    try:
+        text = Path(source).read_text(encoding="utf-8", errors="replace")
+    except OSError:  # it was removed, which `digest` notes
+        return set()
     return {path for base, name in _names(text) for path in _found(source, base, name)}
 
 

@@ -130,6 +130,12 @@ def test_what_was_edited_since_it_was_imported_is_kept_for_nobody_else(checkout:
     assert asked(checkout, ASK) == "18.0 1"
 
 
+def test_a_source_that_is_removed_while_a_process_runs_stops_nothing(checkout: Path):
+    removing = "from pathlib import Path\nimport solvers.kernels.kernel_of_test\n"
+    removing += "Path('solvers/kernels/inner_of_test.py').unlink()\n"
+    assert asked(checkout, removing + ASK) == "6.0 0"
+
+
 def imported(path: Path) -> set[str]:
     """The project's modules that a source imports, by Python's own grammar."""
     found = set()
