@@ -149,6 +149,13 @@ def read(paths: Iterable[Path], schema: pa.Schema = SCHEMA) -> pa.Table:
     return pa.concat_tables([schema.empty_table(), *tables], promote_options="default")
 
 
+def of_other_code(paths: Iterable[Path], code: str) -> str:
+    """A remark on how many of the files that are there were made by other code than this; empty for none."""
+    there = [path for path in paths if path.exists()]
+    older = sum(pq.read_table(path, columns=["code"]).slice(0, 1).to_pylist() != [{"code": code}] for path in there)
+    return f"{older} of {len(there)} there are by other code than today's; --again does all anew" if older else ""
+
+
 @contextmanager
 def alone(folder: Path) -> Iterator[None]:
     """Hold a folder of results for one process; whatever a killed one left half written is removed."""

@@ -64,7 +64,7 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
     tick: told the name of the pass after each step; positions: where to store the positions after every step
     (frames, n, 3) [m], float64. Returns the rows. Raises InputError for what the user can mend.
     """
-    shared, threads = common(run), machine.threads(run.threads)
+    shared, threads = common(run) | {"code": code(parts(run))}, machine.threads(run.threads)
     with machine.pinned_threads(threads.number):
         try:
             found = _passes(run, files, tick, positions)
@@ -281,7 +281,7 @@ def save_positions(path: Path, positions: np.ndarray) -> None:
 def common(run: RunSpec) -> dict[str, Any]:
     """The columns that are the same in all rows of a run."""
     named = {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep}
-    return named | asked(run) | provenance() | {"code": code(parts(run))}
+    return named | asked(run) | provenance()
 
 
 def asked(run: RunSpec) -> dict[str, Any]:
