@@ -286,8 +286,7 @@ class Solver(Protocol):
     """A frozen dataclass of a method's parameters.
 
     minimises: whether its iterates tend to a minimum of the step's objective; a method for which they do not is
-    graded on its trajectories. descends: whether the objective rises in no iteration, round-off apart. Both may be
-    left out (see `minimises` below).
+    graded on its trajectories. descends: whether the objective rises in no iteration, round-off apart.
     """
 
     minimises: ClassVar[bool]
@@ -299,8 +298,3 @@ class Solver(Protocol):
         Raises Unsupported, before any work, for what the method cannot do, and NotPositiveDefinite.
         """
         ...
-
-
-def minimises(solver: Solver) -> bool:
-    """Whether a solver's iterates tend to a minimum; one that does not say counts as one whose do, and is graded so."""
-    return getattr(solver, "minimises", True)

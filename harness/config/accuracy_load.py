@@ -16,8 +16,7 @@ from harness.config.load import check_name, misfits, scenes_of, solvers_of
 from harness.config.sweep import SolverSpec
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
-from solvers.problem import minimises
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load, minimises
 
 MAX_UNITS = 20_000
 

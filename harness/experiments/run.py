@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from harness.base import machine, rows
 from harness.base.errors import InputError, RunFailed
 from harness.config.sweep import RunSpec
+from harness.experiments.code import code, parts, solver_class
 from harness.record.base import RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
@@ -33,8 +34,8 @@ from harness.simulation.measure import Diverged, Measured, Settings, StepFailed,
 from harness.simulation.observe import observe
 from harness.simulation.step import prepare
 from solvers import sources
-from solvers.problem import NotPositiveDefinite, Solver, StopRule, Unsupported, minimises
-from solvers.registry import SOLVERS, load
+from solvers.problem import NotPositiveDefinite, Solver, StopRule, Unsupported
+from solvers.registry import SOLVERS, load, minimises
 
 Tick = Callable[[str], None]
 
@@ -71,7 +72,7 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
         except InputError:
             raise
         except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
-            found = [failure(error, sources.of_class(_class(run)))]
+            found = [failure(error, sources.of_class(solver_class(run)))]
             for earlier in (files.recording, files.picture):  # of a time when it did not fail; they would hide this
                 earlier.unlink(missing_ok=True)
             if run.record and "frame" in found[0]:
@@ -88,10 +89,8 @@ _STATUS: dict[type[BaseException], str] = {Unsupported: "unsupported", Diverged:
 
 
 def failure(error: BaseException, own: Collection[Path] = ()) -> dict[str, Any]:
-    """The row of a run that ended with an error, less what all its rows share; with the frame, where a step failed.
-
-    own: the solver's files, whose lines are blamed first.
-    """
+    """The row of a run that ended with an error, less what all its rows share; with the frame, where a step failed;
+    own: the solver's files, whose lines are blamed first."""
     if isinstance(error, StepFailed) and error.__cause__:
         return failure(error.__cause__, own) | {"frame": error.frame}
     return {"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error, own)}
@@ -181,22 +180,7 @@ def _settings(run: RunSpec) -> Settings:
 
 
 def _solver(run: RunSpec) -> Solver:
-    return _class(run)(**run.solver.parameters)
-
-
-def _class(run: RunSpec) -> Any:
-    return load(SOLVERS[run.solver.name])
-
-
-def parts(run: RunSpec) -> frozenset[type]:
-    """The classes that a run is put together from by name: the solver, the mesh, the effects, a judge's reference."""
-    judge = (load(SOLVERS["newton"]),) if run.judge else ()
-    return frozenset([_class(run), type(run.scene.mesh), *map(type, run.scene.effects), *judge])
-
-
-def code(parts: frozenset[type]) -> str:
-    """12 hexadecimal digits of SHA-256 over all sources that a run of these parts depends on, wherever they lie."""
-    return sources.digest([__file__, *(file for part in parts for file in sources.of_class(part))])[:12]
+    return solver_class(run)(**run.solver.parameters)
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,8 +264,7 @@ def save_positions(path: Path, positions: np.ndarray) -> None:
 
 def common(run: RunSpec) -> dict[str, Any]:
     """The columns that are the same in all rows of a run."""
-    named = {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep}
-    return named | asked(run) | provenance()
+    return {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep} | asked(run) | provenance()
 
 
 def asked(run: RunSpec) -> dict[str, Any]:

@@ -18,7 +18,8 @@ from harness.base import machine, rows
 from harness.base.errors import InputError
 from harness.base.progress import Display
 from harness.config.sweep import RunSpec
-from harness.experiments.run import Files, code, execute, parts
+from harness.experiments.code import code, parts
+from harness.experiments.run import Files, execute
 from harness.record.compare import side_by_side
 from harness.record.reader import read_replay
 from harness.report import opengl

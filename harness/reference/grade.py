@@ -15,7 +15,8 @@ import numpy as np
 
 from harness.base.errors import RunFailed
 from harness.reference.judge import Oracle
-from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule, minimises
+from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule
+from solvers.registry import minimises
 
 SLACK = 10.0
 """A residual may be measured with a factor of few digits, or with a preconditioner that is like Q."""

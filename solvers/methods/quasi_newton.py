@@ -75,12 +75,9 @@ def prepare(system: System, method: Method, linear: Linear, precision: Precision
     )
     base = prepared(bare, energies, lambda Q: factorise(Q, linear, precision))
     found = compiled(base, corrects=True)
-    engine: Engine
-    if isinstance(found, PreparedCompiled):
-        base, engine = found.base, _Compiled(method, found)
-    else:
-        base = replace(base, choice=f"{base.choice}; {found}")
-        engine = _Interpreted(method, base)
+    known = isinstance(found, PreparedCompiled)
+    base = found.base if known else replace(base, choice=f"{base.choice}; {found}")
+    engine: Engine = _Compiled(method, found) if known else _Interpreted(method, base)
     if bare is not system:
         from solvers.contact.quasi_newton import Touching  # for those who need it
 
