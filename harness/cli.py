@@ -71,11 +71,14 @@ def run(
         Path | None, typer.Option(help="Store the positions after every step (float64, .npz) of one run.")
     ] = None,
     again: Annotated[bool, typer.Option("--again", help="Do all runs, also those that are there.")] = False,
+    changed: Annotated[
+        bool, typer.Option("--changed", help="Do also the runs that are there by other code than today's.")
+    ] = False,
 ) -> None:
     """Do what is missing of a sweep, or of the one scene in a file."""
     from harness.base.progress import display
     from harness.config.load import load_any
-    from harness.experiments.sweep import failures, run_sweep
+    from harness.experiments.sweep import failures, of_other_code, run_sweep
     from harness.report.timing_table import summary_table
 
     options = {
@@ -91,8 +94,9 @@ def run(
     sweep = load_any(config, solvers=solver or (), sizes=size or (), **options)
     _check_positions(positions)
     folder = results / sweep.name
-    table = run_sweep(sweep.name, sweep.runs(), folder, display(err), _say, again=again, positions=positions)
-    out.print(summary_table(table))
+    runs = sweep.runs()
+    table = run_sweep(sweep.name, runs, folder, display(err), _say, again=again, changed=changed, positions=positions)
+    out.print(summary_table(table, of_other_code(runs, table)))
     _say(f"rows, recordings and pictures are in {folder}")
     failed = failures(table)
     for line in failed:

@@ -7,13 +7,28 @@ for Python, which take longest to compile.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from numba import njit
 
-_kept: Any = {"cache": True, "_nrt": False, "nogil": True}
-inner_options: Any = {**_kept, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+from solvers.caching import KernelCache
 
-kernel: Any = njit(**_kept)
-inner: Any = njit(**inner_options)
-inner_in_parallel: Any = njit(**inner_options, parallel=True)
+
+def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Numba's `njit` with these options; what it compiles is kept on disk by all that it depends on."""
+
+    def compiling(function: Callable[..., Any]) -> Any:
+        dispatcher: Any = njit(**options)(function)
+        dispatcher._cache = KernelCache(function, options)
+        return dispatcher
+
+    return compiling
+
+
+_bare: Any = {"_nrt": False, "nogil": True}
+inner_options: Any = {**_bare, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+kernel: Any = kept(**_bare)
+inner: Any = kept(**inner_options)
+inner_in_parallel: Any = kept(**inner_options, parallel=True)

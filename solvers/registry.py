@@ -26,3 +26,8 @@ def load(target: str) -> Any:
     """The object that "module:name" names; its module is imported now and no sooner."""
     module, _, name = target.partition(":")
     return getattr(import_module(module), name)
+
+
+def minimises(solver: Any) -> bool:
+    """Whether a solver's iterates tend to a minimum; one that does not say counts as one whose do, and is graded so."""
+    return getattr(solver, "minimises", True)

@@ -67,6 +67,12 @@ COLUMNS = (
     Column("attainable", _REAL, "", "where judged: the least stationarity that round-off lets anyone reach"),
     Column("minimum", pa.bool_(), "", "where judged: whether the Hessian after the step is positive definite"),
     Column(
+        "graded",
+        _REAL,
+        "",
+        "in the first, middle and last frame, if the solver minimises: the stationarity by the oracle, judged or not",
+    ),
+    Column(
         "distance",
         _REAL,
         "",
@@ -101,7 +107,7 @@ COLUMNS = (
     Column("system", _TEXT, "", "operating system and its release"),
     Column("versions", _TEXT, "", "versions of Python and the libraries, as JSON"),
     Column("commit", _TEXT, "", "commit of the code, with -dirty where files differed from it"),
-    Column("code", _TEXT, "", "hash of the sources of solvers and harness: rows made by older code differ"),
+    Column("code", _TEXT, "", "hash of all sources that the run depends on: rows made by other code differ"),
     Column("started", _TEXT, "", "when the run started, UTC, ISO 8601"),
 )
 
@@ -141,6 +147,13 @@ def read(paths: Iterable[Path], schema: pa.Schema = SCHEMA) -> pa.Table:
         except (pa.ArrowInvalid, OSError) as error:
             raise InputError(Mistake(f"holds no rows ({error}); take it out of the results", path)) from error
     return pa.concat_tables([schema.empty_table(), *tables], promote_options="default")
+
+
+def of_other_code(paths: Iterable[Path], code: str) -> str:
+    """A remark on how many of the files that are there were made by other code than this; empty for none."""
+    there = [path for path in paths if path.exists()]
+    older = sum(pq.read_table(path, columns=["code"]).slice(0, 1).to_pylist() != [{"code": code}] for path in there)
+    return f"{older} of {len(there)} there are by other code than today's; --again does all anew" if older else ""
 
 
 @contextmanager

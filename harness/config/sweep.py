@@ -147,8 +147,10 @@ class RunSpec:
     judge: bool
 
     def identity(self) -> str:
-        """All that determines the run's result and timing on one machine, as canonical JSON."""
-        settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("sweep", "scene_name")}
+        """All that determines the run's result and timing on one machine, as canonical JSON; pictures come later, from
+        the recording."""
+        left_out = ("sweep", "scene_name", "pictures")
+        settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
         settings |= {"scene": self.scene.digest, "solver": [self.solver.name, dict(self.solver.parameters)]}
         return json.dumps(settings, sort_keys=True, separators=(",", ":"))
 

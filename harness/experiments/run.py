@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -23,16 +22,20 @@ from numpy.typing import NDArray
 from harness.base import machine, rows
 from harness.base.errors import InputError, RunFailed
 from harness.config.sweep import RunSpec
+from harness.experiments.code import code, parts, solver_class
 from harness.record.base import RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
+from harness.reference.grade import Graded
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
+from harness.simulation.contract import where
 from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, measure
 from harness.simulation.observe import observe
 from harness.simulation.step import prepare
+from solvers import sources
 from solvers.problem import NotPositiveDefinite, Solver, StopRule, Unsupported
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load, minimises
 
 Tick = Callable[[str], None]
 
@@ -62,14 +65,14 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
     tick: told the name of the pass after each step; positions: where to store the positions after every step
     (frames, n, 3) [m], float64. Returns the rows. Raises InputError for what the user can mend.
     """
-    shared, threads = common(run), machine.threads(run.threads)
+    shared, threads = common(run) | {"code": code(parts(run))}, machine.threads(run.threads)
     with machine.pinned_threads(threads.number):
         try:
             found = _passes(run, files, tick, positions)
         except InputError:
             raise
         except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
-            found = [failure(error)]
+            found = [failure(error, sources.of_class(solver_class(run)))]
             for earlier in (files.recording, files.picture):  # of a time when it did not fail; they would hide this
                 earlier.unlink(missing_ok=True)
             if run.record and "frame" in found[0]:
@@ -85,19 +88,19 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
 _STATUS: dict[type[BaseException], str] = {Unsupported: "unsupported", Diverged: "diverged"}
 
 
-def failure(error: BaseException) -> dict[str, Any]:
-    """The row of a run that ended with an error, less what all its rows share; with the frame, where a step failed."""
+def failure(error: BaseException, own: Collection[Path] = ()) -> dict[str, Any]:
+    """The row of a run that ended with an error, less what all its rows share; with the frame, where a step failed;
+    own: the solver's files, whose lines are blamed first."""
     if isinstance(error, StepFailed) and error.__cause__:
-        return failure(error.__cause__) | {"frame": error.frame}
-    return {"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error)}
+        return failure(error.__cause__, own) | {"frame": error.frame}
+    return {"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error, own)}
 
 
-def _reason(error: BaseException) -> str:
+def _reason(error: BaseException, own: Collection[Path]) -> str:
     """An error of ours speaks for itself; of any other the row also says what it was and where it came from."""
     if isinstance(error, (Unsupported, NotPositiveDefinite, Diverged, RunFailed)):
         return str(error)
-    where = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
+    return f"{type(error).__name__}: {error} ({where(error, set(map(str, own)))})"
 
 
 def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
@@ -137,9 +140,10 @@ def _second_pass(
             facts = {"status": "ok", "milliseconds_per_step": 1e3 * float(np.median(seconds))}
             recorder = _recorder(run, files, scene, facts)
             cleanup.callback(recorder.abandon)
+        graded = Graded(measured.prepared, _solver(run), {1, (run.frames + 1) // 2, run.frames})
         found = observe(
             scene,
-            measured.prepared,
+            graded,
             settings,
             recorder=recorder,
             convergence={1, (run.frames + 1) // 2, run.frames}
@@ -153,7 +157,7 @@ def _second_pass(
             recorder.close(_milliseconds(measured, run.frames))
     if positions and stored is not None:
         save_positions(positions, stored)
-    return found
+    return {frame: graded.found.get(frame, {}) | columns for frame, columns in found.items()}
 
 
 def _record_until(run: RunSpec, files: Files, failed: dict[str, Any]) -> None:
@@ -176,7 +180,7 @@ def _settings(run: RunSpec) -> Settings:
 
 
 def _solver(run: RunSpec) -> Solver:
-    return load(SOLVERS[run.solver.name])(**run.solver.parameters)
+    return solver_class(run)(**run.solver.parameters)
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +195,7 @@ def _judge(run: RunSpec, scene: Scene) -> Judge | None:
     if not run.judge:
         return None
     key = (run.scene.digest, run.size, run.integrator, run.first_guess, run.frames)
-    return Judge(scene, _reference(_Motion(key, run)), minimises=_solver(run).minimises)
+    return Judge(scene, _reference(_Motion(key, run)), minimises=minimises(_solver(run)))
 
 
 @lru_cache(maxsize=1)

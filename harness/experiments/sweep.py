@@ -18,6 +18,7 @@ from harness.base import machine, rows
 from harness.base.errors import InputError
 from harness.base.progress import Display
 from harness.config.sweep import RunSpec
+from harness.experiments.code import code, parts
 from harness.experiments.run import Files, execute
 from harness.record.compare import side_by_side
 from harness.record.reader import read_replay
@@ -27,6 +28,9 @@ from harness.report.run_picture import draw_run
 from harness.report.timing_plot import draw_timing
 
 DONE, MISSING = "done", "missing"
+
+_NAMED = 8
+"""So many runs are named where more are meant."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +54,7 @@ class Planned:
 
 def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
     """Each run with its files and what is there already."""
-    code = machine.code_hash()
+    codes: dict[frozenset[type], str] = {}
     planned = []
     for run in runs:
         files = Files.of(run, folder)
@@ -58,7 +62,9 @@ def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
         if files.rows.exists():
             there = pq.read_table(files.rows, columns=["status", "code"]).slice(0, 1).to_pylist()[0]
             state = DONE if there["status"] == "ok" else there["status"]
-            older = there["code"] != code
+            if (made_of := parts(run)) not in codes:
+                codes[made_of] = code(made_of)
+            older = there["code"] != codes[made_of]
             if state == DONE and run.record and not files.recording.exists():
                 state = MISSING
         planned.append(Planned(run, files, state, older))
@@ -73,9 +79,11 @@ def run_sweep(
     say: Callable[[str], None],
     *,
     again: bool = False,
+    changed: bool = False,
     positions: Path | None = None,
 ) -> pa.Table:
-    """Do what is missing of a sweep (all of it with `again` or `positions`) and return all its rows.
+    """Do what is missing of a sweep, all of it with `again` or `positions`, with `changed` also what was done by other
+    code than today's, and return all its rows.
 
     say: prints a remark; positions: where to store the positions of the sweep's only run. Raises InputError.
     """
@@ -88,9 +96,10 @@ def run_sweep(
         (folder / part).mkdir(parents=True, exist_ok=True)
     with rows.alone(folder):
         planned = plan(runs, folder)
-        todo = [p for p in planned if p.state == MISSING or again or positions]
+        todo = [p for p in planned if p.state == MISSING or again or positions or (changed and p.older)]
         if len(todo) < len(planned):
             say(f"{len(planned) - len(todo)} of {len(planned)} runs are there already")
+        _say_older([p for p in planned if p.older and p not in todo], say)
         display.begin(len(todo), sum(map(_work, todo)))
         try:
             for p in todo:
@@ -102,6 +111,20 @@ def run_sweep(
         table = rows.read(p.files.rows for p in planned)
         _draw(name, planned, folder, table, say)
     return table
+
+
+def _say_older(older: list[Planned], say: Callable[[str], None]) -> None:
+    """Say which runs that are shown were done by other code."""
+    if older:
+        more = f" and {len(older) - _NAMED} more" if len(older) > _NAMED else ""
+        say(f"{len(older)} of them by other code than today's: {', '.join(p.title for p in older[:_NAMED])}{more}")
+        say("--changed does these again, --again does all")
+
+
+def of_other_code(runs: Iterable[RunSpec], table: pa.Table) -> set[str]:
+    """The ids of those runs whose rows in the table were made by other code than today's."""
+    here, made = machine.describe().id, dict(zip(*(table[c].to_pylist() for c in ("run_id", "code")), strict=True))
+    return {name for run in runs if made.get(name := run.run_id(here)) != code(parts(run))}
 
 
 def _work(p: Planned) -> float:

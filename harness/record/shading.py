@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from harness.record.base import RecordingInfo
+from solvers.compiling import kept
 from solvers.problem import Positions
 
 STRAIN_COLOURS = ("#125490", "#64a2d6", "#d9d7d2", "#e5863b", "#943404")
@@ -73,7 +73,7 @@ def strains(
 
 # Positions come as writable copies: a read-only array is another type to Numba, and another compilation. Without the
 # interpreter's lock, so that the solver beside need not wait.
-@njit(cache=True, error_model="numpy", nogil=True)
+@kept(error_model="numpy", nogil=True)
 def _strains(p, springs, rest_lengths, of_spring, of_vertex):
     for e in range(len(springs)):
         i, j = springs[e, 0], springs[e, 1]
@@ -86,7 +86,7 @@ def _strains(p, springs, rest_lengths, of_spring, of_vertex):
                 of_vertex[v] = strain
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kept(error_model="numpy", nogil=True)
 def _normals(p, triangles, out):
     for t in range(len(triangles)):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]

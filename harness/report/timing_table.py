@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import duckdb
@@ -110,8 +110,11 @@ _NUMBERS = (
 )
 
 
-def summary_table(table: pa.Table) -> Table:
-    """One line for each run: what it was, whether it succeeded, and its times [ms]."""
+def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
+    """One line for each run: what it was, whether it succeeded, and its times [ms].
+
+    other_code: the ids of the runs that were done by other code than today's, which are marked.
+    """
     out = Table(box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     for name in ("scene", "size", "solver"):
         out.add_column(name, overflow="fold", justify="right" if name == "size" else "left", min_width=len(name))
@@ -126,7 +129,8 @@ def summary_table(table: pa.Table) -> Table:
             names[run.run_id],
             _number(run.vertices, count),
             _number(run.springs, count),
-            f"[{'green' if run.status == 'ok' else 'bold red'}]{run.status}[/]",
+            f"[{'green' if run.status == 'ok' else 'bold red'}]{run.status}[/]"
+            + ("[yellow] by other code[/]" if run.run_id in other_code else ""),
             *(
                 _number(value, quantity)
                 for value in (run.cold, run.warm, run.step, run.least, run.local, run.global_, run.iterations)

@@ -14,6 +14,7 @@ from time import perf_counter
 import numpy as np
 
 from harness.scenes.bind import Scene
+from harness.simulation.contract import Contract
 from harness.simulation.step import Step, prepare, simulate, start
 from solvers.problem import Positions, Prepared, Solver, StopRule
 
@@ -69,9 +70,10 @@ class Measured:
 def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[str], None]) -> Measured:
     """Prepare cold and warm, then time phases and steps; `tick` is told each pass's name after each step.
 
-    Raises Unsupported, NotPositiveDefinite, StepFailed.
+    Raises Unsupported, NotPositiveDefinite, StepFailed, RunFailed where the solver breaks its contract.
     """
     timings: list[Timing] = []
+    contract = Contract(scene.system, solver)
     prepared = None
     for round in range(settings.rounds + 1):
         began = perf_counter()
@@ -79,7 +81,7 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
         timings.append(Timing("prepare", None, round, perf_counter() - began))
     assert prepared is not None
 
-    for step in steps(scene, prepared, settings):
+    for step in steps(scene, contract.checked(prepared), settings):
         for phase, call in prepared.phases(step.problem).items():
             call()
             for round in range(PHASE_REPEATS):

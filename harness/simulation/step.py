@@ -105,11 +105,11 @@ class _Turns:
 
     def __init__(self, usual: Prepared, other: Prepared, rate: float) -> None:
         """rate: of the other [1/s]."""
-        self._usual, self._other, self._rate = usual, other, rate
+        self.usual, self._other, self._rate = usual, other, rate
         self.choice, self.facts = usual.choice, usual.facts
 
     def _of(self, problem: StepProblem) -> Prepared:
-        return self._other if problem.system.rate == self._rate else self._usual
+        return self._other if problem.system.rate == self._rate else self.usual
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         return self._of(problem).iterates(problem)

@@ -8,12 +8,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from solvers.compiling import inner_options
+from solvers.compiling import inner_options, kept
 
 # At a minimum all products may be zero: then quotients are not numbers, and the trial that they make is rejected.
-inner: Any = njit(**inner_options, error_model="numpy")
+inner: Any = kept(**inner_options, error_model="numpy")
 
 CHEBYSHEV, ANDERSON, LBFGS = 0, 1, 2
 

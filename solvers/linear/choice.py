@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from numba import njit
 from scipy.sparse import csr_array
 
+from solvers.compiling import kept
 from solvers.linear.conjugate_gradients import ConjugateGradients
 from solvers.linear.factors import Factor, SimplicialCholesky
 from solvers.linear.inverse import Inverse
@@ -157,7 +157,7 @@ def _refuse(room: float, needs: dict[str, Estimate]) -> Choice:
     raise Unsupported(f"the system does not fit in {in_words(room)} of memory: {listed}; use a coarser mesh")
 
 
-@njit(cache=True)
+@kept()
 def _factorisation(parent, first, row_start, sequence):
     """The most numbers in fronts and waiting updates at a time, and the flops of a multifrontal factorisation."""
     nodes = len(parent)

@@ -11,10 +11,10 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from scipy.linalg import get_lapack_funcs
 from scipy.sparse import csr_array
 
+from solvers.compiling import kept
 from solvers.problem import NotPositiveDefinite, Positions
 
 _ROWS = 4
@@ -62,7 +62,7 @@ class Inverse:
 
 
 # Sums may be reordered, which vectors need; NaN and infinity keep their meaning.
-@njit(cache=True, fastmath={"contract", "reassoc", "nsz"})
+@kept(fastmath={"contract", "reassoc", "nsz"})
 def multiply(inverse, columns, b, out):
     """out = inverse b; `columns` (3, padded n) is scratch whose padding is zero."""
     n = len(b)

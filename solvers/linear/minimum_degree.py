@@ -7,10 +7,11 @@ its neighbours. Exact degrees, no quotient graph: at a hundred vertices that is 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from solvers.compiling import kept
 
 
-@njit(cache=True)
+@kept()
 def _bits(word):
     """The number of ones in a 64-bit word (Warren, Hacker's Delight, section 5-1)."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
@@ -19,7 +20,7 @@ def _bits(word):
     return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@njit(cache=True)
+@kept()
 def minimum_degree(pointers, neighbours, piece, local):
     """Sort `piece` into minimum degree order. `local` (n,) is -1 on entry and on return."""
     size = len(piece)

@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, prange, types
+from numba import prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
+
+from solvers.compiling import kept
 
 BLOCK = 512
 """Rows that a thread does at a time."""
@@ -56,7 +58,7 @@ def _gather(typingctx, values, columns, begin, end, x):
 gather: Any = intrinsic(_gather)
 
 
-@njit(cache=True, parallel=True)
+@kept(parallel=True)
 def multiply(pointers, columns, values, x, out):
     """out = A x."""
     rows = len(out)
@@ -66,7 +68,7 @@ def multiply(pointers, columns, values, x, out):
             out[i, 0], out[i, 1], out[i, 2] = s[0], s[1], s[2]
 
 
-@njit(cache=True, parallel=True)
+@kept(parallel=True)
 def add_product(pointers, columns, values, x, out):
     """out += A x."""
     rows = len(out)
@@ -77,7 +79,7 @@ def add_product(pointers, columns, values, x, out):
                 out[i, c] += s[c]
 
 
-@njit(cache=True, parallel=True)
+@kept(parallel=True)
 def residual(pointers, columns, values, b, x, out):
     """out = b - A x."""
     rows = len(out)
@@ -88,7 +90,7 @@ def residual(pointers, columns, values, b, x, out):
                 out[i, c] = b[i, c] - s[c]
 
 
-@njit(cache=True, parallel=True)
+@kept(parallel=True)
 def smooth_first(inverse_diagonal, scale, b, step, x):
     """step = x = scale D^-1 b: the first step of smoothing from x = 0."""
     rows = len(x)
@@ -100,7 +102,7 @@ def smooth_first(inverse_diagonal, scale, b, step, x):
                 x[i, c] = value
 
 
-@njit(cache=True, parallel=True)
+@kept(parallel=True)
 def smooth(pointers, columns, values, inverse_diagonal, keep, scale, b, step, x, out):
     """step = keep step + scale D^-1 (b - A x);  out = x + step."""
     rows = len(out)
@@ -114,7 +116,7 @@ def smooth(pointers, columns, values, inverse_diagonal, keep, scale, b, step, x,
                 out[i, c] = x[i, c] + value
 
 
-@njit(cache=True, parallel=True)
+@kept(parallel=True)
 def multiply_and_dot(pointers, columns, values, p, out, parts):
     """out = A p; parts[:, :3]: p'out of each block of rows."""
     rows = len(out)
@@ -129,7 +131,7 @@ def multiply_and_dot(pointers, columns, values, p, out, parts):
         parts[block, 0], parts[block, 1], parts[block, 2] = t0, t1, t2
 
 
-@njit(cache=True, parallel=True)
+@kept(parallel=True)
 def advance(alpha, p, image, x, r, rounded, parts):
     """x += alpha p;  r -= alpha image;  rounded = r, in float32;  parts[:, :3]: the largest |x| of each block."""
     rows = len(x)
@@ -144,7 +146,7 @@ def advance(alpha, p, image, x, r, rounded, parts):
                 parts[block, c] = max(parts[block, c], abs(x[i, c]))
 
 
-@njit(cache=True, parallel=True)
+@kept(parallel=True)
 def compare(r, z, parts):
     """parts[:, :6]: r'z of each block of rows, and its largest |z|, by column."""
     rows = len(r)
@@ -157,7 +159,7 @@ def compare(r, z, parts):
             parts[block, c], parts[block, 3 + c] = dot, large
 
 
-@njit(cache=True, parallel=True)
+@kept(parallel=True)
 def turn(beta, z, p):
     """p = z + beta p."""
     rows = len(p)
@@ -167,7 +169,7 @@ def turn(beta, z, p):
                 p[i, c] = z[i, c] + beta[c] * p[i, c]
 
 
-@njit(cache=True)
+@kept()
 def aggregate(pointers, columns, values, strength, dominance):
     """The aggregate of each vertex, -1 for none, and their number (Vanek, Mandel and Brezina 1996).
 
@@ -227,7 +229,7 @@ def aggregate(pointers, columns, values, strength, dominance):
     return of, count
 
 
-@njit(cache=True)
+@kept()
 def filtered(pointers, columns, values, strength):
     """The entries of A (nnz,) with those off the diagonal that are not strong in their row added to the diagonal."""
     out = values.copy()

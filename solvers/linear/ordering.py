@@ -11,9 +11,9 @@ Roman and Amestoy 2000: halo minimum degree).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from solvers.compiling import kept
 from solvers.linear.minimum_degree import minimum_degree
 from solvers.linear.separator import LANDMARKS, TOGETHER, refine, separate
 
@@ -33,7 +33,7 @@ def nested_dissection(pointers: NDArray[np.int64], neighbours: NDArray[np.int32]
     return order
 
 
-@njit(cache=True)
+@kept()
 def _dissect(pointers, neighbours, order, leaf):
     """Sort `order` into the order of elimination: of every piece, its parts first and its separator last."""
     n = len(order)
@@ -76,7 +76,7 @@ def _dissect(pointers, neighbours, order, leaf):
             order[i] = scratch[i]
 
 
-@njit(cache=True)
+@kept()
 def _split_components(pointers, neighbours, owner, piece, order, first, end, leaf, queue, stack):
     """Gather the piece's components and push each; those that are small together, as many as fill a leaf."""
     at, begun = first, first

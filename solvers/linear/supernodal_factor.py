@@ -13,8 +13,8 @@ For springs S and W are sums of terms of one sign (Q is an M-matrix), so inverti
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from solvers.compiling import kept
 from solvers.linear.supernodes import WIDTH
 from solvers.vectors.supernodal import add_forward
 
@@ -22,7 +22,7 @@ _NO_DIGITS = 4.0 * np.finfo(np.float64).eps
 """A pivot this small beside its entry of the matrix is round-off."""
 
 
-@njit(cache=True)
+@kept()
 def factorise(
     pointers,
     neighbours,
@@ -130,25 +130,25 @@ def factorise(
     return -1
 
 
-@njit(cache=True)
+@kept()
 def _padded(count):
     """The count, rounded up to whole strips."""
     return (count + 3) // 4 * 4
 
 
-@njit(cache=True)
+@kept()
 def _at(size, row, col):
     """Where a front of a size has an entry."""
     return 4 * ((col >> 2) * size + row) + (col & 3)
 
 
-@njit(cache=True)
+@kept()
 def _in_tile(row, col, width):
     """Where a panel of a width has an entry: by tiles of four rows, each column by column."""
     return (row >> 2) * 4 * width + 4 * col + (row & 3)
 
 
-@njit(cache=True)
+@kept()
 def _extend_add(front, size, stack, begin, rows, start, end, place):
     """Add a child's update matrix to its parent's front."""
     count = end - start
@@ -161,7 +161,7 @@ def _extend_add(front, size, stack, begin, rows, start, end, place):
             front[target + 4 * place[rows[start + a]]] += stack[source + 4 * a]
 
 
-@njit(cache=True)
+@kept()
 def _eliminate(
     front,
     size,
@@ -268,7 +268,7 @@ def _eliminate(
     return -1
 
 
-@njit(cache=True)
+@kept()
 def keep_sums(panels, rounding, chunks):
     """Add what rounding takes from a column of W as a whole to its smallest entry, where it is rounded the least.
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 from heapq import heapify, heappop, heappush
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from solvers.compiling import kept
 
 WIDTH = 16
 """The most columns that a panel has."""
@@ -29,7 +30,7 @@ _WORTH_GROUPS = 3e4
 second one eats up most of what it gains: 1.1 times as fast at 16 x 16, 1.3 at 20 x 20, 1.6 at 32 x 32."""
 
 
-@njit(cache=True)
+@kept()
 def _cost(width, rows):
     """What a supernode costs a solve, in the cost of an entry."""
     total = 0.0
@@ -41,7 +42,7 @@ def _cost(width, rows):
     return total
 
 
-@njit(cache=True)
+@kept()
 def amalgamate(parent, count):
     """The tree of supernodes after amalgamation, the supernode of each column, and the cost of each supernode."""
     n = len(parent)

@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from solvers.compiling import kept
 from solvers.linear.supernodes import GROUPS, LANES, amalgamate, groups
 
 
@@ -81,7 +81,7 @@ def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
     return place
 
 
-@njit(cache=True)
+@kept()
 def _elimination_tree(pointers, neighbours, order, place):
     """The parent of each column, -1 for a root (Davis 2006, section 4.1)."""
     n = len(order)
@@ -100,7 +100,7 @@ def _elimination_tree(pointers, neighbours, order, place):
     return parent
 
 
-@njit(cache=True)
+@kept()
 def _postorder(parent):
     """The nodes of a forest, children before parents, each subtree together; children in ascending order."""
     n = len(parent)
@@ -129,7 +129,7 @@ def _postorder(parent):
     return post
 
 
-@njit(cache=True)
+@kept()
 def _column_counts(pointers, neighbours, order, place, parent):
     """The entries of each column of L, diagonal included: row i has those on the paths from its entries up to i."""
     n = len(order)
@@ -147,7 +147,7 @@ def _column_counts(pointers, neighbours, order, place, parent):
     return count
 
 
-@njit(cache=True)
+@kept()
 def _structure(pointers, neighbours, slot, vertex, parent, node_of_slot, nodes):
     """The rows below each supernode, by slot: row i belongs to those on the paths from its entries up to i's own."""
     start = np.zeros(nodes + 1, np.int64)

@@ -65,27 +65,32 @@ class CompiledLocalGlobal:
             rounded=self.precision != "float64",
         )
         found = compiled(base)
-        if found is None and alone:
-            return replace(base, project=_projection(alone[0], system.vertices))
-        return found or base
+        if isinstance(found, PreparedCompiled):
+            return found
+        local = {"project": _projection(alone[0], system.vertices)} if alone else {}
+        return replace(base, choice=f"{base.choice}; {found}", **local)
 
 
 ORDERS: dict[type, Callable[[Any], Order]] = {Supernodal: of_supernodal, Inverse: of_inverse}
 """The linear solvers whose panels the kernels go through; the others are called in between."""
 
 
-def compiled(base: PreparedLocalGlobal, *, corrects: bool = False) -> PreparedCompiled | None:
-    """The iterations over the factor's own rows; None where the kernels do not know it, or some energy.
+def compiled(base: PreparedLocalGlobal, *, corrects: bool = False) -> PreparedCompiled | str:
+    """The iterations over the factor's own rows; where there are none, in words that they go through Python, and why.
 
     corrects: whether corrections are wanted whatever the factor's precision.
     """
-    for kind, order in ORDERS.items():
-        if isinstance(base.factor, kind):
-            parts = split(base.system)
-            if parts.unknown or parts.cancel:
-                return None
-            return PreparedCompiled.of(base, parts, order(base.factor), corrects)
-    return None
+    order = next((order for kind, order in ORDERS.items() if isinstance(base.factor, kind)), None)
+    if order is None:
+        return "iterations through Python: this linear solver is called from there"
+    parts = split(base.system)
+    if parts.unknown:
+        return f"iterations through Python: the kernels do not know {', '.join(parts.unknown)}"
+    if parts.cancel:
+        return "iterations through Python: the stiffnesses between some vertices cancel"
+    return PreparedCompiled.of(
+        replace(base, choice=f"{base.choice}; iterations compiled"), parts, order(base.factor), corrects
+    )
 
 
 class _Work(NamedTuple):

@@ -13,7 +13,7 @@ tells, the solve has "stalled", and its iterates stay where they are.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -75,7 +75,9 @@ def prepare(system: System, method: Method, linear: Linear, precision: Precision
     )
     base = prepared(bare, energies, lambda Q: factorise(Q, linear, precision))
     found = compiled(base, corrects=True)
-    engine: Engine = _Interpreted(method, base) if found is None else _Compiled(method, found)
+    known = isinstance(found, PreparedCompiled)
+    base = found.base if known else replace(base, choice=f"{base.choice}; {found}")
+    engine: Engine = _Compiled(method, found) if known else _Interpreted(method, base)
     if bare is not system:
         from solvers.contact.quasi_newton import Touching  # for those who need it
 

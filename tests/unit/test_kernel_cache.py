@@ -1,54 +1,244 @@
-"""Compiled code is kept by the sources it was made from, and goes when new sources come and nobody uses it."""
+"""Compiled code is kept by all that a kernel depends on: what is loaded is what would be compiled."""
 
 from __future__ import annotations
 
+import ast
 import os
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from harness import kernels
+from solvers import caching, sources
+from solvers.compiling import kept
 
 YEAR_2001 = 1e9
 """Seconds since 1970."""
 
+KERNEL = """
+from solvers.compiling import kernel
+from solvers.kernels.inner_of_test import FACTOR, times
+@kernel
+def product(x):
+    return times(x) * FACTOR
+"""
+INNER = """
+from solvers.compiling import inner
+FACTOR = 2.0
+@inner
+def times(x):
+    return 3.0 * x
+"""
+ASK = """
+from solvers.kernels.kernel_of_test import product
+print(product(1.0), sum(product.stats.cache_hits.values()))
+"""
+
 
 @pytest.fixture
-def solvers(tmp_path: Path) -> Path:
-    """A folder of sources with the compiled code of two others: one in use, one not."""
-    (tmp_path / "kernel.py").write_text("one = 1")
-    for name in ("numba-used", "numba-unused"):
-        (tmp_path / "__pycache__" / name / "kernels").mkdir(parents=True)
-    os.utime(tmp_path / "__pycache__" / "numba-unused", (YEAR_2001, YEAR_2001))
+def checkout(tmp_path: Path) -> Path:
+    """A folder with a copy of the solvers' sources, without compiled code, and with a kernel more."""
+    project = Path(__file__).resolve().parents[2]
+    for package in ("solvers", "harness"):
+        shutil.copytree(project / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "solvers" / "kernels" / "kernel_of_test.py").write_text(KERNEL)
+    (tmp_path / "solvers" / "kernels" / "inner_of_test.py").write_text(INNER)
     return tmp_path
 
 
-def kept(solvers: Path) -> set[str]:
-    return {folder.name for folder in (solvers / "__pycache__").iterdir()}
+def asked(checkout: Path, code: str, **environment: str) -> str:
+    """What a new process prints."""
+    kept = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    told = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=checkout,
+        env=kept | {"PYTHONPATH": str(checkout)} | environment,
+        capture_output=True,
+        text=True,
+    )
+    assert told.returncode == 0, told.stderr
+    return told.stdout.strip()
 
 
-def test_new_sources_have_a_folder_of_their_own_and_clear_away_what_nobody_uses(solvers: Path):
-    folder = Path(kernels(solvers))
-    assert kept(solvers) == {folder.name, "numba-used"}
-    (solvers / "kernel.py").write_text("one = 2")
-    assert kernels(solvers) != str(folder)
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
 
 
-def test_a_folder_that_was_not_used_for_long_serves_its_sources_again(solvers: Path):
-    folder = Path(kernels(solvers))
-    (folder / "code").touch()
-    os.utime(folder, (YEAR_2001, YEAR_2001))
-    assert kernels(solvers) == str(folder)
-    (solvers / "kernel.py").write_text("one = 2")
-    kernels(solvers)
-    assert (folder / "code").exists()  # it was in use a moment ago
+def test_a_changed_kernel_never_runs_stale_whoever_imports_the_solvers_and_in_whatever_order(checkout: Path):
+    inner, outer = (checkout / "solvers" / "kernels" / f"{name}_of_test.py" for name in ("inner", "kernel"))
+    assert asked(checkout, ASK) == "6.0 0"
+    assert asked(checkout, "import numba\n" + ASK) == "6.0 1"
+    edit(inner, "3.0 * x", "6.0 * x")  # a function in another file
+    assert asked(checkout, ASK) == "12.0 0"
+    assert asked(checkout, "import numba, harness\n" + ASK) == "12.0 1"
+    edit(inner, "FACTOR = 2.0", "FACTOR = 4.0")  # a constant from another file
+    assert asked(checkout, "import harness, numba\n" + ASK) == "24.0 0"
+    edit(outer, "* FACTOR", "/ FACTOR")
+    assert asked(checkout, "import numba\n" + ASK) == "1.5 0"
+    edit(outer, "/ FACTOR", "* FACTOR")  # as it was: what was compiled then serves again
+    assert asked(checkout, ASK) == "24.0 1"
 
 
-def test_sources_that_cannot_be_written_beside_are_no_obstacle(tmp_path: Path):
+def test_options_of_the_compiler_have_code_of_their_own(checkout: Path):
+    assert asked(checkout, ASK) == "6.0 0"
+    assert asked(checkout, ASK, NUMBA_BOUNDSCHECK="1") == "6.0 0"
+    edit(checkout / "solvers" / "compiling.py", '"nogil": True', '"nogil": True, "fastmath": True')
+    assert asked(checkout, ASK) == "6.0 0"
+
+
+def test_one_folder_may_serve_many_checkouts(checkout: Path, tmp_path_factory: pytest.TempPathFactory):
+    shared, other = tmp_path_factory.mktemp("kernels"), tmp_path_factory.mktemp("other") / "checkout"
+    shutil.copytree(checkout, other)
+    assert asked(checkout, ASK, NUMBA_CACHE_DIR=str(shared)) == "6.0 0"
+    assert asked(other, ASK, NUMBA_CACHE_DIR=str(shared)) == "6.0 1"
+    assert not [*checkout.rglob("*.nbc")]
+
+
+DIGESTS_OF_MODULES = """
+from pathlib import Path
+from solvers import sources
+for path in sorted(Path("solvers").rglob("*.py")):
+    print(path.as_posix(), sources.digest([path]))
+"""
+
+
+def test_editing_one_solver_recompiles_its_own_kernels_only(checkout: Path):
+    def digests() -> dict[str, str]:
+        return dict(line.split() for line in asked(checkout, DIGESTS_OF_MODULES).splitlines())
+
+    before = digests()
+    (kernels,) = checkout.rglob("kernels/xpbd.py")
+    (method,) = (path for path in checkout.rglob("xpbd.py") if path != kernels and "solvers" in path.parts)
+    names = {path.relative_to(checkout).as_posix() for path in (kernels, method)}
+    for path in (kernels, method):
+        path.write_text(path.read_text() + "\n# another line\n")
+    after = digests()
+    assert {name for name, digest in after.items() if before[name] != digest} == names
+
+
+def test_what_was_edited_since_it_was_imported_is_kept_for_nobody_else(checkout: Path):
+    editing = "from pathlib import Path\nimport solvers.kernels.inner_of_test\n"
+    editing += "path = Path('solvers/kernels/inner_of_test.py')\n"
+    editing += "path.write_text(path.read_text().replace('3.0', '9.0'))\n"
+    assert asked(checkout, editing + ASK) == "6.0 0"  # its own module is as it was
+    assert asked(checkout, ASK) == "18.0 0"
+    assert asked(checkout, ASK) == "18.0 1"
+
+
+def test_a_source_that_is_removed_while_a_process_runs_stops_nothing(checkout: Path):
+    removing = "from pathlib import Path\nimport solvers.kernels.kernel_of_test\n"
+    removing += "Path('solvers/kernels/inner_of_test.py').unlink()\n"
+    assert asked(checkout, removing + ASK) == "6.0 0"
+
+
+def imported(path: Path) -> set[str]:
+    """The project's modules that a source imports, by Python's own grammar."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return {name for name in found if name.split(".")[0] in sources.PACKAGES}
+
+
+def test_every_import_of_the_project_is_followed():
+    for package in sources.PACKAGES:
+        for path in (sources.ROOT / package).rglob("*.py"):
+            reached = sources.reached(str(path))
+            for name in imported(path):
+                place = sources.ROOT.joinpath(*name.split("."))
+                module = {str(place.with_suffix(".py")), str(place / "__init__.py")}
+                exists = any(os.path.exists(file) for file in module)
+                assert not exists or module & reached, f"{path} imports {name}"
+
+
+OUTSIDE = {
+    "own.py": "import numpy\nfrom helper import (\n    A,  # one, with a comma\n    B,\n)\nfrom pack import part\n",
+    "helper.py": "import json\nimport solvers.memory as memory, unused\n",
+    "unused.py": "",
+    "json.py": "",
+    "pack/__init__.py": "from .part import C\n",
+    "pack/part.py": "from ..pack import other\nfrom . import another\nfrom .third import D\n",
+    "pack/other.py": "",
+    "pack/another.py": "",
+    "pack/third.py": "",
+    "alien.py": "",
+}
+
+
+def test_a_source_from_outside_depends_on_what_lies_beside_it_and_on_the_solvers_that_it_imports(tmp_path: Path):
+    for name, text in OUTSIDE.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    found = {Path(path) for path in sources.reached(str(tmp_path / "own.py"))}
+    assert {path.relative_to(tmp_path).as_posix() for path in found if tmp_path in path.parents} == (
+        OUTSIDE.keys() - {"alien.py"}
+    )
+    assert sources.ROOT / "solvers" / "memory.py" in found
+
+
+def twice(x: float) -> float:
+    return 2.0 * x
+
+
+Damage = Callable[[Path], object]
+DAMAGES: dict[str, Damage] = {
+    "empty": lambda path: path.write_bytes(b""),
+    "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "of another key": lambda path: path.write_bytes(caching.dumps((("another",), None))),
+    "gone": lambda path: path.unlink(),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_what_cannot_be_read_is_compiled_and_kept_anew(home: Path, damage: Damage):
+    assert kept()(twice)(1.0) == 2.0
+    (path,) = home.glob("*/*.nbc")
+    damage(path)
+    for hits in (0, 1):
+        again = kept()(twice)
+        assert again(1.0) == 2.0
+        assert sum(again.stats.cache_hits.values()) == hits
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder in which kernels are kept."""
+    monkeypatch.setattr(caching, "_home", lambda source: tmp_path)
+    return tmp_path
+
+
+def test_a_disk_without_room_costs_the_kept_code_alone(home: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(caching, "_write", full)
+    assert kept()(twice)(1.0) == 2.0
+    assert not [*home.glob("*/*")]
+
+
+def test_code_of_other_sources_goes_when_new_comes_and_nobody_has_used_it(home: Path):
+    for name in ("used", "unused"):
+        (home / f"{__name__}-{name}").mkdir()
+    (home / "another-unused").mkdir()
+    for name in (f"{__name__}-unused", "another-unused"):
+        os.utime(home / name, (YEAR_2001, YEAR_2001))
+    kept()(twice)(1.0)
+    assert {path.name for path in home.iterdir()} >= {f"{__name__}-used", "another-unused"}
+    assert not (home / f"{__name__}-unused").exists()
+
+
+def test_sources_that_cannot_be_written_beside_are_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "__pycache__").write_text("a file, where a folder would have to be")
-    assert kernels(tmp_path).startswith(str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "users"))
+    monkeypatch.setattr(caching._CONFIG, "CACHE_DIR", "")
+    assert caching._home(str(tmp_path)).is_relative_to(tmp_path / "users")
 
 
 DIGESTS = """

@@ -140,7 +140,6 @@ CHANGES = {
     "threads": {"threads": 2},
     "rounds": {"rounds": 3},
     "solver": {"solvers": ["dense"]},
-    "pictures": {"pictures": False},
     "strain range": {"strain_range": 0.2},
     "convergence frames": {"convergence_frames": [1]},
     "machine": {"machine": "another"},
@@ -165,6 +164,10 @@ SAME = {
     "default spelled out": CLOTH.replace("fixed,", "fixed, bend: 0,"),
     "default size": CLOTH + "default_size: 9\n",
 }
+
+
+def test_pictures_are_no_part_of_the_run_id_for_they_are_drawn_from_recordings(folder: Path) -> None:
+    assert identified(folder) == identified(folder, pictures=False)
 
 
 @pytest.mark.parametrize("change", SAME)

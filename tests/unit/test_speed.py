@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from harness.base import machine
 from harness.base.errors import InputError
 from harness.base.rows import alone
 from harness.config.load import load_any, load_sweep
@@ -197,7 +198,7 @@ def test_a_folder_is_for_one_report_at_a_time(sweep, tmp_path: Path):
         run_speed(sweep, tmp_path / "out", print)
 
 
-def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path):
+def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     said: list[str] = []
     table = run_speed(sweep, tmp_path / "out", said.append)
     assert said == [f"yardstick-cloth {size}: 5 candidates take turns" for size in (4, 5)]
@@ -220,4 +221,10 @@ def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path):
     again = run_speed(sweep, tmp_path / "out", said.append)
     assert len(said) == 2
     assert again.equals(table)
+    # What other code measured is shown, and said to be so.
+    monkeypatch.setattr(machine, "code_hash", lambda: "another")
+    run_speed(sweep, tmp_path / "out", said.append)
+    assert said[2:] == [
+        f"yardstick-cloth {size}: 5 of 5 there are by other code than today's; --again does all anew" for size in (4, 5)
+    ]
     assert all((tmp_path / "out" / "rows").glob("*.parquet"))

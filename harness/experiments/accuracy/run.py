@@ -56,6 +56,8 @@ def run_accuracy(
         todo = sum(not run.done(unit) for unit in units)
         if todo < len(units):
             say(f"{len(units) - todo} of {len(units)} units are there already")
+        if older := rows.of_other_code((run.path(unit) for unit in units if run.done(unit)), machine.code_hash()):
+            say(older)
         display.begin(todo, todo)
         try:
             for _, curves in groupby(accuracy.curves, key=lambda unit: (unit.case.identity(), unit.moment)):

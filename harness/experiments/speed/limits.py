@@ -16,9 +16,11 @@ from typing import Any
 import numba
 import numpy as np
 from llvmlite import ir
-from numba import njit, prange, types
+from numba import prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
+
+from solvers.compiling import kept
 
 WORKING_SETS = tuple(int(2.0**k) for k in np.arange(14, 29.5, 0.5))
 """Bytes in all threads together: from 16 KiB, in the first cache, to 512 MiB, in memory."""
@@ -60,7 +62,7 @@ def probes(sets: tuple[int, ...] = WORKING_SETS) -> Iterator[Probe]:
         yield Probe(name, 0, 0, flops, lambda start=start: _fused(start, threads))
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@kept(parallel=True, fastmath=_FAST)
 def _read(a, threads, repeats):
     total = 0.0
     for t in prange(threads):
@@ -69,7 +71,7 @@ def _read(a, threads, repeats):
     return total
 
 
-@njit(cache=True, fastmath=_FAST)
+@kept(fastmath=_FAST)
 def _sum(a, repeats):
     total = 0.0
     for k in range(repeats):
@@ -81,7 +83,7 @@ def _sum(a, repeats):
     return total
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@kept(parallel=True, fastmath=_FAST)
 def _triad(a, b, c, threads, repeats):
     for t in prange(threads):
         first, last = len(a) * t // threads, len(a) * (t + 1) // threads
@@ -89,13 +91,13 @@ def _triad(a, b, c, threads, repeats):
             _add_scaled(a[first:last], b[first:last], c[first:last])
 
 
-@njit(cache=True, fastmath=_FAST)
+@kept(fastmath=_FAST)
 def _add_scaled(a, b, c):
     for i in range(len(a)):
         a[i] = b[i] + 3.0 * c[i]
 
 
-@njit(cache=True, parallel=True)
+@kept(parallel=True)
 def _fused(start, threads):
     total = 0.0
     for _ in prange(threads):

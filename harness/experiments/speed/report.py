@@ -51,7 +51,10 @@ def run_speed(
         for group in _groups(runs):
             members = [*group, *_beside(group)]
             paths = [Files.of(run, folder).rows for run in members]
-            if again or not all(path.exists() for path in paths):
+            kept = not again and all(path.exists() for path in paths)
+            if kept and (older := rows.of_other_code(paths, machine.code_hash())):
+                say(f"{group[0].scene_name} {group[0].size}: {older}")
+            if not kept:
                 say(f"{group[0].scene_name} {group[0].size}: {len(members)} candidates take turns")
                 for path, found in zip(paths, _measured(members, folder, past, budget), strict=True):
                     rows.write(path, found)

@@ -1,0 +1,99 @@
+"""Grades some steps of a run by the oracle, whatever the run asks for: a residual that is claimed must be one.
+
+    claimed >= |Q^-1 grad g(p)|_Q / SLACK,   p the answer, or the iterate before it, round-off apart
+
+It is done in the second pass, where no clock runs. Whoever does nothing and reports that nothing is left is found out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from harness.base.errors import RunFailed
+from harness.reference.judge import Oracle
+from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule
+from solvers.registry import minimises
+
+SLACK = 10.0
+"""A residual may be measured with a factor of few digits, or with a preconditioner that is like Q."""
+
+LARGEST = 50_000
+"""Vertices up to which the oracle's factor takes seconds at most, on solids too."""
+
+_SAME = 1e-9
+"""Of the largest coordinate, what two sums of the same terms may differ by after many iterations."""
+
+
+class Graded:
+    """A prepared solver whose answers in some frames are graded, as it gives them in turn."""
+
+    def __init__(self, prepared: Prepared, solver: Solver, frames: Collection[int]) -> None:
+        """frames: counted from 1."""
+        self._prepared, self._frames, self._done = prepared, frames if minimises(solver) else (), 0
+        self._name = type(solver).__name__
+        self._oracles: dict[float, Oracle] = {}
+        self.found: dict[int, dict[str, Any]] = {}
+        """By frame, the column `graded` of its row."""
+
+    @property
+    def choice(self) -> str:
+        """The solver's."""
+        return self._prepared.choice
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """The solver's."""
+        return self._prepared.facts
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """The solver's."""
+        return self._prepared.iterates(problem)
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """The solver's."""
+        return self._prepared.phases(problem)
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """The solver's answer; raises RunFailed where it claims what is not so."""
+        found = self._prepared.solve(problem, stop)
+        self._done += 1
+        if self._done in self._frames and np.isfinite(found.positions).all() and len(problem.target) <= LARGEST:
+            self.found[self._done] = self._graded(problem, found, stop)
+        return found
+
+    def _graded(self, problem: StepProblem, found: Solution, stop: StopRule) -> dict[str, Any]:
+        system = problem.system
+        if system.rate not in self._oracles:
+            self._oracles[system.rate] = Oracle(system)
+        oracle = self._oracles[system.rate]
+        reached, attainable = oracle.stationarity(problem, found.positions)
+        residual = oracle.residual(problem, found.positions)
+        known = [residual, *(oracle.residual(problem, p) for p in self._before(problem, found))]
+        yardstick = residual / reached if reached > 0.0 else np.inf
+        least, round_off = min(known) / yardstick, SLACK * attainable
+        told = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)"
+        if np.isnan(found.residual) and found.iterations:
+            raise RunFailed(f"{told}; wanted |Q^-1 grad g|_Q, which is {residual:.3g} (or `minimises = False`)")
+        if SLACK * found.residual / yardstick + round_off < least:
+            raise RunFailed(f"{told}, where |Q^-1 grad g|_Q is {residual:.3g}")
+        if found.stopped == "tolerance" and least > SLACK * (stop.tolerance or 0.0) + round_off:
+            raise RunFailed(f"{told} and says that it reached the tolerance, where {least:.3g} of the start's is left")
+        return {"graded": reached}
+
+    def _before(self, problem: StepProblem, found: Solution) -> list[Positions]:
+        """The iterate before the answer, where the iterates lead to that."""
+        if found.iterations < 1:
+            return []
+        p = before = problem.first_guess.copy()
+        pins = problem.system.pins
+        p[pins.vertices[pins.exact]] = problem.pin_targets[pins.exact]
+        for count, iterate in enumerate(islice(self._prepared.iterates(problem), found.iterations), 1):
+            if count == found.iterations:
+                before = p
+            p = iterate.copy()
+        same = np.abs(p - found.positions).max(initial=0.0) <= _SAME * np.abs(p).max(initial=0.0)
+        return [before] if same else []

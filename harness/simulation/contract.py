@@ -1,0 +1,146 @@
+"""What a solver promises, checked where no clock runs: answers of the right kind, and no writing to what was given.
+
+Errors blame the solver's own line, which whoever wrote it can mend, and not the line of ours that stumbled over it.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.base.errors import RunFailed
+from solvers import sources
+from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule, System
+
+Arrays = dict[str, NDArray[Any]]
+
+
+class Contract:
+    """What a solver was given before it prepared itself."""
+
+    def __init__(self, system: System, solver: Solver) -> None:
+        self._system, self._solver = system, solver
+        self._before = {name: array.copy() for name, array in _of_system(system).items()}
+
+    def checked(self, prepared: Prepared) -> Checked:
+        """The prepared solver with a check around each solve. Raises RunFailed where preparing wrote to the system."""
+        self.require_untouched(_line(type(self._solver), "prepare"))
+        return Checked(prepared, self, frozenset(map(str, sources.of_class(type(self._solver)))))
+
+    def require_untouched(self, line: str) -> None:
+        """Raise RunFailed where the system is not as it was."""
+        written = _differing(self._before, _of_system(self._system))
+        if written:
+            raise RunFailed(f"{line}: wrote to {', '.join(written)}, which it was given; copy what is to be changed")
+
+
+class Checked:
+    """A prepared solver whose every solve is checked."""
+
+    def __init__(self, prepared: Prepared, contract: Contract, own: Collection[str]) -> None:
+        self._prepared, self._contract, self._own = prepared, contract, own
+
+    @property
+    def choice(self) -> str:
+        """The solver's."""
+        return self._prepared.choice
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """The solver's."""
+        return self._prepared.facts
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """The solver's."""
+        return self._prepared.iterates(problem)
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """The solver's."""
+        return self._prepared.phases(problem)
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """The solver's answer; raises RunFailed where it is none, or something was written to."""
+        before = {name: array.copy() for name, array in _of_problem(problem).items()}
+        found: Any = self._prepared.solve(problem, stop)
+        line = _line(type(getattr(self._prepared, "usual", self._prepared)), "solve")
+        written = _differing(before, _of_problem(problem))
+        if written:
+            line = self._writes(_restored(problem, before), stop) or line
+            raise RunFailed(f"{line}: wrote to {', '.join(written)}, which it was given; copy what is to be changed")
+        self._contract.require_untouched(line)
+        if not isinstance(found, Solution):
+            raise RunFailed(f"{line}: gave a {type(found).__name__}; wanted a solvers.problem.Solution")
+        p: Any = found.positions
+        came = f"{p.dtype} of shape {p.shape}" if isinstance(p, np.ndarray) else f"a {type(p).__name__}"
+        if came != (wanted := f"float64 of shape {problem.target.shape}"):
+            raise RunFailed(f"{line}: gave positions as {came}; wanted {wanted}")
+        return found
+
+    def _writes(self, problem: StepProblem, stop: StopRule) -> str:
+        """The line that writes to the problem's arrays, which this time cannot be written to; "" where none shows."""
+        for array in _of_problem(problem).values():
+            array.flags.writeable = False
+        try:
+            self._prepared.solve(problem, stop)
+        except ValueError as error:
+            return where(error, self._own)
+        except Exception:  # a compiled solver may not take such arrays at all
+            return ""
+        return ""
+
+
+def where(error: BaseException, own: Collection[str]) -> str:
+    """`file:line` of an error: the last line in the files `own`, else in those of other people, else of all; with the
+    line that raised it behind that, where it is another."""
+    frames = [(frame.filename, frame.lineno or 0) for frame in traceback.extract_tb(error.__traceback__)]
+    theirs = [frame for frame in frames if not sources.known(frame[0])]
+    blamed = [frame for frame in frames if frame[0] in own] or theirs or frames
+    told = [f"{Path(file).name}:{line}" for file, line in dict.fromkeys((blamed[-1], frames[-1]))]
+    return ", raised in ".join(told)
+
+
+def _line(of: type, method: str) -> str:
+    function: Callable[..., Any] | None = getattr(of, method, None)
+    code = getattr(function, "__code__", None)
+    return f"{Path(code.co_filename).name}:{code.co_firstlineno}" if code else f"{of.__module__}.{of.__name__}.{method}"
+
+
+def _of_problem(problem: StepProblem) -> Arrays:
+    named = {f"problem.{f.name}": getattr(problem, f.name) for f in fields(problem)}
+    named |= {f"problem.start.{f.name}": getattr(problem.start, f.name) for f in fields(problem.start)}
+    return {name: value for name, value in named.items() if isinstance(value, np.ndarray)}
+
+
+def _restored(problem: StepProblem, arrays: Arrays) -> StepProblem:
+    """The problem with copies of these arrays."""
+    copies = {name: array.copy() for name, array in arrays.items()}
+    begun = {
+        f.name: copies.get(f"problem.start.{f.name}", getattr(problem.start, f.name)) for f in fields(problem.start)
+    }
+    own = {name.removeprefix("problem."): array for name, array in copies.items() if "start." not in name}
+    return replace(problem, start=replace(problem.start, **begun), **own)
+
+
+def _of_system(system: System) -> Arrays:
+    named: dict[str, Any] = {"system.mass": system.mass}
+    named |= {f"system.pins.{f.name}": getattr(system.pins, f.name) for f in fields(system.pins)}
+    for energy in system.energies:
+        named |= {f"{type(energy).__name__}.{name}": value for name, value in _held(energy)}
+    return {name: value for name, value in named.items() if isinstance(value, np.ndarray)}
+
+
+def _held(energy: Any) -> Iterator[tuple[str, Any]]:
+    if is_dataclass(energy):
+        return ((f.name, getattr(energy, f.name)) for f in fields(energy))
+    return iter(vars(energy).items() if hasattr(energy, "__dict__") else ())
+
+
+def _differing(before: Arrays, after: Arrays) -> list[str]:
+    """The names of the arrays that are not the same, to the last bit."""
+    return [name for name, array in before.items() if array.tobytes() != after[name].tobytes()]

@@ -1,0 +1,99 @@
+"""A solver as the README tells people to write one, in a file of its own outside the tree, and what it may do wrong."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+from harness.config.load import load_any
+from harness.config.sweep import RunSpec
+from solvers.registry import SOLVERS
+
+SOURCE = '''"""Local-global, by the tree's own."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from solvers.methods.local_global import SparseLocalGlobal
+from solvers.problem import Solution
+
+
+@dataclass(frozen=True)
+class Mine:
+    def prepare(self, system):
+        pass  # while preparing
+        return Prepared(SparseLocalGlobal().prepare(system))
+
+
+class Prepared:
+    choice, facts = "", {}
+
+    def __init__(self, sound):
+        self.sound = sound
+
+    def iterates(self, problem):
+        return self.sound.iterates(problem)
+
+    def phases(self, problem):
+        return {}
+
+    def solve(self, problem, stop):
+        found = self.sound.solve(problem, stop)
+        pass  # while solving
+        return found
+'''
+SCENE = """
+mesh: {kind: grid}
+mass: 1
+time_step: 0.03
+frames: 3
+default_size: 4
+effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
+"""
+SWEEP = "scenes: [scene.yaml]\nsolvers: [mine, sparse]\noptions: {%s}\n"
+OPTIONS = "rounds: 1, iterations: 5, record: false, pictures: false"
+
+_NUMBERS = count()
+
+
+@dataclass(frozen=True)
+class Own:
+    """A folder with a solver and a sweep that asks for it. solver, sweep: their files."""
+
+    solver: Path
+    sweep: Path
+
+    def run(self) -> RunSpec:
+        """The sweep's run of the solver."""
+        return load_any(self.sweep).runs()[0]
+
+    def line(self, code: str) -> str:
+        """`file:line` of the only line of the solver that has this code."""
+        (number,) = (i for i, line in enumerate(self.solver.read_text().splitlines(), 1) if code in line)
+        return f"{self.solver.name}:{number}"
+
+
+def own(
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    solving: str = "pass",
+    preparing: str = "pass",
+    options: str = OPTIONS,
+) -> Own:
+    """The solver `mine` with statements of one's own, while it solves or prepares itself."""
+    name = f"mine{next(_NUMBERS)}"  # a module is imported once by each name
+    solver, sweep = folder / f"{name}.py", folder / "sweep.yaml"
+    text = SOURCE.replace("pass  # while solving", solving).replace("pass  # while preparing", preparing)
+    solver.write_text(text)
+    sweep.write_text(SWEEP % options)
+    (folder / "scene.yaml").write_text(SCENE)
+    monkeypatch.setitem(SOLVERS, "mine", f"{name}:Mine")
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    return Own(solver, sweep)

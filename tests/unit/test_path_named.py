@@ -1,0 +1,63 @@
+"""A row names the path that its iterations took: compiled as a whole, or through Python, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import pytest
+from scipy.sparse import csr_array
+
+from solvers.energies.springs import Springs
+from solvers.methods.anderson import Anderson
+from solvers.methods.chebyshev import Chebyshev
+from solvers.methods.lbfgs import Lbfgs
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.problem import Positions, Solver, System
+from tests.scenes import cloth, first_problem
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """Springs by another name, which no kernel knows."""
+
+    springs: Springs
+
+    def value(self, p: Positions) -> float:
+        return self.springs.value(p)
+
+    def add_gradient(self, p: Positions, out: Positions) -> None:
+        self.springs.add_gradient(p, out)
+
+    def hessian(self, p: Positions) -> csr_array:
+        return self.springs.hessian(p)
+
+    def stiffness_matrix(self, n: int) -> csr_array:
+        return self.springs.stiffness_matrix(n)
+
+    def add_projection(self, p: Positions, out: Positions) -> None:
+        self.springs.add_projection(p, out)
+
+
+SYSTEM = first_problem(cloth(6)).system
+
+
+def foreign(system: System) -> System:
+    (springs,) = (energy for energy in system.energies if isinstance(energy, Springs))
+    return replace(system, energies=(Foreign(springs),))
+
+
+METHODS: tuple[Solver, ...] = (CompiledLocalGlobal(), Anderson(), Chebyshev(), Lbfgs())
+
+
+@pytest.mark.parametrize("solver", METHODS, ids=repr)
+def test_an_energy_that_the_kernels_do_not_know_shows_in_the_choice(solver: Solver):
+    known, unknown = (solver.prepare(system).choice for system in (SYSTEM, foreign(SYSTEM)))
+    assert "iterations compiled" in known
+    assert "through Python" not in known
+    assert "iterations through Python: the kernels do not know Foreign" in unknown
+    assert "compiled" not in unknown
+
+
+@pytest.mark.parametrize("solver", [CompiledLocalGlobal(linear="cg"), Lbfgs(linear="cg")], ids=repr)
+def test_a_linear_solver_that_is_called_from_python_shows_in_the_choice(solver: Solver):
+    assert "iterations through Python: this linear solver" in solver.prepare(SYSTEM).choice

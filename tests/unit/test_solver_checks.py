@@ -1,0 +1,128 @@
+"""A solver is checked once a run, off the clock, and what it did wrong is said of its own line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from harness.experiments import run as runs
+from harness.experiments.run import Files, execute
+from tests.own_solvers import OPTIONS, Own, own
+
+
+def rows_of(made: Own, folder: Path) -> list[dict[str, Any]]:
+    (folder / "rows").mkdir()
+    spec = made.run()
+    return execute(spec, Files.of(spec, folder), lambda phase: None)
+
+
+def test_a_sound_solver_is_ok_and_graded_by_the_oracle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    found = rows_of(own(tmp_path, monkeypatch), tmp_path)
+    assert {row["status"] for row in found} == {"ok"}
+    graded = {row["frame"]: row["graded"] for row in found if row["phase"] == "step"}
+    assert all(0.0 < graded[frame] < 1.0 for frame in (1, 2, 3))  # it descends in five iterations
+
+
+def test_a_run_is_judged_whose_solver_says_no_more_than_the_readme_asks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    found = rows_of(own(tmp_path, monkeypatch, options=OPTIONS + ", judge: true"), tmp_path)
+    steps = [row for row in found if row["phase"] == "step"]
+    assert len(steps) == 3
+    for row in steps:
+        assert row["stationarity"] >= 0.0
+        assert np.isfinite(row["distance"])
+
+
+class Wrong(NamedTuple):
+    """What a solver does, the line that is blamed (its code; "" for none), and what is said."""
+
+    does: str
+    line: str
+    said: str
+
+
+NOTHING = "return Solution(problem.first_guess.copy(), 1, 0.0, 0.0, 'tolerance')"
+WRONG = {
+    "does nothing and says that nothing is left": Wrong(NOTHING, "", "Mine: reports a residual of 0 J^(1/2), where"),
+    "says that it reached the tolerance": Wrong(
+        "return replace(found, stopped='tolerance')", "", "says that it reached the tolerance, where"
+    ),
+    "says a residual that is too small": Wrong("return replace(found, residual=found.residual / 100)", "", "reports a"),
+    "says no residual": Wrong("return replace(found, residual=float('nan'))", "", "reports a residual of nan"),
+    "float32": Wrong(
+        "return replace(found, positions=found.positions.astype(np.float32))",
+        "def solve",
+        "gave positions as float32 of shape (16, 3); wanted float64 of shape (16, 3)",
+    ),
+    "another shape": Wrong(
+        "return replace(found, positions=found.positions.ravel())",
+        "def solve",
+        "gave positions as float64 of shape (48,); wanted float64 of shape (16, 3)",
+    ),
+    "a list": Wrong("return replace(found, positions=[])", "def solve", "gave positions as a list; wanted float64"),
+    "no answer": Wrong("return None", "def solve", "gave a NoneType; wanted a solvers.problem.Solution"),
+    "writes to the target": Wrong("problem.target[:] += 0.1", "problem.target", "wrote to problem.target"),
+    "writes to the velocity": Wrong(
+        "problem.start.velocity[0] = 3.0", "problem.start", "wrote to problem.start.velocity"
+    ),
+    "writes to the springs": Wrong(
+        "e = self.sound.system.energies[0]; e.stiffness.flags.writeable = True; e.stiffness[:] *= 2",
+        "def solve",
+        "wrote to Springs.stiffness",
+    ),
+    "not finite": Wrong("return replace(found, positions=found.positions * np.nan)", "", "not finite from frame 1"),
+    "an error of its own": Wrong("raise LookupError('mine')", "raise LookupError", "LookupError: mine"),
+    "an error of ours": Wrong(
+        "problem.gradient(found.positions.ravel())", "problem.gradient", "ValueError: operands could not be broadcast"
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
+def test_what_a_solver_does_wrong_while_it_solves_is_told(
+    wrong: Wrong, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    made = own(tmp_path, monkeypatch, solving=wrong.does)
+    (row,) = rows_of(made, tmp_path)
+    assert row["status"] == ("diverged" if "not finite" in wrong.said else "failed")
+    assert row["frame"] == 1
+    assert wrong.said in row["reason"]
+    if wrong.line:
+        assert made.line(wrong.line) in row["reason"]
+
+
+def test_what_a_solver_writes_to_while_it_prepares_itself_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    does = "system.mass.flags.writeable = True; system.mass[:] *= 2"
+    made = own(tmp_path, monkeypatch, preparing=does)
+    (row,) = rows_of(made, tmp_path)
+    assert row["status"] == "failed"
+    assert "wrote to system.mass" in row["reason"]
+    assert made.line("def prepare") in row["reason"]
+
+
+def test_a_solver_that_cannot_write_is_blamed_at_the_line_where_it_tried(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    made = own(tmp_path, monkeypatch, preparing="system.mass.flags.writeable = False; system.mass[:] = 2")
+    (row,) = rows_of(made, tmp_path)
+    assert f"({made.line('system.mass')})" in row["reason"]
+
+
+def test_checks_take_no_timed_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The solver that the timed passes use is the one that was prepared, without anything around it."""
+    seen = []
+
+    def spied(*arguments: Any) -> Any:
+        measured = sound(*arguments)
+        seen.append(type(measured.prepared).__module__)
+        return measured
+
+    sound = runs.measure
+    monkeypatch.setattr(runs, "measure", spied)
+    made = own(tmp_path, monkeypatch)
+    rows_of(made, tmp_path)
+    assert seen == [made.solver.stem]
