@@ -26,8 +26,8 @@ from solvers.problem import Energy, Positions, StepProblem
 EPS = float(np.finfo(np.float64).eps)
 
 FACTOR = 8.0
-"""Of the bound, up to which a gradient is round-off. Where solvers are left to go on for ever, it ends at .1 to .9 of the
-bound at the worst vertex of most hard scenes, at 2 in the worst; what has not converged is at a hundred and more."""
+"""Of the bound, up to which a gradient is round-off. Where solvers are left to go on for ever, it ends at .1 to .9 of
+the bound at the worst vertex of most hard scenes, at 2 in the worst; what has not converged is at a hundred or more."""
 
 Terms = NDArray[np.float64]
 

@@ -61,17 +61,25 @@ COLUMNS = (
         "stationarity",
         _REAL,
         "",
-        "where judged, and the solver minimises: |Q^-1 grad g|_Q after the step, by the oracle, over the larger of "
+        "where judged, and the solver minimises: |Q^-1 grad g|_Q at the answer, by the oracle, over the larger of "
         "its value at the current positions and round-off",
     ),
-    Column("attainable", _REAL, "", "where judged: the least stationarity that round-off lets anyone reach"),
-    Column("minimum", pa.bool_(), "", "where judged: whether the Hessian after the step is positive definite"),
+    Column("attainable", _REAL, "", "where judged: of the stationarity, what round-off may make at the answer"),
+    Column(
+        "beyond",
+        _REAL,
+        "",
+        "where judged: the stationarity of what round-off does not explain of the gradient, vertex by vertex; by this "
+        "a step is graded",
+    ),
+    Column("minimum", pa.bool_(), "", "where judged: whether the answer curves upwards beyond round-off"),
+    Column("flat", pa.bool_(), "", "where judged: whether its smallest curvature cannot be told from zero: a valley"),
     Column(
         "distance",
         _REAL,
         "",
         "where judged: largest distance of a vertex from where a run of Newton's method to round-off has it in that "
-        "frame, over the rest shape's size; null from where that is lost",
+        "frame, over the size at rest of the component it belongs to; null from where that is lost",
     ),
     Column("energy_springs", _REAL, "J", "elastic energy of the springs after the step"),
     Column("energy_inertia", _REAL, "J", "inertia term of the step's objective"),

@@ -64,7 +64,7 @@ class Curvature:
     @property
     def flat(self) -> bool:
         """Whether there is a direction in which it may be zero, and none in which it is negative."""
-        return not self.convex and not self.falls
+        return abs(self.smallest) <= self.doubt
 
 
 def curvature(problem: StepProblem, p: Positions) -> Curvature:
@@ -121,8 +121,14 @@ def _softest(H: csr_array) -> tuple[NDArray[np.float64], Solve]:
         solve = definite(csr_array(H + diagonal(np.full(size, shift * scale))))
         if solve is not None:
             given: Any = {"shape": H.shape, "matvec": solve, "dtype": np.dtype(np.float64)}
-            settings: Any = {"k": 1, "sigma": -shift * scale, "OPinv": LinearOperator(**given), "v0": start}
-            return eigsh(H, tol=1e-8, **settings)[1][:, 0], solve
+            settings: Any = {
+                "k": 1,
+                "sigma": -shift * scale,
+                "OPinv": LinearOperator(**given),
+                "v0": start,
+                "tol": 1e-8,
+            }
+            return eigsh(H, **settings)[1][:, 0], solve
     raise ValueError("a Hessian that no multiple of the identity makes positive definite is not symmetric")
 
 

@@ -120,7 +120,7 @@ def reference(found: Iterable[Minimum]) -> Reference:
     known, reason = Reference(()), ""
     for one in found:
         known = known.joined(one)
-        reason = f"no certified minimum: Newton's method ends where {one.flaw}"
+        reason = reason if one.certified else f"no certified minimum: Newton's method ends where {one.flaw}"
     return known if known.minima else Reference((), reason)
 
 
@@ -143,7 +143,7 @@ def certify(problem: StepProblem, p: Positions) -> Minimum:
     p.flags.writeable = False
     length = np.inf if step is None else float(np.linalg.norm(step, axis=1).max(initial=0.0))
     known = step is not None and bool((np.linalg.norm(step, axis=1) <= near[problem.system.free]).all())
-    kind = MINIMUM if found.convex and known else ROUGH if found.convex else SADDLE
+    kind = MINIMUM if found.convex and known else SADDLE if found.falls else ROUGH
     if found.flat:
         kind = VALLEY if _level(problem, p, found, near) else FLAT
     return Minimum(p, problem.value(p), length, found.smallest, found.doubt, near, kind)

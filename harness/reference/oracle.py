@@ -5,8 +5,8 @@
 
 with the Q of the system's projective energies, assembled here and factorised by SuperLU, whatever the solver does.
 
-Round-off is told vertex by vertex (`solvers.round_off`): a gradient of at most FACTOR delta_i at vertex i may be nothing
-but round-off, and what is longer is beyond doubt, however far away or stiff another part of the scene may be. So
+Round-off is told vertex by vertex (`solvers.round_off`): a gradient of at most FACTOR delta_i at vertex i may be no
+more than that, and what is longer is beyond doubt, however far away or stiff another part of the scene may be. So
 
     floor(p)  = sqrt(sum_i (FACTOR delta_i)^2 / Q_ii)          what round-off may make of the residual
     beyond(p) = |Q^-1 (grad g less what round-off explains of it, vertex by vertex)|_Q / yardstick
@@ -31,7 +31,7 @@ from solvers.round_off import FACTOR, gradient_round_off, within
 
 
 class Reading(NamedTuple):
-    """reached: the stationarity; attainable: of it, what round-off may make; beyond: what round-off does not explain."""
+    """reached: the stationarity; attainable: what round-off may make of it; beyond: what it does not explain."""
 
     reached: float
     attainable: float
@@ -45,6 +45,7 @@ class Oracle:
         """Raises NotPositiveDefinite."""
         self._system = system
         self._Q = stiffness(system)
+        self._known: tuple[StepProblem, float] | None = None
 
     @cached_property
     def _factor(self) -> Any:
@@ -74,8 +75,10 @@ class Oracle:
 
     def yardstick(self, problem: StepProblem) -> float:
         """The residual [J^(1/2)] at the current positions, or what round-off may make of it there, if that is more."""
-        current = problem.current
-        return max(self.residual(problem, current), self.floor(problem, current), np.finfo(float).tiny)
+        if self._known is None or self._known[0] is not problem:
+            floor = max(self.floor(problem, problem.current), np.finfo(float).tiny)
+            self._known = problem, max(self.residual(problem, problem.current), floor)
+        return self._known[1]
 
     def stationarity(self, problem: StepProblem, p: Positions) -> Reading:
         """How stationary p (n, 3) [m] is."""

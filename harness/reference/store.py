@@ -28,7 +28,6 @@ from harness.simulation.step import Step
 from solvers.methods.newton import Newton
 from solvers.problem import Positions, Solver
 
-
 _CERTIFICATE = ("positions", "g", "error", "smallest_eigenvalue", "doubt", "near")
 """What is kept of a minimum: all of the point that is stored."""
 

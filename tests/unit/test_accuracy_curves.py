@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.base.errors import RunFailed
-from harness.experiments.accuracy import curves
-from harness.experiments.accuracy.curves import Curve, kept, measure
-from harness.experiments.accuracy.oracle import Oracle
+from harness.accuracy import curves
+from harness.accuracy.curves import Curve, kept, measure
+from harness.accuracy.scales import distances
+from harness.errors import RunFailed
 from harness.reference.minimiser import polish
-from harness.simulation.trace import EnergyNorm
-from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.newton import Newton
+from harness.reference.oracle import Oracle
+from harness.trace import EnergyNorm
+from solvers.local_global import SparseLocalGlobal
+from solvers.newton import Newton
 from solvers.problem import Positions, StepProblem
 from tests.scenes import cloth, first_problem
 
@@ -35,14 +36,14 @@ def test_each_early_iterate_is_graded_and_then_twelve_a_decade() -> None:
 
 
 def test_stationarity_is_the_step_of_local_global_relative_to_that_at_the_current_positions() -> None:
-    oracle, norm = Oracle(PROBLEM), EnergyNorm(PROBLEM.system)
+    oracle, norm = Oracle(PROBLEM.system), EnergyNorm(PROBLEM.system)
     prepared = SparseLocalGlobal().prepare(PROBLEM.system)
     points = [PROBLEM.current, *(p.copy() for p in islice(prepared.iterates(PROBLEM), 4))]
     steps = [norm(after - before) for before, after in pairwise(points)]
     for p, step in zip(points, steps, strict=False):
         # Two factorisations of one matrix solve it, each to round-off in a condition number of 1e3.
-        assert oracle.stationarity(p) == pytest.approx(step / steps[0], rel=1e-9)
-    assert oracle.stationarity(MINIMUM) < 1e-12  # round-off of a gradient beside 1 at the start
+        assert oracle.stationarity(PROBLEM, p).reached == pytest.approx(step / steps[0], rel=1e-9)
+    assert oracle.stationarity(PROBLEM, MINIMUM).reached < 1e-12  # round-off of a gradient beside 1 at the start
 
 
 def test_distances_leave_out_what_is_pinned() -> None:
@@ -50,7 +51,7 @@ def test_distances_leave_out_what_is_pinned() -> None:
     moved[PROBLEM.system.pins.vertices] += 5.0
     free = PROBLEM.system.free
     moved[free[0], 1] += 0.3
-    largest, rms = Oracle(PROBLEM).distances(moved, PROBLEM.current)
+    largest, rms = distances(PROBLEM.system, moved, PROBLEM.current)
     assert (largest, rms) == pytest.approx((0.3, 0.3 / len(free) ** 0.5), rel=1e-12)  # round-off of a difference
 
 
@@ -73,7 +74,7 @@ def towards(share: Callable[[int], float]) -> Callable[[int], Positions]:
 
 def curve(prepared: Any, **more: Any) -> Curve:
     limits: dict[str, Any] = {"iterations": 200, "time_limit": 60.0, "rounds": 2} | more
-    return measure(prepared, PROBLEM, Oracle(PROBLEM), LOWEST, **limits)
+    return measure(prepared, PROBLEM, Oracle(PROBLEM.system), LOWEST, **limits)
 
 
 ENDS = {

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from harness.reference.frozen import Frozen
-from harness.reference.minimiser import Minimum, Reference, Uncertified, certify, find_minima, free_hessian, polish
+from harness.reference.minimiser import SADDLE, Reference, Uncertified, certify, find_minima, free_hessian, polish
 from harness.reference.store import Store
 from solvers.energies.springs import Springs
 from solvers.integrators import Motion
@@ -130,7 +130,8 @@ def test_a_saddle_is_not_certified():
     assert not FLAT.gradient(FLAT.current).any()
     found = certify(FLAT, FLAT.current)
     assert not found.certified
-    assert np.isnan(found.smallest_eigenvalue)
+    assert found.kind == SADDLE
+    assert found.smallest_eigenvalue < -found.doubt
 
 
 def test_the_search_for_a_minimum_leaves_a_saddle():
@@ -142,7 +143,7 @@ def test_the_search_for_a_minimum_leaves_a_saddle():
 def test_a_point_that_is_no_minimum_is_never_a_reference(tmp_path):
     reference = Store(tmp_path, Stays()).reference(frozen(FLAT))
     assert reference.minima == ()
-    with pytest.raises(Uncertified, match="no Cholesky factor"):
+    with pytest.raises(Uncertified, match="it is a saddle"):
         _ = reference.best
     assert not list(tmp_path.iterdir())
 
@@ -186,7 +187,7 @@ def test_minima_are_found_once(tmp_path):
     found = Store(tmp_path).reference(one).best
     again = Store(tmp_path, Stays()).reference(one).best
     np.testing.assert_array_equal(found.positions, again.positions)
-    fields = ("g", "error", "smallest_eigenvalue", "certified", "name")
+    fields = ("g", "error", "smallest_eigenvalue", "doubt", "kind", "name")
     assert [getattr(found, f) for f in fields] == [getattr(again, f) for f in fields]
     assert not again.positions.flags.writeable
 
@@ -199,5 +200,5 @@ def test_minima_are_known_by_where_they_lie():
     known = Reference(()).joined(above).joined(nudged).joined(below)
     assert [m.g for m in known.minima] == [below.g, above.g]
     assert known.branch(nudged) == 1
-    uncertified = Minimum(above.positions + 0.5, -1e9, 0.1, float("nan"), False)
+    uncertified = replace(above, positions=above.positions + 0.5, g=-1e9, kind=SADDLE)
     assert known.joined(uncertified) is known
