@@ -54,7 +54,8 @@ COLUMNS = (
         "residual",
         _REAL,
         "J^(1/2)",
-        "|Q^-1 grad g|_Q where the step's last iteration began or ended, unpinned vertices",
+        "|Q^-1 grad g|_Q where the step's last iteration began or ended, unpinned vertices; null where the solver "
+        "does not minimise",
     ),
     Column("yardstick", _REAL, "J^(1/2)", "the residual at the step's start, which the tolerance refers to"),
     Column(

@@ -20,9 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.base import machine, rows
-from harness.base.errors import InputError, RunFailed
-from harness.config.sweep import RunSpec
+from harness import machine, rows
+from harness.errors import InputError, RunFailed
+from harness.judge import Judge, reference
+from harness.measure import Diverged, Measured, Settings, StepFailed, measure
+from harness.observe import observe, require_numbers
 from harness.record.base import RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
@@ -108,6 +110,7 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
     by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
     if by_frame[run.frames]["digest"] != measured.digest:
         raise RunFailed("the recorded pass ended at other positions than the timed pass")
+    require_numbers(by_frame, minimises=_solver(run).minimises, yardstick=run.tolerance is not None)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
     facts["choice"] = measured.prepared.choice
     return [

@@ -1,11 +1,12 @@
 """The curvature at a point: the Hessian's smallest eigenvalue, and what of it is not to be relied on.
 
     lambda = x' H x,   |x| = 1
-    doubt  = 4 eps |x|' |H| |x|  +  4 max over roundings p' of p of |x' (H(p') - H(p)) x|  +  2 |x' (H(p - e) - H(p)) x|
+    doubt  = 4 eps |x|' |H| |x|  +  4 max over roundings p' of p of |x' (H(p') - H(p)) x|  +  1.1 d
 
 The first part is what sums lose, over the places that x is at: a stiff part that does not move has no share in it. The
 second is what the rounding of the positions makes of the Hessian, a last bit up or down at each coordinate; the third,
-what Newton's next step e across x does, for the curvature in question is that of the stationary point nearby.
+d, is by how much |x' H x| falls within Newton's next step across x, for the curvature in question is that of the
+stationary point nearby: in a valley all that a point beside its floor has is lost there.
 A stationary point is a minimum where lambda > doubt and a saddle where lambda < -doubt. In between it is flat: the
 minima may be a continuum, along a symmetry of the step, and no float64 number tells.
 """
@@ -79,13 +80,14 @@ def curvature(problem: StepProblem, p: Positions) -> Curvature:
     smallest, rng = float(x @ (H @ x)), np.random.default_rng(0)
 
     def change(q: Positions) -> float:
-        return abs(float(x @ (free_hessian(problem, q) @ x)) - smallest)
+        return float(x @ (free_hessian(problem, q) @ x)) - smallest
 
-    moved = max(change(p * (1.0 + EPS * rng.integers(-1, 2, p.shape))) for _ in range(ROUNDINGS))
+    moved = max(abs(change(p * (1.0 + EPS * rng.integers(-1, 2, p.shape)))) for _ in range(ROUNDINGS))
     sums = EPS * float(np.abs(x) @ (abs(H) @ np.abs(x)))
     direction[free] = x.reshape(-1, 3)
     here = Curvature(smallest, 4.0 * (sums + moved), direction, solve)
-    return replace(here, doubt=here.doubt + 2.0 * change(across(problem, p, here)))
+    lost = -np.sign(smallest) * change(across(problem, p, here))
+    return replace(here, doubt=here.doubt + 1.1 * max(0.0, float(lost)))
 
 
 def across(problem: StepProblem, p: Positions, at: Curvature, *, most: float = SHORT) -> Positions:

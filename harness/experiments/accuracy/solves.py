@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -193,8 +194,8 @@ def _points(curve: Curve, system: System, minimum: Minimum | None) -> list[Row]:
     for k, number in enumerate(curve.numbers):
         row: Row = {
             "iteration": number,
-            "g": curve.g[k],
-            "stationarity": curve.stationarity[k],
+            "g": _number(curve.g[k]),
+            "stationarity": _number(curve.stationarity[k]),
             "seconds": curve.seconds[k].tolist(),
         }
         if minimum:
@@ -202,3 +203,8 @@ def _points(curve: Curve, system: System, minimum: Minimum | None) -> list[Row]:
             row |= {"minimum": minimum.name, "largest_error": largest, "rms_error": rms}
         rows.append(row)
     return rows
+
+
+def _number(value: float) -> float | None:
+    """A measured value; null where an iterate has none, as it overflows."""
+    return value if math.isfinite(value) else None
