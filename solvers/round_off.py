@@ -59,9 +59,12 @@ def gradient_round_off(problem: StepProblem, p: Positions) -> Terms:
 
 
 def within(gradient: Positions, bound: Terms) -> Positions:
-    """The part of a gradient (n, 3) [N] that is no longer than the bound (n,) [N]; the rest of it is beyond doubt."""
+    """The part of a gradient (n, 3) [N] that is no longer than the bound (n,) [N]; the rest of it is beyond doubt.
+
+    A bound that is infinite explains nothing.
+    """
     size = lengths(gradient)
-    share = np.divide(np.minimum(size, bound), size, out=np.zeros_like(size), where=size > 0.0)
+    share = np.divide(np.minimum(size, bound), size, out=np.zeros_like(size), where=(size > 0.0) & np.isfinite(bound))
     return share[:, None] * gradient
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import count, islice, pairwise
 from time import sleep
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,12 +16,13 @@ from harness.accuracy.curves import Curve, kept, measure
 from harness.accuracy.scales import distances
 from harness.errors import RunFailed
 from harness.reference.minimiser import polish
-from harness.reference.oracle import Oracle
+from harness.reference.oracle import Oracle, Reading
 from harness.trace import EnergyNorm
 from solvers.local_global import SparseLocalGlobal
 from solvers.newton import Newton
 from solvers.problem import Positions, StepProblem
 from tests.scenes import cloth, first_problem
+from tests.unit.test_minimiser import FLAT
 
 PROBLEM = first_problem(cloth(6, "exact"))
 MINIMUM = polish(PROBLEM, PROBLEM.current, Newton()).positions
@@ -128,3 +130,32 @@ def test_passes_that_differ_in_the_last_bit_are_a_failure() -> None:
 
     with pytest.raises(RunFailed, match="other positions"):
         curve(Scripted(iterate))
+
+
+def at_a_saddle(iterate: Callable[[int], Positions]) -> Curve:
+    above = polish(FLAT, FLAT.current, Newton())
+    limits: dict[str, Any] = {"iterations": 40, "time_limit": 60.0, "rounds": 1}
+    return measure(cast("Any", Scripted(iterate)), STARTED, Oracle(FLAT.system), above.g, **limits)
+
+
+STARTED = replace(FLAT, current=FLAT.current + np.array([[0.0], [0.0], [0.0], [0.0], [1e-3]]))
+"""A step whose current positions are beside the saddle at which FLAT's are."""
+
+
+def test_a_solver_that_sits_on_a_saddle_is_named_so_and_has_not_converged() -> None:
+    found = at_a_saddle(lambda number: FLAT.current)
+    assert found.stationarity[-1] <= curves.STATIONARY
+    assert found.status == "saddle"
+    assert "saddle, where the curvature is -" in found.reason
+
+
+def test_a_solver_that_leaves_a_saddle_goes_on_to_its_minimum() -> None:
+    above = polish(FLAT, FLAT.current, Newton()).positions
+    found = at_a_saddle(lambda number: FLAT.current if number < 3 else above)
+    assert (found.status, found.numbers[-1]) == ("ok", 3)
+
+
+def test_a_stationarity_that_is_no_number_is_a_divergence(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading = Reading(np.inf, 0.0, np.inf)
+    monkeypatch.setattr(Oracle, "stationarity", lambda self, problem, p: reading)
+    assert curve(Scripted(towards(lambda n: 0.5**n))).status == "diverged"

@@ -144,5 +144,6 @@ def test_what_overflows_has_no_bound():
 
 def test_what_round_off_explains_of_a_gradient_is_no_longer_than_the_bound():
     gradient = np.array([[3.0, 4.0, 0.0], [0.3, 0.4, 0.0], [0.0, 0.0, 0.0]])
+    assert not within(gradient, np.full(3, np.inf)).any(), "an infinite bound is none"
     found = within(gradient, np.array([1.0, 1.0, 1.0]))
     np.testing.assert_allclose(found, [[0.6, 0.8, 0.0], [0.3, 0.4, 0.0], [0.0, 0.0, 0.0]], rtol=1e-15)
