@@ -8,19 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.effects.base import Effect
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins as PinsEffect
-from harness.effects.springs import Springs as SpringsEffect
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid, Net
-from harness.mesh.solids import Block, Tower
-from harness.mesh.surfaces import Skirt
 from harness.reference.oracle import stiffness
-from harness.scene import Scene, build
-from harness.simulate import problem, simulate, start
-from harness.spec import MeshSource, SceneSpec
-from solvers.compiled import CompiledLocalGlobal
+from harness.scenes.bind import Scene, build
+from harness.scenes.effects.base import Effect
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins as PinsEffect
+from harness.scenes.effects.springs import Springs as SpringsEffect
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid, Net
+from harness.scenes.mesh.solids import Block, Tower
+from harness.scenes.mesh.surfaces import Skirt
+from harness.scenes.spec import MeshSource, SceneSpec
+from harness.simulation.step import problem, simulate, start
 from solvers.energies.springs import Springs
 from solvers.methods.local_global import DenseLocalGlobal, SparseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal

@@ -20,18 +20,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import machine, rows
-from harness.errors import InputError, RunFailed
-from harness.judge import Judge, reference
-from harness.measure import Diverged, Measured, Settings, StepFailed, measure
-from harness.observe import observe, require_numbers
+from harness.base import machine, rows
+from harness.base.errors import InputError, RunFailed
+from harness.config.sweep import RunSpec
 from harness.record.base import RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
 from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, measure
-from harness.simulation.observe import observe
+from harness.simulation.observe import observe, require_numbers
 from harness.simulation.step import prepare
 from solvers.problem import NotPositiveDefinite, Solver, StopRule, Unsupported
 from solvers.registry import SOLVERS, load

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from harness.reference.curvature import curvature
 from harness.reference.minimiser import TO_THE_END
 from harness.reference.oracle import Oracle, Reading, sizes
-from harness.scene import Scene
-from harness.simulate import Step, prepare, simulate
+from harness.scenes.bind import Scene
+from harness.simulation.step import Step, prepare, simulate
 from solvers.problem import Positions, Solver, StepProblem
 
 LOST = 1e-6

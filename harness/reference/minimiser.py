@@ -20,10 +20,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.errors import RunFailed
+from harness.base.errors import RunFailed
 from harness.reference.curvature import Curvature, across, curvature, definite, free_hessian
 from harness.reference.oracle import sizes
-from harness.simulate import FIRST_GUESSES
+from harness.simulation.step import FIRST_GUESSES
 from solvers.problem import Positions, Solver, StepProblem, StopRule
 from solvers.round_off import EPS
 

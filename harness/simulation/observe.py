@@ -13,12 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.judge import Judge
-from harness.measure import Diverged, Settings, StepFailed, digest, steps
 from harness.record.base import Frame, Recorder
 from harness.record.shading import strains
 from harness.scenes.bind import Scene
-from harness.simulation.measure import Settings, digest, steps
+from harness.simulation.measure import Diverged, Settings, StepFailed, digest, steps
 from harness.simulation.step import Step, start
 from harness.simulation.trace import EnergyNorm, trace
 from solvers.problem import Positions, Prepared

@@ -19,7 +19,7 @@ from harness.experiments.accuracy.run import run_accuracy
 from harness.record.reader import read_replay
 from harness.reference import store
 from harness.reference.minimiser import ROUGH, Reference, certify
-from solvers.local_global import SparseLocalGlobal
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Positions, Prepared, System
 from solvers.registry import SOLVERS
 

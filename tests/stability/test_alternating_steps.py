@@ -9,12 +9,10 @@ import pytest
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.effects.gravity import Gravity
-from harness.judge import Judge
-from harness.load import load_any, load_scene
-from harness.mesh.chain import Chain
+from harness.config.load import load_any, load_scene
+from harness.experiments.run import Files, execute
 from harness.record.reader import read_replay, summary
-from harness.reference.judge import SLACK, Judge
+from harness.reference.judge import Judge
 from harness.scenes.bind import Scene, build
 from harness.scenes.effects.gravity import Gravity
 from harness.scenes.mesh.chain import Chain

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from harness.reference.oracle import Oracle
-from harness.simulate import prepare, problem, start
+from harness.simulation.step import prepare, problem, start
 from solvers.problem import Solution, StepProblem, StopRule, Unsupported
 from tests.stability.test_hard_scenes import METHODS, cases, scene, spacing
 

@@ -14,10 +14,10 @@ import numba
 import numpy as np
 import pytest
 
-from harness.load import load_scene, load_sweep
-from harness.scene import Scene, build
-from harness.simulate import State, Step, prepare, problem, simulate, start
-from solvers.compiled import CompiledLocalGlobal
+from harness.config.load import load_scene, load_sweep
+from harness.scenes.bind import Scene, build
+from harness.simulation.step import State, Step, prepare, problem, simulate, start
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Solver, StopRule, Unsupported
 from solvers.registry import SOLVERS, load
 from tests.scenes import far

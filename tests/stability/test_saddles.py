@@ -10,18 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.effects.pins import Pins as PinsEffect
-from harness.effects.springs import Springs as SpringsEffect
-from harness.judge import Judge
-from harness.judge import is_minimum as minimum
-from harness.load import load_scene
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
-from harness.mesh.solids import Tower
+from harness.config.load import load_scene
+from harness.reference.judge import Judge
+from harness.reference.judge import is_minimum as minimum
 from harness.report.robustness import SLACK
-from harness.scene import Scene, build
-from harness.simulate import State, prepare, problem, simulate
-from solvers.hybrid import Hybrid
+from harness.scenes.bind import Scene, build
+from harness.scenes.effects.pins import Pins as PinsEffect
+from harness.scenes.effects.springs import Springs as SpringsEffect
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.solids import Tower
+from harness.simulation.step import State, prepare, problem, simulate
 from solvers.integrators import INTEGRATORS, Motion
 from solvers.methods.hybrid import Hybrid
 from solvers.methods.newton import Newton

@@ -11,15 +11,15 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from harness.accuracy import curves
-from harness.accuracy.curves import Curve, kept, measure
-from harness.accuracy.scales import distances
-from harness.errors import RunFailed
+from harness.base.errors import RunFailed
+from harness.experiments.accuracy import curves
+from harness.experiments.accuracy.curves import Curve, kept, measure
+from harness.experiments.accuracy.scales import distances
 from harness.reference.minimiser import polish
 from harness.reference.oracle import Oracle, Reading
-from harness.trace import EnergyNorm
-from solvers.local_global import SparseLocalGlobal
-from solvers.newton import Newton
+from harness.simulation.trace import EnergyNorm
+from solvers.methods.local_global import SparseLocalGlobal
+from solvers.methods.newton import Newton
 from solvers.problem import Positions, StepProblem
 from tests.scenes import cloth, first_problem
 from tests.unit.test_minimiser import FLAT

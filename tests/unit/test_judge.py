@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness import rows
-from harness.errors import InputError
-from harness.judge import Judge, is_minimum, reference
-from harness.load import load_any
+from harness.base import rows
+from harness.base.errors import InputError
+from harness.config.load import load_any
+from harness.experiments.run import Files, execute
 from harness.record.reader import read_replay
+from harness.reference.judge import Judge, is_minimum, reference
 from harness.reference.oracle import Oracle
 from harness.report.robustness import (
     DIVERGED,

@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from harness.judge import is_minimum
-from harness.load import load_scene
+from harness.config.load import load_scene
 from harness.reference.curvature import curvature
 from harness.reference.frozen import Frozen
+from harness.reference.judge import is_minimum
 from harness.reference.minimiser import (
     ROUGH,
     SADDLE,

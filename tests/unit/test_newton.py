@@ -8,18 +8,19 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
-from harness.effects.gravity import Gravity
-from harness.effects.pins import Pins as PinsEffect
-from harness.effects.springs import Springs as SpringsEffect
-from harness.mesh.chain import Chain
-from harness.mesh.grid import Grid
 from harness.reference.curvature import free_hessian
-from harness.simulate import problem
-from solvers.descent import PreparedDescent
-from solvers.hybrid import Hybrid
-from solvers.newton import Newton
-from solvers.newton_cg import NewtonCG
-from solvers.objective import Objective, StepObjective
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins as PinsEffect
+from harness.scenes.effects.springs import Springs as SpringsEffect
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.simulation.step import problem
+from solvers.core.descent import PreparedDescent
+from solvers.core.objective import Objective, StepObjective
+from solvers.core.saddles import certified
+from solvers.methods.hybrid import Hybrid
+from solvers.methods.newton import Newton
+from solvers.methods.newton_cg import NewtonCG
 from solvers.problem import Positions, StepProblem, StopRule
 from tests.scenes import cloth, first_problem, random_problem, scene
 from tests.stability.test_hard_cases import CASES, resting

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.judge import Judge
-from harness.load import load_scene
+from harness.config.load import load_scene
+from harness.reference.judge import Judge
 from harness.reference.minimiser import polish
 from harness.reference.oracle import Oracle, component_sizes, sizes, stiffness
-from harness.scene import Scene, build
-from harness.simulate import State, Step, problem, start
+from harness.scenes.bind import Scene, build
+from harness.simulation.step import State, Step, problem, start
 from solvers.integrators import Motion
-from solvers.newton import Newton
+from solvers.methods.newton import Newton
 from solvers.problem import Positions, Solution, StepProblem
 
 HARD = Path(__file__).resolve().parents[2] / "configs" / "hard"

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from harness import machine, run
-from harness.load import load_any
-from harness.measure import StepFailed
-from harness.observe import require_numbers
-from harness.run import Files, execute
+from harness.base import machine
+from harness.config.load import load_any
+from harness.experiments import run
+from harness.experiments.run import Files, execute
+from harness.simulation.measure import StepFailed
+from harness.simulation.observe import require_numbers
 
 
 def test_a_run_that_fails_now_keeps_nothing_of_when_it_did_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -19,8 +19,8 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.accuracy.scales import round_off
-from harness.errors import RunFailed
+from harness.base.errors import RunFailed
+from harness.experiments.accuracy.scales import round_off
 from harness.reference.curvature import Curvature, curvature
 from harness.reference.oracle import Oracle
 from solvers.problem import Positions, Prepared, StepProblem

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness import machine
-from harness.accuracy.curves import Curve
-from harness.accuracy.scales import round_off
-from harness.accuracy.spec import CurveUnit
+from harness.base import machine
+from harness.config.accuracy import CurveUnit
+from harness.experiments.accuracy.curves import Curve
+from harness.experiments.accuracy.scales import round_off
 from harness.record.base import Frame, RecordingInfo
 from harness.record.rerun import RerunRecorder
 

@@ -10,19 +10,19 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from harness import machine
-from harness.accuracy.curves import Curve, measure
-from harness.accuracy.failures import lost
-from harness.accuracy.recording import record
-from harness.accuracy.scales import distances, stiffness_ratio
-from harness.accuracy.spec import Case, CurveUnit
+from harness.base import machine
+from harness.config.accuracy import Case, CurveUnit
+from harness.experiments.accuracy.curves import Curve, measure
+from harness.experiments.accuracy.failures import lost
+from harness.experiments.accuracy.recording import record
+from harness.experiments.accuracy.scales import distances, stiffness_ratio
+from harness.experiments.run import provenance
 from harness.reference.frozen import Frozen, bind
 from harness.reference.minimiser import Minimum, Reference
 from harness.reference.oracle import Oracle
 from harness.reference.store import Store
-from harness.run import provenance
-from harness.scene import Scene
-from harness.simulate import FIRST_GUESSES
+from harness.scenes.bind import Scene
+from harness.simulation.step import FIRST_GUESSES
 from solvers.problem import Positions, Prepared, Solver, System
 from solvers.registry import SOLVERS, load
 
