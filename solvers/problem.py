@@ -184,13 +184,13 @@ class StepProblem:
         return tuple(e.begin_step(self.start) if isinstance(e, LaggedEnergy) else e for e in self.system.energies)
 
     def terms(self, p: Positions) -> dict[str, float]:
-        """The terms [J] of the objective at p, by name: energies (their class's name), inertia, force, pins."""
-        s = self.system
-        values: dict[str, float] = {}
+        """The terms [J] of the objective at p: inertia, force, pins, and energies by their class's name, which is
+        `energy pins` and so on where a class has the name of one of those three."""
+        s, values, away = self.system, dict[str, float](), p - self.target
         for energy in self.energies:
             name = type(energy).__name__.lower()
+            name = f"energy {name}" if name in ("inertia", "force", "pins") else name
             values[name] = values.get(name, 0.0) + energy.value(p)
-        away = p - self.target
         values["inertia"] = 0.5 * float(s.inertia @ np.einsum("ij,ij->i", away, away))
         values["force"] = -float(np.einsum("ij,ij->", p, self.force))
         soft, vertices, weight = s.penalty

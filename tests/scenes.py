@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from harness.reference.oracle import stiffness
 from harness.scenes.bind import Scene, build
 from harness.scenes.effects.base import Effect
 from harness.scenes.effects.gravity import Gravity
@@ -133,3 +134,9 @@ def frozen(problem: StepProblem) -> StepProblem:
     for array in [*arrays, problem.system.mass, problem.system.pins.vertices, problem.system.pins.weight]:
         array.flags.writeable = False
     return problem
+
+
+def far(problem: StepProblem) -> float:
+    """|e|_Q [J^(1/2)] of a displacement e by the largest coordinate at every unpinned vertex: the scale of rounding."""
+    trace = float(stiffness(problem.system).diagonal()[problem.system.unpinned].sum())
+    return float(np.abs(problem.first_guess).max(initial=0.0)) * trace**0.5

@@ -54,18 +54,27 @@ COLUMNS = (
         "residual",
         _REAL,
         "J^(1/2)",
-        "|Q^-1 grad g|_Q where the step's last iteration began or ended, unpinned vertices",
+        "|Q^-1 grad g|_Q where the step's last iteration began or ended, unpinned vertices; null where the solver "
+        "does not minimise",
     ),
     Column("yardstick", _REAL, "J^(1/2)", "the residual at the step's start, which the tolerance refers to"),
     Column(
         "stationarity",
         _REAL,
         "",
-        "where judged, and the solver minimises: |Q^-1 grad g|_Q after the step, by the oracle, over the larger of "
+        "where judged, and the solver minimises: |Q^-1 grad g|_Q at the answer, by the oracle, over the larger of "
         "its value at the current positions and round-off",
     ),
-    Column("attainable", _REAL, "", "where judged: the least stationarity that round-off lets anyone reach"),
-    Column("minimum", pa.bool_(), "", "where judged: whether the Hessian after the step is positive definite"),
+    Column("attainable", _REAL, "", "where judged: of the stationarity, what round-off may make at the answer"),
+    Column(
+        "beyond",
+        _REAL,
+        "",
+        "where judged: the stationarity of what round-off does not explain of the gradient, vertex by vertex; by this "
+        "a step is graded",
+    ),
+    Column("minimum", pa.bool_(), "", "where judged: whether the answer curves upwards beyond round-off"),
+    Column("flat", pa.bool_(), "", "where judged: whether its smallest curvature cannot be told from zero: a valley"),
     Column(
         "graded",
         _REAL,
@@ -77,7 +86,7 @@ COLUMNS = (
         _REAL,
         "",
         "where judged: largest distance of a vertex from where a run of Newton's method to round-off has it in that "
-        "frame, over the rest shape's size; null from where that is lost",
+        "frame, over the size at rest of the component it belongs to; null from where that is lost",
     ),
     Column("energy_springs", _REAL, "J", "elastic energy of the springs after the step"),
     Column("energy_inertia", _REAL, "J", "inertia term of the step's objective"),

@@ -31,7 +31,7 @@ from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
 from harness.simulation.contract import where
 from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, measure
-from harness.simulation.observe import observe
+from harness.simulation.observe import observe, require_numbers
 from harness.simulation.step import prepare
 from solvers import sources
 from solvers.problem import NotPositiveDefinite, Solver, StopRule, Unsupported
@@ -111,6 +111,7 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
     by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
     if by_frame[run.frames]["digest"] != measured.digest:
         raise RunFailed("the recorded pass ended at other positions than the timed pass")
+    require_numbers(by_frame, minimises=_solver(run).minimises, yardstick=run.tolerance is not None)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
     facts["choice"] = measured.prepared.choice
     return [

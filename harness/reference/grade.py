@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from harness.base.errors import RunFailed
-from harness.reference.judge import Oracle
+from harness.reference.oracle import Oracle
 from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule
 from solvers.registry import minimises
 
@@ -70,11 +70,11 @@ class Graded:
         if system.rate not in self._oracles:
             self._oracles[system.rate] = Oracle(system)
         oracle = self._oracles[system.rate]
-        reached, attainable = oracle.stationarity(problem, found.positions)
+        reached, round_off, _ = oracle.stationarity(problem, found.positions)
         residual = oracle.residual(problem, found.positions)
         known = [residual, *(oracle.residual(problem, p) for p in self._before(problem, found))]
-        yardstick = residual / reached if reached > 0.0 else np.inf
-        least, round_off = min(known) / yardstick, SLACK * attainable
+        yardstick = oracle.yardstick(problem)
+        least = min(known) / yardstick
         told = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)"
         if np.isnan(found.residual) and found.iterations:
             raise RunFailed(f"{told}; wanted |Q^-1 grad g|_Q, which is {residual:.3g} (or `minimises = False`)")

@@ -1,10 +1,14 @@
 """The minimum that solvers are graded against: Newton's method to round-off, and a certificate.
 
 At a minimum grad g = 0 and the Hessian H is positive definite. Both are checked by the oracle, `solvers.problem`,
-whoever found the positions: H has a Cholesky factor, inverse iteration (Lanczos) by it gives the smallest eigenvalue,
-and steps |H^-1 grad g| go on for as long as each is shorter than half of the one before, so that the last one tells
-how far round-off leaves the minimum. The energy is not convex: there may be
-several minima. A basin is what Newton's method with a line search, which only descends, makes it.
+whoever found the positions: steps |H^-1 grad g| go on for as long as each is shorter than half of the one before, and
+at the point where they end, which is the one that is stored, the smallest eigenvalue is positive beyond round-off
+(`harness.reference.curvature`) and one more step is short. The energy is not convex: there may be several minima. A
+basin is what Newton's method with a line search, which only descends, makes it.
+
+Where the curvature cannot be told from zero along some direction, and points that way are as low, the minima are a
+valley: a circle, for a chain that may buckle to any side. No distance to one of its points means anything, so that it
+is no reference and says why.
 """
 
 from __future__ import annotations
@@ -12,18 +16,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, csr_array
-from scipy.sparse.linalg import LinearOperator, eigsh
 
 from harness.base.errors import RunFailed
+from harness.reference.curvature import Curvature, across, curvature, definite, free_hessian
+from harness.reference.oracle import sizes
 from harness.simulation.step import FIRST_GUESSES
-from solvers.linear.block import BlockCholesky
-from solvers.matrices import diagonal
 from solvers.problem import Positions, Solver, StepProblem, StopRule
+from solvers.round_off import EPS
 
 TO_THE_END = StopRule(1000)
 """Until round-off lets nothing descend any more: a tolerance would stop at saddles too."""
@@ -36,24 +38,45 @@ class Uncertified(RunFailed):
     """There is no certified minimum to grade against."""
 
 
+MINIMUM, VALLEY, FLAT, SADDLE, ROUGH = "minimum", "valley", "flat", "saddle", "rough"
+"""Kinds of points where Newton's method ends: a certified minimum; one of a continuum of minima; where no curvature is
+negative and one cannot be told from zero; a saddle; a minimum that is not known to `NEAR`."""
+WALK = 1e-3
+"""Of the shape's size: how far along a valley its points are compared."""
+LEVEL = 64.0
+"""Times eps and the objective's terms: what two values may differ by and be one; sums of up to 1e5 terms."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Minimum:
-    """Where Newton's method ended. positions (n, 3) [m], read-only; g [J]; error: the length of the last Newton step,
-    at the vertex where it is largest [m]; smallest_eigenvalue: of the Hessian without the pinned vertices [N/m], nan
-    where that is not positive definite; certified: whether this is a minimum, known to `NEAR`."""
+    """Where Newton's method ended. positions (n, 3) [m], read-only; all else is of this very point: g [J]; error: the
+    length of Newton's next step, at the vertex where it is largest [m], infinite where the Hessian has no factor;
+    smallest_eigenvalue: of the Hessian without the exactly pinned vertices [N/m], and its doubt [N/m]; near (n,) [m]:
+    what `NEAR` is at each vertex, of the size of its component; kind: see above."""
 
     positions: Positions
     g: float
     error: float
     smallest_eigenvalue: float
-    certified: bool
+    doubt: float
+    near: NDArray[np.float64]
+    kind: str
+
+    @property
+    def certified(self) -> bool:
+        """Whether this is a minimum, known to `NEAR`, and no other is next to it."""
+        return self.kind == MINIMUM
 
     @property
     def flaw(self) -> str:
         """What is wrong with a minimum that is not certified."""
-        if np.isnan(self.smallest_eigenvalue):
-            return "the Hessian has no Cholesky factor"
-        return f"its next step is still {self.error:.1e} m, the smallest eigenvalue {self.smallest_eigenvalue:.1e} N/m"
+        curvature = f"the smallest eigenvalue is {self.smallest_eigenvalue:.1e} N/m, give or take {self.doubt:.1e} N/m"
+        return {
+            VALLEY: f"the minima are a valley, all as low, to whose points no distance means anything: {curvature}",
+            FLAT: f"the curvature along some direction is round-off: {curvature}",
+            SADDLE: f"it is a saddle: {curvature}",
+            ROUGH: f"its next step is still {self.error:.1e} m: {curvature}",
+        }[self.kind]
 
     @property
     def name(self) -> str:
@@ -97,7 +120,7 @@ def reference(found: Iterable[Minimum]) -> Reference:
     known, reason = Reference(()), ""
     for one in found:
         known = known.joined(one)
-        reason = f"no certified minimum: Newton's method ends where {one.flaw}"
+        reason = reason if one.certified else f"no certified minimum: Newton's method ends where {one.flaw}"
     return known if known.minima else Reference((), reason)
 
 
@@ -108,68 +131,63 @@ def polish(problem: StepProblem, p: Positions, solver: Solver) -> Minimum:
 
 
 def certify(problem: StepProblem, p: Positions) -> Minimum:
-    """Newton steps from p (n, 3) [m], close to a minimum, to where round-off ends them; then the Hessian's spectrum."""
-    p, free = _pinned(problem, p), problem.system.free
-    error, smallest = np.inf, np.nan
+    """Newton steps from p (n, 3) [m], close to a minimum, to where round-off ends them. Then, there: the curvature, the
+    value, and the length of one more step."""
+    p = _pinned(problem, p)
+    near = NEAR * sizes(problem.system, p)
+    found = curvature(problem, p)
+    if found.convex:
+        _descend(problem, p, near)
+        found = curvature(problem, p)
+    step = _step(problem, p)
+    p.flags.writeable = False
+    length = np.inf if step is None else float(np.linalg.norm(step, axis=1).max(initial=0.0))
+    known = step is not None and bool((np.linalg.norm(step, axis=1) <= near[problem.system.free]).all())
+    kind = MINIMUM if found.convex and known else SADDLE if found.falls else ROUGH
+    if found.flat:
+        kind = VALLEY if _level(problem, p, found, near) else FLAT
+    return Minimum(p, problem.value(p), length, found.smallest, found.doubt, near, kind)
+
+
+def _descend(problem: StepProblem, p: Positions, near: NDArray[np.float64]) -> None:
+    """Newton steps on p itself, for as long as each is shorter than half of the one before."""
+    free = problem.system.free
     for _ in range(REFACTORISATIONS):
-        H = free_hessian(problem, p)
-        factor = _factorised(H)
-        if factor is None:
-            smallest = np.nan
-            break
-        smallest, begun, error = _smallest_eigenvalue(H, factor), p.copy(), np.inf
+        solve = definite(free_hessian(problem, p))
+        if solve is None:
+            return
+        begun, error = p.copy(), np.inf
         while True:
-            step = factor.solve(problem.gradient(p)[free])
+            step = solve(problem.gradient(p)[free].ravel()).reshape(-1, 3)
             length = float(np.linalg.norm(step, axis=1).max(initial=0.0))
             if not length < 0.5 * error:  # round-off, or too far away for this Hessian
                 break
             error = length
             p[free] -= step
-        if np.abs(p - begun).max(initial=0.0) <= NEAR * _size(p):
-            break
-    p.flags.writeable = False
-    certified = error <= NEAR * _size(p) and smallest > 0.0
-    return Minimum(p, problem.value(p), error, smallest, bool(certified))
+        if (np.linalg.norm(p - begun, axis=1) <= near).all():
+            return
 
 
-def free_hessian(problem: StepProblem, p: Positions) -> csr_array:
-    """The objective's Hessian at p [N/m], without the exactly pinned vertices, (3 f, 3 f)."""
-    system = problem.system
-    _, vertices, weight = system.penalty
-    held = system.inertia + np.bincount(vertices, weight, minlength=system.vertices)
-    H = diagonal(np.repeat(held, 3))
-    for energy in problem.energies:
-        H = H + energy.hessian(p)
-    free = (3 * system.free[:, None] + np.arange(3)).ravel()
-    return csr_array(csr_array(H)[free][:, free])
+def _step(problem: StepProblem, p: Positions) -> Positions | None:
+    """Newton's step (f, 3) [m] at p; None where the Hessian has no factor."""
+    free = problem.system.free
+    solve = definite(free_hessian(problem, p)) if len(free) else np.copy
+    return solve(problem.gradient(p)[free].ravel()).reshape(-1, 3) if solve else None
 
 
-def _factorised(H: csr_array) -> BlockCholesky | None:
-    """The Cholesky factor of a Hessian, None where it is not positive definite."""
-    blocks = bsr_array(H, blocksize=(3, 3))
-    blocks.sort_indices()
-    factor = BlockCholesky(csr_array((np.ones(len(blocks.indices)), blocks.indices, blocks.indptr)))
-    return factor if factor.factorise(np.array(blocks.data, np.float64)) else None
-
-
-def _smallest_eigenvalue(H: csr_array, factor: BlockCholesky) -> float:
-    """Of a positive definite matrix [N/m], less what round-off in its factor may have added."""
-    size = len(H.indptr) - 1
-    start = np.random.default_rng(0).normal(size=size)  # the same eigenvalue each time
-    settings: Any = {"k": 1, "sigma": 0.0, "OPinv": _Inverse(factor, size), "v0": start, "tol": 1e-3}
-    found: Any = eigsh(H, return_eigenvectors=False, **settings)
-    return float(found[0]) - 4.0 * np.finfo(float).eps * float(abs(H).sum(axis=1).max())
-
-
-class _Inverse(LinearOperator):
-    """H^-1 of a factorised H."""
-
-    def __init__(self, factor: BlockCholesky, size: int) -> None:
-        super().__init__(np.dtype(np.float64), (size, size))
-        self._solve = factor.solve
-
-    def _matvec(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        return self._solve(x.reshape(-1, 3)).ravel()
+def _level(problem: StepProblem, p: Positions, found: Curvature, near: NDArray[np.float64]) -> bool:
+    """Whether points are as low as p where the flat direction leads, both ways: the minima are a continuum."""
+    lowest, noise = problem.value(p), LEVEL * EPS * problem.magnitude(p)
+    for way in (WALK, -WALK):
+        q = p + way / NEAR * float(near.max()) * found.direction / np.abs(found.direction).max()
+        for _ in range(REFACTORISATIONS):
+            here = curvature(problem, q)
+            if here.falls or not np.isfinite(here.smallest):
+                return False
+            q = across(problem, q, here, most=WALK)
+        if not abs(problem.value(q) - lowest) <= noise:
+            return False
+    return True
 
 
 def _pinned(problem: StepProblem, p: Positions) -> Positions:
@@ -179,11 +197,6 @@ def _pinned(problem: StepProblem, p: Positions) -> Positions:
     return placed
 
 
-def _size(p: Positions) -> float:
-    """The diagonal of the bounding box of p [m]."""
-    return float(np.linalg.norm(np.ptp(p, axis=0)))
-
-
 def _same(one: Minimum, other: Minimum) -> bool:
-    apart = np.abs(one.positions - other.positions).max(initial=0.0)
-    return bool(apart <= 100.0 * NEAR * _size(one.positions))
+    apart = np.linalg.norm(one.positions - other.positions, axis=1)
+    return bool((apart <= 100.0 * one.near).all())

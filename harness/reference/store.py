@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from harness.reference.frozen import Arrays, Frozen, agree, bind, freeze, moment_frames, reference_run, thaw
-from harness.reference.minimiser import Minimum, Reference, find_minima, polish
+from harness.reference.minimiser import MINIMUM, Minimum, Reference, find_minima, polish
 from harness.reference.motion import Field
 from harness.reference.trajectory import Trajectory, integrate
 from harness.scenes.bind import Scene
@@ -27,6 +27,9 @@ from harness.scenes.spec import IntegratorName, SceneSpec
 from harness.simulation.step import Step
 from solvers.methods.newton import Newton
 from solvers.problem import Positions, Solver
+
+_CERTIFICATE = ("positions", "g", "error", "smallest_eigenvalue", "doubt", "near")
+"""What is kept of a minimum: all of the point that is stored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +72,8 @@ class Store:
     def reference(self, frozen: Frozen) -> Reference:
         """The minima known of a problem, found now if there is none. Its `best` raises Uncertified."""
         path = self.folder / f"minima-{frozen.digest}.npz"
-        if path.exists():
-            return _minima(_read(path))
+        if path.exists() and (stored := _read(path)).keys() >= set(_CERTIFICATE):  # else by code that certified less
+            return _minima(stored)
         found = find_minima(frozen.problem, self.solver)
         if found.minima:
             self._remember(frozen, found)
@@ -121,8 +124,7 @@ class Store:
         return kept
 
     def _remember(self, frozen: Frozen, known: Reference) -> None:
-        names = ("positions", "g", "error", "smallest_eigenvalue")
-        arrays = {name: np.array([getattr(minimum, name) for minimum in known.minima]) for name in names}
+        arrays = {name: np.array([getattr(minimum, name) for minimum in known.minima]) for name in _CERTIFICATE}
         _write(self.folder / f"minima-{frozen.digest}.npz", arrays)
 
 
@@ -135,9 +137,9 @@ class _Asked:
 
 
 def _minima(arrays: Arrays) -> Reference:
-    numbers = (arrays[name].tolist() for name in ("g", "error", "smallest_eigenvalue"))
-    columns = zip(arrays["positions"], *numbers, strict=True)
-    return Reference(tuple(Minimum(*values, certified=True) for values in columns))
+    numbers = (arrays[name].tolist() for name in ("g", "error", "smallest_eigenvalue", "doubt"))
+    columns = zip(arrays["positions"], *numbers, arrays["near"], strict=True)
+    return Reference(tuple(Minimum(*values, kind=MINIMUM) for values in columns))
 
 
 def _read(path: Path) -> Arrays:

@@ -5,7 +5,8 @@ A thread beside the solver looks at each step while the solver does the next, on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+import math
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from harness.record.base import Frame, Recorder
 from harness.record.shading import strains
 from harness.scenes.bind import Scene
-from harness.simulation.measure import Settings, digest, steps
+from harness.simulation.measure import Diverged, Settings, StepFailed, digest, steps
 from harness.simulation.step import Step, start
 from harness.simulation.trace import EnergyNorm, trace
 from solvers.problem import Positions, Prepared
@@ -86,3 +87,15 @@ def largest_strain(scene: Scene, p: Positions) -> float:
     """The largest |length / rest length - 1| of a spring at p (n, 3) [m]; 0 without springs."""
     of_spring, _ = strains(p, scene.springs.edges, scene.springs.rest_length)
     return float(np.abs(of_spring).max(initial=0.0))
+
+
+def require_numbers(by_frame: Mapping[int, dict[str, Any]], *, minimises: bool, yardstick: bool) -> None:
+    """What is measured of each frame is a number: raises StepFailed, from Diverged, where one is infinite or NaN.
+
+    minimises, yardstick: whether the solver has a residual, and the stop rule a yardstick; else they become null.
+    """
+    for frame, columns in by_frame.items():
+        columns.update({name: None for name, has in (("residual", minimises), ("yardstick", yardstick)) if not has})
+        for name, value in columns.items():
+            if isinstance(value, float) and not math.isfinite(value):
+                raise StepFailed(frame) from Diverged(f"{name} is {value} from frame {frame} on, of finite positions")

@@ -27,6 +27,7 @@ from scipy.sparse import bsr_array, csr_array
 from solvers.contact import planes as contact_planes
 from solvers.contact.touching import Rows
 from solvers.problem import Positions, Start
+from solvers.round_off import EPS
 
 Array = NDArray[np.float64]
 
@@ -165,6 +166,20 @@ class Contact:
         np.add.at(out, planes.vertices, (planes.stiffness * np.minimum(0.0, gap))[:, None] * planes.normal)
         grips, u, length = self._slipped(p)
         np.add.at(out, planes.vertices[grips], (planes.grip[grips] / np.maximum(self.slip, length))[:, None] * u)
+
+    def add_absolute_terms(self, p: Positions, out: Array) -> None:
+        """Add k (|x| + |d|) [N] of what presses, or may by round-off, and F/max(slip, |u|) (|x| + |a|) of friction to
+        `out` (n,) (`solvers.round_off`)."""
+        if self.idle():
+            return
+        planes, size = self.planes, np.sqrt(_dots(p, p))[self.planes.vertices]
+        reach = size + np.abs(planes.offset)
+        presses = self._gap(p) <= EPS * reach
+        np.add.at(out, planes.vertices, np.where(presses, planes.stiffness * reach, 0.0))
+        grips, _, length = self._slipped(p)
+        anchor = planes.anchor[grips]
+        friction = planes.grip[grips] / np.maximum(self.slip, length) * (size[grips] + np.sqrt(_dots(anchor, anchor)))
+        np.add.at(out, planes.vertices[grips], friction)
 
     def hessian(self, p: Positions) -> csr_array:
         """The Hessian [N/m], shape (3n, 3n): blocks of vertices that press or grip."""

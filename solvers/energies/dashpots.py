@@ -61,6 +61,10 @@ class Dashpots(Edges):
         """The local step: add A'K d(p) [N], shape (n, 3), to `out`."""
         self._add(self._along(p) - self._closing(p)[:, None] * self.direction, out)
 
+    def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
+        """Add k (|p_i| + |p_j| + |offset|) [N] to `out` (n,) at both ends (`solvers.round_off`)."""
+        self._add_absolute(self._reach(p) + np.abs(self.offset), out)
+
     def hessian(self, p: Positions) -> csr_array:
         """The Hessian [N/m], shape (3n, 3n): k nn' an edge."""
         return self._blocks(np.zeros(len(self.edges)), self.direction, len(p))

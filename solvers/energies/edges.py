@@ -53,6 +53,18 @@ class Edges:
         """Add A'K x to `out`, x: (m, 3)."""
         out[: self._named] += self._incidence[1] @ x
 
+    def _add_absolute(self, terms: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        """Add k times the terms (m,) [m] of each edge to `out` (n,) at both of its ends; a self-loop has none."""
+        (i, j), terms = self.edges.T, self.stiffness * terms
+        terms = np.where(i != j, terms, 0.0)
+        for end in (i, j):
+            out += np.bincount(end, terms, minlength=len(out))
+
+    def _reach(self, p: Positions) -> NDArray[np.float64]:
+        """|p_i| + |p_j| of each edge (m,) [m]: what the rounding of its ends is in proportion to."""
+        size = lengths(p)
+        return size[self.edges[:, 0]] + size[self.edges[:, 1]]
+
     def _blocks(self, lateral: NDArray[np.float64], unit: Positions, n: int, along: float | NDArray = 1.0) -> csr_array:
         """The Hessian (3n, 3n) of edges that resist by k (along nn' + lateral (I - nn')), n their unit directions."""
         nn = unit[:, :, None] * unit[:, None, :]

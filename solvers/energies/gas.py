@@ -70,6 +70,22 @@ class Gas:
         """Add the gradient [N], shape (n, 3), to `out`."""
         out -= self._pressure_at(p)[0] * self._volume_gradient(p)
 
+    def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
+        """Add p |b||c|/6 and what the rounding of b and c makes of it at each corner of each triangle a b c, and p/V
+        |grad V| times what V is off by, [N], to `out` (n,) (`solvers.round_off`)."""
+        pressure, volume = self._pressure_at(p)
+        size, relative = (np.linalg.norm(x, axis=1) for x in (p, p - p.mean(axis=0)))
+        size = size + np.abs(p).mean(axis=0).sum()  # the mean is rounded too
+        areas = np.zeros_like(out)
+        for k, corner in enumerate(self.triangles.T):
+            i, j = (self.triangles[:, (k + step) % 3] for step in (1, 2))
+            areas += np.bincount(
+                corner, (relative[i] * relative[j] + size[i] * relative[j] + relative[i] * size[j]) / 6.0, len(out)
+            )
+        slope = np.linalg.norm(self._volume_gradient(p), axis=1)
+        off = float(areas @ relative) / 3.0 + float(slope @ size)
+        out += pressure * (areas + off / volume * slope)
+
     def hessian(self, p: Positions) -> csr_array:
         """The Hessian [N/m], shape (3n, 3n): p/V grad V grad V' - p grad^2 V.
 

@@ -38,6 +38,11 @@ class Quadratic:
         """Add the gradient [N], shape (n, 3), to `out`."""
         out += self._pulled(self.A @ p - self.d)
 
+    def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
+        """Add |A|'W (|A| |p| + |d|) [N] to `out` (n,) (`solvers.round_off`)."""
+        size = abs(self.A)
+        out += size.T @ (self.weight * (size @ np.linalg.norm(p, axis=1) + np.linalg.norm(self.d, axis=1)))
+
     def add_projection(self, p: Positions, out: Positions) -> None:
         """Add A'W d [N], shape (n, 3), the same for any p, to `out`."""
         out += self._pulled(self.d)

@@ -17,6 +17,7 @@ from scipy.sparse import csr_array
 
 from solvers.energies.edges import TINY, Edges, directions, rest_directions
 from solvers.problem import Positions
+from solvers.round_off import EPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +64,17 @@ class Springs(Edges):
         """The local step: add A'K d(p) [N], shape (n, 3), to `out`."""
         _, unit = directions(self._along(p), self.rest_direction)
         self._add(self.rest_length[:, None] * unit, out)
+
+    def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
+        """Add k (max(1, r/l - 1) (|p_i| + |p_j|) + l + r) [N] to `out` (n,) at both ends (`solvers.round_off`).
+
+        A direction is off by no more than its own length, so that a spring of nearly no length adds 2 k r / eps.
+        """
+        length, r = self.lengths(p), self.rest_length
+        lateral = np.divide(r, length, out=np.full_like(length, np.inf), where=length > TINY) - 1.0
+        reach = self._reach(p)
+        turned = np.minimum(np.maximum(1.0, np.where(r > 0.0, lateral, 1.0)) * reach, reach + 2.0 * r / EPS)
+        self._add_absolute(turned + length + r, out)
 
     def hessian(self, p: Positions) -> csr_array:
         """The Hessian [N/m], shape (3n, 3n): k (nn' + (1 - r/l)(I - nn')) a spring, n its direction, l its length.

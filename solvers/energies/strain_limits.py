@@ -16,6 +16,7 @@ from scipy.sparse import csr_array
 
 from solvers.energies.edges import TINY, Edges, directions
 from solvers.problem import Positions
+from solvers.round_off import EPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +51,16 @@ class StrainLimits(Edges):
         """The local step: add A'K d(p) [N], shape (n, 3), to `out`."""
         v, _, beyond, unit = self._beyond(p)
         self._add(v - beyond[:, None] * unit, out)
+
+    def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
+        """Add k (max(1, |l - t|/l) (|p_i| + |p_j|) + 2 l) [N] to `out` (n,) at both ends of edges that are beyond
+        their limits, or that round-off may take there; all others add nothing (`solvers.round_off`)."""
+        _, length, beyond, _ = self._beyond(p)
+        reach = self._reach(p)
+        near = np.maximum(length - self.high, self.low - length) >= -EPS * (reach + length)
+        lateral = np.divide(np.abs(beyond), length, out=np.full_like(length, np.inf), where=length > TINY)
+        turned = np.minimum(np.maximum(1.0, lateral) * reach, reach + 2.0 * np.abs(beyond) / EPS)
+        self._add_absolute(np.where(near, turned + 2.0 * length, 0.0), out)
 
     def hessian(self, p: Positions) -> csr_array:
         """The Hessian [N/m], shape (3n, 3n): that of springs beyond the limits, nothing within."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from solvers.compiling import inner, kernel
 from solvers.energies.springs import TINY, Springs
 from solvers.problem import Positions, StepProblem, System
+from solvers.round_off import EPS
 
 
 class Terms(NamedTuple):
@@ -86,6 +87,36 @@ def gradient(terms, given, p, out):
         out[j, 0] -= tension * n0
         out[j, 1] -= tension * n1
         out[j, 2] -= tension * n2
+
+
+@kernel
+def round_off(terms, given, p, out):
+    """Write the bound (n,) [N] on the round-off of `gradient` at p (n, 3) [m] to `out`, as `solvers.round_off` has it,
+    of springs, inertia, force and penalty pins."""
+    for v in range(len(p)):
+        out[v] = terms.inertia[v] * (size(p, v) + size(given.target, v)) + size(given.force, v)
+    for q in range(len(terms.pinned)):
+        out[terms.pinned[q]] += terms.weight[q] * (size(p, terms.pinned[q]) + size(given.pins, q))
+    for e in range(len(terms.stiffness)):
+        i, j, rest = terms.edges[e, 0], terms.edges[e, 1], terms.rest_length[e]
+        if i == j:
+            continue
+        _, _, _, length = along(terms, e, p)
+        reach = size(p, i) + size(p, j)
+        turned = reach + 2.0 * rest / EPS
+        if length > 0.0:
+            turned = min(max(1.0, rest / length - 1.0) * reach, turned)
+        share = terms.stiffness[e] * (turned + length + rest)
+        out[i] += share
+        out[j] += share
+    for v in range(len(p)):
+        out[v] *= EPS
+
+
+@inner
+def size(x, v):
+    """The length of row v of x (n, 3)."""
+    return np.sqrt(x[v, 0] * x[v, 0] + x[v, 1] * x[v, 1] + x[v, 2] * x[v, 2])
 
 
 @kernel

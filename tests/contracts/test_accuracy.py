@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,7 +18,7 @@ from harness.experiments.accuracy.rows import SCHEMA
 from harness.experiments.accuracy.run import run_accuracy
 from harness.record.reader import read_replay
 from harness.reference import store
-from harness.reference.minimiser import Minimum, Reference
+from harness.reference.minimiser import ROUGH, Reference, certify
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Positions, Prepared, System
 from solvers.registry import SOLVERS
@@ -206,7 +206,7 @@ def test_a_minimum_that_is_not_certified_is_told_and_nothing_is_graded_by_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(store, "find_minima", lambda problem, solver: Reference((), "it ended on a saddle"))
-    monkeypatch.setattr(store, "polish", lambda problem, p, solver: Minimum(p, 0.0, 1.0, -1.0, certified=False))
+    monkeypatch.setattr(store, "polish", lambda problem, p, solver: replace(certify(problem, p), kind=ROUGH))
     made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "early"))
     made.run()
     (problem,) = made.rows("problem")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.reference.judge import SLACK, Oracle
+from harness.reference.oracle import Oracle
 from harness.simulation.step import prepare, problem, start
 from solvers.problem import Solution, StepProblem, StopRule, Unsupported
 from tests.stability.test_hard_scenes import METHODS, cases, scene, spacing
@@ -16,6 +16,8 @@ from tests.stability.test_hard_scenes import METHODS, cases, scene, spacing
 MINIMISERS = {name: solver for name, solver in METHODS.items() if solver.minimises}
 TOLERANCE = 1e-6
 STOP = StopRule(100, TOLERANCE)
+SLACK = 2.0
+"""Two factorisations of one Q differ by round-off, and some methods stop by the residual one iteration earlier."""
 
 UNIQUE = (
     "geometry-all-rest-lengths-zero",
@@ -49,9 +51,8 @@ def test_an_answer_is_as_stationary_as_it_is_said_to_be(case: str):
     stated, found = answers(case, STOP)
     oracle = Oracle(stated.system)
     for name, solution in found.items():
-        reached, attainable = oracle.stationarity(stated, solution.positions)
-        wanted = {"tolerance": TOLERANCE, "floor": attainable, "stalled": attainable}.get(solution.stopped, np.inf)
-        assert reached <= SLACK * max(wanted, attainable), (name, solution.stopped, reached, attainable)
+        reading, said = oracle.stationarity(stated, solution.positions), solution.stopped == "tolerance"
+        assert not said or reading.beyond <= SLACK * TOLERANCE, (name, solution.stopped, reading)
         assert solution.stopped != "iterations" or solution.iterations == STOP.iterations, name
 
 

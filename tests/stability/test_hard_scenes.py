@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from harness.config.load import load_scene, load_sweep
-from harness.reference.judge import Oracle
 from harness.scenes.bind import Scene, build
 from harness.simulation.step import State, Step, prepare, problem, simulate, start
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Solver, StopRule, Unsupported
 from solvers.registry import SOLVERS, load
+from tests.scenes import far
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 CASES = {path.stem: path for path in sorted((CONFIGS / "hard").glob("*.yaml"))}
@@ -88,7 +88,7 @@ def test_a_hard_scene_is_refused_by_name_or_stays_finite_descends_and_repeats_it
         if solver.descends:
             iterates = [stated.first_guess, *(p.copy() for p in islice(prepared.iterates(stated), ITERATIONS))]
             values = [stated.value(p) for p in iterates]
-            floor = Oracle(stated.system).floor(stated.first_guess) / StopRule().floor
+            floor = far(stated)
             slack = VALUE * max(map(stated.magnitude, iterates)) + 0.5 * (ROUNDED * floor) ** 2
             rises = [b - a for a, b in pairwise(values) if not b <= a + slack]
             assert not rises, f"frame {frame}: the objective rose by {rises} J, {slack:.1e} J being round-off"

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.reference.judge import Oracle
 from solvers.problem import Positions, StepProblem, StopRule, System
+from tests.scenes import far
 from tests.stability.random_networks import (
     ALL,
     EPS,
@@ -65,7 +65,7 @@ def test_iterates_are_finite_and_descend(name: str, case: Case):
     iterates = ALL[name].prepare(problem.system).iterates(problem)
     found = [problem.first_guess, *(p.copy() for p in islice(iterates, 8))]
     assert np.isfinite(found).all()
-    floor = Oracle(problem.system).floor(problem.first_guess) / StopRule().floor
+    floor = far(problem)
     slack = VALUE * max(map(problem.magnitude, found)) + 0.5 * (ROUNDED * floor) ** 2
     assert all(problem.value(q) <= problem.value(p) + slack for p, q in pairwise(found))
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import count, islice, pairwise
 from time import sleep
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,13 +14,15 @@ import pytest
 from harness.base.errors import RunFailed
 from harness.experiments.accuracy import curves
 from harness.experiments.accuracy.curves import Curve, kept, measure
-from harness.experiments.accuracy.oracle import Oracle
+from harness.experiments.accuracy.scales import distances
 from harness.reference.minimiser import polish
+from harness.reference.oracle import Oracle, Reading
 from harness.simulation.trace import EnergyNorm
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.methods.newton import Newton
 from solvers.problem import Positions, StepProblem
 from tests.scenes import cloth, first_problem
+from tests.unit.test_minimiser import FLAT
 
 PROBLEM = first_problem(cloth(6, "exact"))
 MINIMUM = polish(PROBLEM, PROBLEM.current, Newton()).positions
@@ -35,14 +38,14 @@ def test_each_early_iterate_is_graded_and_then_twelve_a_decade() -> None:
 
 
 def test_stationarity_is_the_step_of_local_global_relative_to_that_at_the_current_positions() -> None:
-    oracle, norm = Oracle(PROBLEM), EnergyNorm(PROBLEM.system)
+    oracle, norm = Oracle(PROBLEM.system), EnergyNorm(PROBLEM.system)
     prepared = SparseLocalGlobal().prepare(PROBLEM.system)
     points = [PROBLEM.current, *(p.copy() for p in islice(prepared.iterates(PROBLEM), 4))]
     steps = [norm(after - before) for before, after in pairwise(points)]
     for p, step in zip(points, steps, strict=False):
         # Two factorisations of one matrix solve it, each to round-off in a condition number of 1e3.
-        assert oracle.stationarity(p) == pytest.approx(step / steps[0], rel=1e-9)
-    assert oracle.stationarity(MINIMUM) < 1e-12  # round-off of a gradient beside 1 at the start
+        assert oracle.stationarity(PROBLEM, p).reached == pytest.approx(step / steps[0], rel=1e-9)
+    assert oracle.stationarity(PROBLEM, MINIMUM).reached < 1e-12  # round-off of a gradient beside 1 at the start
 
 
 def test_distances_leave_out_what_is_pinned() -> None:
@@ -50,7 +53,7 @@ def test_distances_leave_out_what_is_pinned() -> None:
     moved[PROBLEM.system.pins.vertices] += 5.0
     free = PROBLEM.system.free
     moved[free[0], 1] += 0.3
-    largest, rms = Oracle(PROBLEM).distances(moved, PROBLEM.current)
+    largest, rms = distances(PROBLEM.system, moved, PROBLEM.current)
     assert (largest, rms) == pytest.approx((0.3, 0.3 / len(free) ** 0.5), rel=1e-12)  # round-off of a difference
 
 
@@ -73,7 +76,7 @@ def towards(share: Callable[[int], float]) -> Callable[[int], Positions]:
 
 def curve(prepared: Any, **more: Any) -> Curve:
     limits: dict[str, Any] = {"iterations": 200, "time_limit": 60.0, "rounds": 2} | more
-    return measure(prepared, PROBLEM, Oracle(PROBLEM), LOWEST, **limits)
+    return measure(prepared, PROBLEM, Oracle(PROBLEM.system), LOWEST, **limits)
 
 
 ENDS = {
@@ -127,3 +130,32 @@ def test_passes_that_differ_in_the_last_bit_are_a_failure() -> None:
 
     with pytest.raises(RunFailed, match="other positions"):
         curve(Scripted(iterate))
+
+
+def at_a_saddle(iterate: Callable[[int], Positions]) -> Curve:
+    above = polish(FLAT, FLAT.current, Newton())
+    limits: dict[str, Any] = {"iterations": 40, "time_limit": 60.0, "rounds": 1}
+    return measure(cast("Any", Scripted(iterate)), STARTED, Oracle(FLAT.system), above.g, **limits)
+
+
+STARTED = replace(FLAT, current=FLAT.current + np.array([[0.0], [0.0], [0.0], [0.0], [1e-3]]))
+"""A step whose current positions are beside the saddle at which FLAT's are."""
+
+
+def test_a_solver_that_sits_on_a_saddle_is_named_so_and_has_not_converged() -> None:
+    found = at_a_saddle(lambda number: FLAT.current)
+    assert found.stationarity[-1] <= curves.STATIONARY
+    assert found.status == "saddle"
+    assert "saddle, where the curvature is -" in found.reason
+
+
+def test_a_solver_that_leaves_a_saddle_goes_on_to_its_minimum() -> None:
+    above = polish(FLAT, FLAT.current, Newton()).positions
+    found = at_a_saddle(lambda number: FLAT.current if number < 3 else above)
+    assert (found.status, found.numbers[-1]) == ("ok", 3)
+
+
+def test_a_stationarity_that_is_no_number_is_a_divergence(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading = Reading(np.inf, 0.0, np.inf)
+    monkeypatch.setattr(Oracle, "stationarity", lambda self, problem, p: reading)
+    assert curve(Scripted(towards(lambda n: 0.5**n))).status == "diverged"

@@ -13,7 +13,8 @@ from harness.base.errors import InputError
 from harness.config.load import load_any
 from harness.experiments.run import Files, execute
 from harness.record.reader import read_replay
-from harness.reference.judge import Judge, Oracle, is_minimum, reference
+from harness.reference.judge import Judge, is_minimum, reference
+from harness.reference.oracle import Oracle
 from harness.report.robustness import (
     DIVERGED,
     OTHER,
@@ -21,6 +22,7 @@ from harness.report.robustness import (
     RIGHT,
     SADDLE,
     SHORT,
+    VALLEY,
     WRONG,
     Cell,
     judged,
@@ -95,19 +97,21 @@ def test_a_reference_that_is_lost_is_no_reference():
     assert walked(made, Judge(made, known, minimises=True), 1e-8)[2]["distance"] is None
 
 
-OK = {"status": "ok", "frame": 1, "stationarity": 1e-7, "attainable": 1e-12, "tolerance": 1e-6, "minimum": True}
-OK |= {"distance": 1e-5, "stopped": "tolerance", "reason": None}
+OK = {"status": "ok", "frame": 1, "stationarity": 1e-7, "attainable": 1e-12, "beyond": 1e-7, "tolerance": 1e-6}
+OK |= {"minimum": True, "flat": False, "distance": 1e-5, "stopped": "tolerance", "reason": None}
 GRADES = {
     "right": ([OK, OK], RIGHT),
-    "at round-off": ([OK | {"stationarity": 1e-3, "attainable": 1e-3}], RIGHT),
-    "at round-off, of which two factors have two figures": ([OK | {"stationarity": 1.9e-3, "attainable": 1e-3}], RIGHT),
+    "at round-off": ([OK | {"stationarity": 1e-3, "attainable": 1e-3, "beyond": 0.0}], RIGHT),
+    "where the round-off of another part would hide it": ([OK | {"attainable": 1.0, "beyond": 1e-3}], WRONG),
+    "in a valley": ([OK, OK | {"minimum": False, "flat": True}], VALLEY),
+    "in a valley, and at a saddle": ([OK | {"minimum": False}, OK | {"minimum": False, "flat": True}], SADDLE),
     "no reference": ([OK | {"distance": None}], OTHER),
     "a reference that is lost": ([OK, OK | {"distance": None}], OTHER),
-    "one step short": ([OK, OK | {"stationarity": 2e-6, "stopped": "iterations"}], SHORT),
-    "stuck": ([OK | {"stationarity": 2e-6, "stopped": "stalled"}, OK], SHORT),
-    "not a number": ([OK | {"stationarity": float("nan"), "stopped": "iterations"}], SHORT),
-    "short, and said not to be": ([OK, OK | {"stationarity": 2e-6}, OK | {"minimum": False}], WRONG),
-    "at round-off, and not": ([OK | {"stationarity": 1e-2, "attainable": 1e-3, "stopped": "floor"}], WRONG),
+    "one step short": ([OK, OK | {"beyond": 2e-6, "stopped": "iterations"}], SHORT),
+    "stuck": ([OK | {"beyond": 2e-6, "stopped": "stalled"}, OK], SHORT),
+    "not a number": ([OK | {"beyond": float("nan"), "stopped": "iterations"}], SHORT),
+    "short, and said not to be": ([OK, OK | {"beyond": 2e-6}, OK | {"minimum": False}], WRONG),
+    "at round-off, and not": ([OK | {"beyond": 1e-2, "stopped": "floor"}], WRONG),
     "no tolerance asked": ([OK | {"tolerance": None}], RIGHT),
     "elsewhere": ([OK, OK | {"distance": 0.5}], OTHER),
     "a saddle": ([OK | {"minimum": False}], SADDLE),

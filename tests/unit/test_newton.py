@@ -8,7 +8,7 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
-from harness.reference.judge import free_hessian
+from harness.reference.curvature import free_hessian
 from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins as PinsEffect
 from harness.scenes.effects.springs import Springs as SpringsEffect

@@ -1,5 +1,6 @@
 """One run: a failure leaves a row and nothing that would hide it."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,8 @@ from harness.base import machine
 from harness.config.load import load_any
 from harness.experiments import run
 from harness.experiments.run import Files, execute
+from harness.simulation.measure import StepFailed
+from harness.simulation.observe import require_numbers
 
 
 def test_a_run_that_fails_now_keeps_nothing_of_when_it_did_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -33,3 +36,35 @@ def test_a_run_that_fails_now_keeps_nothing_of_when_it_did_not(tmp_path: Path, m
     assert not files.recording.exists()
     assert not files.picture.exists()
     assert files.rows.exists()
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, that something overflows: it is what is tested
+@pytest.mark.parametrize("stretch", ["1e308", "1e300"])
+@pytest.mark.parametrize("solver", ["sparse", "numba"])
+def test_a_run_whose_residual_is_no_number_is_not_ok(tmp_path: Path, solver: str, stretch: str):
+    (tmp_path / "scene.yaml").write_text(
+        "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 2\ndefault_size: 3\neffects: [{kind: gravity}, "
+        f"{{kind: springs, stretch: {stretch}}}, {{kind: pins, at: [first]}}]\n"
+    )
+    (spec,) = load_any(tmp_path / "scene.yaml", solvers=[solver]).runs()
+    files = Files.of(spec, tmp_path)
+    files.rows.parent.mkdir()
+    for row in execute(spec, files, lambda phase: None):
+        assert row["status"] != "ok" or all(math.isfinite(v) for v in row.values() if isinstance(v, float))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", ["residual", "objective", "stationarity", "energy_springs"])
+def test_a_measured_column_that_is_no_number_fails_its_frame(name: str, value: float):
+    columns = {1: {name: 0.0, "digest": "", "minimum": True}, 2: {name: value, "digest": "", "minimum": None}}
+    with pytest.raises(StepFailed) as caught:
+        require_numbers(columns, minimises=True, yardstick=True)
+    assert caught.value.frame == 2
+    assert run.failure(caught.value)["status"] == "diverged"
+    assert run.failure(caught.value)["reason"].startswith(f"{name} is {value}")
+
+
+def test_what_a_method_does_not_have_is_null_and_no_failure():
+    columns = {1: {"residual": float("nan"), "yardstick": float("nan"), "objective": 1.0}}
+    require_numbers(columns, minimises=False, yardstick=False)
+    assert columns == {1: {"residual": None, "yardstick": None, "objective": 1.0}}

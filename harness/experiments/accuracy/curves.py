@@ -5,7 +5,8 @@ does no more. Each timed pass then takes as many iterates as the first, with a s
 between, and must end at the same positions to the last bit.
 
 A curve ends where it has converged (a stationarity of 1e-10, or an energy within 1e-9 of the gap at the current
-positions), where the iterates do not change any more, and at its limits.
+positions), where the iterates do not change any more, and at its limits. A saddle is stationary too, and is told by its
+curvature: a solver may yet leave it, and one that stays there has not converged.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
-from harness.experiments.accuracy.oracle import Oracle
+from harness.experiments.accuracy.scales import round_off
+from harness.reference.curvature import Curvature, curvature
+from harness.reference.oracle import Oracle
 from solvers.problem import Positions, Prepared, StepProblem
 
 STATIONARY, GAP = 1e-10, 1e-9
@@ -84,7 +87,7 @@ def measure(
     lowest: energy [J] of the lowest minimum known; time_limit: seconds of the solver's own.
     Raises RunFailed where a timed pass ends at other positions.
     """
-    grading = _Grading(oracle, lowest, iterations, time_limit)
+    grading = _Grading(oracle, problem, lowest, iterations, time_limit)
     p, spent, number, still = problem.first_guess.copy(), 0.0, 0, 0
     grading.add(0, p)
     iterates = prepared.iterates(problem)
@@ -111,10 +114,12 @@ def measure(
 class _Grading:
     """The iterates graded so far, and what ends the curve."""
 
-    def __init__(self, oracle: Oracle, lowest: float | None, iterations: int, time_limit: float) -> None:
-        self._oracle, self._iterations, self._limit = oracle, iterations, time_limit
+    def __init__(
+        self, oracle: Oracle, problem: StepProblem, lowest: float | None, iterations: int, time_limit: float
+    ) -> None:
+        self._oracle, self._problem, self._iterations, self._limit = oracle, problem, iterations, time_limit
         self._lowest = np.nan if lowest is None else lowest  # then no gap is small, and none is large
-        self._scale = max(oracle.g0 - self._lowest, oracle.round_off)
+        self._scale = max(problem.value(problem.current) - self._lowest, round_off(problem))
         self.numbers: list[int] = []
         self.positions: list[Positions] = []
         self.g: list[float] = []
@@ -124,8 +129,8 @@ class _Grading:
     def add(self, number: int, p: Positions) -> None:
         finite = bool(np.isfinite(p).all())
         with np.errstate(over="ignore", invalid="ignore"):  # what explodes may overflow before it is not finite
-            self.g.append(self._oracle.problem.value(p) if finite else np.nan)
-            self.stationarity.append(self._oracle.stationarity(p) if finite else np.nan)
+            self.g.append(self._problem.value(p) if finite else np.nan)
+            self.stationarity.append(self._oracle.stationarity(self._problem, p).reached if finite else np.nan)
         self.numbers.append(number)
         self.positions.append(p.copy())
 
@@ -134,9 +139,13 @@ class _Grading:
         number, stationarity = self.numbers[-1], self.stationarity[-1]
         gap = (self.g[-1] - self._lowest) / self._scale
         at = f"after {number} iterations, at a stationarity of {stationarity:.1e}"
-        if not np.isfinite(self.g[-1]) or gap > EXPLODED:
+        saddle = self._saddle() if stationarity <= AT_REST and not gap <= GAP else None
+        if not np.isfinite([self.g[-1], stationarity]).all() or gap > EXPLODED:
             self.status, self.reason = "diverged", f"the energy exploded {at}"
-        elif stationarity <= STATIONARY or gap <= GAP:
+        elif saddle and (fixed or spent > self._limit or number == self._iterations):
+            self.status = "saddle"
+            self.reason = f"ended at a saddle, where the curvature is {saddle.smallest:.1e} N/m, {at}"
+        elif not saddle and (stationarity <= STATIONARY or gap <= GAP):
             self.status = "ok"
         elif fixed:
             self.status = "ok" if stationarity <= AT_REST else "no-progress"
@@ -146,6 +155,11 @@ class _Grading:
         elif number == self._iterations:
             self.status = "ok" if self._progress() else "no-progress"
             self.reason = f"the limit of iterations was reached {at}"
+
+    def _saddle(self) -> Curvature | None:
+        """The curvature at the last iterate, where it is negative beyond round-off."""
+        found = curvature(self._problem, self.positions[-1])
+        return found if found.falls else None
 
     def _progress(self) -> bool:
         """Whether the second half of the iterations came nearer; energy tells it, or a smaller stationarity."""

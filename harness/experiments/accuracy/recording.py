@@ -10,6 +10,7 @@ import numpy as np
 from harness.base import machine
 from harness.config.accuracy import CurveUnit
 from harness.experiments.accuracy.curves import Curve
+from harness.experiments.accuracy.scales import round_off
 from harness.record.base import Frame, RecordingInfo
 from harness.record.rerun import RerunRecorder
 
@@ -57,5 +58,6 @@ def record(unit: CurveUnit, graded: Graded, first_guess: str, curve: Curve, fold
 
 
 def _curves(curve: Curve, graded: Graded, lowest: float) -> dict[str, list[float]]:
-    gap = (np.array(curve.g) - lowest) / max(graded.oracle.g0 - lowest, graded.oracle.round_off)
+    problem = graded.frozen.problem
+    gap = (np.array(curve.g) - lowest) / max(problem.value(problem.current) - lowest, round_off(problem))
     return {"energy gap": gap.tolist(), "stationarity": curve.stationarity}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,17 +12,18 @@ from typing import Any
 
 from harness.base import machine
 from harness.config.accuracy import Case, CurveUnit
-from harness.experiments.accuracy.curves import AT_REST, Curve, measure
+from harness.experiments.accuracy.curves import Curve, measure
 from harness.experiments.accuracy.failures import lost
-from harness.experiments.accuracy.oracle import Oracle, stiffness_ratio
 from harness.experiments.accuracy.recording import record
+from harness.experiments.accuracy.scales import distances, stiffness_ratio
 from harness.experiments.run import provenance
 from harness.reference.frozen import Frozen, bind
 from harness.reference.minimiser import Minimum, Reference
+from harness.reference.oracle import Oracle
 from harness.reference.store import Store
 from harness.scenes.bind import Scene
 from harness.simulation.step import FIRST_GUESSES
-from solvers.problem import Positions, Prepared, Solver
+from solvers.problem import Positions, Prepared, Solver, System
 from solvers.registry import SOLVERS, load
 
 Row = dict[str, Any]
@@ -61,7 +63,7 @@ class Graded:
     @cached_property
     def oracle(self) -> Oracle:
         """What grades iterates."""
-        return Oracle(self.frozen.problem)
+        return Oracle(self.frozen.problem.system)
 
     @property
     def reference(self) -> Reference:
@@ -96,7 +98,7 @@ class Graded:
             "kind": "problem",
             "stiffness_ratio": stiffness_ratio(problem.system, self.scene.springs.stiffness),
             "mean_rest_length": self.mean_rest_length,
-            "g0": self.oracle.g0,
+            "g0": problem.value(problem.current),
             "g0_inertial": problem.value(FIRST_GUESSES["inertial"](problem).first_guess),
             "magnitude": problem.magnitude(best),
         }
@@ -110,7 +112,7 @@ class Graded:
             "branch": branch,
             "minimum": minimum.name,
             "g": minimum.g,
-            "stationarity": self.oracle.stationarity(minimum.positions),
+            "stationarity": self.oracle.stationarity(self.frozen.problem, minimum.positions).reached,
             "smallest_eigenvalue": minimum.smallest_eigenvalue,
             "certified": minimum.certified,
         }
@@ -120,7 +122,7 @@ class Graded:
         if not stationarity <= CONVERGED:
             return None
         for known in self.reference.minima:
-            if self.oracle.distances(p, known.positions)[0] <= CLOSE * self.mean_rest_length:
+            if distances(self.frozen.problem.system, p, known.positions)[0] <= CLOSE * self.mean_rest_length:
                 return known
         found = self.store.classify(self.frozen, p)
         return found if found.certified else None
@@ -168,7 +170,7 @@ def _curve(unit: CurveUnit, prepared: Prepared, graded: Graded, first_guess: str
         time_limit=unit.how.time_limit,
         rounds=unit.how.rounds,
     )
-    reached = graded.reached(curve.positions[-1], curve.stationarity[-1])
+    reached = graded.reached(curve.positions[-1], curve.stationarity[-1]) if curve.status != "saddle" else None
     shared: Row = {
         "kind": "curve",
         "first_guess": first_guess,
@@ -181,25 +183,28 @@ def _curve(unit: CurveUnit, prepared: Prepared, graded: Graded, first_guess: str
         shared |= {"status": "uncertified", "reason": reference.reason}
     if reached:
         shared["branch"] = reference.branch(reached)
-    elif curve.status == "ok" and curve.stationarity[-1] <= AT_REST:
-        shared["reason"] = "ended at a stationary point that is no minimum"
     if unit.recordings and first_guess == unit.first_guesses[0]:
         shared["recording"] = str(record(unit, graded, first_guess, curve, folder).relative_to(folder))
     against = reached or next(iter(reference.minima), None)
-    return [shared | row for row in _points(curve, graded.oracle, against)]
+    return [shared | row for row in _points(curve, graded.frozen.problem.system, against)]
 
 
-def _points(curve: Curve, oracle: Oracle, minimum: Minimum | None) -> list[Row]:
+def _points(curve: Curve, system: System, minimum: Minimum | None) -> list[Row]:
     rows: list[Row] = []
     for k, number in enumerate(curve.numbers):
         row: Row = {
             "iteration": number,
-            "g": curve.g[k],
-            "stationarity": curve.stationarity[k],
+            "g": _number(curve.g[k]),
+            "stationarity": _number(curve.stationarity[k]),
             "seconds": curve.seconds[k].tolist(),
         }
         if minimum:
-            largest, rms = oracle.distances(curve.positions[k], minimum.positions)
+            largest, rms = distances(system, curve.positions[k], minimum.positions)
             row |= {"minimum": minimum.name, "largest_error": largest, "rms_error": rms}
         rows.append(row)
     return rows
+
+
+def _number(value: float) -> float | None:
+    """A measured value; null where an iterate has none, as it overflows."""
+    return value if math.isfinite(value) else None

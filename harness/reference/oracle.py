@@ -1,0 +1,120 @@
+"""The oracle of stationarity: how far a point is from one where the gradient vanishes, and what of that is round-off.
+
+    residual(p)     = |Q^-1 grad g(p)|_Q over the unpinned vertices, which a heavy pin does not blind
+    stationarity(p) = residual(p) / yardstick,   yardstick = max(residual(current positions), floor(current positions))
+
+with the Q of the system's projective energies, assembled here and factorised by SuperLU, whatever the solver does.
+
+Round-off is told vertex by vertex (`solvers.round_off`): a gradient of at most FACTOR delta_i at vertex i may be no
+more than that, and what is longer is beyond doubt, however far away or stiff another part of the scene may be. So
+
+    floor(p)  = sqrt(sum_i (FACTOR delta_i)^2 / Q_ii)          what round-off may make of the residual
+    beyond(p) = |Q^-1 (grad g less what round-off explains of it, vertex by vertex)|_Q / yardstick
+
+and a step is judged by `beyond`: it is 0 where each vertex is at rest for all that float64 can tell.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+
+from solvers.matrices import assemble, energy_norm
+from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
+from solvers.round_off import FACTOR, gradient_round_off, within
+
+
+class Reading(NamedTuple):
+    """reached: the stationarity; attainable: what round-off may make of it; beyond: what it does not explain."""
+
+    reached: float
+    attainable: float
+    beyond: float
+
+
+class Oracle:
+    """The residual of step problems of one system."""
+
+    def __init__(self, system: System) -> None:
+        """Raises NotPositiveDefinite."""
+        self._system = system
+        self._Q = stiffness(system)
+        self._known: tuple[StepProblem, float] | None = None
+
+    @cached_property
+    def _factor(self) -> Any:
+        free = self._system.free
+        return symmetric_lu(csr_array(self._Q[free][:, free]))
+
+    def residual(self, problem: StepProblem, p: Positions) -> float:
+        """|Q^-1 grad g(p)|_Q [J^(1/2)] over the unpinned vertices."""
+        return self._length(problem.gradient(p))
+
+    def _length(self, gradient: Positions) -> float:
+        """|Q^-1 g|_Q [J^(1/2)] of a gradient (n, 3) [N], over the unpinned vertices; infinite where it overflows."""
+        free, e = self._system.free, np.zeros_like(gradient)
+        if len(free):
+            e[free] = self._factor.solve(gradient[free])
+        e[self._system.pins.vertices] = 0.0
+        with np.errstate(over="ignore", invalid="ignore"):
+            length = energy_norm(self._Q, e)
+        return length if np.isfinite(length) else np.inf
+
+    def floor(self, problem: StepProblem, p: Positions) -> float:
+        """What round-off may make of the residual [J^(1/2)] at p."""
+        loose = self._system.unpinned
+        bound, stiffness = gradient_round_off(problem, p)[loose], self._Q.diagonal()[loose]
+        with np.errstate(over="ignore"):
+            return FACTOR * float(np.sqrt(np.sum(bound**2 / stiffness)))
+
+    def yardstick(self, problem: StepProblem) -> float:
+        """The residual [J^(1/2)] at the current positions, or what round-off may make of it there, if that is more."""
+        if self._known is None or self._known[0] is not problem:
+            floor = max(self.floor(problem, problem.current), np.finfo(float).tiny)
+            self._known = problem, max(self.residual(problem, problem.current), floor)
+        return self._known[1]
+
+    def stationarity(self, problem: StepProblem, p: Positions) -> Reading:
+        """How stationary p (n, 3) [m] is."""
+        yardstick, gradient = self.yardstick(problem), problem.gradient(p)
+        reached = self._length(gradient) / yardstick
+        doubtless = gradient - within(gradient, FACTOR * gradient_round_off(problem, p))
+        beyond = min(reached, self._length(doubtless) / yardstick)
+        return Reading(reached, self.floor(problem, p) / yardstick, beyond)
+
+
+def stiffness(system: System) -> csr_array:
+    """Q (n, n) [N/m] of a system's projective energies. Raises NotPositiveDefinite."""
+    return assemble(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
+
+
+def sizes(system: System, p: Positions) -> NDArray[np.float64]:
+    """The size of each vertex's component at p (n, 3) [m], (n,) [m]; see `component_sizes`."""
+    return component_sizes(stiffness(system), p)
+
+
+def component_sizes(graph: csr_array, p: Positions) -> NDArray[np.float64]:
+    """The diagonal of the bounding box of each vertex's component of a graph (n, n) at p (n, 3) [m], (n,).
+
+    A component without extent has the median size of those that have one; a metre where none has.
+    """
+    count, label = connected_components(graph, directed=False)
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, label, p)
+    np.maximum.at(high, label, p)
+    size = np.linalg.norm(high - low, axis=1)
+    extended = size[size > 0.0]
+    size[size == 0.0] = np.median(extended) if len(extended) else 1.0
+    return size[label]
+
+
+def symmetric_lu(matrix: csr_array) -> Any:
+    """SuperLU of a symmetric matrix, with its pivots on the diagonal. Raises RuntimeError where one is zero."""
+    settings: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    return splu(matrix.tocsc(), **settings)

@@ -1,0 +1,30 @@
+"""The step's objective: no term is lost, whatever an energy is called."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from solvers.energies.springs import Springs
+from solvers.problem import StepProblem
+from tests.scenes import random_problem
+
+
+def named(name: str) -> StepProblem:
+    """A problem with an energy more, of a class of this name."""
+    problem = random_problem(3)
+    (springs,) = problem.system.energies
+    assert isinstance(springs, Springs)
+    more = type(name, (Springs,), {})(springs.edges, springs.stiffness, springs.rest_length, springs.rest_direction)
+    return replace(problem, system=replace(problem.system, energies=(springs, more)))
+
+
+@pytest.mark.parametrize("name", ["Inertia", "Force", "Pins", "Springs", "Glue"])
+def test_an_energy_counts_whatever_its_class_is_called(name: str):
+    plain, problem = random_problem(3), named(name)
+    p, (springs, _) = problem.current + 0.01, problem.system.energies
+    assert springs.value(p) > 0.0
+    # Sums of a dozen terms in another order.
+    assert problem.value(p) == pytest.approx(plain.value(p) + springs.value(p), rel=1e-13)
+    assert problem.terms(p).items() >= {key: plain.terms(p)[key] for key in ("inertia", "force", "pins")}.items()

@@ -1,0 +1,149 @@
+"""The bound on a gradient's round-off: it holds against exact arithmetic, and knows nothing of what is elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from solvers.energies.springs import Springs
+from solvers.energies.strain_limits import StrainLimits
+from solvers.kernels import objective
+from solvers.problem import Energy, Pins, Positions, StepProblem, System
+from solvers.round_off import EPS, Rounded, gradient_round_off, lengths, within
+from tests.effects import SCENES, stepped
+from tests.scenes import begun, random_problem
+
+NUDGES = 20
+"""Of the last bit: as many ways to round the positions."""
+
+
+def nudged(p: Positions, seed: int) -> Positions:
+    """The positions with each coordinate moved by its last bit, up, down or not at all."""
+    return p * (1.0 + EPS * np.random.default_rng(seed).integers(-1, 2, p.shape))
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "midpoint"])
+@pytest.mark.parametrize("case", SCENES)
+def test_the_rounding_of_positions_moves_the_gradient_by_no_more_than_the_bound(case: str, integrator: str):
+    """Another rounding of the same positions is another gradient, and the bound is for what this makes of it: twice,
+    for either of the two is off by as much."""
+    problem = stepped(SCENES[case](), integrator)
+    for p in (problem.current, problem.target, problem.current + 1e3):
+        bound = 2.0 * gradient_round_off(problem, p)
+        for seed in range(NUDGES):
+            change = problem.gradient(nudged(p, seed)) - problem.gradient(p)
+            assert (lengths(change) <= bound).all()
+
+
+@pytest.mark.parametrize("case", SCENES)
+def test_the_bound_is_not_slack(case: str):
+    """Some rounding of the positions comes within a factor of 300 of it somewhere: of 60 terms, some cancel."""
+    problem = stepped(SCENES[case]())
+    p, bound = problem.current, gradient_round_off(problem, problem.current)
+    free = problem.system.free
+    changes = [lengths(problem.gradient(nudged(p, seed)) - problem.gradient(p))[free] for seed in range(NUDGES)]
+    assert (np.max(changes, axis=0) / bound[free]).max() > 1 / 300
+
+
+def beside(problem: StepProblem, other: StepProblem) -> StepProblem:
+    """Two problems as one, whose components do not touch."""
+    n, systems = problem.system.vertices, (problem.system, other.system)
+    moved = [replace(e, edges=e.edges + n) for e in other.system.energies if isinstance(e, Springs | StrainLimits)]
+    pins = [s.pins for s in systems]
+    system = System(
+        np.concatenate([s.mass for s in systems]),
+        problem.system.time_step,
+        (*problem.system.energies, *moved),
+        Pins(np.append(pins[0].vertices, pins[1].vertices + n), np.append(pins[0].weight, pins[1].weight)),
+    )
+    names = ("target", "force", "pin_targets", "current", "first_guess")
+    arrays = {name: np.concatenate([getattr(problem, name), getattr(other, name)]) for name in names}
+    return StepProblem(system, **arrays, start=begun(system, arrays["current"], arrays["current"]))
+
+
+def moved(problem: StepProblem, by: float, stiffer: float = 1.0) -> StepProblem:
+    """The problem elsewhere, and of stiffer springs."""
+    names = ("target", "pin_targets", "current", "first_guess")
+    energies = tuple(
+        replace(e, stiffness=stiffer * e.stiffness) for e in problem.system.energies if isinstance(e, Springs)
+    )
+    arrays = {name: getattr(problem, name) + by for name in names}
+    return replace(problem, system=replace(problem.system, energies=energies), **arrays)
+
+
+@pytest.mark.parametrize(("by", "stiffer"), [(1e6, 1.0), (1e9, 1e8), (0.0, 1e12)])
+def test_the_bound_does_not_change_when_another_component_is_added(by: float, stiffer: float):
+    problem = random_problem(1)
+    both, n = beside(problem, moved(random_problem(2), by, stiffer)), problem.system.vertices
+    alone = gradient_round_off(problem, problem.current)
+    np.testing.assert_array_equal(gradient_round_off(both, both.current)[:n], alone)
+
+
+def test_a_limit_that_is_not_reached_adds_nothing_however_stiff():
+    problem = random_problem(1)
+    (springs,) = problem.system.energies
+    assert isinstance(springs, Springs)
+    m = len(springs.edges)
+    limits = StrainLimits(springs.edges, np.full(m, 1e18), np.zeros(m), np.full(m, 1e3), springs.rest_direction)
+    limited = replace(problem, system=replace(problem.system, energies=(springs, limits)))
+    p = problem.current
+    np.testing.assert_array_equal(gradient_round_off(limited, p), gradient_round_off(problem, p))
+    reached = replace(limits, high=np.zeros(m))
+    taut = replace(problem, system=replace(problem.system, energies=(springs, reached)))
+    ends = np.setdiff1d(springs.edges, problem.system.pins.vertices[problem.system.pins.exact])
+    assert (gradient_round_off(taut, p)[ends] >= 1e18 * EPS * springs.lengths(p).min()).all()
+
+
+@dataclass(frozen=True)
+class Unstated:
+    """An energy that states nothing but what it must."""
+
+    inner: Energy
+
+    def value(self, p: Positions) -> float:
+        return self.inner.value(p)
+
+    def add_gradient(self, p: Positions, out: Positions) -> None:
+        self.inner.add_gradient(p, out)
+
+    def hessian(self, p: Positions) -> csr_array:
+        return self.inner.hessian(p)
+
+
+@pytest.mark.parametrize("case", SCENES)
+def test_an_energy_that_states_no_terms_has_a_sound_bound_by_its_hessian(case: str):
+    problem = stepped(SCENES[case]())
+    assert all(isinstance(energy, Rounded) for energy in problem.energies)
+    stated = replace(problem, system=replace(problem.system, energies=tuple(map(Unstated, problem.energies))))
+    assert not any(isinstance(energy, Rounded) for energy in stated.energies)
+    p, bound = problem.current, 2.0 * gradient_round_off(stated, problem.current)
+    for seed in range(NUDGES):
+        change = problem.gradient(nudged(p, seed)) - problem.gradient(p)
+        assert (lengths(change) <= bound).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_compiled_bound_is_the_plain_one(seed: int):
+    problem = random_problem(seed)
+    (springs,) = problem.system.energies
+    assert isinstance(springs, Springs)
+    p, out = problem.current.copy(), np.empty(problem.system.vertices)
+    objective.round_off(objective.Terms.of(problem.system, springs), objective.Given.of(problem), p, out)
+    out[problem.system.pins.vertices[problem.system.pins.exact]] = 0.0
+    np.testing.assert_allclose(out, gradient_round_off(problem, p), rtol=1e-14)  # sums in another order
+
+
+def test_what_overflows_has_no_bound():
+    problem = random_problem(1)
+    huge = np.full_like(problem.current, 1e308)
+    assert np.isinf(gradient_round_off(problem, huge)[problem.system.free]).all()
+
+
+def test_what_round_off_explains_of_a_gradient_is_no_longer_than_the_bound():
+    gradient = np.array([[3.0, 4.0, 0.0], [0.3, 0.4, 0.0], [0.0, 0.0, 0.0]])
+    assert not within(gradient, np.full(3, np.inf)).any(), "an infinite bound is none"
+    found = within(gradient, np.array([1.0, 1.0, 1.0]))
+    np.testing.assert_allclose(found, [[0.6, 0.8, 0.0], [0.3, 0.4, 0.0], [0.0, 0.0, 0.0]], rtol=1e-15)
