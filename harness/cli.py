@@ -6,39 +6,23 @@ Exit codes: 0 all is well, 1 a run failed or a gate found a regression, 2 the us
 from __future__ import annotations
 
 import json
+import math
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.table import Table
-from typer.core import TyperGroup
 
-from harness.base.console import err, out, show_log
+from harness.base.commands import Commands
+from harness.base.console import err, out
 from harness.base.console import say as _say
-from harness.base.errors import InputError, SpringbenchError
+from harness.base.errors import InputError, Mistake
 from harness.experiments.ablation.command import ablate
 from harness.experiments.gallery import gallery
 
-
-class _Commands(TyperGroup):
-    """Answers our own errors and Ctrl-C with a message and an exit code instead of a traceback."""
-
-    def invoke(self, ctx: Any) -> Any:
-        show_log()
-        try:
-            return super().invoke(ctx)
-        except SpringbenchError as error:
-            for mistake in getattr(error, "mistakes", (error,)):
-                _say(f"springbench: {mistake}")
-            raise typer.Exit(error.exit_code) from error
-        except KeyboardInterrupt:
-            _say("springbench: stopped; what is complete is kept, and the same command goes on from there")
-            raise typer.Exit(130) from None
-
-
 app = typer.Typer(
-    cls=_Commands,
+    cls=Commands,
     help="A laboratory for implicit time stepping of mass-spring systems.",
     no_args_is_help=True,
     add_completion=False,
@@ -76,6 +60,7 @@ def run(
     ] = False,
 ) -> None:
     """Do what is missing of a sweep, or of the one scene in a file."""
+    from harness.base.claim import claimed
     from harness.base.progress import display
     from harness.config.load import load_any
     from harness.experiments.sweep import failures, of_other_code, run_sweep
@@ -88,12 +73,12 @@ def run(
         "integrator": integrator,
         "time_step": time_step,
         "first_guess": first_guess,
-        "threads": int(threads) if threads and threads.isdecimal() else threads,
+        "threads": int(threads) if threads and threads.isdecimal() and len(threads) < 10 else threads,
         "rounds": rounds,
     }
     sweep = load_any(config, solvers=solver or (), sizes=size or (), **options)
     _check_positions(positions)
-    folder = results / sweep.name
+    folder = claimed(results / sweep.name, config)
     runs = sweep.runs()
     table = run_sweep(sweep.name, runs, folder, display(err), _say, again=again, changed=changed, positions=positions)
     out.print(summary_table(table, of_other_code(runs, table)))
@@ -112,14 +97,17 @@ def speed(
     again: Annotated[bool, typer.Option("--again", help="Do all sizes, also those that are there.")] = False,
 ) -> None:
     """Time a sweep's solvers in turns, beside a yardstick in C++ and the machine's own limits."""
+    from harness.base.claim import claimed
     from harness.config.load import load_sweep
     from harness.experiments.speed.figures import figures
     from harness.experiments.speed.pictures import draw
     from harness.experiments.speed.report import run_speed
     from harness.experiments.speed.table import remarks, speed_table
 
+    if not 0.0 < budget < math.inf:
+        raise InputError(Mistake(f"came {budget:g}; wanted a number of seconds above 0", key="--budget"))
     sweep = load_sweep(config)
-    folder = results / sweep.name
+    folder = claimed(results / sweep.name, config)
     found = figures(run_speed(sweep, folder, _say, again=again, budget=budget))
     out.print(speed_table(found))
     for line in remarks(found):
@@ -136,13 +124,14 @@ def accuracy(
     again: Annotated[bool, typer.Option("--again", help="Measure all again, also what is there.")] = False,
 ) -> None:
     """Measure what accuracy costs in time: convergence on frozen steps, and errors of whole simulations."""
+    from harness.base.claim import claimed
     from harness.base.progress import display
     from harness.config.accuracy_load import load_accuracy
     from harness.experiments.accuracy.run import failures, run_accuracy
     from harness.report.accuracy import draw
 
     asked = load_accuracy(config)
-    folder = results / asked.name
+    folder = claimed(results / asked.name, config)
     files = run_accuracy(asked, folder, display(err), _say, again=again)
     drawn = draw(folder, files)
     _say(f"rows are in {folder / 'accuracy'}; {len(drawn)} pictures and pages tell of them, {drawn[-1]} of all")
@@ -213,7 +202,7 @@ def list_runs(config: Config, results: Results = Path("results")) -> None:
     table = Table("run", "scene", "size", "solver", "iterations", "frames", "threads", "state")
     for p in plan(sweep.runs(), results / sweep.name):
         r = p.run
-        state = p.state + (" (by other code)" if p.older else "")
+        state = p.state + (" (by other code)" if p.older else "") + (" (damaged)" if p.damage else "")
         cells = (
             p.files.rows.stem[-12:],
             r.scene_name,
@@ -233,11 +222,15 @@ def query(
     sql: Annotated[str, typer.Argument(help="A query over the tables `rows`, `accuracy`, `ablation`.")],
     results: Results = Path("results"),
     csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
+    seconds: Annotated[float, typer.Option(help="Processor time that the answer may take.")] = 15.0,
 ) -> None:
     """Answer an SQL query over the rows of all sweeps."""
-    from harness.report.query import answer
+    from harness.report.query import PRINTED, SHOWN, answer
 
-    found = answer(sql, results)
+    found = answer(sql, results, most=PRINTED if csv else SHOWN, seconds=seconds)
+    if found.more:
+        more = "" if csv else "; --csv prints more"
+        _say(f"only the first {len(found.values):,} rows of the answer are shown{more}")
     if csv:
         found.write_csv(sys.stdout)
     else:
@@ -285,7 +278,7 @@ def gate(
 
 
 def _check_positions(path: Path | None) -> None:
-    if path and (path.suffix != ".npz" or not path.parent.is_dir()):
+    if path and (path.suffix != ".npz" or not path.parent.is_dir() or (path.exists() and not path.is_file())):
         raise InputError(f"--positions: came {path}; wanted a file that ends in .npz, in a folder that exists")
 
 

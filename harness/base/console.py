@@ -13,9 +13,13 @@ if not out.is_terminal:
     out.width = 240  # a pipe or a file has no width of its own, and no cell should be cut there
 
 
+_LONGEST = 4_000
+"""Characters of a line: names in foreign files may have millions."""
+
+
 def say(line: str) -> None:
-    """Print a line to standard error, as it stands."""
-    err.print(escape(line), highlight=False, soft_wrap=True)
+    """Print a line to standard error, as it stands; no more of it than fits a screen."""
+    err.print(escape(line if len(line) <= _LONGEST else line[:_LONGEST] + " ..."), highlight=False, soft_wrap=True)
 
 
 def show_log() -> None:

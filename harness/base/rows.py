@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterable, Iterator, Mapping
+import stat
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.base.errors import InputError, Mistake
+from harness.base.files import replacing
 
 
 class Column(NamedTuple):
@@ -95,6 +97,12 @@ COLUMNS = (
     Column("energy_effects", _REAL, "J", "all other energies of the step's objective: bending, gas, damping and so on"),
     Column("objective", _REAL, "J", "the step's objective, the sum of all terms"),
     Column("largest_strain", _REAL, "", "largest |length / rest length - 1| of a spring after the step"),
+    Column(
+        "penetration",
+        _REAL,
+        "m",
+        "how deep the deepest vertex is inside an obstacle after the step, 0 where none is; null without obstacles",
+    ),
     Column("digest", _TEXT, "", "SHA-256 of the positions after the step (float64 bytes)"),
     Column("nnz_system", _INT, "", "stored entries of the system matrix Q"),
     Column("nnz_factor", _INT, "", "stored entries of its triangular factor, null where the library hides it"),
@@ -130,45 +138,75 @@ SCHEMA = schema_of(COLUMNS)
 Row = Mapping[str, Any]
 
 
+MOST = 2_000_000
+"""No file may hold more rows: a few bytes can claim any number of them."""
+
+
 def write(path: Path, rows: Iterable[Row], schema: pa.Schema = SCHEMA) -> None:
-    """Write one file's rows under a partial name and rename: a kill leaves the whole file or none."""
+    """Write one file's rows under a partial name and rename: a kill leaves the whole file or none, and so does an
+    error. Raises CannotWrite."""
     rows = list(rows)
     unknown = {key for row in rows for key in row} - set(schema.names)
     if unknown:
         raise ValueError(f"rows have no columns {sorted(unknown)}")
-    partial = path.with_name(f".{path.name}.partial")
-    with partial.open("wb") as file:
+    with replacing(path) as partial, partial.open("wb") as file:
         pq.write_table(pa.Table.from_pylist(rows, schema=schema), file)
         file.flush()
         os.fsync(file.fileno())
-    os.replace(partial, path)
 
 
-def read(paths: Iterable[Path], schema: pa.Schema = SCHEMA) -> pa.Table:
+def read(paths: Iterable[Path], schema: pa.Schema = SCHEMA, *, needed: Sequence[str] = ()) -> pa.Table:
     """All rows of the files, in the order of the paths; files of an older schema get nulls.
 
-    Raises InputError for a file that holds no rows.
+    needed: columns without which a row is none of ours. Raises InputError, with its name, for a file that is damaged,
+    foreign or without rows.
     """
-    tables = []
-    for path in paths:
-        try:
-            tables.append(pq.read_table(path))
-        except (pa.ArrowInvalid, OSError) as error:
-            raise InputError(Mistake(f"holds no rows ({error}); take it out of the results", path)) from error
-    return pa.concat_tables([schema.empty_table(), *tables], promote_options="default")
+    tables = [_one(path, schema, needed) for path in paths]
+    try:
+        return pa.concat_tables([schema.empty_table(), *tables], promote_options="default")
+    except pa.ArrowException as error:  # two foreign columns of one name
+        raise InputError(f"rows do not fit together ({error}); take the foreign files out of the results") from error
+
+
+def first(path: Path, schema: pa.Schema = SCHEMA, *, needed: Sequence[str] = ()) -> dict[str, Any] | str:
+    """The first row of a file, or in words what is wrong with the file."""
+    try:
+        return _one(path, schema, needed).slice(0, 1).to_pylist()[0]
+    except InputError as error:
+        return error.mistakes[0].problem
+
+
+def _one(path: Path, schema: pa.Schema, needed: Sequence[str]) -> pa.Table:
+    try:
+        if not path.is_file():  # a pipe would be waited for
+            raise OSError("it is no plain file")
+        with pq.ParquetFile(path) as file:
+            if file.metadata.num_rows > MOST:
+                raise OSError(f"it claims {file.metadata.num_rows:,} rows, and at most {MOST:,} are read")
+            table = pa.concat_tables([schema.empty_table(), file.read()], promote_options="default")
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(Mistake(f"holds no rows ({error}); take it out of the results", path)) from error
+    lacking = [name for name in needed if name not in table.column_names or table[name].null_count]
+    if lacking or not len(table):
+        why = f"no {lacking[0]}" if lacking else "it is empty"
+        raise InputError(Mistake(f"holds no rows of a run ({why}); take it out of the results", path))
+    return table
 
 
 def of_other_code(paths: Iterable[Path], code: str) -> str:
-    """A remark on how many of the files that are there were made by other code than this; empty for none."""
-    there = [path for path in paths if path.exists()]
-    older = sum(pq.read_table(path, columns=["code"]).slice(0, 1).to_pylist() != [{"code": code}] for path in there)
+    """A remark on how many of the whole files that are there were made by other code than this; empty for none."""
+    there = [row for path in paths if path.exists() and isinstance(row := first(path, pa.schema([])), dict)]
+    older = sum(row.get("code") != code for row in there)
     return f"{older} of {len(there)} there are by other code than today's; --again does all anew" if older else ""
 
 
 @contextmanager
 def alone(folder: Path) -> Iterator[None]:
     """Hold a folder of results for one process; whatever a killed one left half written is removed."""
-    with (folder / ".lock").open("w") as lock:
+    lock = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+    try:
+        if not stat.S_ISREG(os.fstat(lock).st_mode):
+            raise InputError(Mistake("is no plain file; take it away", folder / ".lock"))
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -176,3 +214,5 @@ def alone(folder: Path) -> Iterator[None]:
         for partial in folder.glob("*/.*partial*"):
             partial.unlink()
         yield
+    finally:
+        os.close(lock)

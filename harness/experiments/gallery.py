@@ -9,6 +9,7 @@ import numpy as np
 import typer
 
 from harness.base.console import say
+from harness.base.errors import InputError
 
 
 def gallery(
@@ -18,6 +19,8 @@ def gallery(
     """Draw a sheet of scenes, each simulated at its default size up to its last frame."""
     from harness.report.contact_sheet import draw_sheet
 
+    if output.suffix != ".png" or not output.parent.is_dir() or output.is_dir():
+        raise InputError(f"--output: came {output}; wanted a file that ends in .png, in a folder that exists")
     tiles = []
     for path in scenes:
         tiles.append(_tile(path))
@@ -39,7 +42,7 @@ def _tile(path: Path) -> Any:
     from solvers.problem import StopRule
     from solvers.registry import SOLVERS, load
 
-    (run,) = load_any(path).runs()
+    run = load_any(path, solvers=["hybrid"]).runs()[0]
     scene = build(run.scene, run.size)
     solver = load(SOLVERS["hybrid"])()
     p = scene.mesh.rest

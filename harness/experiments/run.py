@@ -7,7 +7,6 @@ final positions must equal the timed ones to the last bit. The rows are written 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from harness.base import machine, rows
 from harness.base.errors import InputError, RunFailed
+from harness.base.files import CannotWrite, replacing
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts, solver_class
 from harness.record.base import RecordingInfo
@@ -63,7 +63,7 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
     """Do one run and write its files; a failure is a row with a status and a reason.
 
     tick: told the name of the pass after each step; positions: where to store the positions after every step
-    (frames, n, 3) [m], float64. Returns the rows. Raises InputError for what the user can mend.
+    (frames, n, 3) [m], float64. Returns the rows. Raises InputError, and CannotWrite without rows.
     """
     shared, threads = common(run) | {"code": code(parts(run))}, machine.threads(run.threads)
     with machine.pinned_threads(threads.number):
@@ -90,7 +90,9 @@ _STATUS: dict[type[BaseException], str] = {Unsupported: "unsupported", Diverged:
 
 def failure(error: BaseException, own: Collection[Path] = ()) -> dict[str, Any]:
     """The row of a run that ended with an error, less what all its rows share; with the frame, where a step failed;
-    own: the solver's files, whose lines are blamed first."""
+    own: the solver's files, whose lines are blamed first. Raises CannotWrite if that is the error."""
+    if isinstance(error, CannotWrite):  # that is no outcome: a row of it would keep the run from being done again
+        raise error
     if isinstance(error, StepFailed) and error.__cause__:
         return failure(error.__cause__, own) | {"frame": error.frame}
     return {"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error, own)}
@@ -257,10 +259,9 @@ def _milliseconds(measured: Measured, frames: int) -> dict[str, list[float]]:
 
 
 def save_positions(path: Path, positions: np.ndarray) -> None:
-    """Store positions (frames, n, 3) [m] under a partial name and rename."""
-    partial = path.with_name(f".{path.name}.partial.npz")
-    np.savez_compressed(partial, positions=positions)
-    os.replace(partial, path)
+    """Store positions (frames, n, 3) [m] under a partial name and rename. Raises CannotWrite."""
+    with replacing(path) as partial:
+        np.savez_compressed(partial, positions=positions)
 
 
 def common(run: RunSpec) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from harness.base import machine, rows
 from harness.base.errors import InputError
@@ -22,12 +21,15 @@ from harness.experiments.code import code, parts
 from harness.experiments.run import Files, execute
 from harness.record.compare import side_by_side
 from harness.record.reader import read_replay
+from harness.record.sound import whole_messages
 from harness.report import opengl
 from harness.report.comparison import draw_comparison
 from harness.report.run_picture import draw_run
 from harness.report.timing_plot import draw_timing
 
 DONE, MISSING = "done", "missing"
+NEEDED = ("run_id", "scene", "size", "solver", "status", "code")
+"""Columns without which a row tells nothing of a run."""
 
 _NAMED = 8
 """So many runs are named where more are meant."""
@@ -37,13 +39,15 @@ _NAMED = 8
 class Planned:
     """A run of a sweep, its files, and its state: done, missing, or the status of a run that failed.
 
-    older: whether its rows were made by other code than today's.
+    older: whether its rows were made by other code than today's; damage: what is wrong with its rows or its recording,
+    for which it is missing.
     """
 
     run: RunSpec
     files: Files
     state: str
     older: bool
+    damage: str = ""
 
     @property
     def title(self) -> str:
@@ -58,17 +62,29 @@ def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
     planned = []
     for run in runs:
         files = Files.of(run, folder)
-        state, older = MISSING, False
+        state, older, damage = MISSING, False, ""
         if files.rows.exists():
-            there = pq.read_table(files.rows, columns=["status", "code"]).slice(0, 1).to_pylist()[0]
-            state = DONE if there["status"] == "ok" else there["status"]
-            if (made_of := parts(run)) not in codes:
-                codes[made_of] = code(made_of)
-            older = there["code"] != codes[made_of]
-            if state == DONE and run.record and not files.recording.exists():
-                state = MISSING
-        planned.append(Planned(run, files, state, older))
+            there = rows.first(files.rows, needed=NEEDED)
+            if isinstance(there, str):
+                damage = f"{files.rows} {there}"
+            else:
+                state = DONE if there["status"] == "ok" else there["status"]
+                if (made_of := parts(run)) not in codes:
+                    codes[made_of] = code(made_of)
+                older = there["code"] != codes[made_of]
+            if state == DONE and run.record:
+                damage = _unfit(files.recording)
+                state = MISSING if damage or not files.recording.exists() else DONE
+        planned.append(Planned(run, files, state, older, damage))
     return planned
+
+
+def _unfit(recording: Path) -> str:
+    """What keeps a recording from being one, without reading all of it; nothing does where there is none."""
+    if not recording.exists():
+        return ""
+    whole = recording.is_file() and whole_messages(recording)[0]
+    return "" if whole else f"{recording} is cut before its end"
 
 
 def run_sweep(
@@ -100,6 +116,9 @@ def run_sweep(
         if len(todo) < len(planned):
             say(f"{len(planned) - len(todo)} of {len(planned)} runs are there already")
         _say_older([p for p in planned if p.older and p not in todo], say)
+        for p in todo:
+            if p.damage:
+                say(f"{p.damage}; its run is done again")
         display.begin(len(todo), sum(map(_work, todo)))
         try:
             for p in todo:
@@ -108,7 +127,7 @@ def run_sweep(
                 display.finished(_outcome(execute(p.run, p.files, display.tick, positions=positions)))
         finally:
             display.end()
-        table = rows.read(p.files.rows for p in planned)
+        table = rows.read((p.files.rows for p in planned), needed=NEEDED)
         _draw(name, planned, folder, table, say)
     return table
 

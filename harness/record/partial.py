@@ -15,11 +15,14 @@ import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings
 
-from harness.base.errors import RunFailed
-from harness.record.reader import whole_messages
+from harness.base.files import CannotWrite, cannot_write
+from harness.record.sound import trust, whole_messages
 
 _PATIENCE = 30
 """Seconds that a flush may take."""
+
+_PAGE = 2**16
+"""Bytes that a disk that is full does not take any more."""
 
 _broken: list[rr.RecordingStream] = []
 """Streams whose writing thread has died."""
@@ -28,7 +31,7 @@ _broken: list[rr.RecordingStream] = []
 class PartialFile:
     """An open recording stream into a partial file beside `path`.
 
-    Raises RunFailed, from any method, when the file cannot be written or, at the end, is not whole.
+    Raises CannotWrite, from any method, when the file cannot be written or, at the end, is not whole.
     """
 
     def __init__(self, path: Path, application: str, recording_id: str, title: str) -> None:
@@ -81,6 +84,7 @@ class PartialFile:
             if not whole_messages(self._partial)[0]:
                 raise OSError("its end is missing")
             os.replace(self._partial, self._path)
+            trust(self._path)
         except (OSError, RuntimeError, ValueError) as error:
             raise self._failure(error) from error
         finally:
@@ -93,7 +97,7 @@ class PartialFile:
             self.stream.disconnect()
         self._partial.unlink(missing_ok=True)
 
-    def _failure(self, error: Exception) -> RunFailed:
+    def _failure(self, error: Exception) -> CannotWrite:
         if not self._broken:
             # The library's writing thread has died (the disk is full), and whatever waits for it may wait for
             # ever: disconnecting, the clean-up at exit, the stream's end. So none of them is to come.
@@ -101,4 +105,14 @@ class PartialFile:
             _broken.append(self.stream)
             rr.unregister_shutdown()
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(self.stream))
-        return RunFailed(f"{self._path}: the recording cannot be written: {error}")
+        return cannot_write(self._path, self._cause() or error)
+
+    def _cause(self) -> OSError | None:
+        """Why the library's writer died, which it does not tell: the file is in its state still, so one asks again."""
+        try:
+            with self._partial.open("ab") as file:
+                file.write(bytes(_PAGE))
+                os.fsync(file.fileno())
+        except OSError as error:
+            return error
+        return None

@@ -1,19 +1,17 @@
 """Recordings read back, without a viewer: what pictures are drawn from and `springbench inspect` prints.
 
 A complete file is read through the index in its footer. A file without one (its run was killed) is scanned up to
-the last whole message. A recording is a header of 12 bytes and messages, each a kind and a length of 8 bytes,
-then that many bytes of payload.
+the last whole message. What this process has not written is tried in another one first (see `harness.record.sound`).
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-import struct
 import tempfile
 import warnings
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,8 +23,9 @@ from rerun.chunk import Chunk, LazyStore, RrdReader
 
 from harness.base.errors import InputError, Mistake
 from harness.record.base import Replay
+from harness.record.sound import require_sound, trust, whole_messages
 
-_MAGIC, _HEADER, _END = b"RRF2", 12, 0
+_MAGIC = b"RRF2"
 _ROW_ID = "rerun.controls.RowId"
 _POSITIONS = ("Mesh3D:vertex_positions", "Points3D:positions")
 _SCALAR = "Scalars:scalars"
@@ -143,11 +142,22 @@ def summary(path: Path) -> Summary:
         )
 
 
+def _try(path: Path) -> None:
+    """Read all of a recording in every way that there is; raises anything, or ends the process, where it is damaged."""
+    trust(path)
+    with open_recording(path) as source:
+        for chunk in source.chunks(content="/**"):
+            chunk.to_record_batch().validate(full=True)
+    summary(path)
+    with suppress(InputError):  # of a recording that is not of one run
+        read_replay(path)
+
+
 @contextmanager
 def open_recording(path: Path) -> Iterator[Source]:
     """The recording at `path`, for as long as the context lasts.
 
-    Raises InputError when the file is not a Rerun recording or nothing of it can be read.
+    Raises InputError when the file is not a Rerun recording, is damaged, or nothing of it can be read.
     """
     if not path.is_file():
         raise InputError(Mistake("there is no such file; a Rerun recording (.rrd) was expected", file=path))
@@ -156,6 +166,7 @@ def open_recording(path: Path) -> Iterator[Source]:
     if start != _MAGIC:
         came = f"begins with {start!r}" if start else "is empty"
         raise InputError(Mistake(f"{came} and so is not a Rerun recording (.rrd)", file=path))
+    require_sound(path, _try)
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of files without a footer: `complete` says so
         complete, end = whole_messages(path)
@@ -173,21 +184,6 @@ def open_recording(path: Path) -> Iterator[Source]:
         if not runs:
             raise InputError(Mistake("has nothing in it that can be read: it was cut at its start", file=path))
         yield Source(path, store, complete, runs[0].application_id, runs[0].recording_id)
-
-
-def whole_messages(path: Path) -> tuple[bool, int]:
-    """Whether the file has its end mark, and where its last whole message ends."""
-    size, place = path.stat().st_size, _HEADER
-    with path.open("rb") as file:
-        while place + 16 <= size:
-            file.seek(place)
-            kind, length = struct.unpack("<QQ", file.read(16))
-            if place + 16 + length > size:
-                break
-            if kind == _END:
-                return True, size
-            place += 16 + length
-    return False, place
 
 
 def network(source: Source) -> dict[str, NDArray[Any]]:

@@ -10,7 +10,6 @@ Files have a partial name until they are complete, and hold arrays only.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from harness.base.files import replacing
 from harness.reference.frozen import Arrays, Frozen, agree, bind, freeze, moment_frames, reference_run, thaw
 from harness.reference.minimiser import MINIMUM, Minimum, Reference, find_minima, polish
 from harness.reference.motion import Field
@@ -152,6 +152,5 @@ def _read(path: Path) -> Arrays:
 
 def _write(path: Path, arrays: Arrays) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.npz")
-    np.savez(partial, allow_pickle=False, **arrays)
-    os.replace(partial, path)
+    with replacing(path) as partial:
+        np.savez(partial, allow_pickle=False, **arrays)

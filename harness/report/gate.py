@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, model_validator
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
@@ -27,15 +27,27 @@ OTHER_MACHINE_MARGIN = 0.25
 MINIMUM_MARGIN = 0.5
 """Minima of two runs lie 4 % apart on an idle machine; another program on the same core doubles them."""
 
+_MOST = 2**25
+"""Bytes of a stored file; each time of each benchmark takes 20."""
+
 REGRESSIONS = ("slower", "vanished")
+
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class Ratio(BaseModel):
     """A median ratio of times and its 95 % interval."""
 
-    median: float = Field(gt=0)
-    low: float = Field(gt=0)
-    high: float = Field(gt=0)
+    median: Positive
+    low: Positive
+    high: Positive
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Ratio:
+        if not self.low <= self.median <= self.high:
+            raise ValueError(f"the median {self.median:g} lies outside of its interval")
+        return self
 
 
 class Extra(BaseModel):
@@ -47,7 +59,7 @@ class Extra(BaseModel):
 class Stats(BaseModel):
     """The times of a benchmark [s]."""
 
-    min: float = Field(gt=0)
+    min: Positive
 
 
 class Benchmark(BaseModel):
@@ -72,7 +84,8 @@ class Stored(BaseModel):
     @property
     def machine(self) -> tuple[Any, ...]:
         """What decides about speed: the processor and how many of its cores may be used."""
-        cpu = self.machine_info.get("cpu") or {}
+        cpu = self.machine_info.get("cpu")
+        cpu = cpu if isinstance(cpu, Mapping) else {}
         return (cpu.get("brand_raw"), cpu.get("count"), self.machine_info.get("affinity"))
 
 
@@ -131,7 +144,13 @@ def _read(path: Path) -> Stored:
     """The stored benchmarks of a file; raises InputError."""
     wanted = "wanted a file that pytest-benchmark stored; `pytest tests/bench --benchmark-only` makes one"
     try:
-        return Stored.model_validate_json(path.read_bytes())
+        if path.exists() and not path.is_file():
+            raise InputError(Mistake(f"is no file; {wanted}", path))
+        with path.open("rb") as file:
+            content = file.read(_MOST + 1)
+        if len(content) > _MOST:
+            raise InputError(Mistake(f"has more than {_MOST:,} bytes; {wanted}", path))
+        return Stored.model_validate_json(content)
     except OSError as error:
         raise InputError(Mistake(f"cannot be read ({error.strerror}); {wanted}", path)) from error
     except ValidationError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from harness.base.files import replacing
 from harness.record.base import Replay
 from harness.report.style import DPI, HEIGHT, INK, MUTED, PAGE, STRAIN_MAP, WIDTH
 
@@ -40,10 +40,9 @@ def paste(page: Figure, pixels: NDArray[np.uint8], left: int, top: int) -> None:
 
 
 def save(page: Figure, path: Path) -> None:
-    """Write the page under a partial name and rename it: a kill leaves the whole picture or none."""
-    partial = path.with_name(f".{path.name}.partial")
-    page.savefig(partial, format="png", dpi=DPI)
-    os.replace(partial, path)
+    """Write the page under a partial name and rename it: a kill leaves all of it or nothing. Raises CannotWrite."""
+    with replacing(path) as partial:
+        page.savefig(partial, format="png", dpi=DPI)
 
 
 def header(page: Figure, headline: str, facts: Sequence[str], *, letters: int = 56) -> None:

@@ -1,4 +1,7 @@
-"""SQL over the rows of all sweeps, accuracy configs and ablations (DuckDB on the Parquet files)."""
+"""SQL over the rows of all sweeps, accuracy configs and ablations (DuckDB on the Parquet files).
+
+A query runs in the child that `harness.base.child` keeps: it may ask for more time or memory than there is.
+"""
 
 from __future__ import annotations
 
@@ -10,26 +13,39 @@ from typing import Any, TextIO
 import duckdb
 import pyarrow as pa
 from rich.table import Table
+from rich.text import Text
 
-from harness.base import rows
-from harness.base.errors import InputError
+from harness.base import child, rows
+from harness.base.errors import InputError, Mistake
 
 _TABLES: dict[str, pa.Schema] = {"rows": rows.SCHEMA, "accuracy": pa.schema([]), "ablation": pa.schema([])}
 """The tables by the names of their folders, with the columns that they have even where no row has them."""
 
+SHOWN, PRINTED = 1_000, 1_000_000
+"""Rows of an answer in a table and in CSV; the rest of them is left out."""
+MEMORY = 2**30
+"""Bytes that a query may take, the tables included."""
+_CELL, _COLUMNS = 1_000, 200
+"""Characters of a cell in a table, and its columns: who prints more has lost the table."""
+_CHARACTERS = 50_000_000
+"""Of all texts of an answer together."""
+
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Names of columns and the rows of values that a query gave."""
+    """Names of columns and the rows of values that a query gave; more: whether there are more than these."""
 
     columns: list[str]
     values: list[tuple[Any, ...]]
+    more: bool = False
 
     def table(self) -> Table:
-        """The answer as a table to print."""
-        table = Table(*self.columns)
+        """The answer as a table to print; what cells hold is text and no markup."""
+        table = Table()
+        for name in self.columns[:_COLUMNS]:
+            table.add_column(Text(_shown(name)))
         for row in self.values:
-            table.add_row(*("" if v is None else f"{v:.6g}" if isinstance(v, float) else str(v) for v in row))
+            table.add_row(*(Text(_shown(value)) for value in row[:_COLUMNS]))
         return table
 
     def write_csv(self, file: TextIO) -> None:
@@ -39,23 +55,48 @@ class Answer:
         writer.writerows(self.values)
 
 
-def answer(sql: str, results: Path) -> Answer:
+def _shown(value: Any) -> str:
+    text = "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+    return "".join(c if c.isprintable() else " " for c in text[:_CELL])
+
+
+def answer(sql: str, results: Path, *, most: int = SHOWN, seconds: float = 15.0) -> Answer:
     """What a query says of the tables `rows`, `accuracy` and `ablation`; it can read nothing else and write nothing.
 
-    Raises InputError where there are no rows, or with DuckDB's message where the query is wrong.
+    most: rows of the answer; seconds: of processor time that it may take. Raises InputError where there are no rows,
+    where the query takes too much, or with DuckDB's message where it is wrong.
     """
+    if not 0.0 < seconds <= 1e6:
+        raise InputError(Mistake(f"came {seconds:g}; wanted a number of seconds above 0", key="--seconds"))
     files = {table: sorted(results.glob(f"*/{table}/*.parquet")) for table in _TABLES}
     if not any(files.values()):
         raise InputError(f"{results}: holds no rows; run a sweep first, or name its folder with --results")
-    with duckdb.connect() as connection:
+    try:
+        return child.call(_answered, sql, files, most, limits=child.Limits(seconds, MEMORY))
+    except child.Lost as error:
+        raise InputError(f"query: {error}; ask for less, or give it more with --seconds") from None
+
+
+def _answered(sql: str, files: dict[str, list[Path]], most: int) -> Answer:
+    with duckdb.connect(config={"memory_limit": f"{MEMORY // 2}B", "threads": 1, "temp_directory": ""}) as connection:
         for table, schema in _TABLES.items():
             if files[table] or len(schema):
                 connection.register(table, rows.read(files[table], schema))
         connection.execute("SET enable_external_access = false; SET lock_configuration = true")
         try:
             found = connection.execute(sql)
-        except duckdb.Error as error:
-            raise InputError(f"query: {error}") from error
-        if found is None or found.description is None:
-            raise InputError("query: came without a statement; wanted one, such as SELECT count(*) FROM rows")
-        return Answer([column[0] for column in found.description], found.fetchall())
+            if found is None or found.description is None:
+                raise InputError("query: came without a statement; wanted one, such as SELECT count(*) FROM rows")
+            values, characters = [], 0
+            while len(values) <= most and characters < _CHARACTERS and (row := found.fetchone()):
+                values.append(_plain(row))
+                characters += sum(len(value) for value in values[-1] if isinstance(value, str))
+        except (duckdb.Error, ValueError, OverflowError) as error:  # dates and numbers that Python does not have
+            raise InputError(f"query: {str(error)[:2000]}") from error
+        columns = [column[0] for column in found.description]
+        return Answer(columns, values[:most], len(values) > most or characters >= _CHARACTERS)
+
+
+def _plain(row: tuple[Any, ...]) -> tuple[Any, ...]:
+    """A row without DuckDB's own types."""
+    return tuple(v if isinstance(v, (int, float, bool, str, type(None))) else str(v) for v in row)

@@ -95,7 +95,7 @@ def read_cells(folder: Path) -> list[Cell]:
     Raises InputError where no run was judged.
     """
     files = sorted((folder / "rows").glob("*.parquet"))
-    table = rows.read(files).to_pylist()
+    table = rows.read(files, needed=("run_id", "scene", "size", "solver", "phase", "status", "started")).to_pylist()
     runs: dict[str, list[dict[str, Any]]] = {}
     for row in table:
         if row["phase"] == "run" or (row["phase"] == "step" and row["round"] == 0):

@@ -22,6 +22,8 @@ from solvers.problem import NotPositiveDefinite, Pins, Positions, ProjectiveEner
 
 _LOG = logging.getLogger("springbench")
 AT_REST = Rest()
+LONG = 1.0
+"""Time steps [s] beyond it are asked about: what moves in them is over within a few of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +82,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
     mesh = spec.mesh.build(size)
     mass = _mass(spec, mesh)
     parts = [_bound(spec, i, mesh, mass) for i in range(len(spec.effects))]
+    _single(spec, parts)
     pins, targets, moving = _pins(parts)
     energies = tuple(energy for part in parts for energy in part.energies)
     energies += tuple(energy for part in parts for derive in part.derived for energy in derive(energies))
@@ -93,6 +96,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
     _require_determined(system)
     start = spec.start or AT_REST
     _check(parts, start.positions(mesh.rest))
+    _doubt(spec)
     other = spec.alternate_time_step
     return Scene(
         mesh=mesh,
@@ -128,6 +132,26 @@ def _check(parts: list[Contribution], start: Positions) -> None:
                 check(start, pins)
         except InputError as error:
             raise InputError([replace(mistake, key=f"effects[{i}]") for mistake in error.mistakes]) from error
+
+
+def _single(spec: SceneSpec, parts: list[Contribution]) -> None:
+    """Raise InputError where two effects are what a scene can have but once."""
+    first: dict[str, int] = {}
+    for i, part in enumerate(parts):
+        for what in part.once:
+            if first.setdefault(what, i) != i:
+                problem = f"{what} is there already, as effects[{first[what]}]; the two would add up, so keep one"
+                raise InputError(Mistake(problem, key=f"effects[{i}]"))
+
+
+def _doubt(spec: SceneSpec) -> None:
+    """Say of what is allowed, and seldom meant."""
+    if spec.time_step > LONG:
+        _LOG.warning("%s: a time step of %g s is long; is it meant in seconds?", spec.path.name, spec.time_step)
+    for i, effect in enumerate(spec.effects):
+        k = spec.effects.index(effect)
+        if k < i:
+            _LOG.warning("%s: effects[%d] repeats effects[%d] (%s); both act", spec.path.name, i, k, effect.kind)
 
 
 def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ key. Before the first key and after the last one the points rest.
 
 from __future__ import annotations
 
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -33,7 +34,7 @@ class Key(Model):
 class Motion(Model):
     """A rigid motion along key frames."""
 
-    keys: tuple[Key, ...] = Field(min_length=1)
+    keys: tuple[Key, ...] = Field(min_length=1, max_length=10_000)
     """The key frames, their times rising."""
     axis: Vector = (0.0, 1.0, 0.0)
     """The direction of the axis of turns, of any length but zero."""
@@ -62,10 +63,30 @@ class Motion(Model):
         arm = points - self.about
         return points + offset + arm @ (_rotation(self.axis, np.deg2rad(turn)) - np.eye(3)).T
 
+    @property
+    def straight(self) -> bool:
+        """Whether points go along straight lines from key to key, each at one speed."""
+        return self.between == "linear" and len({key.turn for key in self.keys}) == 1
+
+    def speed(self, begin: float, end: float, points: Positions, *, slack: float = 0.0) -> float:
+        """The largest speed [m/s], or more, of points (q, 3) [m], or of what is within `slack` [m] of where they are
+        declared, between two times [s] that no key lies between."""
+        times, values = self.table
+        k = int(np.clip(np.searchsorted(times, begin, side="right"), 1, max(1, len(times) - 1)))
+        if len(times) == 1 or begin >= times[-1] or end <= times[0]:
+            return 0.0
+        *offset, turn = np.abs(values[k] - values[k - 1]) / (times[k] - times[k - 1])
+        arm = float(np.linalg.norm(points - self.about, axis=1).max(initial=0.0)) + slack
+        return _STEEPEST[self.between] * (float(np.linalg.norm(offset)) + float(np.deg2rad(turn)) * arm)
+
+    @cached_property
+    def table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The times [s] of the keys, and their offsets [m] and turns [degrees] (k, 4)."""
+        return np.array(self.times), np.array([(*key.offset, key.turn) for key in self.keys])
+
     def _at(self, time: float) -> NDArray[np.float64]:
         """Offset [m] and turn [degrees] at a time [s], (4,)."""
-        times = np.array([key.time for key in self.keys])
-        values = np.array([(*key.offset, key.turn) for key in self.keys])
+        times, values = self.table
         t = float(np.clip(time, times[0], times[-1]))
         return values[0] if len(times) == 1 else _BETWEEN[self.between](times, values, t)
 
@@ -79,6 +100,9 @@ def _smooth(times: NDArray[np.float64], values: NDArray[np.float64], t: float) -
 
     return np.asarray(PchipInterpolator(times, values)(t))
 
+
+_STEEPEST = {"linear": 1.0, "smooth": 3.0}
+"""The largest slope between two keys, in that of the straight line: Fritsch and Carlson's condition."""
 
 _BETWEEN: dict[str, Any] = {"linear": _linear, "smooth": _smooth}
 

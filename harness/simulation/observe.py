@@ -19,6 +19,7 @@ from harness.scenes.bind import Scene
 from harness.simulation.measure import Diverged, Settings, StepFailed, digest, steps
 from harness.simulation.step import Step, start
 from harness.simulation.trace import EnergyNorm, trace
+from solvers.contact.energy import Contact
 from solvers.problem import Positions, Prepared
 
 _OWN = ("springs", "inertia", "force", "pins")
@@ -52,6 +53,7 @@ def observe(
             "energy_effects": sum(value for name, value in terms.items() if name not in _OWN),
             "objective": sum(terms.values()),
             "largest_strain": largest_strain(scene, p),
+            "penetration": penetration(scene, p, scene.time(step.index)),
             "iterations": s.iterations,
             "stopped": s.stopped,
             "residual": s.residual,
@@ -81,6 +83,13 @@ def observe(
         if looked:
             looked.result()
     return found
+
+
+def penetration(scene: Scene, p: Positions, time: float) -> float | None:
+    """How deep the deepest vertex at p (n, 3) [m] is inside an obstacle at a time [s]; None without obstacles."""
+    contacts = [energy for energy in scene.system.energies if isinstance(energy, Contact)]
+    inside = [-one.distance(p, time).min(initial=0.0) for contact in contacts for one in contact.obstacles]
+    return float(max(inside)) if inside else None
 
 
 def largest_strain(scene: Scene, p: Positions) -> float:

@@ -141,3 +141,13 @@ def _estimate(now):
     if ratio > promised**_SLOWER and ratio > promised:
         wide = np.cosh(np.arccosh(max(1.0, ratio / promised)) / now.degree)
         now.radius, now.degree = min(0.5 * now.radius * (1.0 + wide), _ROUNDEST), 0
+
+
+MOST_PAIRS = 100
+"""Each costs two vectors of the mesh and a scalar product with all others, and old ones tell of another place."""
+
+
+def require_pairs(pairs: int) -> None:
+    """Raise ValueError for a window that none is kept in, or too many."""
+    if not 1 <= pairs <= MOST_PAIRS:
+        raise ValueError(f"pairs: should be from 1 to {MOST_PAIRS}, not {pairs}")

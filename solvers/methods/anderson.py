@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from solvers.kernels.accelerate_coefficients import ANDERSON
+from solvers.kernels.accelerate_coefficients import ANDERSON, require_pairs
 from solvers.linear.choice import Linear, Precision
 from solvers.methods.quasi_newton import Method, PreparedAccelerated, prepare
 from solvers.problem import System
@@ -29,6 +29,10 @@ class Anderson:
     pairs: int = 5
     linear: Linear = "auto"
     precision: Precision = "float64"
+
+    def __post_init__(self) -> None:
+        """Raises ValueError."""
+        require_pairs(self.pairs)
 
     def prepare(self, system: System) -> PreparedAccelerated:
         """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""

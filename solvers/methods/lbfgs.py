@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from solvers.kernels.accelerate_coefficients import LBFGS
+from solvers.kernels.accelerate_coefficients import LBFGS, require_pairs
 from solvers.linear.choice import Linear, Precision
 from solvers.methods.quasi_newton import Method, PreparedAccelerated, prepare
 from solvers.problem import System
@@ -31,6 +31,10 @@ class Lbfgs:
     pairs: int = 5
     linear: Linear = "auto"
     precision: Precision = "float64"
+
+    def __post_init__(self) -> None:
+        """Raises ValueError."""
+        require_pairs(self.pairs)
 
     def prepare(self, system: System) -> PreparedAccelerated:
         """Raises NotPositiveDefinite, and Unsupported where Q fits nowhere."""

@@ -11,7 +11,8 @@ import pyarrow as pa
 import pytest
 from rerun.chunk import RrdReader
 
-from harness.base.errors import InputError, RunFailed
+from harness.base.errors import InputError
+from harness.base.files import CannotWrite
 from harness.record.base import Frame
 from harness.record.compare import side_by_side
 from harness.record.reader import open_recording, read_replay, summary
@@ -175,7 +176,7 @@ def test_nothing_is_left_of_an_abandoned_recording(tmp_path: Path):
 
 def test_a_recording_that_cannot_be_written_fails(tmp_path: Path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(RunFailed, match="cannot be written"):
+    with pytest.raises(CannotWrite, match="cannot be written"):
         RerunRecorder(tmp_path / "file" / "a.rrd", info())
 
 

@@ -133,7 +133,7 @@ REFUSED = {
             contact(OBSTACLES["plane"]),
             net(motion=Motion(keys=(Key(time=0), Key(time=2, offset=(0, -3, 0))))),
         ],
-        ["contact", "pins", "2 s", "plane"],
+        ["contact", "pins", " s", "plane"],
     ),
     "start": ([contact({"kind": "box", "low": (-1, -1, -1), "high": (0.1, 0.1, 0.1)})], ["contact", "starts", "box"]),
 }

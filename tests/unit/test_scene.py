@@ -9,10 +9,13 @@ import pytest
 
 from harness.base.errors import InputError
 from harness.scenes.bind import build
+from harness.scenes.effects.contact import Contact
+from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.chain import Chain
 from harness.scenes.spec import SceneSpec
+from harness.simulation.observe import penetration
 from tests.scenes import scene
 
 
@@ -50,3 +53,38 @@ def test_springs_of_several_effects_are_all_the_springs():
     made = scene(Chain(), Springs(stretch=1.0, rule="fixed"), Springs(stretch=2.0, rule="fixed"), size=3)
     assert made.springs.stiffness.tolist() == [1.0, 1.0, 2.0, 2.0]
     assert len(scene(Chain(), size=3).springs.edges) == 0
+
+
+def test_gravity_twice_is_refused_with_both_places():
+    with pytest.raises(InputError, match=r"effects\[2\]: gravity is there already, as effects\[0\]"):
+        scene(Chain(), Gravity(), Springs(stretch=1.0), Gravity(acceleration=(0.0, 0.0, -1.0)), size=4)
+
+
+def test_a_gravity_of_zero_is_none():
+    scene(Chain(), Gravity(), Springs(stretch=1.0), Gravity(acceleration=(0.0, 0.0, 0.0)), size=4)
+
+
+@pytest.mark.parametrize(
+    ("time_step", "effects", "said"),
+    [
+        (60.0, [Springs(stretch=1.0)], "a time step of 60 s is long"),
+        (0.1, [Springs(stretch=1.0), Springs(stretch=1.0)], "effects[1] repeats effects[0] (springs)"),
+        (1.0, [Springs(stretch=1.0), Springs(stretch=2.0)], ""),
+    ],
+)
+def test_what_is_allowed_and_seldom_meant_is_asked_about(
+    time_step: float, effects: list[Springs], said: str, caplog: pytest.LogCaptureFixture
+):
+    with caplog.at_level("WARNING", logger="springbench"):
+        scene(Chain(), *effects, size=4, time_step=time_step)
+    assert (said in caplog.text) if said else not caplog.records
+
+
+@pytest.mark.parametrize(("height", "deep"), [(0.5, 0.0), (-0.25, 0.25)])
+def test_penetration_is_the_depth_of_the_deepest_vertex_in_an_obstacle(height: float, deep: float):
+    floor = Contact.model_validate({"obstacles": [{"kind": "plane", "point": [0, -5, 0]}]})
+    made = scene(Chain(), Springs(stretch=1.0), floor, size=4)
+    p = made.mesh.rest.copy()
+    p[2, 1] = -5.0 + height
+    assert penetration(made, p, 0.0) == pytest.approx(deep, abs=1e-12)
+    assert penetration(scene(Chain(), Springs(stretch=1.0), size=4), p, 0.0) is None

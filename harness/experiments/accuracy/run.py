@@ -13,8 +13,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
-
 from harness.base import machine, rows
 from harness.base.errors import InputError
 from harness.base.progress import Display
@@ -108,7 +106,9 @@ class _Run:
         path = self.path(unit)
         if self._again or not path.exists():
             return False
-        there = pq.read_table(path, columns=["unit", "problem"]).slice(0, 1).to_pylist()[0]
+        there = rows.first(path, SCHEMA)
+        if isinstance(there, str):
+            return False
         return there["unit"] == unit.unit_id(self._machine) and problem in (None, there["problem"])
 
     def curves(self, group: Sequence[CurveUnit]) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import html
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 from plotly.offline import get_plotlyjs
 
+from harness.base.files import replacing
 from harness.report.accuracy.convergence import GUESSES
 from harness.report.accuracy.growth import TARGET, growths
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
@@ -69,9 +69,8 @@ def write_page(
     words |= {"__TITLE__": html.escape(title), "__FACTS__": html.escape("   ·   ".join(table.machine))}
     for place in ("__TITLE__", "__FACTS__", "__DATA__", "__PLOTLY__"):
         filled = filled.replace(place, words[place])
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(filled, encoding="utf-8")
-    os.replace(partial, path)
+    with replacing(path) as partial:
+        partial.write_text(filled, encoding="utf-8")
 
 
 def _mark(mark: Mark) -> dict[str, str]:

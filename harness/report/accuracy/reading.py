@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from harness.base.errors import InputError, Mistake
+from harness.base.rows import read as read_rows
 from harness.report.accuracy.table import Curve, Problem, Table, Values, Work
 
 ROUND_OFF = 100 * float(np.finfo(np.float64).eps)
@@ -30,10 +30,7 @@ def read(folder: Path, files: Iterable[Path] | None = None) -> Table:
     """The rows in these files, all under `folder`/accuracy if left out. Raises InputError where there are none."""
     tables = []
     for path in sorted((folder / "accuracy").rglob("*.parquet") if files is None else files):
-        try:
-            tables.append(pq.read_table(path))
-        except (pa.ArrowInvalid, OSError) as error:
-            raise InputError(Mistake(f"holds no rows ({error}); take it out of the results", path)) from error
+        tables.append(read_rows([path], pa.schema([]), needed=("kind",)))
     if not tables:
         raise InputError(Mistake("holds no accuracy rows; run `springbench accuracy CONFIG` first", folder))
     kinds: dict[str, list[_Row]] = defaultdict(list)

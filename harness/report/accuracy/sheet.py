@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogFormatterMathtext, LogLocator, NullLocator
 
+from harness.base.files import replacing
 from harness.report.accuracy.times import duration
 from harness.report.page import axes, header, new_page, quantity, save, shorten, text
 from harness.report.style import DASH_DOTTED, DASHED, DOTTED, HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark, marks
@@ -35,9 +35,8 @@ def sheet(stem: Path, title: str, facts: Sequence[str]) -> Iterator[Figure]:
         header(page, title, facts, letters=84)
         yield page
         save(page, stem.with_suffix(".png"))
-        partial = stem.with_name(f".{stem.name}.svg.partial")
-        page.savefig(partial, format="svg", metadata={"Date": None})
-        os.replace(partial, stem.with_suffix(".svg"))
+        with replacing(stem.with_suffix(".svg")) as partial:
+            page.savefig(partial, format="svg", metadata={"Date": None})
 
 
 def files(stem: Path) -> list[Path]:

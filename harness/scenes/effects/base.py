@@ -72,6 +72,8 @@ class Contribution:
     filters: tuple[VelocityFilter, ...] = field(default=())
     derived: tuple[Derived, ...] = field(default=())
     checks: tuple[Check, ...] = field(default=())
+    once: tuple[str, ...] = field(default=())
+    """What a scene can have but once, in words; a second one would be added to the first."""
 
     @property
     def empty(self) -> bool:

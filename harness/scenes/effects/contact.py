@@ -14,6 +14,7 @@ from harness.base.model import Model
 from harness.scenes.effects.base import Contribution, Pin
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.obstacles import AnyObstacle
+from harness.scenes.room import gap, looks, nearest
 from solvers.contact.energy import Contact as Energy
 from solvers.matrices import assemble
 from solvers.problem import Energy as AnyEnergy
@@ -81,16 +82,24 @@ class Contact(Model):
         return Contribution(derived=(derived,), checks=(self._check,))
 
     def _check(self, start: Positions, pins: Sequence[Pin]) -> None:
-        """Raise InputError for pins or a start (n, 3) [m] inside an obstacle."""
+        """Raise InputError for pins or a start (n, 3) [m] inside an obstacle, and for planes without room between."""
+        limit = self.thickness - self.depth
         for k, given in enumerate(self.obstacles):
-            obstacle, moves = given.obstacle(), given.motion.times if given.motion else ()
+            obstacle = given.obstacle()
             for pin in pins:
-                for time in sorted({0.0, *moves, *(pin.motion.times if pin.motion else ())}):
-                    targets = pin.motion.moved(pin.targets, time) if pin.motion else pin.targets
-                    self._refuse(
-                        f"pins hold vertex {{}} at {time:g} s", k, obstacle.distance(targets, time), pin.vertices
-                    )
+                if met := nearest(obstacle, given.motion, pin.targets, pin.motion, limit):
+                    time, distance = met
+                    self._refuse(f"pins hold vertex {{}} at {time:g} s", k, distance, pin.vertices)
             self._refuse("vertex {} starts", k, obstacle.distance(start, 0.0), np.arange(len(start)))
+        planes = [one for one in self.obstacles if one.kind == "plane"]
+        if len(planes) > 1 and any(one.motion for one in planes):  # others leave the room that the start is in
+            solid = [one.obstacle() for one in planes]
+            for time in looks([one.motion for one in planes]):
+                if (radius := gap(solid, time)) < limit:
+                    raise InputError(
+                        f"contact: the planes leave no room at {time:g} s: {max(2.0 * radius, 0.0):.3g} m at most lie "
+                        f"between them, and vertices stay {self.thickness:g} m away from each; move them less"
+                    )
 
     def _refuse(self, who: str, k: int, distance: NDArray[np.float64], vertices: NDArray[np.int64]) -> None:
         near = np.flatnonzero(distance < self.thickness - self.depth)

@@ -19,4 +19,5 @@ class Gravity(Model):
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
         """m g on every vertex."""
-        return Contribution(forces=steady(mass[:, None] * np.array(self.acceleration)))
+        forces = steady(mass[:, None] * np.array(self.acceleration))
+        return Contribution(forces=forces, once=("gravity",) if forces else ())

@@ -54,8 +54,8 @@ class Cells:
         return not len(self.tetrahedra) and set(self.polygons) <= {2}
 
 
-def check_file(path: Path) -> None:
-    """Raise InputError unless `path` is a file of a size that may be read."""
+def check_file(path: Path, *, most: int = MAX_BYTES) -> None:
+    """Raise InputError unless `path` is a file of so many bytes at most."""
     try:
         size = path.stat().st_size
     except (OSError, ValueError) as error:
@@ -63,8 +63,8 @@ def check_file(path: Path) -> None:
         raise InputError(Mistake(f"cannot be opened ({reason}); give the path of a mesh file", path)) from None
     if not path.is_file():
         raise InputError(Mistake("is no file; give the path of a mesh file", path))
-    if size > MAX_BYTES:
-        raise InputError(Mistake(f"has {size:,} bytes; at most {MAX_BYTES:,} are read", path))
+    if size > most:
+        raise InputError(Mistake(f"has {size:,} bytes; at most {most:,} are read", path))
 
 
 def network(cells: Cells, rule: SpringRule, path: Path) -> Mesh:

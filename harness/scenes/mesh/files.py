@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-import io
-import warnings
-from contextlib import redirect_stderr, redirect_stdout
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
-import meshio
 import numpy as np
+from numpy.typing import NDArray
 
+from harness.base import child
 from harness.base.errors import InputError, Mistake
 from harness.base.model import Model
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.cells import MAX_COORDINATE, Cells, SpringRule, check_file, network
+from harness.scenes.mesh.foreign import Block, read
 from harness.scenes.mesh.obj import read_obj
 from harness.scenes.mesh.scene_json import read_scene_json
 from harness.scenes.mesh.topology import NO_PAIRS, Indices
 
 _KINDS = ("line", "triangle", "quad", "polygon", "tetra")
 """The kinds of cells that springs are made of; the kind `vertex` is passed over."""
+
+SECONDS, BYTES_PER_SECOND = 5.0, 1e6
+"""What a file may take to read: meshio takes text at 1 MB/s at least, and reads some broken files for ever."""
+MEMORY, MEMORY_PER_BYTE = 2**29, 20
+"""Bytes that it may take: lists of Python, for a number of two characters each."""
 
 
 class File(Model):
@@ -49,19 +54,8 @@ class File(Model):
 def _read_meshio(path: Path) -> Cells:
     """The points and cells that meshio finds; whatever goes wrong there is an InputError."""
     check_file(path)
-    printed = io.StringIO()
-    try:
-        with redirect_stdout(printed), redirect_stderr(printed), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            raw = meshio.read(path)
-            points = np.array(raw.points, np.float64)
-            blocks = [(block.type, np.array(block.data, np.int64)) for block in raw.cells if len(block.data)]
-            blocks = [(kind, data) for kind, data in blocks if kind != "vertex"]
-    except (Exception, SystemExit) as error:  # readers raise anything on a broken file, or leave by sys.exit
-        reason = str(error) if isinstance(error, Exception) else printed.getvalue()
-        reason = " ".join(reason.split())[:300] or type(error).__name__
-        raise InputError(Mistake(f"cannot be read as a mesh: {reason}", path)) from None
-
+    state = path.stat()
+    points, blocks = _read(path, state.st_mtime_ns, state.st_size)
     problem = _problem(points, blocks)
     if problem:
         raise InputError(Mistake(problem, path))
@@ -77,6 +71,16 @@ def _read_meshio(path: Path) -> Cells:
     )
 
 
+@lru_cache(maxsize=2)  # a scene builds its mesh several times, and a child takes a while to start
+def _read(path: Path, changed: int, size: int) -> tuple[NDArray[np.float64], list[Block]]:
+    """What meshio finds in a file of so many bytes, changed last at a time [ns]."""
+    limits = child.Limits(SECONDS + size / BYTES_PER_SECOND, MEMORY + MEMORY_PER_BYTE * size)
+    try:
+        return child.call(read, path, limits=limits)
+    except child.Lost as error:
+        raise InputError(Mistake(f"cannot be read as a mesh: {error}", path)) from None
+
+
 def _problem(points: np.ndarray, blocks: list[tuple[str, Indices]]) -> str:
     """What is wrong with what meshio read, or nothing."""
     if points.ndim != 2 or not 1 <= points.shape[1] <= 3:
@@ -87,6 +91,8 @@ def _problem(points: np.ndarray, blocks: list[tuple[str, Indices]]) -> str:
     for kind, data in blocks:
         if kind not in _KINDS:
             return f"has cells of type {kind}; wanted {', '.join(_KINDS)}"
+        if data.ndim != 2 or data.shape[1] < 2:
+            return f"has a {kind} of fewer than 2 points"
         ordered = np.sort(data, axis=1)
         wrong = (ordered[:, 0] < 0) | (ordered[:, -1] >= len(points))
         wrong |= np.any(ordered[:, 1:] == ordered[:, :-1], axis=1)

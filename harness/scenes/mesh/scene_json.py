@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import Field, ValidationError
+from pydantic import FailFast, Field, ValidationError
 
 from harness.base.errors import InputError, Mistake, did_you_mean
 from harness.base.model import Model
 from harness.scenes.mesh.cells import check_file
+
+MAX_BYTES = 2**22
+"""Larger files are refused: they name a mesh, and half a million pins at most."""
 
 
 class SceneJson(Model):
@@ -23,7 +26,7 @@ class SceneJson(Model):
     """Stiffness of every spring [N/m]."""
     m: float | None = Field(default=None, gt=0)
     """Mass of every vertex [kg]; if absent, the faces are weighed at density 1."""
-    b: list[int]
+    b: Annotated[list[int], FailFast()]
     """Pinned vertices, each once."""
     png: str | None = None
     """A texture, for viewers."""
@@ -31,7 +34,7 @@ class SceneJson(Model):
 
 def read_scene_json(path: Path) -> SceneJson:
     """The scene that a JSON file describes; raises InputError with file, line and key of each mistake."""
-    check_file(path)
+    check_file(path, most=MAX_BYTES)
     try:
         data = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_once)
     except json.JSONDecodeError as error:
@@ -65,10 +68,10 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _mistake(path: Path, detail: Any) -> Mistake:
     """A pydantic error as a mistake."""
-    key = str(detail["loc"][0])
+    key = str(detail["loc"][0])[:80]
     problem = f"{detail['msg']}, came {str(detail['input'])[:80]!r}"
     if detail["type"] == "extra_forbidden":
         problem = f"unknown key; wanted {did_you_mean(key, SceneJson.model_fields)}"
     elif detail["type"] == "missing":
         problem = f"is missing: {SceneJson.model_fields[key].description}"
-    return Mistake(problem, path, line_of(path, key), ".".join(map(str, detail["loc"])))
+    return Mistake(problem, path, line_of(path, key), ".".join(map(str, detail["loc"]))[:80])

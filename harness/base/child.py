@@ -1,0 +1,183 @@
+"""Foreign input is read in a process of its own, which may hang, swell or crash, and this one goes on.
+
+One child serves all calls of a process, one after the other, and is started anew when it was lost. Before each call it
+limits its own processor time and memory, both counted from there. Function, arguments and answer travel as pickles.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import pickle
+import resource
+import signal
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from threading import Timer
+from typing import Any, BinaryIO
+
+from harness.base.errors import InputError
+
+_PATIENCE = 10.0
+"""Wall seconds that a call may take for each second of processor time: others may hold the cores."""
+
+_LENGTH = struct.Struct("<Q")
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a call may take: seconds of processor time, and bytes of memory beyond what the child has already."""
+
+    seconds: float
+    bytes: int
+
+
+class Lost(Exception):
+    """The child gave no answer; the message says why, as the end of a sentence."""
+
+
+def call(function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any:
+    """What a function of a module says to these arguments, within limits; all of it must pickle.
+
+    Raises InputError where the function does, and Lost where it raises anything else, takes too much, or crashes.
+    """
+    child = _Child.running()
+    try:
+        child.send((os.getcwd(), function, arguments, limits))
+        kind, answer = child.receive(_PATIENCE * limits.seconds)
+    except (EOFError, OSError):
+        raise Lost(_why(child.end(), limits)) from None
+    if kind == "mistakes":
+        raise InputError(answer)
+    if kind == "error":
+        raise Lost(answer)
+    return answer
+
+
+def _why(code: int, limits: Limits) -> str:
+    if code in (-signal.SIGXCPU, -signal.SIGKILL):
+        return f"reading it takes more than {limits.seconds:.3g} s"
+    name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    return f"the library that reads it crashed ({name})"
+
+
+class _Child:
+    """A running process that serves calls."""
+
+    _one: _Child | None = None
+
+    def __init__(self) -> None:
+        paths = [path or os.getcwd() for path in sys.path]
+        one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
+        self._owner = os.getpid()
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", f"from {__name__} import serve; serve()"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, **one_thread, "PYTHONPATH": os.pathsep.join(paths)},
+        )
+
+    @classmethod
+    def running(cls) -> _Child:
+        """The child of this process; a fork of it gets one of its own."""
+        one = cls._one
+        if one is None or one._owner != os.getpid() or one._process.poll() is not None:
+            one = cls._one = cls()
+            atexit.register(one.end)
+        return one
+
+    def send(self, message: Any) -> None:
+        assert self._process.stdin
+        _write(self._process.stdin, message)
+
+    def receive(self, seconds: float) -> Any:
+        """The next message; raises EOFError where the child ends before it, as it has to after so many seconds."""
+        assert self._process.stdout
+        timer = Timer(seconds, self._process.kill)
+        timer.start()
+        try:
+            return _read(self._process.stdout)
+        finally:
+            timer.cancel()
+
+    def end(self) -> int:
+        """End it, if it has not ended by itself; its exit code, negative for a signal."""
+        if self._owner != os.getpid():
+            return 0
+        for pipe in (self._process.stdin, self._process.stdout):
+            with suppress(OSError):
+                if pipe:
+                    pipe.close()
+        try:
+            return self._process.wait(timeout=5.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return self._process.wait()
+
+
+def _write(pipe: BinaryIO | Any, message: Any) -> None:
+    content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
+    pipe.write(_LENGTH.pack(len(content)))
+    pipe.write(content)
+    pipe.flush()
+
+
+def _read(pipe: BinaryIO | Any) -> Any:
+    head = pipe.read(_LENGTH.size)
+    if len(head) < _LENGTH.size:
+        raise EOFError
+    content = pipe.read(_LENGTH.unpack(head)[0])
+    return pickle.loads(content)
+
+
+def serve() -> None:
+    """Serve calls until there are no more: what the child does. What readers print goes nowhere."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    calls, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for standard in range(3):
+        os.dup2(nowhere, standard)
+    while True:
+        try:
+            here, function, arguments, limits = _read(calls)  # which imports the function's module, without limits
+        except (EOFError, KeyboardInterrupt):
+            return
+        with suppress(OSError):  # relative paths mean what they mean to the caller
+            os.chdir(here)
+        _write(answers, _answer(function, arguments, limits))
+
+
+def _answer(function: Callable[..., Any], arguments: tuple[Any, ...], limits: Limits) -> tuple[str, Any]:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    _limit(resource.RLIMIT_CPU, used.ru_utime + used.ru_stime + limits.seconds)
+    _limit(resource.RLIMIT_DATA, _data() + limits.bytes)
+    try:
+        return "answer", function(*arguments)
+    except InputError as error:
+        return "mistakes", error.mistakes
+    except MemoryError:
+        return "error", f"reading it takes more than {limits.bytes / 2**30:.1f} GiB of memory"
+    except BaseException as error:  # readers raise anything on a broken file; so do panics of compiled libraries
+        said = " ".join(str(error).split())[:300]
+        return "error", said or type(error).__name__
+    finally:
+        for what in (resource.RLIMIT_CPU, resource.RLIMIT_DATA):
+            _limit(what, resource.RLIM_INFINITY)
+
+
+def _limit(what: int, value: float) -> None:
+    """Set a soft limit; the hard one stays, so that the next call may have another."""
+    hard = resource.getrlimit(what)[1]
+    soft = int(value) if value != resource.RLIM_INFINITY else hard
+    resource.setrlimit(what, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
+
+
+def _data() -> int:
+    """Bytes of memory that this process has of its own, as the limit counts them; 0 where the system does not say."""
+    with suppress(OSError), open("/proc/self/status") as file:
+        return next((1024 * int(line.split()[1]) for line in file if line.startswith("VmData:")), 0)
+    return 0

@@ -1,0 +1,39 @@
+"""A command line that answers what goes wrong with a message and an exit code instead of a traceback."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from harness.base.console import say, show_log
+from harness.base.errors import SpringbenchError
+from harness.base.files import MISTAKES, told
+
+
+class Commands(TyperGroup):
+    """Answers our own errors, those of the system and Ctrl-C."""
+
+    def invoke(self, ctx: Any) -> Any:
+        show_log()
+        try:
+            return super().invoke(ctx)
+        except SpringbenchError as error:
+            for mistake in getattr(error, "mistakes", (error,)):
+                say(f"springbench: {mistake}")
+            raise typer.Exit(error.exit_code) from error
+        except BrokenPipeError:  # whoever read the answer has read enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(1) from None
+        except OSError as error:
+            say(f"springbench: {told(error)}")
+            raise typer.Exit(2 if error.errno in MISTAKES else 1) from error
+        except MemoryError as error:
+            say("springbench: there is not enough memory for this; take a smaller mesh")
+            raise typer.Exit(1) from error
+        except KeyboardInterrupt:
+            say("springbench: stopped; what is complete is kept, and the same command goes on from there")
+            raise typer.Exit(130) from None

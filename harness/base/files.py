@@ -1,0 +1,56 @@
+"""Files that are whole or not there, and in words why one cannot be written."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from harness.base.errors import SpringbenchError
+
+
+class CannotWrite(SpringbenchError):
+    """The disk is full, or will not be written for another such reason: no fault of a run, which may be done again."""
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A partial name beside a file, for what takes the file's place where nothing goes wrong, and goes where it does.
+
+    Raises CannotWrite from an OSError.
+    """
+    partial = path.with_name(f".{path.stem[:100]}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    finally:
+        with suppress(OSError):  # a folder that is gone tells its own tale
+            partial.unlink(missing_ok=True)
+
+
+MISTAKES = {
+    *(errno.EACCES, errno.EEXIST, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENODEV, errno.ENOENT),
+    *(errno.ENOTDIR, errno.ENXIO, errno.EOPNOTSUPP, errno.EPERM, errno.EROFS),
+}
+"""What the system says to a path that is the user's mistake."""
+
+
+def told(error: OSError) -> str:
+    """The file that an error is about, and why, as a message."""
+    names = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
+    return f"{names or 'a file'}: {reason(error)}"
+
+
+def cannot_write(path: Path, error: Exception) -> CannotWrite:
+    """What to raise where a file cannot be written because of an error."""
+    return CannotWrite(f"{path}: cannot be written: {reason(error)}")
+
+
+def reason(error: Exception) -> str:
+    """What the system says of an error, else what the error does: `No space left on device`."""
+    number = getattr(error, "errno", None)
+    return os.strerror(number) if number else " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,114 @@
+"""The child that reads foreign input: it may hang, swell, crash or leave, and the next call is answered as before."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from harness.base import child
+from harness.base.errors import InputError, Mistake
+from harness.base.files import CannotWrite, replacing, told
+
+LIMITS = child.Limits(0.5, 2**27)
+
+
+def double(number: int) -> int:
+    return 2 * number
+
+
+def loop() -> None:
+    while True:
+        pass
+
+
+def swell() -> int:
+    return len([bytes(2**20) for _ in range(2**10)])
+
+
+def crash() -> None:
+    ctypes.string_at(0)
+
+
+def abort() -> None:
+    os.abort()
+
+
+def leave() -> None:
+    sys.exit("I am off")
+
+
+def end() -> None:
+    os._exit(7)
+
+
+def panic() -> None:
+    raise BaseException("index out of\nrange")
+
+
+def refuse(path: Path) -> None:
+    raise InputError(Mistake("is odd", path, 3, "key"))
+
+
+def half(path: Path) -> None:
+    with replacing(path) as partial:
+        partial.write_text("new")
+        raise OSError(errno.ENOSPC, "the disk is full")
+
+
+def here() -> str:
+    return os.getcwd()
+
+
+def test_it_answers_and_prints_nothing(capfd: pytest.CaptureFixture[str]):
+    assert child.call(double, 21, limits=LIMITS) == 42
+    child.call(print, "noise", limits=LIMITS)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("function", "why"),
+    [
+        (loop, "takes more than 0.5 s"),
+        (swell, "takes more than 0.1 GiB of memory"),
+        (crash, "crashed (SIGSEGV)"),
+        (abort, "crashed (SIGABRT)"),
+        (leave, "I am off"),
+        (end, "crashed (exit code 7)"),
+        (panic, "index out of range"),
+    ],
+)
+def test_what_it_does_not_answer_is_said_in_words_and_the_next_call_is_answered(function, why):
+    with pytest.raises(child.Lost) as caught:
+        child.call(function, limits=LIMITS)
+    assert why in str(caught.value)
+    assert child.call(double, 21, limits=LIMITS) == 42
+
+
+def test_a_mistake_comes_with_its_place(tmp_path: Path):
+    with pytest.raises(InputError) as caught:
+        child.call(refuse, tmp_path, limits=LIMITS)
+    assert caught.value.mistakes == (Mistake("is odd", tmp_path, 3, "key"),)
+
+
+def test_relative_paths_mean_what_they_mean_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    assert child.call(here, limits=LIMITS) == os.getcwd()
+
+
+def test_a_file_takes_its_place_whole_or_not_at_all(tmp_path: Path):
+    path = tmp_path / "a.txt"
+    with replacing(path) as partial:
+        partial.write_text("old")
+    with pytest.raises(CannotWrite, match=r"a\.txt: cannot be written: No space left on device"):
+        half(path)
+    assert path.read_text() == "old"
+    assert [file.name for file in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_an_error_of_the_system_names_its_files():
+    assert told(OSError(20, "Not a directory", "a", None, "b")) == "a and b: Not a directory"

@@ -1,0 +1,80 @@
+"""What moves through obstacles between its key times is found, and so are planes that close."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.scenes.motion import Key, Motion
+from harness.scenes.obstacles import Plane, Sphere
+from harness.scenes.room import gap, key_times, looks, nearest
+
+POINT = np.array([[0.0, 0.0, 0.0]])
+LIMIT = 0.01
+
+
+def moving(*keys: dict[str, Any], **more: Any) -> Motion:
+    return Motion.model_validate({"keys": list(keys), **more})
+
+
+ACROSS = moving({"time": 0.0}, {"time": 1.0, "offset": (4.0, 0.0, 0.0)})
+ROUND = moving({"time": 0.0}, {"time": 1.0, "turn": 360.0}, about=(2.0, 0.0, 0.0))
+SMOOTH = moving({"time": 0.0}, {"time": 1.0, "offset": (4.0, 0.0, 0.0)}, between="smooth")
+BALL = Sphere(center=(2.0, 0.0, 0.0), radius=0.1)
+FAR = Sphere(center=(4.0, 0.0, 0.0), radius=0.05)
+
+
+# The way is one long step and many short ones: the time of contact is where the distance is the limit, or a step later.
+@pytest.mark.parametrize(
+    ("ball", "motion", "when"),
+    [(BALL, ACROSS, 0.4725), (FAR, ROUND, 0.4952), (BALL, SMOOTH, 0.4725)],
+    ids=["along a line", "along a circle", "along a cubic"],
+)
+def test_a_way_through_a_ball_is_found_where_it_begins(ball: Sphere, motion: Motion, when: float):
+    found = nearest(ball.obstacle(), None, POINT, motion, LIMIT)
+    assert found is not None
+    assert found[0] == pytest.approx(when, abs=0.01)
+    assert found[1].min() < LIMIT
+
+
+def test_a_ball_that_comes_is_found_like_a_way_to_it():
+    back = moving({"time": 0.0}, {"time": 1.0, "offset": (-4.0, 0.0, 0.0)})
+    ball = Sphere(center=(2.0, 0.0, 0.0), radius=0.1, motion=back)
+    found = nearest(ball.obstacle(), back, POINT, None, LIMIT)
+    assert found is not None
+    assert found[0] == pytest.approx(0.4725, abs=0.01)
+
+
+@pytest.mark.parametrize("motion", [None, ACROSS, ROUND, SMOOTH])
+def test_a_way_beside_a_ball_is_free(motion: Motion | None):
+    beside = Sphere(center=(2.0, 5.0, 0.0), radius=0.1)
+    assert nearest(beside.obstacle(), None, POINT, motion, LIMIT) is None
+
+
+@pytest.mark.parametrize("motion", [ACROSS, ROUND, SMOOTH])
+def test_no_point_is_faster_than_is_said(motion: Motion):
+    times = np.linspace(0.0, 1.0, 1001)
+    way = np.array([motion.moved(POINT, t)[0] for t in times])
+    fastest = np.linalg.norm(np.diff(way, axis=0), axis=1).max() / times[1]
+    assert fastest <= motion.speed(0.0, 1.0, POINT) * (1 + 1e-9)  # round-off of differences of 1e-3
+
+
+@pytest.mark.parametrize(("height", "radius"), [(1.0, 0.5), (0.1, 0.05), (-1.0, -0.5)])
+def test_the_gap_between_two_planes_is_that_of_the_largest_ball(height: float, radius: float):
+    lid = Plane(point=(0.0, height, 0.0), normal=(0.0, -1.0, 0.0))
+    assert gap([Plane().obstacle(), lid.obstacle()], 0.0) == pytest.approx(radius, abs=1e-9)
+
+
+def test_four_planes_may_leave_no_room_where_any_three_do():
+    normals = [(1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0)]
+    planes = [Plane(point=normal, normal=normal).obstacle() for normal in normals]
+    assert gap(planes, 0.0) < 0.0
+    assert all(gap(planes[:k] + planes[k + 1 :], 0.0) > 0.0 for k in range(4))
+
+
+def test_planes_that_turn_are_looked_at_between_their_keys():
+    assert list(looks([ACROSS])) == [0.0, 1.0]
+    assert len(list(looks([ROUND]))) > 32
+    assert key_times(ACROSS, None, Motion(keys=(Key(time=0.5),))) == [0.0, 0.5, 1.0]
