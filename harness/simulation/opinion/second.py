@@ -203,10 +203,15 @@ def _arrays(side: _Side, stated: Stated, problem: StepProblem, time: float) -> I
         return
     weights = [w for w in stated.weights if np.isfinite(w)]
     yield from _differ("weights of pins", system.pins.weight, stated.weights, max(weights, default=0.0))
+    yield from _differ("targets of pins", problem.pin_targets, stated.held, _held(side, stated, reach))
+
+
+def _held(side: _Side, stated: Stated, reach: float) -> float:
+    """The size [m] of which eps is the round-off of the pins' targets."""
     size = reach + sum(opinion.reach for opinion in side.opinions)
-    moves = [motion for effect in declared.effects if (motion := getattr(effect, "motion", None))]
-    size = max([size, *(blur(motion, size, time + dt) / EPS for motion in moves)])
-    yield from _differ("targets of pins", problem.pin_targets, stated.held, size)
+    moves = [motion for effect in side.declared.effects if (motion := getattr(effect, "motion", None))]
+    end = stated.moment.time + stated.moment.time_step
+    return max([size, *(blur(motion, size, end) / EPS for motion in moves)])
 
 
 def _shortest(side: _Side, opinion: Opinion) -> float:
@@ -240,7 +245,7 @@ def _energies(
             if np.isfinite(told.value) or any(np.isfinite(energy.value(at)) for energy in own):
                 yield from _against(side.name(k), told, own, at, np.asarray(d, float))
         value, slope, room = value + told.value, slope + told.slope, room + np.array(told.allowed)
-    yield from _objective(stated, problem, x, d, (value, slope, room), reach)
+    yield from _objective(stated, problem, x, d, (value, slope, room), reach, _held(side, stated, reach))
 
 
 def _against(name: str, told: Told, own: Sequence[Energy], x: Array, d: Array) -> Iterator[Finding]:
@@ -258,9 +263,15 @@ def _against(name: str, told: Told, own: Sequence[Energy], x: Array, d: Array) -
 
 
 def _objective(
-    stated: Stated, problem: StepProblem, x: Any, d: Any, energies: tuple[float, float, Any], reach: float
+    stated: Stated,
+    problem: StepProblem,
+    x: Any,
+    d: Any,
+    energies: tuple[float, float, Any],
+    reach: float,
+    aimed: float,
 ) -> Iterator[Finding]:
-    """The sum of all terms, and its gradient along d."""
+    """The sum of all terms, and its gradient along d; aimed: the size [m] of the round-off of the pins' targets."""
     value, slope, room = energies
     if not np.isfinite(value):
         return
@@ -273,7 +284,7 @@ def _objective(
         terms = [inertia / 2 * (away**2).sum(axis=1), weight / 2 * (sag**2).sum(axis=1)]
         return np.concatenate([*terms, -(y * stated.force).sum(axis=1)])
 
-    told = tell(quadratic, x, d, reach, float(np.abs(np.asarray(x, float)).max(initial=1.0)))
+    told = tell(quadratic, x, d, max(reach, aimed), reach or 1.0)
     at = np.asarray(x, float)
     size = float(np.abs(d).sum()) * stated.force_size
     figures = (

@@ -111,7 +111,8 @@ def gas(effect: Any, declared: Declared) -> Opinion:
         part = volume(x) / at_rest
         if part.real <= 0:
             return wide([np.inf])
-        return np.array([-effect.pressure * abs(at_rest) * np.log(part)])
+        much = effect.pressure * abs(at_rest)
+        return np.array([-much * (1 + np.log(part)), part * 0 + much])  # the logarithm's round-off is that of one
 
     return Opinion(lambda moment: values)
 
