@@ -52,7 +52,8 @@ def _of_obstacle(effect: Any, one: Any, k: Wide, slip: float, moment: Moment) ->
     depth = np.maximum(0, d - (n * carried).sum(axis=1))
     # Of the step's end; where x belongs to an earlier time, nearer to the start in proportion.
     w, started = moment.when, (n * moment.p).sum(axis=1)
-    offset, anchor, grip = started + w * (d - started), moment.p + w * (carried - moment.p), effect.friction * k * w * depth
+    offset, anchor = started + w * (d - started), moment.p + w * (carried - moment.p)
+    grip = effect.friction * k * w * depth
     grips = grip > 0
 
     def values(x: Wide) -> Wide:
@@ -69,8 +70,8 @@ def _of_obstacle(effect: Any, one: Any, k: Wide, slip: float, moment: Moment) ->
 
 
 def _half_space(one: Any, a: Wide, b: Wide, R: float) -> tuple[Wide, Wide]:
-    """The nearest points of the obstacle and the normals there, (n, 3) each, where Newton's method ends on the ways from
-    a to b (n, 3)."""
+    """The nearest points of the obstacle and the normals there, (n, 3) each, where Newton's method ends on the ways
+    from a to b (n, 3)."""
     begin, end = wide(np.zeros(len(a))), wide(np.full(len(a), np.inf))
     far, touched, out = nearest(one, a)
     slope = (out * (b - a)).sum(axis=1)
@@ -96,8 +97,8 @@ def radius(one: Any) -> float:
 
 
 def nearest(one: Any, x: Wide) -> tuple[Wide, Wide, Wide]:
-    """The distances (m,) [m] of points (m, 3) from an obstacle as declared, its radius aside, negative inside; the nearest
-    points of its surface and the normals there, (m, 3) each."""
+    """The distances (m,) [m] of points (m, 3) from an obstacle as declared, its radius aside, negative inside; the
+    nearest points of its surface and the normals there, (m, 3) each."""
     if one.kind == "plane":
         n = wide(one.normal)
         out = np.tile(n / np.sqrt(n @ n), (len(x), 1))
@@ -133,6 +134,9 @@ def _nearest_of_box(low: Wide, high: Wide, x: Wide) -> tuple[Wide, Wide, Wide]:
 
 def _reach(one: Any) -> float:
     """The largest coordinate [m] that an obstacle is declared with, infinite planes by their point."""
-    declared = {"plane": ("point",), "sphere": ("center", "radius"), "capsule": ("ends", "radius"), "box": ("low", "high")}
-    sizes = [float(np.abs(getattr(one, name)).max()) for name in declared[one.kind]]
-    return max(sizes) + max((float(np.abs(key.offset).max()) for key in one.motion.keys) if one.motion else [0.0])
+    sizes = [np.abs(getattr(one, name)).max() for name in _SIZES[one.kind]]
+    moves = [np.abs(key.offset).max() for key in one.motion.keys] if one.motion else [0.0]
+    return float(max(sizes) + max(moves))
+
+
+_SIZES = {"plane": ("point",), "sphere": ("center", "radius"), "capsule": ("ends", "radius"), "box": ("low", "high")}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -57,11 +57,6 @@ Force = Callable[[Array, Array, float], tuple[Array, float]]
 round-off."""
 
 
-def no_resistance(resists: Array) -> Array:
-    """What an effect without a share of Q adds."""
-    return np.zeros_like(resists)
-
-
 @dataclass(frozen=True)
 class Opinion:
     """What one effect is thought to contribute.
@@ -89,16 +84,15 @@ def chosen(declared: Declared, selection: Any) -> list[int]:
         named |= set(mesh.parts[part].tolist())
     if selection.box:
         low, high = selection.box.low, selection.box.high
-        named |= {
-            i for i, x in enumerate(mesh.rest) if all(a <= c <= b for a, c, b in zip(low, x, high, strict=True))
-        }
+        named |= {i for i, x in enumerate(mesh.rest) if all(a <= c <= b for a, c, b in zip(low, x, high, strict=True))}
     if not (selection.at or selection.indices or selection.box):
         named = set(range(len(mesh.rest)))
     return sorted(named)[:: selection.every]
 
 
-def counts(edges: Array | Sequence[Any], weight: Array, n: int) -> Array:
+def counts(edges: NDArray[np.int64], weight: Array, n: int) -> Array:
     """The sum (n,) of the weights (m,) of the edges (m, 2) at each vertex; an edge from a vertex to itself is none."""
-    i, j = np.asarray(edges, np.int64).reshape(-1, 2).T
+    i, j = edges.T
     apart = i != j
-    return np.bincount(i[apart], weight[apart], n) + np.bincount(j[apart], weight[apart], n)
+    ends = np.concatenate([i[apart], j[apart]])
+    return np.asarray(np.bincount(ends, np.tile(weight[apart], 2), n), np.float64)

@@ -11,8 +11,8 @@ eps X / l of any term, and one derivative more of each:
     |error of f'|  <= C eps ((1 + X/l) sum |f_e'|  + X sum |f_e''|)
     |error of f''| <= C eps ((1 + X/l) sum |f_e''| + X sum |f_e'''|) + |what both sides' differences differ by|
 
-The last difference is s f''', and large where a corner of the energy (a limit, a contact) lies within s: there f'' means
-nothing.
+The last difference is s f''', and large where a corner of the energy (a limit, a contact) lies within s: there f''
+means nothing.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def tell(values: Values, x: Wide, d: Wide, reach: float, shortest: float) -> Tol
     """What an energy is at x along d, both (n, 3); reach: X [m]; shortest: l [m]."""
 
     def slopes(at: Wide) -> Wide:
-        return values(at + 1j * _TINY * d).imag / _TINY
+        return np.imag(values(at + 1j * _TINY * d)) / _TINY
 
     s = np.longdouble(_STEP * shortest)
     here, first, ahead, behind = values(x), slopes(x), slopes(x + s * d), slopes(x - s * d)

@@ -79,7 +79,7 @@ def strain_limits(effect: Any, declared: Declared) -> Opinion:
 
     def values(x: Wide) -> Wide:
         l = _lengths(x, edges)
-        allowed = np.where(l.real < low, low, np.where(l.real > high, high, l))
+        allowed = np.where(np.real(l) < low, low, np.where(np.real(l) > high, high, l))
         return wide(k) / 2 * (l - allowed) ** 2
 
     return Opinion(lambda moment: values, counts(edges, k, len(declared.mass)))

@@ -1,11 +1,11 @@
 """External forces once more: weight, newtons a vertex, and wind.
 
-    gravity          m g                          constant force   the same newtons on every vertex
-    wind             the field on every vertex, or shared as the mass is, or on triangles (Keckeisen et al. 2004)
+gravity          m g                          constant force   the same newtons on every vertex
+wind             the field on every vertex, or shared as the mass is, or on triangles (Keckeisen et al. 2004)
 
-        f = rho/2 A |u| (n.u) (C_D u/|u| + C_L (n - (n.u) u/|u|^2)),   at most m |u| / dt
+    f = rho/2 A |u| (n.u) (C_D u/|u| + C_L (n - (n.u) u/|u|^2)),   at most m |u| / dt
 
-    with u the air's velocity less the triangle's and n its normal on the side where n.u >= 0.
+with u the air's velocity less the triangle's and n its normal on the side where n.u >= 0.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Field = Callable[[Array, float], Array]
 
 def gravity(effect: Any, declared: Declared) -> Opinion:
     """Weight."""
-    weight = np.outer(declared.mass, effect.acceleration)
+    weight = declared.mass[:, None] * np.array(effect.acceleration)
     return Opinion(force=lambda p, v, t: (weight, float(np.abs(weight).max())))
 
 

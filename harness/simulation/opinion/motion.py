@@ -1,4 +1,6 @@
-"""Key frames once more: q(t) = about + R(axis, turn) (q - about) + offset, R v = v cos a + k x v sin a + k (k.v)(1 - cos a).
+"""Key frames once more, with the axis k and the angle a of a turn:
+
+    q(t) = about + R (q - about) + offset,   R v = v cos a + k x v sin a + k (k.v)(1 - cos a)
 
 Between keys straight, or by monotone cubics (Fritsch and Carlson 1980, with the slopes of Fritsch and Butland 1984).
 """
@@ -42,7 +44,8 @@ def place(motion: Any, time: float) -> Place:
     *offset, turn = _between(times, values, min(max(wide(time), times[0]), times[-1]), motion.between)
     k, angle = wide(motion.axis), np.remainder(turn, 360) * _PI / 180
     k = k / np.sqrt(k @ k)
-    columns = [e * np.cos(angle) + np.cross(k, e) * np.sin(angle) + k * (k @ e) * (1 - np.cos(angle)) for e in np.eye(3)]
+    cos, sin = np.cos(angle), np.sin(angle)
+    columns = [e * cos + np.cross(k, e) * sin + k * (k @ e) * (1 - cos) for e in np.eye(3)]
     return Place(np.stack(columns, axis=1), wide(motion.about), wide(offset))
 
 

@@ -1,6 +1,6 @@
 """Effects from outside, of which nobody has written a second opinion: they are held against themselves.
 
-The gradient g of an energy is compared with complex steps of its own value; where that does not take complex numbers, or
+The gradient of an energy is compared with complex steps of its own value; where that does not take complex numbers, or
 is no analytic function of them, with central differences at two steps, whose distance tells how far off they are.
 """
 
@@ -81,7 +81,8 @@ def _by_complex_steps(energy: Any, x: Array, d: Array, slope: float, size: float
 
 
 def _by_differences(energy: Any, x: Array, d: Array, h: float, reach: float) -> tuple[float, float]:
-    """The derivative by differences of the step h [m], the error of its second order taken out, and how far off it is."""
+    """The derivative by differences of the step h [m], the error of its second order taken out; and how far off it
+    is."""
     values = [float(energy.value(x + s * h * d)) for s in (-1.0, -0.5, 0.5, 1.0)]
     rough, fine = (values[3] - values[0]) / (2 * h), (values[2] - values[1]) / h
     room = abs(rough - fine) + ROUNDINGS * EPS * (max(map(abs, values)) / h + reach / h * abs(fine))

@@ -1,7 +1,7 @@
 """Where opinions are compared: random motions and unknowns around a scene's start and its rest shape.
 
-They differ from those by 1e-3 to 0.5 of the spacing of the mesh, and move by as much in a step. Where there are obstacles
-the mesh is brought up to one, so that something touches.
+They differ from those by 1e-3 to 0.5 of the spacing of the mesh, and move by as much in a step. Where there are
+obstacles the mesh is brought up to one, so that something touches.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from harness.simulation.opinion.contact import nearest, radius
 from harness.simulation.opinion.declared import Array, Declared
 from harness.simulation.opinion.derivatives import wide
 from harness.simulation.opinion.motion import place
-from solvers.integrators import Motion
 
 POINTS = 20
 FRACTIONS = (1e-3, 1e-2, 0.1, 0.5)
@@ -27,8 +26,8 @@ FRACTIONS = (1e-3, 1e-2, 0.1, 0.5)
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """The state that a step starts from, shifts (n, 3) [m] of its unknown from where the velocity leads, and a direction
-    (n, 3)."""
+    """The state that a step starts from, shifts (n, 3) [m] of its unknown from where the velocity leads, and a
+    direction (n, 3)."""
 
     state: State
     shift: Array
@@ -55,7 +54,11 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[Point]:
         shift = some * rng.normal(size=rest.shape)
         far = np.linalg.norm(shift, axis=1).max()
         shift *= min(1.0, limit / far) if far else 1.0
-        yield Point(State(Motion(p, v), Motion(*before) if index else None, index), shift, rng.normal(size=rest.shape))
+        yield Point(
+            State(type(begun)(p, v), type(begun)(*before) if index else None, index),
+            shift,
+            rng.normal(size=rest.shape),
+        )
 
 
 def _brought(effect: Any, one: Any, p: Array, time: float, rng: np.random.Generator) -> Array:

@@ -1,9 +1,9 @@
-"""The step once more: what each integrator makes of a motion, as Liu et al. 2013 (eq. 6) and Hairer and Wanner have it.
+"""The step once more: what each integrator makes of a motion (Liu et al. 2013, eq. 6; Hairer and Wanner).
 
-                     c     x             target                                  velocity at x             after the step
-    implicit Euler   1     p(t + dt)     p + dt v                                (x - p)/dt                x
-    BDF2             9/4   p(t + dt)     (4 p - p')/3 + 2 dt/9 (4 v - v')        (3 x - 4 p + p')/(2 dt)   x
-    midpoint         4     p(t + dt/2)   p + dt/2 v                              2 (x - p)/dt              2 x - p
+                     c     x             target                            velocity at x             after the step
+    implicit Euler   1     p(t + dt)     p + dt v                          (x - p)/dt                x
+    BDF2             9/4   p(t + dt)     (4 p - p')/3 + 2 dt/9 (4 v - v')  (3 x - 4 p + p')/(2 dt)   x
+    midpoint         4     p(t + dt/2)   p + dt/2 v                        2 (x - p)/dt              2 x - p
 
 A step of BDF2 without a motion before it is one of implicit Euler. Forces and what is lagged are taken where it starts
 for implicit Euler, and else extrapolated to the time of x.
@@ -20,7 +20,7 @@ import numpy as np
 from harness.simulation.opinion.declared import Array, Declared, Moment, Opinion
 from harness.simulation.opinion.derivatives import wide
 
-Motion = tuple[Array, Array]
+Motion = Sequence[Array]
 """Positions (n, 3) [m] and velocities (n, 3) [m/s]."""
 
 
@@ -80,4 +80,4 @@ def _decayed(motion: Motion, opinions: Sequence[Opinion]) -> Motion:
     p, v = motion
     for opinion in opinions:
         v = opinion.decay(v) if opinion.decay else v
-    return p, v
+    return [p, v]

@@ -1,11 +1,11 @@
 """Bending and gas once more, from the triangles.
 
-    bending   B/2 |K x|^2 / (A0 + A1) over each pair of triangles that share an edge x0 x1 and have x2, x3 across, with
-              K = (c03 + c04, c01 + c02, -c01 - c03, -c02 - c04), the cotangents c of the angles at the edge and the areas
-              A at rest (Bergou et al. 2006, with 3/(A0 + A1) halved and thirded as `solvers.energies.bending` argues:
-              a cylinder of curvature k stores B/2 k^2 a unit of area). Rectangles count as cut by either diagonal, half
-              each.
-    gas       -p0 V0 ln(V/V0), V = sum of a.(b x c)/6 over triangles that face outwards
+bending   B/2 |K x|^2 / (A0 + A1) over each pair of triangles that share an edge x0 x1 and have x2, x3 across, with
+          K = (c03 + c04, c01 + c02, -c01 - c03, -c02 - c04), the cotangents c of the angles at the edge and the areas
+          A at rest (Bergou et al. 2006, with 3/(A0 + A1) halved and thirded as `solvers.energies.bending` argues:
+          a cylinder of curvature k stores B/2 k^2 a unit of area). Rectangles count as cut by either diagonal, half
+          each.
+gas       -p0 V0 ln(V/V0), V = sum of a.(b x c)/6 over triangles that face outwards
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ _SAME = 1e-6
 def bending(effect: Any, declared: Declared) -> Opinion:
     """The quadratic bending energy of the mesh's triangles."""
     corners, K, weight = stencils(effect.stiffness, declared)
-    resists = np.bincount(corners.ravel(), (weight[:, None] * K**2).ravel().astype(float), len(declared.mass))
+    share = np.asarray(weight[:, None] * K**2, float)
+    resists = np.asarray(np.bincount(corners.ravel(), share.ravel(), len(declared.mass)), float)
     return Opinion(lambda moment: _bent(corners, K, weight, 0.0), resists)
 
 
@@ -49,7 +50,8 @@ def _bent(corners: Any, K: Wide, weight: Wide, origin: Any) -> Values:
 
 
 def stencils(B: float, declared: Declared) -> tuple[Any, Wide, Wide]:
-    """The corners (h, 4), the coefficients K (h, 4) and the weights (h,) of all pairs of triangles, for a rigidity B."""
+    """The corners (h, 4), the coefficients K (h, 4) and the weights (h,) of all pairs of triangles, for a rigidity
+    B."""
     rest, surface = declared.rest, [frozenset(t) for t in declared.mesh.triangles.tolist()]
     pairs = list(_pairs(surface))
     rectangles, share = [pair for pair in pairs if _rectangle(rest[list(pair)])], B

@@ -1,11 +1,11 @@
 """What acts vertex by vertex, once more: attachments, drag, Rayleigh damping, decay of the velocity, pins.
 
-    attachments   k/2 |x_i - q_i(t)|^2, the stiffness shared equally
-    air drag      c rate/2 |x_i - o_i|^2, of which the gradient is c v_i; quadratic: m dv/dt = -c |v| v, solved exactly
-                  over a step, v <- v / (1 + dt c |v| / m)
-    ether drag    v <- exp(-c dt) v                                           Liu et al. 2013, section 5
-    Rayleigh      C = a M + b K: a m_i as drag, b k as dashpots along springs, b times the matrix of bending
-    pins          w/2 |x_i - q_i(t)|^2, or exactly, at the rest position moved by key frames
+attachments   k/2 |x_i - q_i(t)|^2, the stiffness shared equally
+air drag      c rate/2 |x_i - o_i|^2, of which the gradient is c v_i; quadratic: m dv/dt = -c |v| v, solved exactly
+              over a step, v <- v / (1 + dt c |v| / m)
+ether drag    v <- exp(-c dt) v                                           Liu et al. 2013, section 5
+Rayleigh      C = a M + b K: a m_i as drag, b k as dashpots along springs, b times the matrix of bending
+pins          w/2 |x_i - q_i(t)|^2, or exactly, at the rest position moved by key frames
 """
 
 from __future__ import annotations
