@@ -1,4 +1,4 @@
-"""Contact with Coulomb friction once more (formulas: `solvers.energies.contact`, `solvers.energies.contact_planes`).
+"""Contact with Coulomb friction once more (formulas: `solvers.contact.energy`, `solvers.contact.planes`).
 
     k_i/2 min(0, n.x_i - d)^2 + F_i h(|u_i|),   u_i = (I - nn')(x_i - a_i),   h(u) = u^2/(2 slip), beyond it u - slip/2
 

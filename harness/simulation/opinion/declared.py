@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.mesh.base import Mesh
+from harness.scenes.mesh.base import Mesh
 from harness.simulation.opinion.derivatives import Values, Wide, wide
 
 Array = NDArray[np.float64]

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from harness.mesh.base import Mesh
+from harness.scenes.mesh.base import Mesh
 from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion, counts
 from harness.simulation.opinion.derivatives import Values, Wide, length, wide
 
 
 def stiffness(mesh: Mesh, effect: Any, stretch: float, shear: float, bend: float) -> Array:
-    """The stiffness (m,) [N/m] of each of a mesh's springs, by the effect's rule (see `harness.material`)."""
+    """The stiffness (m,) [N/m] of each of a mesh's springs, by the effect's rule (see `harness.scenes.material`)."""
     k, h = np.zeros(len(mesh.springs)), mesh.spacing
     for family, constant in {"stretch": stretch, "shear": shear, "bend": bend}.items():
         for e in mesh.families[family]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.effects.base import Contribution, Pin
+from harness.scenes.effects.base import Contribution, Pin
 from harness.simulation.opinion.declared import Array, Opinion
 from harness.simulation.opinion.derivatives import EPS, ROUNDINGS, Told, wide
 from harness.simulation.opinion.vertices import moved

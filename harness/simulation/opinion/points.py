@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from harness.scene import Scene
-from harness.simulate import State, start
+from harness.scenes.bind import Scene
 from harness.simulation.opinion.contact import nearest, radius
 from harness.simulation.opinion.declared import Array, Declared
 from harness.simulation.opinion.derivatives import wide
 from harness.simulation.opinion.motion import place
+from harness.simulation.step import State, start
 
 POINTS = 20
 FRACTIONS = (1e-3, 1e-2, 0.1, 0.5)
@@ -39,7 +39,7 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[Point]:
     rng, rest = np.random.default_rng(0), scene.mesh.rest
     begun = start(scene).now
     touching = [(effect, one) for effect in declared.of_kind("contact") for one in effect.obstacles]
-    # What forces may do in a step is limited where there are obstacles (`margin` of `solvers.energies.contact`).
+    # What forces may do in a step is limited where there are obstacles (`margin` of `solvers.contact.energy`).
     limit = 0.05 * scene.mesh.size if touching else np.inf
     for k in range(POINTS):
         index = 0 if k % 5 == 0 else int(rng.integers(1, max(2, frames)))

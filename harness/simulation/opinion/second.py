@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from harness.scene import Scene
-from harness.simulate import simulate
+from harness.scenes.bind import Scene
+from harness.scenes.spec import SceneSpec
 from harness.simulation.opinion.compare import Finding, Place, differ, energies, steps
 from harness.simulation.opinion.declared import Array
 from harness.simulation.opinion.points import Point, points
 from harness.simulation.opinion.sides import Side, side
 from harness.simulation.opinion.steps import state
-from harness.spec import SceneSpec
+from harness.simulation.step import simulate
 from solvers.problem import Solution, StepProblem, StopRule
 
 AGREES, DISAGREES, SINGLE = "agrees", "disagrees", "single opinion"

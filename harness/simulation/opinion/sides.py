@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from harness.effects.table import EFFECTS
-from harness.scene import Scene
+from harness.scenes.bind import Scene
+from harness.scenes.effects.table import EFFECTS
+from harness.scenes.spec import SceneSpec
 from harness.simulation.opinion import contact, edges, forces, surfaces, vertices
 from harness.simulation.opinion.declared import Begin, Declared, Opinion
 from harness.simulation.opinion.outside import from_outside, resistance
-from harness.spec import SceneSpec
 
 _OPINIONS: dict[str, Callable[[Any, Declared], Opinion]] = {
     "air-drag": vertices.air_drag,
