@@ -15,6 +15,7 @@ from harness.experiments.run import Files, execute
 from harness.record.reader import read_replay
 from harness.reference.judge import Judge, Oracle, is_minimum, reference
 from harness.report.robustness import (
+    DISPUTED,
     DIVERGED,
     OTHER,
     REFUSED,
@@ -119,6 +120,7 @@ GRADES = {
     ),
     "a motion without a reference": ([OK | {"stationarity": None, "distance": None}], SHORT),
     "diverged": ([OK | {"status": "diverged", "reason": "not finite"}], DIVERGED),
+    "disputed": ([OK | {"status": "disputed", "reason": "the second opinion disagrees: forces"}], DISPUTED),
     "refused": ([OK | {"status": "unsupported", "frame": None, "reason": "no mass"}], REFUSED),
 }
 

@@ -10,6 +10,7 @@ eps X / l of any term, and one derivative more of each:
     |error of f|   <= C eps ((1 + X/l) sum |f_e|   + X sum |f_e'|)
     |error of f'|  <= C eps ((1 + X/l) sum |f_e'|  + X sum |f_e''|)
     |error of f''| <= C eps ((1 + X/l) sum |f_e''| + X sum |f_e'''|) + |what both sides' differences differ by|
+                      + |error of f'| e/(eps s), e the eps of extended precision
 
 The last difference is s f''', and large where a corner of the energy (a limit, a contact) lies within s: there f''
 means nothing.
@@ -68,4 +69,5 @@ def tell(values: Values, x: Wide, d: Wide, reach: float, shortest: float) -> Tol
     sums = [float(np.abs(part).sum()) for part in (here, first, second)]
     sums.append(corner / float(s))
     room = [ROUNDINGS * EPS * ((1.0 + reach / shortest) * sums[k] + reach * sums[k + 1]) for k in range(3)]
-    return Told(float(here.sum()), float(first.sum()), float(second.sum()), (room[0], room[1], room[2] + corner))
+    room[2] += corner + room[1] / EPS * float(np.finfo(np.longdouble).eps / s)
+    return Told(float(here.sum()), float(first.sum()), float(second.sum()), (room[0], room[1], room[2]))
