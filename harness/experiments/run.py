@@ -23,6 +23,7 @@ from harness.base import machine, rows
 from harness.base.errors import InputError, RunFailed
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts, solver_class
+from harness.experiments.standing import standing
 from harness.record.base import RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
@@ -32,7 +33,6 @@ from harness.scenes.bind import Scene, build
 from harness.simulation.contract import where
 from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, measure
 from harness.simulation.observe import observe
-from harness.simulation.opinion.second import DISAGREES, second_opinion
 from harness.simulation.step import prepare
 from solvers import sources
 from solvers.problem import NotPositiveDefinite, Solver, StopRule, Unsupported
@@ -114,23 +114,14 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
         raise RunFailed("the recorded pass ended at other positions than the timed pass")
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
     facts["choice"] = measured.prepared.choice
-    if run.judge:
-        facts["second_opinion"] = _second_opinion(_Formulas((run.scene.digest, run.size, run.integrator), run))
+    facts |= standing(run)
     return [
         counts
         | facts
-        | _standing(facts.get("second_opinion"))
         | {"phase": t.phase, "frame": t.frame, "round": t.round, "seconds": t.seconds}
         | (by_frame[t.frame] if t.phase == "step" and t.frame else {})
         for t in measured.timings
     ]
-
-
-def _standing(opinion: str | None) -> dict[str, str]:
-    """The status of a run that was done, by what a second opinion says of its steps, where it was asked."""
-    if opinion and opinion.startswith(DISAGREES):
-        return {"status": "disputed", "reason": f"the second opinion {opinion}"}
-    return {"status": "ok"}
 
 
 def _second_pass(
@@ -207,21 +198,6 @@ def _judge(run: RunSpec, scene: Scene) -> Judge | None:
         return None
     key = (run.scene.digest, run.size, run.integrator, run.first_guess, run.frames)
     return Judge(scene, _reference(_Motion(key, run)), minimises=minimises(_solver(run)))
-
-
-@dataclass(frozen=True, slots=True)
-class _Formulas:
-    """A run's scene, and what else determines how its steps are stated; two of one key are the same."""
-
-    key: tuple[str | int, ...]
-    run: RunSpec = field(compare=False)
-
-
-@lru_cache(maxsize=32)
-def _second_opinion(formulas: _Formulas) -> str:
-    """Of the steps of a scene: once for all the solvers that are run on it."""
-    run = formulas.run
-    return second_opinion(run.scene, build(run.scene, run.size, run.integrator), run.integrator)
 
 
 @lru_cache(maxsize=1)

@@ -15,6 +15,7 @@ from scipy.sparse import csr_array
 from harness.base.model import Model
 from harness.config.load import load_any, load_scene
 from harness.experiments import run as runs
+from harness.experiments import standing
 from harness.report.robustness import DISPUTED, RIGHT, judged
 from harness.scenes.bind import Scene
 from harness.scenes.effects.base import Contribution, Pin
@@ -190,7 +191,7 @@ def test_a_run_that_is_disputed_is_not_right(tmp_path: Path, monkeypatch: pytest
         times.append(second_opinion(*given))
         return times[-1]
 
-    monkeypatch.setattr(runs, "second_opinion", counted)
+    monkeypatch.setattr(standing, "second_opinion", counted)
 
     def rows_of(run: Any) -> list[dict[str, Any]]:
         files = runs.Files.of(run, tmp_path)
@@ -199,25 +200,25 @@ def test_a_run_that_is_disputed_is_not_right(tmp_path: Path, monkeypatch: pytest
         named = {"distance": None, "stationarity": None, "frame": None, "reason": None, "minimum": None}
         return [named | row for row in done if row["phase"] == "step"]
 
-    runs._second_opinion.cache_clear()
+    standing.opinion.cache_clear()
     for run in (newton, sparse):
         done = rows_of(run)
         assert {(row["status"], row["second_opinion"]) for row in done} == {("ok", "agrees")}
     assert judged(rows_of(newton))[0] is RIGHT
     assert times == ["agrees"]  # once for the scene
     bound(Bending, scaled(weight=2.0))(monkeypatch)
-    runs._second_opinion.cache_clear()
+    standing.opinion.cache_clear()
     done = rows_of(newton)
     assert {row["status"] for row in done} == {"disputed"}
     outcome, _, _, reason = judged(done)
     assert outcome is DISPUTED
     assert reason.startswith("the second opinion disagrees: effects[2] bending")
-    runs._second_opinion.cache_clear()
+    standing.opinion.cache_clear()
 
 
 def test_a_run_that_is_not_judged_asks_for_no_second_opinion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "scene.yaml").write_text(SCENE)
-    monkeypatch.setattr(runs, "second_opinion", lambda *given: pytest.fail("was asked"))
+    monkeypatch.setattr(standing, "second_opinion", lambda *given: pytest.fail("was asked"))
     (run,) = load_any(tmp_path / "scene.yaml", solvers=["sparse"], rounds=1, record=False).runs()
     files = runs.Files.of(run, tmp_path)
     files.rows.parent.mkdir()
