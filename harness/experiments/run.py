@@ -113,8 +113,7 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
     if by_frame[run.frames]["digest"] != measured.digest:
         raise RunFailed("the recorded pass ended at other positions than the timed pass")
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
-    facts["choice"] = measured.prepared.choice
-    facts |= standing(run)
+    facts |= {"choice": measured.prepared.choice} | standing(run)
     return [
         counts
         | facts
