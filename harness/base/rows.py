@@ -90,6 +90,13 @@ COLUMNS = (
         "where judged: largest distance of a vertex from where a run of Newton's method to round-off has it in that "
         "frame, over the size at rest of the component it belongs to; null from where that is lost",
     ),
+    Column(
+        "second_opinion",
+        _TEXT,
+        "",
+        "where judged: whether the step's formulas, written once more, agree at random points: agrees, disagrees (in "
+        "what, and by how much), or single opinion (effects from outside, held against themselves)",
+    ),
     Column("energy_springs", _REAL, "J", "elastic energy of the springs after the step"),
     Column("energy_inertia", _REAL, "J", "inertia term of the step's objective"),
     Column("energy_force", _REAL, "J", "external forces' term of the step's objective"),
@@ -115,7 +122,7 @@ COLUMNS = (
     Column("flops", _REAL, "", "additions and multiplications of the phase, by count"),
     Column("working_set", _REAL, "", "bytes that the phase goes through again and again"),
     Column("load", _REAL, "", "load average over a minute when the phase was timed"),
-    Column("status", _TEXT, "", "ok, unsupported, diverged, failed or skipped"),
+    Column("status", _TEXT, "", "ok, unsupported, diverged, disputed (by the second opinion), failed or skipped"),
     Column("reason", _TEXT, "", "why the status is not ok"),
     Column("machine", _TEXT, "", "id of the machine: hash of its processor, cores and memory"),
     Column("cpu", _TEXT, "", "name of the processor"),

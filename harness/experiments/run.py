@@ -23,6 +23,7 @@ from harness.base.errors import InputError, RunFailed
 from harness.base.files import CannotWrite, replacing
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts, solver_class
+from harness.experiments.standing import standing
 from harness.record.base import RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
@@ -115,11 +116,11 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
         raise RunFailed("the recorded pass ended at other positions than the timed pass")
     require_numbers(by_frame, minimises=_solver(run).minimises, yardstick=run.tolerance is not None)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
-    facts["choice"] = measured.prepared.choice
+    facts |= {"choice": measured.prepared.choice} | standing(run)
     return [
         counts
         | facts
-        | {"status": "ok", "phase": t.phase, "frame": t.frame, "round": t.round, "seconds": t.seconds}
+        | {"phase": t.phase, "frame": t.frame, "round": t.round, "seconds": t.seconds}
         | (by_frame[t.frame] if t.phase == "step" and t.frame else {})
         for t in measured.timings
     ]

@@ -4,7 +4,8 @@ A run that means to minimise is right where every step's answer is stationary to
 for what is round-off, vertex by vertex, and a certified minimum, and the motion is that of the reference in every
 frame: all three by the oracle, never by what the solver says of itself. What it says is compared: a step that ended
 because its residual was small enough, and that the oracle finds not stationary, makes the run wrong and not merely
-unconverged. A method that does not minimise is graded by the motion alone.
+unconverged. A method that does not minimise is graded by the motion alone. Where the second opinion
+disputes the steps themselves, no run of them is right.
 """
 
 from __future__ import annotations
@@ -56,12 +57,13 @@ SHORT = Outcome("not converged", "#f2c45f", "finite, and not yet stationary, or 
 WRONG = Outcome("silently wrong", "#e0683c", "said of a step that it had converged, which the oracle finds untrue")
 DIVERGED = Outcome("diverged", "#d1495b", "positions are not finite any more")
 FAILED = Outcome("failed", "#23262b", "ended with an error")
+DISPUTED = Outcome("disputed", "#8a6d4b", "the second opinion finds the formulas of the steps themselves wrong")
 REFUSED = Outcome("refused", "#d9d9d6", "refused before it began, with a reason")
-OUTCOMES = (RIGHT, OTHER, VALLEY, SADDLE, SHORT, WRONG, DIVERGED, FAILED, REFUSED)
+OUTCOMES = (RIGHT, OTHER, VALLEY, SADDLE, SHORT, WRONG, DIVERGED, FAILED, DISPUTED, REFUSED)
 
 _CLAIMS = ("tolerance", "floor")
 """How a solve ends that takes itself for converged."""
-_ENDED = {"unsupported": REFUSED, "diverged": DIVERGED, "failed": FAILED}
+_ENDED = {"unsupported": REFUSED, "diverged": DIVERGED, "failed": FAILED, "disputed": DISPUTED}
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +121,7 @@ def judged(run: Sequence[dict[str, Any]]) -> tuple[Outcome, float | None, str, s
     """The outcome of a run from its rows, one a step; its worst figure, what that is, and why it is not right."""
     first = run[0]
     if first["status"] != "ok":
-        where = f"frame {first['frame']}: " if first["frame"] else ""
+        where = f"frame {first['frame']}: " if first["frame"] and first["status"] != "disputed" else ""
         return _ENDED[first["status"]], None, "", where + first["reason"]
     farthest = max((away for row in run if (away := row["distance"]) is not None), default=None)
     lost = any(row["distance"] is None for row in run)

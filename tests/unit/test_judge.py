@@ -16,6 +16,7 @@ from harness.record.reader import read_replay
 from harness.reference.judge import Judge, is_minimum, reference
 from harness.reference.oracle import Oracle
 from harness.report.robustness import (
+    DISPUTED,
     DIVERGED,
     OTHER,
     REFUSED,
@@ -123,6 +124,7 @@ GRADES = {
     ),
     "a motion without a reference": ([OK | {"stationarity": None, "distance": None}], SHORT),
     "diverged": ([OK | {"status": "diverged", "reason": "not finite"}], DIVERGED),
+    "disputed": ([OK | {"status": "disputed", "reason": "the second opinion disagrees: forces"}], DISPUTED),
     "refused": ([OK | {"status": "unsupported", "frame": None, "reason": "no mass"}], REFUSED),
 }
 

@@ -1,0 +1,163 @@
+"""What differs between two opinions at one point.
+
+Arrays may differ by the round-off of what was added up for them, energies and their derivatives as `derivatives` says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from harness.simulation.opinion.declared import Array
+from harness.simulation.opinion.derivatives import EPS, ROUNDINGS, Told, tell, wide
+from harness.simulation.opinion.motion import blur
+from harness.simulation.opinion.outside import own_slope
+from harness.simulation.opinion.sides import Side
+from harness.simulation.opinion.steps import Stated
+from solvers.problem import Energy, StepProblem
+
+_LARGEST_EXACT = 1000
+"""Vertices up to which the Hessian of gas is exact, as it says itself."""
+
+
+class Finding(NamedTuple):
+    """Two figures of one thing that should be the same; their distance in parts of the size of the second."""
+
+    name: str
+    by: float
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where opinions are compared: a step as it should be stated, as the harness states it, the unknown x (n, 3) [m]
+    and a direction (n, 3)."""
+
+    side: Side
+    stated: Stated
+    problem: StepProblem
+    x: Array
+    direction: Array
+
+    @property
+    def reach(self) -> float:
+        """The largest of the coordinates [m] that the step goes by."""
+        m = self.stated.moment
+        parts = (self.x, m.p, m.origin, m.time_step * m.v, self.stated.target)
+        return max(float(np.abs(part).max(initial=0.0)) for part in parts)
+
+    @property
+    def aim(self) -> float:
+        """The size [m] of which eps is the round-off of the pins' targets."""
+        size = self.reach + sum(opinion.reach for opinion in self.side.opinions)
+        moves = [motion for effect in self.side.declared.effects if (motion := getattr(effect, "motion", None))]
+        end = self.stated.moment.time + self.stated.moment.time_step
+        return max([size, *(blur(motion, size, end) / EPS for motion in moves)])
+
+
+def differ(name: str, ours: Any, theirs: Any, size: float) -> Iterator[Finding]:
+    """Arrays that differ by more than the round-off of numbers of a size."""
+    ours, theirs = wide(ours), wide(theirs)
+    if ours.shape != theirs.shape:
+        yield Finding(f"{name} (number)", 1.0)
+        return
+    away = float(np.where(ours == theirs, 0.0, np.abs(ours - theirs)).max(initial=0.0))
+    if not away <= ROUNDINGS * EPS * size:
+        yield Finding(name, _part(away, float(np.abs(theirs).max(initial=0.0))))
+
+
+def _part(away: float, size: float) -> float:
+    return away / max(size, np.finfo(float).tiny)
+
+
+def steps(at: Place) -> Iterator[Finding]:
+    """Masses, inertia, forces, pins."""
+    system, problem, stated = at.problem.system, at.problem, at.stated
+    m, start, mass, reach = stated.moment, at.problem.start, at.side.declared.mass, at.reach
+    dt, most = m.time_step, float(np.abs(mass).max(initial=0.0))
+    yield from differ("masses", system.mass, mass, most)
+    yield from differ("inertia", system.inertia, stated.c * mass / dt**2, stated.c * most / dt**2)
+    yield from differ("inertial target", problem.target, stated.target, reach)
+    yield from differ("the step's start", start.positions, m.p, reach)
+    yield from differ("filtered velocities", start.velocity, m.v, reach / dt)
+    yield from differ("origin of velocities", start.origin, m.origin, reach)
+    yield from differ("rate of velocities", [start.rate, system.rate], [m.rate, m.rate], m.rate)
+    yield from differ("times", [start.time, start.until], [m.time, m.until], max(m.until, dt))
+    yield from differ("forces", problem.force, stated.force, stated.force_size * (1.0 + reach / at.side.shortest()))
+    if system.pins.vertices.tolist() != stated.vertices:
+        yield Finding("pinned vertices", 1.0)
+        return
+    soft = max((w for w in stated.weights if np.isfinite(w)), default=0.0)
+    yield from differ("weights of pins", system.pins.weight, stated.weights, soft)
+    yield from differ("targets of pins", problem.pin_targets, stated.held, at.aim)
+
+
+def energies(at: Place) -> Iterator[Finding]:
+    """The energies of each effect, and the objective that all terms add up to."""
+    side, stated, reach = at.side, at.stated, at.reach
+    free = at.direction.copy()
+    free[[i for i, w in zip(stated.vertices, stated.weights, strict=True) if np.isinf(w)]] = 0.0
+    x, d = wide(at.x), wide(free)
+    parts = [_others(at, x, d)]
+    for k, begin in enumerate(side.begins):
+        own = [at.problem.energies[i] for i in side.owned[k]]
+        if begin is None:
+            told, wrong = own_slope(own, at.x, free, reach, side.shortest())
+            if wrong is not None:
+                yield Finding(f"{side.name(k)} (gradient against its own value)", wrong)
+        else:
+            told = tell(begin(stated.moment), x, d, _reach_of(at, k), side.shortest(k))
+            if np.isfinite(told.value) or any(np.isfinite(energy.value(at.x)) for energy in own):
+                yield from _against(side.name(k), told, own, at.x, free)
+        parts.append(told)
+    if not all(np.isfinite(part.value) for part in parts):
+        return
+    # Forces are told in float64, each vertex's by a sum of its own.
+    pulled = ROUNDINGS * EPS * float(np.abs(d).sum()) * stated.force_size
+    room = [sum(part.allowed[k] for part in parts) for k in range(2)]
+    value, slope = at.problem.value(at.x), float((at.problem.gradient(at.x) * free).sum())
+    yield from _told("objective (value)", value, sum(part.value for part in parts), room[0] + reach * pulled)
+    yield from _told("objective (gradient)", slope, sum(part.slope for part in parts), room[1] + pulled)
+
+
+def _reach_of(at: Place, k: int) -> float:
+    """The largest coordinate [m] that effect k goes by, with what moves."""
+    effect, reach = at.side.declared.effects[k], at.reach + at.side.opinions[k].reach
+    moving = [effect, *getattr(effect, "obstacles", ())]
+    late = at.stated.moment.time + at.stated.moment.time_step
+    return max([reach, *(blur(getattr(one, "motion", None), reach, late) / EPS for one in moving)])
+
+
+def _against(name: str, told: Told, own: Sequence[Energy], x: Array, d: Array) -> Iterator[Finding]:
+    """The energies of one effect against what is told of them."""
+    gradient = np.zeros_like(x)
+    for energy in own:
+        energy.add_gradient(x, gradient)
+    yield from _told(f"{name} (value)", sum(energy.value(x) for energy in own), told.value, told.allowed[0])
+    yield from _told(f"{name} (gradient)", float((gradient * d).sum()), told.slope, told.allowed[1])
+    if len(x) <= _LARGEST_EXACT or "gas" not in name:
+        flat = d.ravel()
+        bend = sum(float(flat @ (energy.hessian(x) @ flat)) for energy in own)
+        yield from _told(f"{name} (Hessian)", bend, told.bend, told.allowed[2])
+
+
+def _told(name: str, ours: float, theirs: float, room: float) -> Iterator[Finding]:
+    if not abs(ours - theirs) <= room:
+        yield Finding(name, _part(abs(ours - theirs), abs(theirs)))
+
+
+def _others(at: Place, x: Any, d: Any) -> Told:
+    """Inertia, the pins' penalties and the forces."""
+    stated = at.stated
+    soft = [i for i, w in enumerate(stated.weights) if np.isfinite(w)]
+    held, weight = [stated.vertices[i] for i in soft], wide([stated.weights[i] for i in soft])
+    inertia = wide(stated.c * at.side.declared.mass / stated.moment.time_step**2)
+
+    def values(y: Any) -> Any:
+        away, sag = y - wide(stated.target), y[held] - stated.held[soft]
+        squares = [inertia / 2 * (away**2).sum(axis=1), weight / 2 * (sag**2).sum(axis=1)]
+        return np.concatenate([*squares, -(y * stated.force).sum(axis=1)])
+
+    return tell(values, x, d, max(at.reach, at.aim), at.reach or 1.0)

@@ -1,0 +1,142 @@
+"""Contact with Coulomb friction once more (formulas: `solvers.contact.energy`, `solvers.contact.planes`).
+
+    k_i/2 min(0, n.x_i - d)^2 + F_i h(|u_i|),   u_i = (I - nn')(x_i - a_i),   h(u) = u^2/(2 slip), beyond it u - slip/2
+
+    k_i = 4 Q_ii max(1, speed dt / tolerance)              F_i = mu k_i depth where the step starts
+
+The half-space n.x >= d touches an obstacle, R outwards, where Newton's method for f = R ends, f the distance to the
+obstacle along the straight way of the vertex in one step, both seen from the obstacle. Here obstacles are told by the
+points of space that they were declared with, moved back and forth by their motion.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion
+from harness.simulation.opinion.derivatives import Values, Wide, length, wide
+from harness.simulation.opinion.motion import place
+
+_ITERATIONS = 40
+_THERE = 1e-6
+"""Of R: so near is on the surface."""
+
+
+def contact(effect: Any, declared: Declared) -> Opinion:
+    """Contact with every obstacle of the effect; its stiffness follows from what else resists."""
+    depth = effect.thickness / 10 if effect.tolerance is None else effect.tolerance
+    slip = effect.creep * declared.mesh.spacing
+
+    def needs(resists: Array) -> Begin:
+        k = 4 * wide(resists) * max(1.0, effect.speed * declared.time_step / depth)
+
+        def begin(moment: Moment) -> Values:
+            parts = [_of_obstacle(effect, one, k, slip, moment) for one in effect.obstacles]
+            return lambda x: np.concatenate([values(x) for values in parts])
+
+        return begin
+
+    return Opinion(needs=needs, shortest=depth, reach=max(map(_reach, effect.obstacles)))
+
+
+def _of_obstacle(effect: Any, one: Any, k: Wide, slip: float, moment: Moment) -> Values:
+    R = radius(one) + effect.thickness
+    begun, ended = (place(one.motion, moment.time + dt) for dt in (0.0, moment.time_step))
+    a, b = begun.back(moment.p), ended.back(moment.p + moment.time_step * moment.v)
+    touched, out = _half_space(one, a, b, R)
+    n = out @ ended.turn.T
+    d = (n * ended.there(touched + R * out)).sum(axis=1)
+    carried = ended.there(a)
+    depth = np.maximum(0, d - (n * carried).sum(axis=1))
+    # Of the step's end; where x belongs to an earlier time, nearer to the start in proportion.
+    w, started = moment.when, (n * moment.p).sum(axis=1)
+    offset, anchor = started + w * (d - started), moment.p + w * (carried - moment.p)
+    grip = effect.friction * k * w * depth
+    grips = grip > 0
+
+    def values(x: Wide) -> Wide:
+        gap = (n * x).sum(axis=1) - offset
+        pressed = k / 2 * np.where(gap.real < 0, gap, 0) ** 2
+        away, normal = (x - anchor)[grips], n[grips]
+        across = away - (away * normal).sum(axis=1)[:, None] * normal
+        square = (across**2).sum(axis=1)
+        sticks = square.real <= slip**2
+        slipped = np.where(sticks, square / (2 * slip), np.sqrt(np.where(sticks, 1, square)) - slip / 2)
+        return np.concatenate([pressed, grip[grips] * slipped])
+
+    return values
+
+
+def _half_space(one: Any, a: Wide, b: Wide, R: float) -> tuple[Wide, Wide]:
+    """The nearest points of the obstacle and the normals there, (n, 3) each, where Newton's method ends on the ways
+    from a to b (n, 3)."""
+    begin, end = wide(np.zeros(len(a))), wide(np.full(len(a), np.inf))
+    far, touched, out = nearest(one, a)
+    slope = (out * (b - a)).sum(axis=1)
+    for _ in range(_ITERATIONS):
+        left = np.flatnonzero((far > (1 + _THERE) * R) & (slope < 0))
+        s = begin[left] - (far[left] - R) / slope[left]
+        left, s = left[s < 1], s[s < 1]
+        if not len(left):
+            break
+        s = np.where(s >= end[left], (begin[left] + end[left]) / 2, s)
+        there, at, normal = nearest(one, a[left] + s[:, None] * (b - a)[left])
+        steep = (normal * (b - a)[left]).sum(axis=1)
+        falls = steep < 0
+        on = left[falls]
+        begin[on], far[on], slope[on], touched[on], out[on] = (x[falls] for x in (s, there, steep, at, normal))
+        end[left[~falls]] = s[~falls]  # past the nearest point of the way: it misses the obstacle
+    return touched, out
+
+
+def radius(one: Any) -> float:
+    """The radius [m] around what `nearest` tells the distance of."""
+    return one.radius if one.kind in ("sphere", "capsule") else 0.0
+
+
+def nearest(one: Any, x: Wide) -> tuple[Wide, Wide, Wide]:
+    """The distances (m,) [m] of points (m, 3) from an obstacle as declared, its radius aside, negative inside; the
+    nearest points of its surface and the normals there, (m, 3) each."""
+    if one.kind == "plane":
+        n = wide(one.normal)
+        out = np.tile(n / np.sqrt(n @ n), (len(x), 1))
+        far = ((x - wide(one.point)) * out).sum(axis=1)
+        return far, x - far[:, None] * out, out
+    if one.kind == "sphere":
+        touched = np.tile(wide(one.center), (len(x), 1))
+    elif one.kind == "capsule":
+        first, last = wide(one.ends)
+        way = last - first
+        part = np.clip((x - first) @ way / (way @ way), 0, 1)
+        touched = first + part[:, None] * way
+    else:
+        return _nearest_of_box(wide(one.low), wide(one.high), x)
+    far = length(x - touched)
+    return far, touched, (x - touched) / far[:, None]
+
+
+def _nearest_of_box(low: Wide, high: Wide, x: Wide) -> tuple[Wide, Wide, Wide]:
+    touched = np.clip(x, low, high)
+    far, out = length(x - touched), x - touched
+    for k, point in enumerate(x):
+        if far[k] > 0:
+            out[k] /= far[k]
+            continue
+        faces = np.stack([high - point, point - low], axis=1).ravel()  # +x, -x, +y, ...
+        face = int(faces.argmin())
+        out[k], far[k] = 0, -faces[face]
+        out[k, face // 2] = 1 - 2 * (face % 2)
+        touched[k, face // 2] = (high, low)[face % 2][face // 2]
+    return far, touched, out
+
+
+def _reach(one: Any) -> float:
+    """The largest coordinate [m] that an obstacle is declared with, infinite planes by their point."""
+    sizes = [np.abs(getattr(one, name)).max() for name in _SIZES[one.kind]]
+    moves = [np.abs(key.offset).max() for key in one.motion.keys] if one.motion else [0.0]
+    return float(max(sizes) + max(moves))
+
+
+_SIZES = {"plane": ("point",), "sphere": ("center", "radius"), "capsule": ("ends", "radius"), "box": ("low", "high")}

@@ -1,0 +1,128 @@
+"""External forces once more: weight, newtons a vertex, and wind.
+
+gravity          m g                          constant force   the same newtons on every vertex
+wind             the field on every vertex, or shared as the mass is, or on triangles (Keckeisen et al. 2004)
+
+    f = rho/2 A |u| (n.u) (C_D u/|u| + C_L (n - (n.u) u/|u|^2)),   at most m |u| / dt
+
+with u the air's velocity less the triangle's and n its normal on the side where n.u >= 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from harness.simulation.opinion.declared import Array, Declared, Opinion
+from harness.simulation.opinion.surfaces import triangle_areas
+
+Field = Callable[[Array, float], Array]
+
+
+def gravity(effect: Any, declared: Declared) -> Opinion:
+    """Weight."""
+    weight = declared.mass[:, None] * np.array(effect.acceleration)
+    return Opinion(force=lambda p, v, t: (weight, float(np.abs(weight).max())))
+
+
+def constant_force(effect: Any, declared: Declared) -> Opinion:
+    """The same newtons on every vertex."""
+    force = np.ones((len(declared.mass), 1)) * np.array(effect.force)
+    return Opinion(force=lambda p, v, t: (force, float(np.abs(force).max())))
+
+
+def wind(effect: Any, declared: Declared) -> Opinion:
+    """The field, on what it acts on."""
+    field, phase = _FIELDS[effect.field](effect, declared)
+
+    def on_vertices(p: Array, v: Array, t: float) -> tuple[Array, float]:
+        share = np.ones(len(p)) if effect.per == "vertex" else declared.mesh.shares
+        force = share[:, None] * field(p, t)
+        return force, float(share.max() * np.abs(_most(effect)).max() * (1.0 + phase(p, t)))
+
+    def on_triangles(p: Array, v: Array, t: float) -> tuple[Array, float]:
+        triangles, areas = declared.mesh.triangles, triangle_areas(p, declared.mesh.triangles)
+        at_rest = triangle_areas(declared.mesh.rest, triangles)
+        around = np.zeros(len(p))
+        for triangle, area in zip(triangles, at_rest, strict=True):
+            around[triangle] += area
+        total, size = np.zeros_like(p), 0.0
+        middles = field(p[triangles].mean(axis=1), t) * np.ones((len(triangles), 1))
+        for triangle, area, rested, air in zip(triangles, areas, at_rest, middles, strict=True):
+            a, b, c = p[triangle]
+            u = air - v[triangle].sum(axis=0) / 3
+            speed = np.sqrt(u @ u)
+            if area == 0 or speed == 0:
+                continue
+            n = np.cross(b - a, c - a) / (2 * area)
+            n = n if n @ u >= 0 else -n
+            lift = n - (n @ u) * u / speed**2
+            f = effect.density / 2 * area * speed * (n @ u) * (effect.drag * u / speed + effect.lift * lift)
+            most = sum(rested * declared.mass[i] / around[i] for i in triangle) * speed / declared.time_step
+            asked = np.sqrt(f @ f)
+            f = f * (most / asked) if asked > most else f
+            total[triangle] += f / 3
+            size += min(asked, most) * (1 + (np.abs(air).max() + np.abs(v[triangle]).max()) / speed)
+        return total, size * (1.0 + phase(p, t))
+
+    return Opinion(force=on_triangles if effect.per == "triangle" else on_vertices)
+
+
+def _mean(effect: Any) -> Array:
+    return effect.strength * np.array(effect.velocity if effect.per == "triangle" else effect.force)
+
+
+def _most(effect: Any) -> Array:
+    """The largest that the field gets, about."""
+    return effect.strength * np.array([6.0, 2.0, 1.0]) if effect.field == "assignment" else 3.0 * _mean(effect)
+
+
+def _constant(effect: Any, declared: Declared) -> tuple[Field, Callable[[Array, float], float]]:
+    return lambda x, t: np.ones((len(x), 1)) * _mean(effect), lambda x, t: 0.0
+
+
+def _assignment(effect: Any, declared: Declared) -> tuple[Field, Callable[[Array, float], float]]:
+    low, high = declared.mesh.rest.min(axis=0), declared.mesh.rest.max(axis=0)
+    diagonal = float(np.sqrt(((high - low) ** 2).sum())) or 1.0
+
+    def field(x: Array, t: float) -> Array:
+        blown = [
+            (3 + 1.5 * (1 + np.cos(5 * phi)), 1 + np.cos(0.3 + phi), np.sin(phi)) for phi in x[:, 0] / diagonal + t
+        ]
+        return effect.strength * np.array(blown)
+
+    return field, lambda x, t: 5 * (float(np.abs(x).max()) / diagonal + abs(t))
+
+
+def _gusts(effect: Any, declared: Declared) -> tuple[Field, Callable[[Array, float], float]]:
+    """Sixteen waves, their frequencies spread evenly by their logarithms from a quarter to four times the middle, with
+    random phases; the numbers are drawn in that order from NumPy's generator of the seed."""
+    mean, waves = _mean(effect), 16
+    speed = float(np.sqrt((mean**2).sum()))
+    if not speed:
+        return _constant(effect, declared)
+    draws = np.random.default_rng(effect.seed)
+    octaves = draws.uniform(np.log(0.25), np.log(4), waves)
+    phases = draws.uniform(0, 2 * np.pi, (waves, 3))
+    ways = declared.mesh.rest.max(axis=0) - declared.mesh.rest.min(axis=0)
+    size = float(np.sqrt((ways**2).sum())) or 1.0
+    slow = mean / speed**2 if effect.per == "triangle" else mean / (speed * size)
+
+    def field(x: Array, t: float) -> Array:
+        blown = np.ones((len(x), 1)) * mean
+        for octave, shift in zip(octaves, phases, strict=True):
+            w = 2 * np.pi * effect.frequency * np.exp(octave)
+            blown += effect.gustiness * speed * np.sqrt(2 / waves) * np.cos(w * (t - (x @ slow)[:, None]) + shift)
+        return blown
+
+    fastest = 8 * np.pi * effect.frequency
+    return field, lambda x, t: (1 + effect.gustiness) * (1 + fastest * (abs(t) + float(np.abs(x @ slow).max())))
+
+
+_FIELDS: dict[str, Callable[..., tuple[Field, Callable[[Array, float], float]]]] = {
+    "assignment": _assignment,
+    "constant": _constant,
+    "gusts": _gusts,
+}

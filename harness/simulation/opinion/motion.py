@@ -1,0 +1,95 @@
+"""Key frames once more, with the axis k and the angle a of a turn:
+
+    q(t) = about + R (q - about) + offset,   R v = v cos a + k x v sin a + k (k.v)(1 - cos a)
+
+Between keys straight, or by monotone cubics (Fritsch and Carlson 1980, with the slopes of Fritsch and Butland 1984).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from harness.simulation.opinion.derivatives import EPS, Wide, wide
+
+_PI = 4 * np.arctan(np.longdouble(1))
+
+
+class Place(NamedTuple):
+    """A rigid motion at one time: the rotation R (3, 3), a point on its axis and the offset (3,) [m]."""
+
+    turn: Wide
+    about: Wide
+    offset: Wide
+
+    def there(self, q: Wide) -> Wide:
+        """Where points declared at q (m, 3) [m] are."""
+        return self.about + (q - self.about) @ self.turn.T + self.offset
+
+    def back(self, x: Wide) -> Wide:
+        """Where points that are at x (m, 3) [m] were declared."""
+        return self.about + (x - self.offset - self.about) @ self.turn
+
+
+_STILL = Place(wide(np.eye(3)), wide(np.zeros(3)), wide(np.zeros(3)))
+
+
+def place(motion: Any, time: float) -> Place:
+    """Where a motion (None: none) is at a time [s]."""
+    if motion is None:
+        return _STILL
+    times = wide([key.time for key in motion.keys])
+    values = wide([(*key.offset, key.turn) for key in motion.keys])
+    *offset, turn = _between(times, values, min(max(wide(time), times[0]), times[-1]), motion.between)
+    k, angle = wide(motion.axis), np.remainder(turn, 360) * _PI / 180
+    k = k / np.sqrt(k @ k)
+    cos, sin = np.cos(angle), np.sin(angle)
+    columns = [e * cos + np.cross(k, e) * sin + k * (k @ e) * (1 - cos) for e in np.eye(3)]
+    return Place(np.stack(columns, axis=1), wide(motion.about), wide(offset))
+
+
+def blur(motion: Any, size: float, time: float) -> float:
+    """How far [m] round-off may take points that lie within `size` [m] of zero, at a time [s]."""
+    if motion is None:
+        return EPS * size
+    times, turns = ([getattr(key, name) for key in motion.keys] for name in ("time", "turn"))
+    values = np.array([(*key.offset, np.deg2rad(key.turn)) for key in motion.keys])
+    arm = size + float(np.abs(motion.about).max())
+    steep = np.abs(np.diff(values, axis=0) / np.diff(times)[:, None]).max(axis=0, initial=0.0)
+    far = arm + float(np.abs(values[:, :3]).max()) + arm * np.deg2rad(np.abs(turns).max())
+    return EPS * (far + max(time, *times) * (steep[:3].max() + arm * steep[3]))
+
+
+def _between(times: Wide, values: Wide, t: Any, how: str) -> Wide:
+    """Offset [m] and turn [degrees] at t, (4,)."""
+    if len(times) == 1:
+        return values[0]
+    k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
+    h = times[k + 1] - times[k]
+    s = (t - times[k]) / h
+    if how == "linear":
+        return values[k] + s * (values[k + 1] - values[k])
+    a, b = (np.array([_slope(times, column, j) for column in values.T]) * h for j in (k, k + 1))
+    ease = s * s * (3 - 2 * s)
+    return values[k] * (1 - ease) + values[k + 1] * ease + a * s * (1 - s) ** 2 - b * s * s * (1 - s)
+
+
+def _slope(times: Wide, y: Wide, j: int) -> Any:
+    """The slope of the cubics at key j: a weighted harmonic mean, zero where the way turns back."""
+    h, last = np.diff(times), len(times) - 1
+    rise = np.diff(y) / h
+    if last == 1:
+        return rise[0]
+    if 0 < j < last:
+        if rise[j - 1] * rise[j] <= 0:
+            return np.longdouble(0)
+        one, two = 2 * h[j] + h[j - 1], h[j] + 2 * h[j - 1]
+        return (one + two) / (one / rise[j - 1] + two / rise[j])
+    near, far = (0, 1) if j == 0 else (last - 1, last - 2)
+    end = ((2 * h[near] + h[far]) * rise[near] - h[near] * rise[far]) / (h[near] + h[far])
+    if np.sign(end) != np.sign(rise[near]):
+        return np.longdouble(0)
+    if np.sign(rise[near]) != np.sign(rise[far]) and abs(end) > 3 * abs(rise[near]):
+        return 3 * rise[near]
+    return end

@@ -1,0 +1,89 @@
+"""Effects from outside, of which nobody has written a second opinion: they are held against themselves.
+
+The gradient of an energy is compared with complex steps of its own value; where that does not take complex numbers, or
+is no analytic function of them, with central differences at two steps, whose distance tells how far off they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from harness.scenes.effects.base import Contribution, Pin
+from harness.simulation.opinion.declared import Array, Opinion
+from harness.simulation.opinion.derivatives import EPS, ROUNDINGS, Told, wide
+from harness.simulation.opinion.vertices import moved
+from solvers.problem import Energy, LaggedEnergy, ProjectiveEnergy, Start
+
+_TINY = 1e-100
+
+
+def from_outside(bound: Contribution) -> Opinion:
+    """The forces, filters and pins of an effect, as they are."""
+
+    def force(p: Array, v: Array, t: float) -> tuple[Array, float]:
+        parts = [np.asarray(one(p, v, t)) for one in bound.forces]
+        return sum(parts, np.zeros_like(p)), sum(float(np.abs(part).max()) for part in parts)
+
+    def decay(v: Array) -> Array:
+        for one in bound.filters:
+            v = one(v)
+        return v
+
+    held = {i: (pin.weight, moved(pin.motion, q)) for pin in bound.pins for i, q in _each(pin)}
+    return Opinion(force=force if bound.forces else None, decay=decay if bound.filters else None, pins=held)
+
+
+def _each(pin: Pin) -> list[tuple[int, Any]]:
+    return list(zip(pin.vertices.tolist(), wide(pin.targets), strict=True))
+
+
+def resistance(energies: Sequence[Energy], n: int, time_step: float) -> Array:
+    """What energies say that they add to the diagonal of Q (n,) [N/m] at the rate 1/dt."""
+    zero, total = np.zeros((n, 3)), np.zeros(n)
+    start = Start(zero, zero, 0.0, zero, 1.0 / time_step, 0.0)
+    for energy in energies:
+        begun = energy.begin_step(start) if isinstance(energy, LaggedEnergy) else energy
+        if isinstance(begun, ProjectiveEnergy):
+            total += begun.stiffness_matrix(n).diagonal()
+    return total
+
+
+def own_slope(own: Sequence[Energy], x: Array, d: Array, reach: float, shortest: float) -> tuple[Told, float | None]:
+    """The values and gradients of energies along d at x, both (n, 3), and by how much of its size the gradient is not
+    that of the value, None where it is."""
+    values, slopes, wrong = [], [], None
+    for energy in own:
+        gradient = np.zeros_like(x)
+        energy.add_gradient(x, gradient)
+        value, slope = float(energy.value(x)), float((gradient * d).sum())
+        size = float(np.abs(gradient * d).sum())
+        if not (_by_complex_steps(energy, x, d, slope, size, reach / shortest) or not np.isfinite(value)):
+            found, room = _by_differences(energy, x, d, 1e-4 * shortest, reach)
+            if not abs(found - slope) <= room + ROUNDINGS * EPS * (1.0 + reach / shortest) * size:
+                wrong = max(wrong or 0.0, abs(found - slope) / max(abs(found), size, np.finfo(float).tiny))
+        values.append(value)
+        slopes.append(slope)
+    rounded = ROUNDINGS * EPS
+    room = rounded * sum(map(abs, values)), rounded * sum(map(abs, slopes)), 0.0
+    return Told(sum(values), sum(slopes), 0.0, room), wrong
+
+
+def _by_complex_steps(energy: Any, x: Array, d: Array, slope: float, size: float, far: float) -> bool:
+    """Whether the derivative of the energy's value by a complex step is the slope."""
+    try:
+        found = complex(energy.value(x + 1j * _TINY * d)).imag / _TINY
+    except Exception:  # it is made for real numbers, and may say so in any way
+        return False
+    return bool(abs(found - slope) <= ROUNDINGS * EPS * (1.0 + far) * size)
+
+
+def _by_differences(energy: Any, x: Array, d: Array, h: float, reach: float) -> tuple[float, float]:
+    """The derivative by differences of the step h [m], the error of its second order taken out; and how far off it
+    is."""
+    values = [float(energy.value(x + s * h * d)) for s in (-1.0, -0.5, 0.5, 1.0)]
+    rough, fine = (values[3] - values[0]) / (2 * h), (values[2] - values[1]) / h
+    room = abs(rough - fine) + ROUNDINGS * EPS * (max(map(abs, values)) / h + reach / h * abs(fine))
+    return (4 * fine - rough) / 3, room

@@ -1,0 +1,70 @@
+"""Where opinions are compared: random motions and unknowns around a scene's start and its rest shape.
+
+They differ from those by 1e-3 to 0.5 of the spacing of the mesh, and move by as much in a step. Where there are
+obstacles the mesh is brought up to one, so that something touches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harness.scenes.bind import Scene
+from harness.simulation.opinion.contact import nearest, radius
+from harness.simulation.opinion.declared import Array, Declared
+from harness.simulation.opinion.derivatives import wide
+from harness.simulation.opinion.motion import place
+from harness.simulation.step import State, start
+
+POINTS = 20
+FRACTIONS = (1e-3, 1e-2, 0.1, 0.5)
+"""Of the spacing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """The state that a step starts from, shifts (n, 3) [m] of its unknown from where the velocity leads, and a
+    direction (n, 3)."""
+
+    state: State
+    shift: Array
+    direction: Array
+
+
+def points(scene: Scene, declared: Declared, frames: int) -> Iterator[Point]:
+    """The points of a scene, the same each time; steps are any of the scene's frames, and every fifth the first."""
+    rng, rest = np.random.default_rng(0), scene.mesh.rest
+    begun = start(scene).now
+    touching = [(effect, one) for effect in declared.of_kind("contact") for one in effect.obstacles]
+    # What forces may do in a step is limited where there are obstacles (`margin` of `solvers.contact.energy`).
+    limit = 0.05 * scene.mesh.size if touching else np.inf
+    for k in range(POINTS):
+        index = 0 if k % 5 == 0 else int(rng.integers(1, max(2, frames)))
+        of = scene.at(index)
+        dt, some = of.system.time_step, FRACTIONS[k % len(FRACTIONS)] * scene.mesh.spacing
+        p = (begun.positions if k // len(FRACTIONS) % 2 == 0 else rest) + some * rng.normal(size=rest.shape)
+        v = begun.velocity + some / dt * rng.normal(size=rest.shape)
+        if touching:
+            effect, one = touching[k % len(touching)]
+            p = _brought(effect, one, p, scene.time(index), rng)
+        before = p - dt * v + some * rng.normal(size=rest.shape), v + some / dt * rng.normal(size=rest.shape)
+        shift = some * rng.normal(size=rest.shape)
+        far = np.linalg.norm(shift, axis=1).max()
+        shift *= min(1.0, limit / far) if far else 1.0
+        yield Point(
+            State(type(begun)(p, v), type(begun)(*before) if index else None, index),
+            shift,
+            rng.normal(size=rest.shape),
+        )
+
+
+def _brought(effect: Any, one: Any, p: Array, time: float, rng: np.random.Generator) -> Array:
+    """Positions (n, 3) [m] as a whole so near to an obstacle that a random vertex is within the thickness."""
+    at = place(one.motion, time)
+    which = int(rng.integers(len(p)))
+    far, _, out = nearest(one, at.back(wide(p[which : which + 1])))
+    wanted = radius(one) + effect.thickness * rng.uniform()
+    return p + np.asarray((wanted - far[0]) * (out @ at.turn.T)[0], float)

@@ -1,0 +1,83 @@
+"""The second opinion of a scene: whether two ways to write its steps agree at random points.
+
+At each point the harness states one step and does it, with a solver that answers the point. Compared are the masses,
+the inertia and its target, the forces, the pins, the motion after the step; the energy of each effect, its gradient and
+its Hessian along a random direction; and the objective that all add up to. An effect from outside has no second
+opinion: its energies' gradients are held against their own values; its forces, pins and filters are taken as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from harness.scenes.bind import Scene
+from harness.scenes.spec import SceneSpec
+from harness.simulation.opinion.compare import Finding, Place, differ, energies, steps
+from harness.simulation.opinion.declared import Array
+from harness.simulation.opinion.points import Point, points
+from harness.simulation.opinion.sides import Side, side
+from harness.simulation.opinion.steps import state
+from harness.simulation.step import simulate
+from solvers.problem import Solution, StepProblem, StopRule
+
+AGREES, DISAGREES, SINGLE = "agrees", "disagrees", "single opinion"
+
+
+def second_opinion(spec: SceneSpec, scene: Scene, integrator: str) -> str:
+    """`agrees`; `disagrees: what, by how much; ...`; or `single opinion: effects` where there is no second one.
+
+    scene: what was built of the spec with the integrator of that name.
+    """
+    with np.errstate(all="ignore"):  # what is not finite is compared like all else
+        sides = [side(spec, scene)]
+        if scene.alternate:
+            sides.append(side(spec.stepped(scene.alternate.system.time_step), scene.alternate))
+        found: dict[str, float] = {}
+        for point in points(scene, sides[0].declared, spec.frames):
+            for finding in _compared(sides, scene, integrator, point):
+                found[finding.name] = max(finding.by, found.get(finding.name, 0.0))
+    if found:
+        worst = sorted(found.items(), key=lambda item: -item[1])
+        return f"{DISAGREES}: " + "; ".join(f"{name}, by {by:.2g} of its size" for name, by in worst)
+    single = ", ".join(sides[0].name(k) for k in sorted(sides[0].outside))
+    return f"{SINGLE}: {single}" if single else AGREES
+
+
+class _Answer:
+    """Stands for a prepared solver: what it answers to any step is x (n, 3) [m]."""
+
+    def __init__(self, x: Array) -> None:
+        self.x = x
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """The one answer."""
+        return Solution(self.x, 0, float("nan"), float("nan"), "iterations")
+
+
+def _compared(sides: list[Side], scene: Scene, integrator: str, point: Point) -> Iterator[Finding]:
+    """What differs at one point."""
+    index, now, before = point.state.index, point.state.now, point.state.before
+    own = sides[index % len(sides)]
+    time = sum(sides[k % len(sides)].declared.time_step for k in range(len(sides))) * (index // len(sides))
+    time += sides[0].declared.time_step * (index % len(sides))
+    stated = state(integrator, own.declared, own.opinions, now, before, time)
+    m = stated.moment
+    x = np.asarray(m.p + m.when * m.time_step * m.v, float) + point.shift
+    answer: Any = _Answer(x)
+    run = simulate(scene, answer, StopRule(), first_guess="current", frames=index + 1, state=point.state)
+    done = next(run)
+    at = Place(own, stated, done.problem, x, point.direction)
+    yield from steps(at)
+    p, v = stated.after(x)
+    after = done.state
+    yield from differ("positions after the step", after.now.positions, p, at.reach)
+    yield from differ("velocities after the step", after.now.velocity, v, m.rate * at.reach)
+    if after.before is None:
+        yield Finding("the motion before (number)", 1.0)
+    else:
+        yield from differ("positions before", after.before.positions, m.p, at.reach)
+        yield from differ("velocities before", after.before.velocity, m.v, at.reach / m.time_step)
+    yield from energies(at)

@@ -1,0 +1,87 @@
+"""One side of the comparison: what a scene declares and what the second opinion makes of each effect."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harness.scenes.bind import Scene
+from harness.scenes.effects.table import EFFECTS
+from harness.scenes.spec import SceneSpec
+from harness.simulation.opinion import contact, edges, forces, surfaces, vertices
+from harness.simulation.opinion.declared import Begin, Declared, Opinion
+from harness.simulation.opinion.outside import from_outside, resistance
+
+_OPINIONS: dict[str, Callable[[Any, Declared], Opinion]] = {
+    "air-drag": vertices.air_drag,
+    "attachments": vertices.attachments,
+    "bending": surfaces.bending,
+    "constant-force": forces.constant_force,
+    "contact": contact.contact,
+    "dashpots": edges.dashpots,
+    "ether-drag": vertices.ether_drag,
+    "gas": surfaces.gas,
+    "gravity": forces.gravity,
+    "pins": vertices.pins,
+    "rayleigh": vertices.rayleigh,
+    "springs": edges.springs,
+    "strain-limits": edges.strain_limits,
+    "wind": forces.wind,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """A scene with steps of one length: what it declares, the opinion of each effect and its energies, None for none;
+    owned: which of the scene's energies are each effect's; outside: the effects of which there is no second opinion."""
+
+    declared: Declared
+    opinions: list[Opinion]
+    begins: list[Begin | None]
+    owned: list[list[int]]
+    outside: set[int]
+
+    def name(self, k: int) -> str:
+        """Effect k in words."""
+        return f"effects[{k}] {self.declared.effects[k].kind}"
+
+    def shortest(self, k: int | None = None) -> float:
+        """The shortest length [m] that effect k goes by, springs at rest if left out."""
+        lengths = self.declared.mesh.rest_lengths
+        springs = float(lengths[lengths > 0.0].min(initial=self.declared.mesh.spacing))
+        return springs if k is None else min(springs, self.opinions[k].shortest)
+
+
+def side(spec: SceneSpec, scene: Scene) -> Side:
+    """What is thought of a scene that was built of the spec."""
+    mesh, dt = scene.mesh, spec.time_step
+    mass = np.asarray(mesh.mass if spec.mass is None else spec.mass * mesh.shares)
+    declared = Declared(mesh, mass, dt, tuple(spec.effects))
+    bound = [effect.bind(mesh, mass, dt) for effect in declared.effects]
+    # In the order in which a scene lines them up: each effect's, then what follows from all of those.
+    first = [energy for part in bound for energy in part.energies]
+    owners = [k for k, part in enumerate(bound) for _ in part.energies]
+    owners += [k for k, part in enumerate(bound) for derive in part.derived for _ in derive(first)]
+    owned = [[i for i, owner in enumerate(owners) if owner == k] for k in range(len(bound))]
+    outside = {k for k, effect in enumerate(declared.effects) if not _known(effect)}
+    if any(owned[k] for k in outside):  # nobody knows what damping by stiffness makes of their energies
+        outside |= {k for k, one in enumerate(declared.effects) if one.kind == "rayleigh" and one.stiffness}
+    opinions, resists = [], mass / dt**2
+    for k, (effect, part) in enumerate(zip(declared.effects, bound, strict=True)):
+        if k in outside:
+            opinions.append(from_outside(part))
+            resists = resists + resistance(part.energies, len(mass), dt)
+        else:
+            opinions.append(Opinion() if part.empty else _OPINIONS[effect.kind](effect, declared))
+            resists = resists + (0.0 if opinions[k].resists is None else opinions[k].resists)
+    begins = [opinion.needs(resists) if opinion.needs else opinion.begin for opinion in opinions]
+    return Side(declared, opinions, begins, owned, outside)
+
+
+def _known(effect: Any) -> bool:
+    """Whether an effect is the shipped one of its kind."""
+    kind = type(effect)
+    return effect.kind in _OPINIONS and EFFECTS.get(effect.kind) == f"{kind.__module__}:{kind.__qualname__}"

@@ -1,0 +1,83 @@
+"""The step once more: what each integrator makes of a motion (Liu et al. 2013, eq. 6; Hairer and Wanner).
+
+                     c     x             target                            velocity at x             after the step
+    implicit Euler   1     p(t + dt)     p + dt v                          (x - p)/dt                x
+    BDF2             9/4   p(t + dt)     (4 p - p')/3 + 2 dt/9 (4 v - v')  (3 x - 4 p + p')/(2 dt)   x
+    midpoint         4     p(t + dt/2)   p + dt/2 v                        2 (x - p)/dt              2 x - p
+
+A step of BDF2 without a motion before it is one of implicit Euler. Forces and what is lagged are taken where it starts
+for implicit Euler, and else extrapolated to the time of x.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harness.simulation.opinion.declared import Array, Declared, Moment, Opinion
+from harness.simulation.opinion.derivatives import wide
+
+Motion = Sequence[Array]
+"""Positions (n, 3) [m] and velocities (n, 3) [m/s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """One step as it should be stated: c, target (n, 3) [m], force (n, 3) [N] and the size [N] of its round-off, pinned
+    vertices with weights [N/m] and targets (q, 3) [m], and the moment; now: the motion at the start, filtered."""
+
+    c: float
+    target: Any
+    force: Array
+    force_size: float
+    vertices: list[int]
+    weights: list[float]
+    held: Any
+    moment: Moment
+    now: Motion
+
+    def after(self, x: Array) -> tuple[Any, Any]:
+        """Positions and velocities at the step's end, from its unknown x (n, 3) [m]."""
+        m = self.moment
+        v = m.rate * (wide(x) - m.origin)
+        return (wide(x), v) if m.when == 1.0 else (2 * wide(x) - m.p, 2 * v - m.v)
+
+
+def state(
+    integrator: str, declared: Declared, opinions: Sequence[Opinion], now: Motion, before: Motion | None, time: float
+) -> Stated:
+    """The step from a motion now and one step before it (None: there is none), at a time [s]."""
+    dt = declared.time_step
+    now, earlier = _decayed(now, opinions), _decayed(before or now, opinions)
+    (p, v), (p0, v0) = ((wide(a), wide(b)) for a, b in (now, earlier))
+    method = "implicit-euler" if integrator == "bdf2" and before is None else integrator
+    if method == "implicit-euler":
+        c, target, origin, when, ahead = 1.0, p + dt * v, p, 1.0, 0.0
+    elif method == "bdf2":
+        origin = (4 * p - p0) / 3
+        c, target, when, ahead = 9 / 4, origin + 2 * dt * (4 * v - v0) / 9, 1.0, 1.0
+    else:
+        c, target, origin, when, ahead = 4.0, p + dt * v / 2, p, 0.5, 0.5
+    far = ahead if before else 0.0
+    at = [np.asarray(x + far * (x - y), float) for x, y in zip(now, earlier, strict=True)]
+    force, size = np.zeros_like(now[0]), 0.0
+    for opinion in opinions:
+        if opinion.force:
+            more, its = opinion.force(at[0], at[1], time + ahead * dt)
+            force, size = force + more, size + its
+    pinned = {i: pin for opinion in opinions for i, pin in opinion.pins.items()}
+    vertices = sorted(pinned)
+    held = wide([pinned[i][1](time + dt) for i in vertices]).reshape(-1, 3)
+    held = p[vertices] + when * (held - p[vertices]) if when < 1.0 else held
+    moment = Moment(dt, c**0.5 / dt, when, time, time + when * dt, p, v, p + ahead * dt * v, origin)
+    return Stated(c, target, force, size, vertices, [pinned[i][0] for i in vertices], held, moment, now)
+
+
+def _decayed(motion: Motion, opinions: Sequence[Opinion]) -> Motion:
+    p, v = motion
+    for opinion in opinions:
+        v = opinion.decay(v) if opinion.decay else v
+    return [p, v]

@@ -1,0 +1,130 @@
+"""Bending and gas once more, from the triangles.
+
+bending   B/2 |K x|^2 / (A0 + A1) over each pair of triangles that share an edge x0 x1 and have x2, x3 across, with
+          K = (c03 + c04, c01 + c02, -c01 - c03, -c02 - c04), the cotangents c of the angles at the edge and the areas
+          A at rest (Bergou et al. 2006, with 3/(A0 + A1) halved and thirded as `solvers.energies.bending` argues:
+          a cylinder of curvature k stores B/2 k^2 a unit of area). Rectangles count as cut by either diagonal, half
+          each.
+gas       -p0 V0 ln(V/V0), V = sum of a.(b x c)/6 over triangles that face outwards
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from harness.simulation.opinion.declared import Array, Declared, Moment, Opinion
+from harness.simulation.opinion.derivatives import Values, Wide, wide
+
+Triangle = frozenset[int]
+_SAME = 1e-6
+"""Of a diagonal: rectangles are told from other quadrangles by less."""
+
+
+def bending(effect: Any, declared: Declared) -> Opinion:
+    """The quadratic bending energy of the mesh's triangles."""
+    corners, K, weight = stencils(effect.stiffness, declared)
+    share = np.asarray(weight[:, None] * K**2, float)
+    resists = np.asarray(np.bincount(corners.ravel(), share.ravel(), len(declared.mass)), float)
+    return Opinion(lambda moment: _bent(corners, K, weight, 0.0), resists)
+
+
+def damped_bending(effect: Any, b: float, declared: Declared) -> Any:
+    """b times the matrix of the bending as damping: the energy of a step."""
+    corners, K, weight = stencils(effect.stiffness, declared)
+
+    def begin(moment: Moment) -> Values:
+        return _bent(corners, K, b * moment.rate * weight, moment.origin)
+
+    return begin
+
+
+def _bent(corners: Any, K: Wide, weight: Wide, origin: Any) -> Values:
+    def values(x: Wide) -> Wide:
+        bent = (K[:, :, None] * (x - origin)[corners]).sum(axis=1)
+        return weight / 2 * (bent**2).sum(axis=1)
+
+    return values
+
+
+def stencils(B: float, declared: Declared) -> tuple[Any, Wide, Wide]:
+    """The corners (h, 4), the coefficients K (h, 4) and the weights (h,) of all pairs of triangles, for a rigidity
+    B."""
+    rest, surface = declared.rest, [frozenset(t) for t in declared.mesh.triangles.tolist()]
+    pairs = list(_pairs(surface))
+    rectangles, share = [pair for pair in pairs if _rectangle(rest[list(pair)])], B
+    if rectangles:
+        cut = {frozenset(pair[:2]) | {tip} for pair in rectangles for tip in pair[2:]}
+        other = [frozenset(pair[2:]) | {end} for pair in rectangles for end in pair[:2]]
+        pairs += _pairs([triangle for triangle in surface if triangle not in cut] + other)
+        share = B / 2
+    made = [_stencil(rest[list(pair)]) for pair in pairs]
+    K, weight = [K for K, _ in made], [share / area for _, area in made]
+    return np.array(pairs, int).reshape(-1, 4), wide(K).reshape(-1, 4), wide(weight)
+
+
+def _pairs(surface: Sequence[Triangle]) -> Iterator[tuple[int, int, int, int]]:
+    """Edges that two triangles share, and the two corners across."""
+    tips: dict[Triangle, list[int]] = {}
+    for triangle in surface:
+        for tip in triangle:
+            tips.setdefault(triangle - {tip}, []).append(tip)
+    for edge, across in tips.items():
+        if len(across) == 2:
+            i, j = sorted(edge)
+            yield i, j, across[0], across[1]
+
+
+def _rectangle(x: Wide) -> bool:
+    """Whether the diagonals of x (4, 3) are equally long and halve each other."""
+    one, two, apart = x[0] - x[1], x[2] - x[3], x[0] + x[1] - x[2] - x[3]
+    a, b, c = (np.sqrt(v @ v) for v in (one, two, apart))
+    return bool(max(abs(a - b), c) <= _SAME * a)
+
+
+def _stencil(x: Wide) -> tuple[list[Any], Any]:
+    """K and A0 + A1 of the corners x (4, 3)."""
+    edge = x[1] - x[0]
+
+    def cotangent(u: Wide, v: Wide) -> Any:
+        w = np.cross(u, v)
+        return (u @ v) / np.sqrt(w @ w)
+
+    c01, c02 = (cotangent(edge, tip - x[0]) for tip in x[2:])
+    c03, c04 = (cotangent(-edge, tip - x[1]) for tip in x[2:])
+    normals = [np.cross(edge, tip - x[0]) for tip in x[2:]]
+    return [c03 + c04, c01 + c02, -c01 - c03, -c02 - c04], sum(np.sqrt(w @ w) for w in normals) / 2
+
+
+def gas(effect: Any, declared: Declared) -> Opinion:
+    """Gas at constant temperature in the closed mesh."""
+    a, b, c = declared.mesh.triangles.T
+    about = declared.rest.mean(axis=0)
+
+    def volume(x: Wide) -> Any:
+        y = x - about
+        return (y[a] * _cross(y[b], y[c])).sum() / 6
+
+    at_rest = volume(declared.rest)  # negative where the triangles face inwards
+
+    def values(x: Wide) -> Wide:
+        part = volume(x) / at_rest
+        if part.real <= 0:
+            return wide([np.inf])
+        much = effect.pressure * abs(at_rest)
+        return np.array([-much * (1 + np.log(part)), part * 0 + much])  # the logarithm's round-off is that of one
+
+    return Opinion(lambda moment: values)
+
+
+def _cross(u: Wide, v: Wide) -> Wide:
+    (x, y, z), (a, b, c) = u.T, v.T
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=1)
+
+
+def triangle_areas(x: Array, triangles: Any) -> Array:
+    """The areas (f,) [m^2] of triangles at x (n, 3) [m]."""
+    a, b, c = (x[corner] for corner in triangles.T)
+    return 0.5 * np.sqrt((_cross(b - a, c - a) ** 2).sum(axis=1))

@@ -1,0 +1,225 @@
+"""The second opinion agrees with every shipped scene and hard case, holds what comes from outside against itself, and
+disputes the runs of steps that it finds wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from harness.base.model import Model
+from harness.config.load import load_any, load_scene
+from harness.experiments import run as runs
+from harness.experiments import standing
+from harness.report.robustness import DISPUTED, RIGHT, judged
+from harness.scenes.bind import Scene
+from harness.scenes.effects.base import Contribution, Pin
+from harness.scenes.mesh.base import Mesh
+from harness.simulation.opinion.second import second_opinion
+from solvers.energies.bending import Bending
+from solvers.energies.quadratic import Quadratic
+from solvers.problem import Energy, Positions
+from tests.lies import (
+    BALL,
+    BEND,
+    DASHPOTS,
+    DRAG,
+    FLOOR,
+    FORCES,
+    GAS,
+    GRAVITY,
+    GUSTS,
+    LIMITS,
+    METHODS,
+    PINS,
+    RAYLEIGH,
+    SKIP_ONE,
+    SLOWED,
+    SPRINGS,
+    TIED,
+    bound,
+    declared,
+    opinion,
+    patched,
+    scaled,
+)
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+SCENES = {path.stem: path for path in sorted((CONFIGS / "scenes").glob("*.yaml"))}
+HARD = {path.stem: path for folder in ("hard", "hard-long") for path in sorted((CONFIGS / folder).glob("*.yaml"))}
+SIZES = {"pulled-curtain": 9}
+"""Mesh sizes of scenes whose pins ask for them."""
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_both_opinions_agree_on_a_scene(name: str):
+    spec = load_scene(SCENES[name])
+    # A third of the size has the same formulas and takes a tenth of the time; the integrators take turns.
+    size = SIZES.get(name) or max(getattr(spec.mesh, "SMALLEST", 2), (spec.default_size or 0) // 3)
+    assert opinion(spec, size, METHODS[list(SCENES).index(name) % 3]) == "agrees"
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_both_opinions_agree_on_a_hard_case(name: str):
+    spec = load_scene(HARD[name])
+    assert opinion(spec, spec.default_size or 0) == "agrees"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("integrator", METHODS)
+@pytest.mark.parametrize("name", [*SCENES, *HARD])
+def test_both_opinions_agree_with_every_integrator_at_full_size(name: str, integrator: str):
+    spec = load_scene((SCENES | HARD)[name])
+    assert opinion(spec, spec.default_size or 0, integrator) == "agrees"
+
+
+@pytest.mark.parametrize("integrator", METHODS)
+def test_both_opinions_agree_where_all_effects_are(integrator: str):
+    every = [SKIP_ONE, PINS, TIED, LIMITS, GUSTS, BEND, DASHPOTS, RAYLEIGH, DRAG, FLOOR, *FORCES, *SLOWED]
+    assert opinion(declared(*every, velocity=(0.1, 0.2, 0.3)), 5, integrator) == "agrees"
+    gas = [SPRINGS, GAS, LIMITS, GUSTS, BEND, DASHPOTS, RAYLEIGH, DRAG, *FORCES]
+    assert opinion(declared(*gas, mesh=BALL), 2, integrator) == "agrees"
+
+
+def test_steps_of_two_lengths_are_compared(monkeypatch: pytest.MonkeyPatch):
+    spec = declared(SPRINGS, PINS, DASHPOTS, FLOOR, *SLOWED, alternate_time_step=1 / 50)
+    assert opinion(spec, 5) == "agrees"
+    patched(Scene, "time", lambda true: lambda self, index: index * self.system.time_step)(monkeypatch)
+    assert "times" in opinion(spec, 5)
+
+
+class Well(Quadratic):
+    """A well that draws every vertex to the origin; the name is that of no shipped energy."""
+
+
+class Cone:
+    """w |p| for each vertex: no function of complex numbers, for it takes lengths by `numpy.linalg.norm`."""
+
+    def __init__(self, weight: float, told: float) -> None:
+        self.weight, self.told = weight, told
+
+    def value(self, p: Positions) -> float:
+        return self.weight * float(np.linalg.norm(p, axis=1).sum())
+
+    def add_gradient(self, p: Positions, out: Positions) -> None:
+        out += self.told * p / np.linalg.norm(p, axis=1)[:, None]
+
+    def hessian(self, p: Positions) -> csr_array:
+        return csr_array((p.size, p.size))
+
+
+class Outside(Model):
+    """An effect that nobody but its author knows."""
+
+    kind: Literal["magnet"] = "magnet"
+    told: float = 3.0
+    """The gradient in parts of what it should be, times 3."""
+    shape: Literal["well", "cone"] = "well"
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        n = len(mass)
+        well = Well(csr_array(np.eye(n)), np.full(n, 3.0), np.zeros((n, 3)))
+        if self.told != 3.0:
+            true = well.add_gradient
+            object.__setattr__(well, "add_gradient", lambda p, out: scaled_sum(true, p, out, self.told / 3.0))
+        energy: Energy = well if self.shape == "well" else Cone(3.0, self.told)
+        return Contribution(
+            energies=(energy,),
+            forces=(lambda p, v, t: 0.1 * np.sin(p) - v + t,),
+            filters=(lambda v: 0.99 * v,),
+            pins=(Pin(np.array([0]), mesh.rest[:1], 1e5),),
+        )
+
+
+def scaled_sum(true: Callable[[Positions, Positions], None], p: Positions, out: Positions, by: float) -> None:
+    added = np.zeros_like(out)
+    true(p, added)
+    out += by * added
+
+
+@pytest.mark.parametrize("integrator", METHODS)
+@pytest.mark.parametrize("shape", ["well", "cone"])
+def test_an_effect_from_outside_is_held_against_its_own_value(shape: Any, integrator: str):
+    spec = declared(SPRINGS, GRAVITY, FLOOR)
+    known = spec.effects
+
+    def asked(outside: Outside) -> str:
+        return opinion(spec.model_copy(update={"effects": (*known, outside)}), 4, integrator)
+
+    assert asked(Outside(shape=shape)) == "single opinion: effects[3] magnet"
+    assert asked(Outside(shape=shape, told=3.003)).startswith(
+        "disagrees: effects[3] magnet (gradient against its own value)"
+    )
+
+
+def test_an_effect_that_takes_a_known_name_is_from_outside():
+    class Springs(Outside):
+        kind: Literal["springs"] = "springs"  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    spec = declared(GRAVITY)
+    spec = spec.model_copy(update={"effects": (*spec.effects, Springs())})
+    assert opinion(spec, 4) == "single opinion: effects[1] springs"
+
+
+def test_damping_of_what_comes_from_outside_has_no_second_opinion():
+    spec = declared(SPRINGS, RAYLEIGH)
+    spec = spec.model_copy(update={"effects": (*spec.effects, Outside())})
+    assert opinion(spec, 4) == "single opinion: effects[1] rayleigh, effects[2] magnet"
+
+
+SCENE = """mesh: {kind: grid}
+mass: 1
+time_step: 0.03
+frames: 2
+default_size: 4
+effects: [{kind: gravity}, {kind: springs, stretch: 100}, {kind: bending, stiffness: 0.1}, {kind: pins, at: [left]}]
+"""
+
+
+def test_a_run_that_is_disputed_is_not_right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    asked = {"tolerance": 1e-6, "rounds": 1, "judge": True, "record": False, "iterations": 200}
+    newton, sparse = load_any(tmp_path / "scene.yaml", solvers=["newton", "sparse"], **asked).runs()
+    times: list[str] = []
+
+    def counted(*given: Any) -> str:
+        times.append(second_opinion(*given))
+        return times[-1]
+
+    monkeypatch.setattr(standing, "second_opinion", counted)
+
+    def rows_of(run: Any) -> list[dict[str, Any]]:
+        files = runs.Files.of(run, tmp_path)
+        files.rows.parent.mkdir(exist_ok=True)
+        done = runs.execute(run, files, lambda phase: None)
+        named = {"distance": None, "stationarity": None, "frame": None, "reason": None, "minimum": None}
+        return [named | row for row in done if row["phase"] == "step"]
+
+    standing.opinion.cache_clear()
+    for run in (newton, sparse):
+        done = rows_of(run)
+        assert {(row["status"], row["second_opinion"]) for row in done} == {("ok", "agrees")}
+    assert judged(rows_of(newton))[0] is RIGHT
+    assert times == ["agrees"]  # once for the scene
+    bound(Bending, scaled(weight=2.0))(monkeypatch)
+    standing.opinion.cache_clear()
+    done = rows_of(newton)
+    assert {row["status"] for row in done} == {"disputed"}
+    outcome, _, _, reason = judged(done)
+    assert outcome is DISPUTED
+    assert reason.startswith("the second opinion disagrees: effects[2] bending")
+    standing.opinion.cache_clear()
+
+
+def test_a_run_that_is_not_judged_asks_for_no_second_opinion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    monkeypatch.setattr(standing, "second_opinion", lambda *given: pytest.fail("was asked"))
+    (run,) = load_any(tmp_path / "scene.yaml", solvers=["sparse"], rounds=1, record=False).runs()
+    files = runs.Files.of(run, tmp_path)
+    files.rows.parent.mkdir()
+    assert {row["status"] for row in runs.execute(run, files, lambda phase: None)} == {"ok"}
