@@ -32,6 +32,12 @@ from harness.scenes.bind import Scene, build
 from harness.simulation.contract import where
 from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, measure
 from harness.simulation.observe import observe, require_numbers
+from harness.record.verify import require_last
+from harness.reference.judge import Judge, reference
+from harness.scenes.bind import Scene, build
+from harness.simulation import times
+from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, digest, measure
+from harness.simulation.observe import observe
 from harness.simulation.step import prepare
 from solvers import sources
 from solvers.problem import NotPositiveDefinite, Solver, StopRule, Unsupported
@@ -110,18 +116,14 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
     settings = _settings(run)
     measured = measure(scene, _solver(run), settings, tick)
+    told = times.rows(measured)
     by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
-    if by_frame[run.frames]["digest"] != measured.digest:
-        raise RunFailed("the recorded pass ended at other positions than the timed pass")
     require_numbers(by_frame, minimises=_solver(run).minimises, yardstick=run.tolerance is not None)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
     facts["choice"] = measured.prepared.choice
     return [
-        counts
-        | facts
-        | {"status": "ok", "phase": t.phase, "frame": t.frame, "round": t.round, "seconds": t.seconds}
-        | (by_frame[t.frame] if t.phase == "step" and t.frame else {})
-        for t in measured.timings
+        counts | facts | {"status": "ok"} | row | (by_frame[row["frame"]] if row["phase"] == "step" else {})
+        for row in told
     ]
 
 
@@ -156,8 +158,12 @@ def _second_pass(
             judge=_judge(run, scene),
             tick=lambda: tick("second pass"),
         )
+        if found[run.frames]["digest"] != digest(measured.final):
+            raise RunFailed("the recorded pass ended at other positions than the timed pass")
         if recorder:
-            recorder.close(_milliseconds(measured, run.frames))
+            path = recorder.close(_milliseconds(measured, run.frames))
+            ends = run.frames, scene.time(run.frames), measured.final
+            found[run.frames]["recorded"] = require_last(path, recorder.info, *ends)
     if positions and stored is not None:
         save_positions(positions, stored)
     return {frame: graded.found.get(frame, {}) | columns for frame, columns in found.items()}

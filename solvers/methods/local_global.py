@@ -106,8 +106,17 @@ class PreparedLocalGlobal:
         constant, b = self._constant(problem), np.empty_like(problem.target)
         p = self._placed(problem.first_guess, problem)
         out, project = p.copy(), self._local(problem)
-        project(p, constant, b)
-        return {"local": lambda: project(p, constant, b), "global": lambda: self.toward(b, p, out)}
+
+        def local() -> Positions:
+            project(p, constant, b)
+            return b
+
+        def whole() -> Positions:
+            self.toward(b, p, out)
+            return out
+
+        local()
+        return {"local": local, "global": whole}
 
     def _local(self, problem: StepProblem) -> Project:
         return self.begin(problem) if self.begin else self.project

@@ -251,11 +251,17 @@ class PreparedCompiled:
 
         edges = self.parts.begun(self.edges, problem)
 
-        def local() -> None:
+        def local() -> NDArray[Any]:
             step.local(self.plan, self.bundles, edges, a, right, p, b)
+            return b
 
         y, out = self.base.system.inertia[:, None] * target + force, np.zeros_like(target)
-        return {"local": local, "global": lambda: self.base.correction(y, out)}
+
+        def whole() -> Positions:
+            self.base.correction(y, out)
+            return out
+
+        return {"local": local, "global": whole}
 
     def _arrays(self, problem: StepProblem) -> list[Positions]:
         """The problem's arrays. The kernels are compiled for arrays that may be written to: what may not is copied."""
