@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from time import perf_counter, thread_time
 from typing import Any, ClassVar
@@ -17,8 +18,9 @@ from harness.record.base import Frame
 from harness.record.rerun import RerunRecorder
 from harness.record.shading import Shading
 from harness.simulation import step as simulate
+from solvers.integrators import Integrator, Motion
 from solvers.methods.local_global import SparseLocalGlobal
-from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System
+from solvers.problem import Positions, Prepared, Solution, Start, StepProblem, StopRule, System
 from solvers.registry import SOLVERS
 
 FRAMES = 6
@@ -159,3 +161,17 @@ def test_a_run_whose_recording_does_not_end_as_it_did_fails(ran, monkeypatch: py
     assert row["status"] == "failed"
     assert reason in row["reason"]
     assert not files.recording.exists()
+
+
+def test_a_run_whose_second_pass_goes_another_way_than_the_timed_one_fails(ran, monkeypatch: pytest.MonkeyPatch):
+    steps = count()
+    advance = Integrator.advance
+
+    def drifting(self: Integrator, start: Start, solution: Solution) -> Motion:
+        moved = advance(self, start, solution)
+        return moved._replace(positions=moved.positions + 1e-9 * (next(steps) >= 2 * FRAMES))
+
+    monkeypatch.setattr(Integrator, "advance", drifting)
+    (row,), _ = ran()
+    assert row["status"] == "failed"
+    assert row["reason"] == "the recorded pass ended at other positions than the timed pass"

@@ -139,11 +139,30 @@ def seen_colour(image: NDArray[np.float64] | NDArray[np.uint8]) -> NDArray[np.fl
     return np.median(image[60:100, 60:100].reshape(-1, 3), axis=0) / 255
 
 
+def pulled(triangles: bool) -> tuple[Replay, list[Replay]]:
+    """A cloth or a net in three frames, compressed, at rest, and stretched; and each of them alone."""
+    frames = [cloth(frames=1, stretch=1 + strain, triangles=triangles) for strain in (-0.1, 0.0, 0.1)]
+    whole = cloth(frames=3, triangles=triangles)
+    return replace(whole, positions=np.concatenate([frame.positions for frame in frames])), frames
+
+
+@needs_opengl
+@pytest.mark.parametrize("triangles", [True, False], ids=["cloth", "net"])
+def test_each_frame_is_drawn_as_it_would_be_alone(triangles: bool) -> None:
+    replay, frames = pulled(triangles)
+    view = frame_all(frames[1].positions[0], aspect=1.0, angles=(20.0, 10.0))
+    with Studio(160, 160) as studio:
+        together = [studio.draw(replay, k, view) for k in range(3)]
+        alone = [studio.draw(frame, 0, view) for frame in frames]
+    for k in range(3):
+        np.testing.assert_array_equal(together[k], alone[k])
+        assert not np.array_equal(together[k], together[k - 1])
+
+
 @needs_opengl
 def test_each_frame_is_drawn_in_its_own_colours_and_positions() -> None:
-    """Of a net: springs as tubes, balls at vertices; of a cloth: the surface. Drawn out of order, by one window."""
-    frames = [cloth(frames=1, stretch=1 + strain) for strain in (-0.1, 0.0, 0.1)]
-    replay = replace(cloth(frames=3), positions=np.concatenate([frame.positions for frame in frames]))
+    """Drawn out of order, by one window."""
+    replay, frames = pulled(True)
     view = frame_all(frames[1].positions[0], aspect=1.0, angles=(0.0, 0.0))
     with Studio(160, 160) as studio:
         seen = {k: studio.draw(replay, k, view) for k in (2, 0, 1)}
