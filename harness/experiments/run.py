@@ -26,6 +26,7 @@ from harness.experiments.code import code, parts, solver_class
 from harness.record.base import RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
+from harness.record.verify import require_last
 from harness.reference.grade import Graded
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
@@ -36,6 +37,7 @@ from harness.record.verify import require_last
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
 from harness.simulation import times
+from harness.simulation.contract import where
 from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, digest, measure
 from harness.simulation.observe import observe
 from harness.simulation.step import prepare
@@ -115,8 +117,7 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
     scene = build(run.scene, run.size, run.integrator)
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
     settings = _settings(run)
-    measured = measure(scene, _solver(run), settings, tick)
-    told = times.rows(measured)
+    told = times.rows(measured := measure(scene, _solver(run), settings, tick))
     by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
     require_numbers(by_frame, minimises=_solver(run).minimises, yardstick=run.tolerance is not None)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
@@ -161,9 +162,9 @@ def _second_pass(
         if found[run.frames]["digest"] != digest(measured.final):
             raise RunFailed("the recorded pass ended at other positions than the timed pass")
         if recorder:
-            path = recorder.close(_milliseconds(measured, run.frames))
+            recorder.close(_milliseconds(measured, run.frames))
             ends = run.frames, scene.time(run.frames), measured.final
-            found[run.frames]["recorded"] = require_last(path, recorder.info, *ends)
+            found[run.frames]["recorded"] = require_last(files.recording, recorder.info, *ends)
     if positions and stored is not None:
         save_positions(positions, stored)
     return {frame: graded.found.get(frame, {}) | columns for frame, columns in found.items()}

@@ -18,8 +18,8 @@ import numba
 import numpy as np
 
 from harness.scenes.bind import Scene
-from harness.simulation.contract import Contract
 from harness.simulation.clock import Watch, working
+from harness.simulation.contract import Contract
 from harness.simulation.step import Step, prepare, simulate, start
 from solvers.problem import Positions, Prepared, Solver, StopRule
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from harness.base import machine
-from harness.base.errors import InputError
 from harness.base.errors import InputError, RunFailed
 from harness.base.rows import alone
 from harness.config.load import load_any, load_sweep
