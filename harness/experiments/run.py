@@ -30,16 +30,10 @@ from harness.record.verify import require_last
 from harness.reference.grade import Graded
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
-from harness.simulation.contract import where
-from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, measure
-from harness.simulation.observe import observe, require_numbers
-from harness.record.verify import require_last
-from harness.reference.judge import Judge, reference
-from harness.scenes.bind import Scene, build
 from harness.simulation import times
 from harness.simulation.contract import where
 from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, digest, measure
-from harness.simulation.observe import observe
+from harness.simulation.observe import observe, require_numbers
 from harness.simulation.step import prepare
 from solvers import sources
 from solvers.problem import NotPositiveDefinite, Solver, StopRule, Unsupported
@@ -162,7 +156,7 @@ def _second_pass(
         if found[run.frames]["digest"] != digest(measured.final):
             raise RunFailed("the recorded pass ended at other positions than the timed pass")
         if recorder:
-            recorder.close(_milliseconds(measured, run.frames))
+            recorder.close(times.milliseconds(measured, run.frames))
             ends = run.frames, scene.time(run.frames), measured.final
             found[run.frames]["recorded"] = require_last(files.recording, recorder.info, *ends)
     if positions and stored is not None:
@@ -254,15 +248,6 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
             obstacles=listed(run.scene.effects),
         ),
     )
-
-
-def _milliseconds(measured: Measured, frames: int) -> dict[str, list[float]]:
-    """The median over the rounds of each phase in each frame [ms]."""
-    by_phase: dict[str, list[list[float]]] = {}
-    for t in measured.timings:
-        if t.frame is not None:
-            by_phase.setdefault(t.phase, [[] for _ in range(frames)])[t.frame - 1].append(1e3 * t.seconds)
-    return {phase: [float(np.median(times)) for times in series] for phase, series in by_phase.items()}
 
 
 def save_positions(path: Path, positions: np.ndarray) -> None:

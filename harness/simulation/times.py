@@ -47,3 +47,12 @@ def _adds_up(timings: list[Timing]) -> dict[str, bool]:
     iteration = medians.pop(ITERATION)
     ratio = float(np.median(sum(medians.values()) / iteration))
     return dict.fromkeys([*medians, ITERATION], bool(abs(ratio - 1.0) <= ITERATION_SHARE))
+
+
+def milliseconds(measured: Measured, frames: int) -> dict[str, list[float]]:
+    """The median over the rounds of each phase in each frame [ms]."""
+    by_phase: dict[str, list[list[float]]] = {}
+    for t in measured.timings:
+        if t.frame is not None:
+            by_phase.setdefault(t.phase, [[] for _ in range(frames)])[t.frame - 1].append(1e3 * t.seconds)
+    return {phase: [float(np.median(times)) for times in series] for phase, series in by_phase.items()}
