@@ -131,8 +131,9 @@ class PreparedLocalGlobal:
             y[s.free] -= self.coupling @ problem.pin_targets[s.pins.exact]
         return y
 
-    def correction(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b, by the factor as it is, to `out`, both (n, 3); exactly pinned vertices keep what is there."""
+    def correction(self, b: Positions, out: Positions) -> Positions:
+        """Write Q^-1 b, by the factor as it is, to `out`, which it returns, both (n, 3); exactly pinned vertices keep
+        what is there."""
         free = self.system.free
         if len(free) == len(b):
             self.factor.solve(b, out)
@@ -140,6 +141,7 @@ class PreparedLocalGlobal:
             solved = np.empty((len(free), 3))
             self.factor.solve(b[free], solved)
             out[free] = solved
+        return out
 
     def toward(self, b: Positions, p: Positions, out: Positions) -> None:
         """Write where Q p = b leads from p to `out`, (n, 3) all, as `correction` does; by a rounded factor, nearer."""

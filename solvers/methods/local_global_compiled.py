@@ -256,12 +256,7 @@ class PreparedCompiled:
             return b
 
         y, out = self.base.system.inertia[:, None] * target + force, np.zeros_like(target)
-
-        def whole() -> Positions:
-            self.base.correction(y, out)
-            return out
-
-        return {"local": local, "global": whole}
+        return {"local": local, "global": lambda: self.base.correction(y, out)}
 
     def _arrays(self, problem: StepProblem) -> list[Positions]:
         """The problem's arrays. The kernels are compiled for arrays that may be written to: what may not is copied."""

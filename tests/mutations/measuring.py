@@ -62,7 +62,7 @@ MEASURING = (
     Mutation(
         "global-leaves-what-is-there",
         "solvers/methods/local_global_compiled.py",
-        '"global": whole}',
+        '"global": lambda: self.base.correction(y, out)}',
         '"global": lambda: out}',
         (_PHASES,),
         ("numba", "does nothing"),
