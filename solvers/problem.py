@@ -278,7 +278,7 @@ class Prepared(Protocol):
         ...
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The parts of an iteration by name (`local` and `global`), as callables to be timed apart; may be empty."""
+        """The parts of an iteration by name, if any; each returns the array (or what else) that it has computed."""
         ...
 
 

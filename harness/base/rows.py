@@ -46,10 +46,39 @@ COLUMNS = (
     Column("max_iterations", _INT, "", "the iteration limit of a step"),
     Column("tolerance", _REAL, "", "relative tolerance of the stop rule; null: all iterations are done"),
     Column("threads", _INT, "", "threads of Numba and of BLAS"),
-    Column("phase", _TEXT, "", "prepare, step, local, global or run (the run as a whole); of a machine its kernel"),
+    Column(
+        "phase",
+        _TEXT,
+        "",
+        "prepare, step, local, global, iteration or run (the run as a whole), and what else a solver times; "
+        "of a machine its kernel",
+    ),
     Column("frame", _INT, "", "the step, from 1; null where the phase has none"),
     Column("round", _INT, "", "repetition of the measurement, from 0; prepare: 0 is cold, later ones are warm"),
-    Column("seconds", _REAL, "s", "wall time of the phase; local and global: of one such step"),
+    Column(
+        "seconds",
+        _REAL,
+        "s",
+        "wall time of the phase; local and global: of one such step; iteration: of a whole solve next to these, over "
+        "its iterations",
+    ),
+    Column(
+        "pass_seconds", _REAL, "s", "wall time, by another clock, of all of the phase in the run; of steps in the round"
+    ),
+    Column("summed_seconds", _REAL, "s", "what the rows' times add up to in it"),
+    Column("cpu_seconds", _REAL, "s", "CPU time of the process in it"),
+    Column(
+        "interrupted",
+        pa.bool_(),
+        "",
+        "whether more than 3 % and 1 ms of it went by without computing: stopped, or others had the processor",
+    ),
+    Column(
+        "adds_up",
+        pa.bool_(),
+        "",
+        "of the parts of an iteration: whether they add up to one within 15 %, by the medians over the frames",
+    ),
     Column("iterations", _INT, "", "iterations done in the step"),
     Column("stopped", _TEXT, "", "what ended the step's iterations: iterations, tolerance, floor or stalled"),
     Column(
@@ -111,6 +140,12 @@ COLUMNS = (
         "how deep the deepest vertex is inside an obstacle after the step, 0 where none is; null without obstacles",
     ),
     Column("digest", _TEXT, "", "SHA-256 of the positions after the step (float64 bytes)"),
+    Column(
+        "recorded",
+        _TEXT,
+        "",
+        "SHA-256 of the positions that the recording ends with, read back from its file (float32 bytes)",
+    ),
     Column("nnz_system", _INT, "", "stored entries of the system matrix Q"),
     Column("nnz_factor", _INT, "", "stored entries of its triangular factor, null where the library hides it"),
     Column("nnz_hessian_factor", _INT, "", "stored entries of the triangular factor of Newton's Hessian"),

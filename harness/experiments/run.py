@@ -27,11 +27,13 @@ from harness.experiments.standing import standing
 from harness.record.base import RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
+from harness.record.verify import require_last
 from harness.reference.grade import Graded
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
+from harness.simulation import times
 from harness.simulation.contract import where
-from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, measure
+from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, digest, measure
 from harness.simulation.observe import observe, require_numbers
 from harness.simulation.step import prepare
 from solvers import sources
@@ -110,20 +112,12 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
     scene = build(run.scene, run.size, run.integrator)
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
     settings = _settings(run)
-    measured = measure(scene, _solver(run), settings, tick)
+    told = times.rows(measured := measure(scene, _solver(run), settings, tick))
     by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
-    if by_frame[run.frames]["digest"] != measured.digest:
-        raise RunFailed("the recorded pass ended at other positions than the timed pass")
     require_numbers(by_frame, minimises=_solver(run).minimises, yardstick=run.tolerance is not None)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
     facts |= {"choice": measured.prepared.choice} | standing(run)
-    return [
-        counts
-        | facts
-        | {"phase": t.phase, "frame": t.frame, "round": t.round, "seconds": t.seconds}
-        | (by_frame[t.frame] if t.phase == "step" and t.frame else {})
-        for t in measured.timings
-    ]
+    return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
 
 
 def _second_pass(
@@ -157,8 +151,12 @@ def _second_pass(
             judge=_judge(run, scene),
             tick=lambda: tick("second pass"),
         )
+        if found[run.frames]["digest"] != digest(measured.final):
+            raise RunFailed("the recorded pass ended at other positions than the timed pass")
         if recorder:
-            recorder.close(_milliseconds(measured, run.frames))
+            recorder.close(times.milliseconds(measured, run.frames))
+            ends = run.frames, scene.time(run.frames), measured.final
+            found[run.frames]["recorded"] = require_last(files.recording, recorder.info, *ends)
     if positions and stored is not None:
         save_positions(positions, stored)
     return {frame: graded.found.get(frame, {}) | columns for frame, columns in found.items()}
@@ -248,15 +246,6 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
             obstacles=listed(run.scene.effects),
         ),
     )
-
-
-def _milliseconds(measured: Measured, frames: int) -> dict[str, list[float]]:
-    """The median over the rounds of each phase in each frame [ms]."""
-    by_phase: dict[str, list[list[float]]] = {}
-    for t in measured.timings:
-        if t.frame is not None:
-            by_phase.setdefault(t.phase, [[] for _ in range(frames)])[t.frame - 1].append(1e3 * t.seconds)
-    return {phase: [float(np.median(times)) for times in series] for phase, series in by_phase.items()}
 
 
 def save_positions(path: Path, positions: np.ndarray) -> None:

@@ -61,6 +61,11 @@ class RerunRecorder:
         self._file = PartialFile(path, application, info.run_id, info.title)
         self._stream = self._file.stream
 
+    @property
+    def info(self) -> RecordingInfo:
+        """What does not change in the recording."""
+        return self._info
+
     def frame(self, frame: Frame) -> None:
         """Record one frame; its arrays are only read."""
         if not self._frames:

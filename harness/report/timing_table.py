@@ -23,7 +23,8 @@ class Run(NamedTuple):
 
     cold and warm: of preparing; step: median, its quartiles and the least of all steps; local, global_:
     medians of one such step; iterations: median of a step; residual [J^(1/2)]: of the last step;
-    largest_strain: of the whole run. The fields are the columns of `_SUMMARY`, in order.
+    largest_strain: of the whole run; interrupted: whether steps were, in any round; adds_up: whether the phases add up
+    to an iteration. The fields are the columns of `_SUMMARY`, in order.
     """
 
     run_id: str
@@ -47,6 +48,8 @@ class Run(NamedTuple):
     iterations: float | None
     residual: float | None
     largest_strain: float | None
+    interrupted: bool | None
+    adds_up: bool | None
 
 
 _SUMMARY = """
@@ -65,7 +68,7 @@ select run_id, any_value(scene), any_value("size"), any_value(solver), any_value
     1e3 * median(seconds) filter (phase = 'global'),
     median(iterations) filter (phase = 'step'),
     arg_max(residual, frame) filter (phase = 'step'),
-    max(largest_strain)
+    max(largest_strain), bool_or(interrupted) filter (phase = 'step'), bool_and(adds_up)
 from numbered group by run_id order by min(place)
 """
 
@@ -110,12 +113,17 @@ _NUMBERS = (
 )
 
 
+INTERRUPTED = "! the process was interrupted while steps were timed: its least time is nearest to the truth"
+APART = "~ local and global, timed alone, do not add up to an iteration within 15 %"
+"""What the marks in the table mean."""
+
+
 def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
-    """One line for each run: what it was, whether it succeeded, and its times [ms].
+    """One line for each run: what it was, whether it succeeded, and its times [ms], marked where they are doubtful.
 
     other_code: the ids of the runs that were done by other code than today's, which are marked.
     """
-    out = Table(box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
+    out = Table(box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False, caption_justify="left")
     for name in ("scene", "size", "solver"):
         out.add_column(name, overflow="fold", justify="right" if name == "size" else "left", min_width=len(name))
     for name in _NUMBERS:
@@ -131,16 +139,24 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
             _number(run.springs, count),
             f"[{'green' if run.status == 'ok' else 'bold red'}]{run.status}[/]"
             + ("[yellow] by other code[/]" if run.run_id in other_code else ""),
-            *(
-                _number(value, quantity)
-                for value in (run.cold, run.warm, run.step, run.least, run.local, run.global_, run.iterations)
-            ),
+            *(_number(value, quantity) for value in (run.cold, run.warm)),
+            _number(run.step, quantity) + ("!" if run.interrupted else ""),
+            _number(run.least, quantity),
+            *(_number(value, quantity) + _apart(run, value) for value in (run.local, run.global_)),
+            _number(run.iterations, quantity),
             _number(run.residual, "{:.1e}".format),
             _number(run.largest_strain, lambda strain: f"{100 * strain:.3g} %"),
         )
+    marks = {INTERRUPTED: any(run.interrupted for run in found), APART: any(_apart(run, run.local) for run in found)}
+    out.caption = "\n".join(words for words, there in marks.items() if there) or None
     # Lines longer than a narrow terminal keep their numbers; Rich would cut them to ellipses.
     out.width = Measurement.get(wide := Console(width=1000), wide.options, out).maximum
     return out
+
+
+def _apart(run: Run, value: float | None) -> str:
+    """The mark of a phase's time where the phases do not add up to an iteration."""
+    return "~" if value is not None and run.adds_up is False else ""
 
 
 def _number(value, words) -> str:

@@ -1,26 +1,33 @@
 """Wall times of a run: preparing, whole steps, and the local and the global step apart.
 
-The timed passes record nothing. They come after a pass in which the phases are timed apart, which warms up
-all that the steps use, and they repeat the whole simulation `rounds` times.
+The timed passes record nothing. They come after a pass in which the phases are timed apart, each frame's next to an
+iteration of its solve, which warms up all that the steps use, and they repeat the whole simulation `rounds` times.
+All that is timed is timed once more by a `Watch`.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
+from itertools import pairwise
 from time import perf_counter
 
+import numba
 import numpy as np
 
 from harness.scenes.bind import Scene
+from harness.simulation.clock import Watch, working
 from harness.simulation.contract import Contract
 from harness.simulation.step import Step, prepare, simulate, start
 from solvers.problem import Positions, Prepared, Solver, StopRule
 
 PHASE_REPEATS = 3
-"""How often the local and the global step are timed in each frame, after one call to warm up."""
+"""How often the local and the global step are timed in each frame, after calls that warm up."""
 
+ITERATION = "iteration"
+"""The phase that the others should add up to: the time of a whole solve over its iterations, taken next to theirs."""
 
 LARGEST = 1e150
 """Coordinates [m] from this one on count as not finite: their squares, and so all energies, are infinite."""
@@ -40,12 +47,13 @@ class StepFailed(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """One measured time: phase, frame (None where it has none), round, wall seconds."""
+    """One measured time: phase, frame (None where it has none), round, wall seconds of each of so many calls."""
 
     phase: str
     frame: int | None
     round: int
     seconds: float
+    calls: int = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,11 +68,18 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """What the timed passes found: the prepared solver, all times, and the digest of the final positions."""
+    """What the timed passes found: the prepared solver, all times, a watch over those of each phase (of steps over
+    those of each round), and the final positions (n, 3) [m]."""
 
     prepared: Prepared
     timings: list[Timing]
-    digest: str
+    watches: dict[tuple[str, int | None], Watch]
+    final: Positions
+
+    @staticmethod
+    def pass_of(timing: Timing) -> int | None:
+        """The round of a time's watch."""
+        return timing.round if timing.phase == "step" else None
 
 
 def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[str], None]) -> Measured:
@@ -73,38 +88,55 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
     Raises Unsupported, NotPositiveDefinite, StepFailed, RunFailed where the solver breaks its contract.
     """
     timings: list[Timing] = []
+    watches: dict[tuple[str, int | None], Watch] = {}
     contract = Contract(scene.system, solver)
+
+    def watch(phase: str, round: int | None = None) -> Watch:
+        return watches.setdefault((phase, round), Watch(numba.get_num_threads()))
+
     prepared = None
     for round in range(settings.rounds + 1):
-        began = perf_counter()
-        prepared = prepare(scene, solver)
-        timings.append(Timing("prepare", None, round, perf_counter() - began))
+        with watch("prepare"):
+            began = perf_counter()
+            prepared = prepare(scene, solver)
+            seconds = perf_counter() - began
+        timings.append(Timing("prepare", None, round, seconds))
     assert prepared is not None
 
     for step in steps(scene, contract.checked(prepared), settings):
-        for phase, call in prepared.phases(step.problem).items():
-            call()
-            for round in range(PHASE_REPEATS):
+        phases = working(prepared, step.problem)
+        for phase, call in phases.items():
+            with watch(phase):
+                stamps = [perf_counter()]
+                for _ in range(PHASE_REPEATS):
+                    call()
+                    stamps.append(perf_counter())
+            timings += [Timing(phase, step.index, round, b - a) for round, (a, b) in enumerate(pairwise(stamps))]
+        if phases:
+            with watch(ITERATION):
                 began = perf_counter()
-                call()
-                timings.append(Timing(phase, step.index, round, perf_counter() - began))
+                done = max(1, prepared.solve(step.problem, settings.stop).iterations)
+                seconds = perf_counter() - began
+            timings.append(Timing(ITERATION, step.index, 0, seconds / done, done))
         tick("warm up and phases")
 
     final = start(scene).now.positions
     for round in range(settings.rounds):
-        for step in steps(scene, prepared, settings):
+        for step in steps(scene, prepared, settings, watch("step", round)):
             timings.append(Timing("step", step.index, round, step.seconds))
             final = step.positions
             tick("timed pass")
-    return Measured(prepared, timings, digest(final))
+    return Measured(prepared, timings, watches, final)
 
 
-def steps(scene: Scene, prepared: Prepared, settings: Settings) -> Iterator[Step]:
-    """The run's steps; raises StepFailed, from Diverged where a position is not finite."""
+def steps(scene: Scene, prepared: Prepared, settings: Settings, watch: Watch | None = None) -> Iterator[Step]:
+    """The run's steps, each done under the watch; raises StepFailed, from Diverged where a position is not finite."""
     run = simulate(scene, prepared, settings.stop, first_guess=settings.first_guess, frames=settings.frames)
+    watched = watch or nullcontext()
     for frame in range(1, settings.frames + 1):
         try:
-            step = next(run)
+            with watched:
+                step = next(run)
             if not np.abs(step.positions).max(initial=0.0) < LARGEST:  # so that NaN counts too
                 raise Diverged(f"positions are not finite from frame {frame} on")
         except Exception as error:

@@ -106,8 +106,17 @@ class PreparedLocalGlobal:
         constant, b = self._constant(problem), np.empty_like(problem.target)
         p = self._placed(problem.first_guess, problem)
         out, project = p.copy(), self._local(problem)
-        project(p, constant, b)
-        return {"local": lambda: project(p, constant, b), "global": lambda: self.toward(b, p, out)}
+
+        def local() -> Positions:
+            project(p, constant, b)
+            return b
+
+        def whole() -> Positions:
+            self.toward(b, p, out)
+            return out
+
+        local()
+        return {"local": local, "global": whole}
 
     def _local(self, problem: StepProblem) -> Project:
         return self.begin(problem) if self.begin else self.project
@@ -122,8 +131,9 @@ class PreparedLocalGlobal:
             y[s.free] -= self.coupling @ problem.pin_targets[s.pins.exact]
         return y
 
-    def correction(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b, by the factor as it is, to `out`, both (n, 3); exactly pinned vertices keep what is there."""
+    def correction(self, b: Positions, out: Positions) -> Positions:
+        """Write Q^-1 b, by the factor as it is, to `out`, which it returns, both (n, 3); exactly pinned vertices keep
+        what is there."""
         free = self.system.free
         if len(free) == len(b):
             self.factor.solve(b, out)
@@ -131,6 +141,7 @@ class PreparedLocalGlobal:
             solved = np.empty((len(free), 3))
             self.factor.solve(b[free], solved)
             out[free] = solved
+        return out
 
     def toward(self, b: Positions, p: Positions, out: Positions) -> None:
         """Write where Q p = b leads from p to `out`, (n, 3) all, as `correction` does; by a rounded factor, nearer."""

@@ -251,8 +251,9 @@ class PreparedCompiled:
 
         edges = self.parts.begun(self.edges, problem)
 
-        def local() -> None:
+        def local() -> NDArray[Any]:
             step.local(self.plan, self.bundles, edges, a, right, p, b)
+            return b
 
         y, out = self.base.system.inertia[:, None] * target + force, np.zeros_like(target)
         return {"local": local, "global": lambda: self.base.correction(y, out)}

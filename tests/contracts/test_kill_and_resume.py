@@ -24,7 +24,8 @@ from harness.report import opengl
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES = 8
-WRITTEN_BY = ("seconds", "started", "commit", "code")
+TIMES = ("seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted", "adds_up")
+WRITTEN_BY = (*TIMES, "started", "commit", "code")
 """Columns that tell how long a run took, and when and by which state of the code it was done."""
 
 CLOTH = f"""

@@ -17,6 +17,7 @@ from harness.record.base import Frame
 from harness.record.compare import side_by_side
 from harness.record.reader import open_recording, read_replay, summary
 from harness.record.rerun import SCALARS, RerunRecorder
+from harness.record.shading import LEVELS, palette
 from harness.scenes.mesh.grid import Grid
 from tests.recordings import MESHES, foreign, info, record, waving
 
@@ -42,6 +43,29 @@ def test_positions_come_back_exactly_to_float32(mesh: str, tmp_path: Path):
     np.testing.assert_array_equal(replay.positions, expected)
     np.testing.assert_array_equal(replay.frames, np.arange(12))
     np.testing.assert_allclose(replay.times, 0.01 * np.arange(12), atol=1e-9)  # the file counts nanoseconds
+
+
+@pytest.mark.parametrize(("mesh", "component"), [("cloth", "Mesh3D:vertex_colors"), ("chain", "Points3D:colors")])
+def test_each_frame_has_the_colours_of_its_own_strains(mesh: str, component: str, tmp_path: Path):
+    of = info(mesh)
+    found: dict[int, list[int]] = {}
+    with open_recording(record(tmp_path / "a.rrd", of, count=12)) as source:
+        for chunk in source.chunks(content="/scene/mesh", components=[component]):
+            batch = chunk.to_record_batch()
+            found |= dict(zip(batch["frame"].to_pylist(), batch[component].to_pylist(), strict=True))
+    scale = {int(colour): level for level, colour in enumerate(palette().view(">u4").ravel())}
+    seen = set()
+    for frame in waving(of, 12):
+        strain = np.linalg.norm(np.diff(frame.positions[of.springs], axis=1)[:, 0], axis=1) / of.rest_lengths - 1.0
+        levels = []
+        for v in range(len(frame.positions)):
+            near = strain[(of.springs == v).any(axis=1)]
+            most = near[np.abs(near).argmax()]
+            levels.append(round((float(np.clip(most / of.strain_range, -1, 1)) + 1) * (LEVELS - 1) / 2))
+        recorded = [scale[colour] for colour in found[frame.index]]
+        assert np.abs(np.subtract(recorded, levels)).max() <= 1, "a strain may be rounded to either of two levels"
+        seen.add(tuple(recorded))
+    assert len(seen) == 12, "another frame's colours are others"
 
 
 @pytest.mark.parametrize("mesh", MESHES)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count, islice, pairwise
-from time import sleep
+from time import perf_counter, sleep
 from typing import Any, cast
 
 import numpy as np
@@ -118,6 +118,15 @@ def test_grades_are_the_oracles_and_stamps_ascend_in_each_round() -> None:
     assert found.seconds.shape == (len(found.numbers), 3)
     assert (found.seconds[0] == 0.0).all()
     assert (np.diff(found.seconds, axis=0) > 0.0).all()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 2.0])
+def test_stamps_that_another_clock_does_not_bear_out_are_a_failure(
+    scale: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(curves, "perf_counter", lambda: scale * perf_counter())
+    with pytest.raises(RunFailed, match="the times of iterates add up to"):
+        curve(SparseLocalGlobal().prepare(PROBLEM.system), iterations=120)
 
 
 def test_passes_that_differ_in_the_last_bit_are_a_failure() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.chain import Chain
 from harness.scenes.spec import SceneSpec
+from harness.simulation import step as simulate_module
 from harness.simulation.step import prepare, simulate
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule
@@ -81,8 +83,16 @@ def test_a_smaller_step_and_a_better_integrator_err_less(trajectory: Trajectory)
 def test_each_round_has_a_time_and_their_median_is_the_cost(trajectory: Trajectory) -> None:
     found = row(replace(UNIT, how=replace(UNIT.how, rounds=3)), trajectory)
     assert len(found["seconds"]) == 3
-    assert all(seconds > 0.0 for seconds in found["seconds"])
     assert found["seconds_per_simulated"] == np.median(found["seconds"]) / HORIZON
+
+
+def test_seconds_that_another_clock_does_not_bear_out_are_a_failure(
+    trajectory: Trajectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(simulate_module, "perf_counter", lambda: perf_counter() / 1000)
+    found = row(UNIT, trajectory)
+    assert (found["status"], "seconds" in found) == ("failed", False)
+    assert "the times of step add up to" in found["reason"]
 
 
 LOST = [

@@ -241,4 +241,4 @@ def test_stiffness_beyond_the_digits_of_inertia_leaves_numbers(backend):
     problem = StepProblem(system, rest, zero, none, rest, rest + 1.0, begun(system, rest, rest))
     solution = backend.prepare(system).solve(problem, StopRule(5, 1e-6))
     assert np.isfinite(solution.positions).all()
-    assert solution.residual >= 0.0
+    assert np.isfinite(solution.residual)

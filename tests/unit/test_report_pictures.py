@@ -129,9 +129,51 @@ def test_a_uniform_strain_has_the_documented_colour(strain: float, colour: str) 
     view = frame_all(replay.positions[0], aspect=1.0, angles=(0.0, 0.0))
     with Studio(160, 160) as studio:
         image = studio.draw(replay, 0, view)
-    seen = np.median(image[60:100, 60:100].reshape(-1, 3), axis=0) / 255
+    seen = seen_colour(image)
     # Light and mesh lines change a facing surface's brightness by up to a tenth; the colours differ by more.
     assert np.abs(seen - to_rgb(colour)).max() < 0.1
+
+
+def seen_colour(image: NDArray[np.float64] | NDArray[np.uint8]) -> NDArray[np.float64]:
+    """The colour in the middle of a square picture, each channel from 0 to 1."""
+    return np.median(image[60:100, 60:100].reshape(-1, 3), axis=0) / 255
+
+
+def pulled(triangles: bool) -> tuple[Replay, list[Replay]]:
+    """A cloth or a net in three frames, compressed, at rest, and stretched; and each of them alone."""
+    frames = [cloth(frames=1, stretch=1 + strain, triangles=triangles) for strain in (-0.1, 0.0, 0.1)]
+    whole = cloth(frames=3, triangles=triangles)
+    return replace(whole, positions=np.concatenate([frame.positions for frame in frames])), frames
+
+
+@needs_opengl
+@pytest.mark.parametrize("triangles", [True, False], ids=["cloth", "net"])
+def test_each_frame_is_drawn_as_it_would_be_alone(triangles: bool) -> None:
+    replay, frames = pulled(triangles)
+    view = frame_all(frames[1].positions[0], aspect=1.0, angles=(20.0, 10.0))
+    with Studio(160, 160) as studio:
+        together = [studio.draw(replay, k, view) for k in range(3)]
+        alone = [studio.draw(frame, 0, view) for frame in frames]
+    for k in range(3):
+        np.testing.assert_array_equal(together[k], alone[k])
+        assert not np.array_equal(together[k], together[k - 1])
+
+
+@needs_opengl
+def test_each_frame_is_drawn_in_its_own_colours_and_positions() -> None:
+    """Drawn out of order, by one window."""
+    replay, frames = pulled(True)
+    view = frame_all(frames[1].positions[0], aspect=1.0, angles=(0.0, 0.0))
+    with Studio(160, 160) as studio:
+        seen = {k: studio.draw(replay, k, view) for k in (2, 0, 1)}
+    for k, colour in zip((0, 1, 2), STRAIN_COLOURS[::2], strict=True):
+        # As above.
+        assert np.abs(seen_colour(seen[k]) - to_rgb(colour)).max() < 0.1
+    shares = [drawn(seen[k].astype(float), 0, 0, 160, 160) for k in (0, 1, 2)]
+    assert shares[0] < shares[2], "a stretched cloth covers more"
+    for k, frame in enumerate(frames):
+        assert spring_strain(replay, k) == pytest.approx(spring_strain(frame, 0))
+        assert vertex_strain(replay, k) == pytest.approx(vertex_strain(frame, 0))
 
 
 def test_a_vertex_shows_its_most_strained_spring_with_its_sign() -> None:

@@ -20,7 +20,7 @@ from harness.report import page, timing_plot
 from harness.report.labels import LINE, spread
 from harness.report.style import HEIGHT, WIDTH, marks
 from harness.report.timing_plot import draw_timing
-from harness.report.timing_table import labels, runs, summary_table
+from harness.report.timing_table import APART, INTERRUPTED, labels, runs, summary_table
 from solvers.registry import SOLVERS
 
 POWERS = {"sparse": 1.0, "dense": 2.0, "xpbd": 1.5}  # of the vertices, in the times of each solver
@@ -191,3 +191,19 @@ def test_the_summary_has_a_line_for_each_run() -> None:
     lines = [" ".join(line.split()) for line in console.export_text().splitlines()]
     assert "cloth 10 sparse 100 400 ok 0.8 0.3 0.1 0.099 0.01 0.02 10 1.0e-04 40 %" in lines
     assert f"cloth 10 dense 100 400 diverged{9 * ' –'}" in lines
+
+
+def test_the_summary_marks_times_that_are_doubtful_and_says_why() -> None:
+    told = rows(sizes=(10,), solvers=("sparse",)).to_pylist()
+    for row in told:
+        row["interrupted"] = row["phase"] == "step" and row["frame"] == 2
+        row["adds_up"] = False if row["phase"] in ("local", "global") else None
+    console = Console(width=200, record=True, file=StringIO())
+    console.print(summary_table(pa.Table.from_pylist(told, schema=SCHEMA)))
+    text = " ".join(console.export_text().split())
+    assert "ok 0.8 0.3 0.1! 0.099 0.01~ 0.02~ 10" in text
+    assert INTERRUPTED in text
+    assert APART in text
+    console.print(summary_table(rows(sizes=(10,), solvers=("sparse",))))
+    text = " ".join(console.export_text().split())
+    assert not {"!", "~"} & set(text.split("strain")[-1]), "rows that say nothing of it have no marks"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from time import perf_counter, sleep
 
 import numpy as np
 import pytest
@@ -136,7 +137,27 @@ def test_each_step_starts_from_the_two_before_it():
         np.testing.assert_allclose(stated.target, rest + k + moved, rtol=0, atol=1e-14)
         assert stop == rule
     assert all(step.problem is stated for step, (stated, _) in zip(steps, prepared.asked, strict=True))
-    assert all(step.seconds >= 0.0 for step in steps)
+
+
+class Slow(Pushed):
+    """It sleeps while it solves."""
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        began = perf_counter()
+        sleep(0.005)
+        self.slept = perf_counter() - began
+        return super().solve(problem, stop)
+
+
+def test_a_steps_seconds_hold_its_solve_and_nothing_between_steps():
+    prepared = Slow()
+    steps = simulate(MADE, prepared, StopRule(), first_guess="current", frames=3)
+    for _ in range(3):
+        began = perf_counter()
+        step = next(steps)
+        around = perf_counter() - began
+        assert prepared.slept <= step.seconds <= around  # intervals on one clock, each within the next
+        sleep(0.01)
 
 
 def test_steps_are_done_only_when_asked_for():

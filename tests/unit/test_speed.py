@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter, thread_time
 from typing import Any
 
 import numpy as np
 import pytest
 
 from harness.base import machine
-from harness.base.errors import InputError
+from harness.base.errors import InputError, RunFailed
 from harness.base.rows import alone
 from harness.config.load import load_any, load_sweep
 from harness.config.sweep import RunSpec, SolverSpec
@@ -228,3 +229,15 @@ def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path, monkeypatch: 
         f"yardstick-cloth {size}: 5 of 5 there are by other code than today's; --again does all anew" for size in (4, 5)
     ]
     assert all((tmp_path / "out" / "rows").glob("*.parquet"))
+
+
+def test_a_time_that_another_clock_does_not_bear_out_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def busy() -> None:
+        began = thread_time()
+        while thread_time() - began < 0.005:
+            pass
+
+    assert average(candidates.repeated(busy)) >= 0.005
+    monkeypatch.setattr(candidates, "perf_counter", lambda: perf_counter() / 1000)
+    with pytest.raises(RunFailed, match="the times of calls add up to"):
+        average(candidates.repeated(busy))

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from itertools import islice
 from time import perf_counter
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +24,7 @@ from harness.base.errors import RunFailed
 from harness.experiments.accuracy.scales import round_off
 from harness.reference.curvature import Curvature, curvature
 from harness.reference.oracle import Oracle
+from harness.simulation.clock import Watch
 from solvers.problem import Positions, Prepared, StepProblem
 
 STATIONARY, GAP = 1e-10, 1e-9
@@ -85,7 +87,7 @@ def measure(
     """The curve of a solve from the problem's first guess.
 
     lowest: energy [J] of the lowest minimum known; time_limit: seconds of the solver's own.
-    Raises RunFailed where a timed pass ends at other positions.
+    Raises RunFailed where a timed pass ends at other positions, or another clock saw other seconds go by.
     """
     grading = _Grading(oracle, problem, lowest, iterations, time_limit)
     p, spent, number, still = problem.first_guess.copy(), 0.0, 0, 0
@@ -170,17 +172,19 @@ class _Grading:
 
 def _timed(prepared: Prepared, problem: StepProblem, count: int, expected: Positions) -> NDArray[np.float64]:
     """Wall seconds (count + 1,) from the start to the first guess (0), and to each iterate."""
-    stamps = np.zeros(count + 1)
+    stamps, watch = np.zeros(count + 1), Watch(numba.get_num_threads())
     p = problem.first_guess
     gc.disable()  # a collection in the middle would be counted as the solver's
     try:
-        began = perf_counter()
-        for number, following in enumerate(islice(prepared.iterates(problem), count), start=1):
-            stamps[number] = perf_counter()
-            p = following
+        with watch:
+            began = perf_counter()
+            for number, following in enumerate(islice(prepared.iterates(problem), count), start=1):
+                stamps[number] = perf_counter()
+                p = following
     finally:
         gc.enable()
     if not np.array_equal(p, expected, equal_nan=True):
         raise RunFailed("a timed pass ended at other positions than the graded one")
     stamps[1:] -= began
+    watch.columns("iterates", np.diff(stamps))
     return stamps

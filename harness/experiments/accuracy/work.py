@@ -19,6 +19,7 @@ from harness.experiments.accuracy.failures import OverTime, lost
 from harness.reference.frozen import bind
 from harness.reference.trajectory import Trajectory
 from harness.scenes.bind import Scene
+from harness.simulation.clock import Watch
 from harness.simulation.measure import Diverged
 from harness.simulation.step import prepare, simulate
 from solvers.problem import Positions, Prepared, Solver, StopRule
@@ -73,10 +74,16 @@ def _simulated(unit: WorkUnit, trajectory: Trajectory, tick: Callable[[], None])
 
 
 def _run(unit: WorkUnit, scene: Scene, prepared: Prepared, frames: int) -> tuple[Positions, float, int]:
-    """The last positions (n, 3) [m], the wall seconds of all steps, and the iterations done in them."""
+    """The last positions (n, 3) [m], the wall seconds of all steps, and the iterations done in them.
+
+    Raises RunFailed where another clock saw other seconds go by.
+    """
     stop, seconds, iterations = StopRule(unit.iterations, unit.tolerance), 0.0, 0
-    p = scene.mesh.rest
-    for step in simulate(scene, prepared, stop, first_guess=unit.first_guess, frames=frames):
+    p, watch = scene.mesh.rest, Watch(unit.how.threads)
+    run = simulate(scene, prepared, stop, first_guess=unit.first_guess, frames=frames)
+    for _ in range(frames):
+        with watch:
+            step = next(run)
         p = step.positions
         seconds += step.seconds
         iterations += step.solution.iterations
@@ -84,4 +91,5 @@ def _run(unit: WorkUnit, scene: Scene, prepared: Prepared, frames: int) -> tuple
             raise Diverged(f"positions are not finite from frame {step.index} on")
         if seconds > unit.how.time_limit and step.index < frames:
             raise OverTime(f"the limit of {unit.how.time_limit:g} s was reached in frame {step.index} of {frames}")
+    watch.columns("step", [seconds])
     return p, seconds, iterations

@@ -11,11 +11,14 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
+import numba
+
 from harness.config.sweep import RunSpec
 from harness.experiments.speed import limits, work
 from harness.experiments.speed.rest import Rest, apart, precision
 from harness.experiments.speed.yardstick import Yardstick
 from harness.scenes.bind import Scene
+from harness.simulation.clock import Watch, working
 from solvers.problem import Positions, Prepared, StepProblem, StopRule
 from solvers.registry import SOLVERS, load
 
@@ -71,9 +74,12 @@ class SolverCandidate:
 
     def prepare(self) -> float:
         """See Candidate. Raises Unsupported, NotPositiveDefinite, MemoryError."""
-        began = perf_counter()
-        prepared = self._solver.prepare(self._scene.system)
-        seconds = perf_counter() - began
+        watch = Watch(numba.get_num_threads())
+        with watch:
+            began = perf_counter()
+            prepared = self._solver.prepare(self._scene.system)
+            seconds = perf_counter() - began
+        watch.columns("prepare", [seconds])
         if self._prepared is None:
             self._prepared = prepared = self._shared.setdefault(str(self._solver), prepared)
             counts = self._scene.system.vertices, len(self._scene.springs.edges)
@@ -88,8 +94,8 @@ class SolverCandidate:
         """See Candidate."""
         prepared = self._prepared
         assert prepared is not None
-        readings = [Reading("step", average(self._step), self._columns("iteration", self.run.iterations))]
-        for phase, call in prepared.phases(self._problem).items():
+        readings = [Reading("step", average(repeated(self._step)), self._columns("iteration", self.run.iterations))]
+        for phase, call in working(prepared, self._problem).items():
             readings.append(Reading(phase, average(repeated(call)), self._columns(phase, 1)))
         return readings
 
@@ -98,13 +104,10 @@ class SolverCandidate:
         self._prepared = None
         return self._positions
 
-    def _step(self, number: int) -> float:
+    def _step(self) -> None:
         assert self._prepared is not None
         stop = StopRule(self.run.iterations, self.run.tolerance)
-        began = perf_counter()
-        for _ in range(number):
-            self._positions = self._prepared.solve(self._problem, stop).positions
-        return perf_counter() - began
+        self._positions = self._prepared.solve(self._problem, stop).positions
 
     def _columns(self, phase: str, times: int) -> dict[str, Any]:
         done = {"iterations": times}
@@ -188,13 +191,17 @@ class MachineCandidate:
 
 
 def repeated(call: Callable[[], object]) -> Callable[[int], float]:
-    """The seconds that some calls take, by their number."""
+    """The seconds that some calls take, by their number. These raise RunFailed where another clock saw other ones."""
 
     def seconds(number: int) -> float:
-        began = perf_counter()
-        for _ in range(number):
-            call()
-        return perf_counter() - began
+        watch = Watch(numba.get_num_threads())
+        with watch:
+            began = perf_counter()
+            for _ in range(number):
+                call()
+            found = perf_counter() - began
+        watch.columns("calls", [found])
+        return found
 
     return seconds
 

@@ -1,0 +1,177 @@
+"""A run whose times, phases or recording say what is not so is a failed run, whoever's code said it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from time import perf_counter, thread_time
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from harness.config.load import load_any
+from harness.experiments.run import Files, execute
+from harness.record.base import Frame
+from harness.record.rerun import RerunRecorder
+from harness.record.shading import Shading
+from harness.simulation import step as simulate
+from solvers.integrators import Integrator, Motion
+from solvers.methods.local_global import SparseLocalGlobal
+from solvers.problem import Positions, Prepared, Solution, Start, StepProblem, StopRule, System
+from solvers.registry import SOLVERS
+
+FRAMES = 6
+SCENE = f"""
+mesh: {{kind: grid}}
+mass: 1.0
+time_step: 1/30
+frames: {FRAMES}
+default_size: 5
+effects: [{{kind: springs, stretch: 100}}, {{kind: gravity}}, {{kind: pins, at: [top_corners]}}]
+"""
+SOLVE = 0.003
+"""Seconds of CPU time that a solve takes at least, so that steps are nothing but solves."""
+
+spent = 0.0
+"""Seconds that solves have taken until now."""
+
+
+@dataclass(frozen=True)
+class Busy:
+    """Local-global iterations that take their time; lies: phases instead of its own."""
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+    lies: ClassVar[dict[str, Callable[[], object]]] = {}
+
+    def prepare(self, system: System) -> _Busy:
+        return _Busy(SparseLocalGlobal().prepare(system))
+
+
+@dataclass(frozen=True)
+class _Busy:
+    base: Prepared
+
+    @property
+    def choice(self) -> str:
+        return self.base.choice
+
+    @property
+    def facts(self) -> dict[str, float]:
+        return self.base.facts
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        return self.base.iterates(problem)
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        global spent
+        began, busy = perf_counter(), thread_time()
+        while thread_time() - busy < SOLVE:
+            pass
+        solution = self.base.solve(problem, stop)
+        spent += perf_counter() - began
+        return solution
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        return self.base.phases(problem) | Busy.lies
+
+
+@pytest.fixture
+def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[list[dict[str, Any]], Files]]:
+    """Does a run of the busy solver; its rows, and its files."""
+    monkeypatch.setitem(SOLVERS, "busy", f"{__name__}:Busy")
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    (spec,) = load_any(tmp_path / "scene.yaml", solvers=["busy"], iterations=3, rounds=1).runs()
+    files = Files.of(spec, tmp_path)
+    files.rows.parent.mkdir()
+    return lambda: (execute(spec, files, lambda phase: None), files)
+
+
+def test_a_run_that_tells_the_truth_is_done(ran):
+    found, files = ran()
+    assert {row["status"] for row in found} == {"ok"}
+    assert files.recording.exists()
+    steps = [row for row in found if row["phase"] == "step"]
+    assert all(row["pass_seconds"] >= FRAMES * SOLVE for row in steps)
+    assert [row["frame"] for row in steps if row.get("recorded")] == [FRAMES]
+
+
+CLOCKS = {
+    "without the solve": lambda: perf_counter() - spent,
+    "over a thousand": lambda: perf_counter() / 1000,
+    "times two": lambda: perf_counter() * 2,
+}
+
+
+@pytest.mark.parametrize("clock", CLOCKS.values(), ids=CLOCKS)
+def test_a_run_whose_steps_do_not_add_up_to_the_wall_time_fails(ran, monkeypatch: pytest.MonkeyPatch, clock):
+    monkeypatch.setattr(simulate, "perf_counter", clock)
+    (row,), files = ran()
+    assert row["status"] == "failed"
+    assert "the times of step add up to" in row["reason"]
+    assert not files.recording.exists()
+
+
+UNTOUCHED = np.ones((25, 3))
+
+
+@pytest.mark.parametrize("whole", [lambda: None, lambda: UNTOUCHED], ids=["nothing", "what was there"])
+def test_a_run_with_a_phase_that_does_nothing_fails(ran, monkeypatch: pytest.MonkeyPatch, whole):
+    monkeypatch.setitem(Busy.lies, "global", whole)
+    (row,), _ = ran()
+    assert row["status"] == "failed"
+    assert "the phase global does nothing" in row["reason"]
+
+
+def late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each frame has the positions of the one before."""
+    record, held = RerunRecorder.frame, []
+
+    def frame(self: RerunRecorder, frame: Frame) -> None:
+        held.append(frame.positions)
+        record(self, replace(frame, positions=held[-2] if len(held) > 1 else held[0]))
+
+    monkeypatch.setattr(RerunRecorder, "frame", frame)
+
+
+def recoloured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each frame has the colours of the first."""
+    strains, first = Shading.strains, []
+
+    def of(self: Shading, p: Positions):
+        first.append(strains(self, p))
+        return first[0]
+
+    monkeypatch.setattr(Shading, "strains", of)
+
+
+RECORDINGS = {
+    "a frame late": (late, "was recorded with other positions"),
+    "another frame's colours": (recoloured, "was recorded with other colours"),
+}
+
+
+@pytest.mark.parametrize(("lie", "reason"), RECORDINGS.values(), ids=RECORDINGS)
+def test_a_run_whose_recording_does_not_end_as_it_did_fails(ran, monkeypatch: pytest.MonkeyPatch, lie, reason: str):
+    lie(monkeypatch)
+    (row,), files = ran()
+    assert row["status"] == "failed"
+    assert reason in row["reason"]
+    assert not files.recording.exists()
+
+
+def test_a_run_whose_second_pass_goes_another_way_than_the_timed_one_fails(ran, monkeypatch: pytest.MonkeyPatch):
+    steps = count()
+    advance = Integrator.advance
+
+    def drifting(self: Integrator, start: Start, solution: Solution) -> Motion:
+        moved = advance(self, start, solution)
+        return moved._replace(positions=moved.positions + 1e-9 * (next(steps) >= 2 * FRAMES))
+
+    monkeypatch.setattr(Integrator, "advance", drifting)
+    (row,), _ = ran()
+    assert row["status"] == "failed"
+    assert row["reason"] == "the recorded pass ended at other positions than the timed pass"

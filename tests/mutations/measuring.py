@@ -1,0 +1,169 @@
+"""Lies in measuring, recordings and pictures. Those with a third part are found out by the product as well: by a run of
+that solver, whose row gives the reason."""
+
+from __future__ import annotations
+
+from tests.mutations.base import Mutation
+
+_STEP, _MEASURE, _CLOCK = (f"harness/simulation/{name}.py" for name in ("step", "measure", "clock"))
+_RERUN, _RENDER = "harness/record/rerun.py", "harness/report/render.py"
+_LIES, _RECORDINGS = "tests/contracts/test_lies.py", "tests/contracts/test_recordings.py"
+_UNIT_STEP, _UNIT_MEASURE, _UNIT_CLOCK = (f"tests/unit/test_{name}.py" for name in ("simulate", "measure", "clock"))
+_PICTURES, _PHASES = (
+    "tests/unit/test_report_pictures.py",
+    "tests/contracts/test_solver_contract.py::test_each_phase_does_what_it_returns",
+)
+_TWO_CLOCKS = "add up to"
+
+MEASURING = (
+    Mutation(
+        "steps-without-solve",
+        _STEP,
+        "        solution = prepared.solve(stated, stop)\n",
+        "        solution = prepared.solve(stated, stop)\n        began = perf_counter()\n",
+        (_UNIT_STEP,),
+        ("sparse", _TWO_CLOCKS),
+    ),
+    Mutation(
+        "steps-scaled",
+        _STEP,
+        "seconds = perf_counter() - began",
+        "seconds = (perf_counter() - began) / 1000",
+        (_UNIT_STEP,),
+        ("sparse", _TWO_CLOCKS),
+    ),
+    Mutation(
+        "phases-scaled", _MEASURE, "round, b - a)", "round, (b - a) / 1000)", (_UNIT_MEASURE,), ("sparse", _TWO_CLOCKS)
+    ),
+    Mutation(
+        "prepare-scaled",
+        _MEASURE,
+        'Timing("prepare", None, round, seconds)',
+        'Timing("prepare", None, round, seconds / 1000)',
+        (_UNIT_MEASURE,),
+        ("sparse", _TWO_CLOCKS),
+    ),
+    Mutation(
+        "rows-scaled",
+        "harness/simulation/times.py",
+        '"seconds": t.seconds,',
+        '"seconds": t.seconds / 1000,',
+        (_UNIT_MEASURE,),
+        ("sparse", _TWO_CLOCKS),
+    ),
+    Mutation(
+        "global-does-nothing",
+        "solvers/methods/local_global.py",
+        '"global": whole}',
+        '"global": lambda: None}',
+        (_PHASES,),
+        ("sparse", "does nothing"),
+    ),
+    Mutation(
+        "global-leaves-what-is-there",
+        "solvers/methods/local_global_compiled.py",
+        '"global": lambda: self.base.correction(y, out)}',
+        '"global": lambda: out}',
+        (_PHASES,),
+        ("numba", "does nothing"),
+    ),
+    Mutation(
+        "a-round-too-few",
+        _MEASURE,
+        "    for round in range(settings.rounds):",
+        "    for round in range(settings.rounds - 1):",
+        (_UNIT_MEASURE,),
+    ),
+    Mutation("tolerance-of-all", _CLOCK, "SHARE, LEAST, CALL = 0.03", "SHARE, LEAST, CALL = 3.0", (_UNIT_CLOCK,)),
+    Mutation("never-interrupted", _CLOCK, '"interrupted": self.lost >', '"interrupted": 0.0 >', (_UNIT_CLOCK,)),
+    Mutation("phases-of-any-time", _CLOCK, "ITERATION_SHARE = 0.15", "ITERATION_SHARE = 15.0", (_UNIT_MEASURE,)),
+    Mutation(
+        "curves-scaled",
+        "harness/experiments/accuracy/curves.py",
+        "    stamps[1:] -= began\n",
+        "    stamps[1:] -= began\n    stamps /= 1000.0\n",
+        ("tests/unit/test_accuracy_curves.py",),
+    ),
+    Mutation(
+        "turns-scaled",
+        "harness/experiments/speed/candidates.py",
+        "found = perf_counter() - began",
+        "found = (perf_counter() - began) / 1000",
+        ("tests/unit/test_speed.py::test_a_time_that_another_clock_does_not_bear_out_is_a_failure",),
+    ),
+    Mutation(
+        "table-of-other-phase",
+        "harness/report/timing_table.py",
+        "median(seconds) filter (phase = 'local')",
+        "median(seconds) filter (phase = 'global')",
+        ("tests/unit/test_report_timing.py",),
+    ),
+    Mutation(
+        "frame-late",
+        _RERUN,
+        "self._held.append((frame.index, p,",
+        "self._held.append((frame.index, self._held[-1][1] if self._held else p,",
+        (_RECORDINGS,),
+        ("sparse", "other positions"),
+    ),
+    Mutation(
+        "frame-of-the-start",
+        "harness/simulation/observe.py",
+        "scene.time(step.index), p, terms",
+        "scene.time(step.index), step.problem.start.positions, terms",
+        (_LIES,),
+        ("sparse", "other positions"),
+    ),
+    Mutation(
+        "colours-late",
+        _RERUN,
+        "p, self._shading.colours(of_vertex)))",
+        "p, self._held[-1][2] if self._held else self._shading.colours(of_vertex)))",
+        (_RECORDINGS,),
+        ("sparse", "other colours"),
+    ),
+    Mutation(
+        "colours-inverted",
+        "harness/record/shading.py",
+        "np.clip(strain / self._range, -1, 1)",
+        "np.clip(-strain / self._range, -1, 1)",
+        ("tests/unit/test_record_shading.py",),
+        ("sparse", "other colours"),
+    ),
+    Mutation("times-in-microseconds", "harness/record/reader.py", "counts / 1e9", "counts / 1e6", (_RECORDINGS,)),
+    Mutation(
+        "recording-not-compared",
+        "harness/record/verify.py",
+        "if last.positions.tobytes() != expected.tobytes():",
+        "if False:",
+        ("tests/unit/test_record_verify.py",),
+    ),
+    Mutation(
+        "passes-not-compared",
+        "harness/experiments/run.py",
+        'if found[run.frames]["digest"] != digest(measured.final):',
+        "if False:",
+        (_LIES,),
+    ),
+    Mutation(
+        "picture-of-other-colours",
+        _RENDER,
+        'mesh.point_data["strain"] = vertex_strain(replay, frame)',
+        'mesh.point_data["strain"] = vertex_strain(replay, 0)',
+        (_PICTURES,),
+    ),
+    Mutation(
+        "net-of-other-colours",
+        _RENDER,
+        'lines.cell_data["strain"] = spring_strain(replay, frame)',
+        'lines.cell_data["strain"] = spring_strain(replay, 0)',
+        (_PICTURES,),
+    ),
+    Mutation(
+        "picture-of-other-frame",
+        _RENDER,
+        "np.ascontiguousarray(replay.positions[frame], np.float32)",
+        "np.ascontiguousarray(replay.positions[0], np.float32)",
+        (_PICTURES,),
+    ),
+)

@@ -1,0 +1,9 @@
+"""All planted lies."""
+
+from __future__ import annotations
+
+from tests.mutations.energies import ENERGIES
+from tests.mutations.measuring import MEASURING
+from tests.mutations.steps import STEPS
+
+TABLE = ENERGIES + STEPS + MEASURING

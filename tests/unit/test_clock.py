@@ -1,0 +1,134 @@
+"""Two clocks: what a second one sees go by decides whether times are believed, and what was lost is no lie."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from time import sleep
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.base.errors import RunFailed
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.mesh.chain import Chain
+from harness.simulation.clock import CALL, LEAST, SHARE, Watch, working
+from tests.scenes import first_problem, scene
+
+SECOND = Watch(wall=1.0, entered=100, process=1.0, thread=1.0)
+"""A second in which one thread computed all the time."""
+
+HALF_LOST = Watch(wall=1.0, entered=100, process=0.5, thread=0.5)
+
+LIES = {
+    "the solve is left out": (SECOND, 0.05),
+    "times are scaled": (SECOND, 1e-3),
+    "times are scaled up": (SECOND, 1.5),
+    "a twentieth is left out": (SECOND, 0.95),
+    "a time is not a number": (SECOND, np.nan),
+    "times are scaled on a busy machine": (HALF_LOST, 1e-3),
+    "times are longer than the wall's on a busy machine": (HALF_LOST, 1.05),
+}
+
+
+@pytest.mark.parametrize(("watch", "told"), LIES.values(), ids=LIES)
+def test_times_that_another_clock_did_not_see_are_refused(watch: Watch, told: float) -> None:
+    with pytest.raises(RunFailed, match="the times of step add up to"):
+        watch.columns("step", [told / 4] * 4)
+
+
+HONEST = {
+    "to the last bit": (SECOND, 1.0),
+    "within three hundredths": (SECOND, 1.0 - 0.9 * SHARE),
+    "within a millisecond": (Watch(wall=2e-3, entered=1, process=2e-3, thread=2e-3), 2e-3 - 0.9 * LEAST),
+    "within what reading a clock takes": (Watch(wall=0.03, entered=1000, process=0.03, thread=0.03), 0.03 - 900 * CALL),
+    "a delay between two steps": (HALF_LOST, 0.6),
+    "two threads that take turns": (Watch(threads=2, wall=1.0, entered=1, process=1.1, thread=0.99), 1.0),
+}
+
+
+@pytest.mark.parametrize(("watch", "told"), HONEST.values(), ids=HONEST)
+def test_times_that_another_clock_saw_are_believed_and_both_are_told(watch: Watch, told: float) -> None:
+    columns = watch.columns("step", [told / 2] * 2)
+    assert columns == {
+        "pass_seconds": watch.wall,
+        "summed_seconds": told,
+        "cpu_seconds": watch.process,
+        "interrupted": watch is HALF_LOST,
+    }
+
+
+def test_both_of_two_threads_that_were_stopped_for_half_the_time_are_found_out() -> None:
+    assert Watch(threads=2, wall=1.0, process=1.0, thread=0.5).columns("step", [1.0])["interrupted"]
+
+
+def test_a_watch_adds_up_what_is_done_within_it_and_nothing_in_between() -> None:
+    watch = Watch()
+    for _ in range(2):
+        with watch:
+            sleep(0.01)
+        sleep(0.2)
+    assert watch.entered == 2
+    assert watch.wall >= 0.02
+    # A thread that sleeps takes no CPU time, but for waking up: a hundredth of what it slept is ample.
+    assert watch.lost >= 0.019
+
+
+STOPPED = """
+import os, signal
+from harness.simulation.clock import Watch
+watch = Watch()
+with watch:
+    os.kill(os.getpid(), signal.SIGSTOP)
+print(watch.columns("step", [watch.wall])["interrupted"], watch.lost)
+"""
+
+
+def test_a_process_that_was_stopped_says_so() -> None:
+    child = subprocess.Popen([sys.executable, "-c", STOPPED], stdout=subprocess.PIPE, text=True)
+    _, status = os.waitpid(child.pid, os.WUNTRACED)
+    assert os.WIFSTOPPED(status)
+    sleep(0.1)
+    child.send_signal(signal.SIGCONT)
+    said, _ = child.communicate()
+    interrupted, lost = said.split()
+    assert interrupted == "True"
+    assert float(lost) >= 0.1
+
+
+PROBLEM = first_problem(scene(Chain(), Gravity(), Pins(at=("first",), weight=1e4), size=4))
+KEPT, UNTOUCHED = np.ones((2, 4, 3))
+
+
+def filled() -> np.ndarray:
+    KEPT[:] = 1.0
+    return KEPT
+
+
+DOES = {
+    "it writes to its array": filled,
+    "it returns a new array": lambda: np.ones(3),
+    "it tells whether it succeeded": lambda: False,
+    "it writes what is not a number": lambda: np.full(3, np.nan),
+}
+DOES_NOT = {"it returns nothing": lambda: None, "it returns its array as it is": lambda: UNTOUCHED}
+
+
+def prepared(call: Any) -> Any:
+    return SimpleNamespace(phases=lambda problem: {"local": filled, "global": call})
+
+
+@pytest.mark.parametrize("call", DOES.values(), ids=DOES)
+def test_a_phase_that_computes_is_timed(call: Any) -> None:
+    assert working(prepared(call), PROBLEM) == {"local": filled, "global": call}
+
+
+@pytest.mark.parametrize("call", DOES_NOT.values(), ids=DOES_NOT)
+def test_a_phase_that_computes_nothing_is_found_out(call: Any) -> None:
+    with pytest.raises(RunFailed, match="the phase global does nothing"):
+        working(prepared(call), PROBLEM)

@@ -1,0 +1,168 @@
+"""Times hold what they are said to hold: each is set between what was done within it and what went on around it.
+
+A scripted solver sleeps and takes its own stamps, of the clock that the harness reads. An interval that encloses
+another one is longer, on a machine of any speed; sums of them are not compared to a share.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from time import perf_counter, sleep
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from harness.base.errors import RunFailed
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.mesh.chain import Chain
+from harness.simulation import times
+from harness.simulation.clock import Watch
+from harness.simulation.measure import ITERATION, PHASE_REPEATS, Measured, Settings, Timing, measure
+from solvers.problem import Positions, Solution, StepProblem, StopRule, System
+from tests.scenes import scene
+
+FRAMES, ROUNDS, ITERATIONS = 3, 2, 4
+MADE = scene(Chain(), Gravity(), size=4)
+SETTINGS = Settings(StopRule(ITERATIONS), "current", FRAMES, ROUNDS)
+TAKES = {"prepare": 0.004, "solve": 0.008, "local": 0.001, "global": 0.002}
+"""Seconds that each part sleeps at least."""
+
+
+@dataclass
+class Sleeper:
+    """A solver that is prepared with itself; slept: by part, how long each call of it slept, by its own stamps."""
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+
+    slept: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    choice: str = ""
+    facts: dict[str, float] = field(default_factory=dict)
+
+    def rest(self, part: str) -> Positions:
+        began = perf_counter()
+        sleep(TAKES[part])
+        self.slept[part].append(perf_counter() - began)
+        return np.zeros((4, 3))
+
+    def prepare(self, system: System) -> Sleeper:
+        self.rest("prepare")
+        return self
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        yield problem.first_guess
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        self.rest("solve")
+        return Solution(problem.first_guess + 1.0, stop.iterations, 0.0, 0.0, "iterations")
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        return {part: lambda part=part: self.rest(part) for part in ("local", "global")}
+
+
+@pytest.fixture(scope="module")
+def seen() -> tuple[Sleeper, Measured, float]:
+    """The solver, what was measured of it, and the seconds of all."""
+    solver, began = Sleeper(), perf_counter()
+    measured = measure(MADE, solver, SETTINGS, lambda phase: sleep(0.02))
+    return solver, measured, perf_counter() - began
+
+
+def of(measured: Measured, phase: str) -> list[Timing]:
+    return [t for t in measured.timings if t.phase == phase]
+
+
+def test_each_phase_is_timed_as_often_as_it_says(seen):
+    _, measured, _ = seen
+    counts = {phase: len(of(measured, phase)) for phase in ("prepare", "local", "global", ITERATION, "step")}
+    repeated = FRAMES * PHASE_REPEATS
+    steps = FRAMES * ROUNDS
+    assert counts == {"prepare": ROUNDS + 1, "local": repeated, "global": repeated, ITERATION: FRAMES, "step": steps}
+    assert len(measured.timings) == sum(counts.values())
+    assert [(t.frame, t.round) for t in of(measured, "step")] == [(f, r) for r in range(ROUNDS) for f in (1, 2, 3)]
+
+
+def test_times_hold_what_was_done_in_them(seen):
+    solver, measured, whole = seen
+    repeats = [call for k, call in enumerate(solver.slept["local"]) if k % (PHASE_REPEATS + 2) >= 2]
+    assert all(t.seconds >= slept for t, slept in zip(of(measured, "local"), repeats, strict=True))
+    repeats = [call for k, call in enumerate(solver.slept["global"]) if k % (PHASE_REPEATS + 2) >= 2]
+    assert all(t.seconds >= slept for t, slept in zip(of(measured, "global"), repeats, strict=True))
+    assert all(t.seconds >= slept for t, slept in zip(of(measured, "prepare"), solver.slept["prepare"], strict=True))
+    beside, timed = solver.slept["solve"][1 : 2 * FRAMES : 2], solver.slept["solve"][2 * FRAMES :]
+    assert all(t.seconds * t.calls >= slept for t, slept in zip(of(measured, ITERATION), beside, strict=True))
+    assert all(t.seconds >= slept for t, slept in zip(of(measured, "step"), timed, strict=True))
+    assert sum(t.seconds * t.calls for t in measured.timings) <= whole
+
+
+def test_what_is_shown_between_steps_is_in_no_time(seen):
+    _, measured, whole = seen
+    shown = 0.02 * FRAMES * (1 + ROUNDS)
+    assert sum(t.seconds * t.calls for t in measured.timings) <= whole - shown
+    assert sum(watch.wall for watch in measured.watches.values()) <= whole - shown
+
+
+def test_every_time_lies_within_what_its_watch_saw(seen):
+    _, measured, _ = seen
+    assert set(measured.watches) == {("prepare", None), ("local", None), ("global", None), (ITERATION, None)} | {
+        ("step", round) for round in range(ROUNDS)
+    }
+    for (phase, round), watch in measured.watches.items():
+        told = sum(t.seconds * t.calls for t in of(measured, phase) if round in (None, t.round))
+        # The raw clock and the one that is adjusted differ by 500 parts in a million at most.
+        assert told <= watch.wall * (1 + 5e-4)
+
+
+def test_rows_tell_both_clocks_and_that_a_solver_which_sleeps_was_interrupted(seen):
+    _, measured, _ = seen
+    for row in times.rows(measured):
+        assert row["summed_seconds"] <= row["pass_seconds"] * (1 + 5e-4)
+        assert row["cpu_seconds"] < row["pass_seconds"]
+        assert row["interrupted"]
+    by_round = [
+        {r["summed_seconds"] for r in times.rows(measured) if r["round"] == k and r["phase"] == "step"} for k in (0, 1)
+    ]
+    for round, told in enumerate(by_round):
+        assert told == {sum(t.seconds for t in of(measured, "step") if t.round == round)}
+
+
+@pytest.mark.parametrize("phase", ["prepare", "local", "global", ITERATION, "step"])
+def test_no_row_is_made_of_times_that_are_scaled(seen, phase: str):
+    _, measured, _ = seen
+    scaled = [
+        Timing(t.phase, t.frame, t.round, t.seconds / (1000 if t.phase == phase else 1), t.calls)
+        for t in measured.timings
+    ]
+    busy = {key: Watch(1, watch.wall, watch.entered, watch.wall, watch.wall) for key, watch in measured.watches.items()}
+    with pytest.raises(RunFailed, match=f"the times of {phase} add up to"):
+        times.rows(Measured(measured.prepared, scaled, busy, measured.final))
+
+
+PARTS = {
+    "they do": ({"local": 3.0, "global": 7.0}, 10.0, True),
+    "a phase does nothing": ({"local": 3.0, "global": 0.001}, 10.0, False),
+    "just so": ({"local": 3.0, "global": 8.4}, 10.0, True),
+    "too much": ({"local": 3.0, "global": 8.6}, 10.0, False),
+    "too little": ({"local": 3.0, "global": 5.4}, 10.0, False),
+    "three of them": ({"gradient": 3.0, "factor": 5.0, "solve": 2.0}, 10.0, True),
+}
+
+
+@pytest.mark.parametrize(("phases", "iteration", "expected"), PARTS.values(), ids=PARTS)
+def test_rows_say_whether_phases_add_up_to_an_iteration(phases: dict[str, float], iteration: float, expected: bool):
+    timings = [Timing("step", 1, 0, 40.0)]
+    for frame in (1, 2, 3):
+        slow = 50.0 if frame == 2 else 1.0  # one frame that was disturbed does not decide
+        timings += [Timing(phase, frame, k, t * slow) for phase, t in phases.items() for k in range(PHASE_REPEATS)]
+        timings.append(Timing(ITERATION, frame, 0, iteration, 4))
+    watches = {}
+    for t in timings:
+        watch = watches.setdefault((t.phase, Measured.pass_of(t)), Watch(1))
+        watch.wall = watch.process = watch.thread = watch.wall + t.seconds * t.calls
+    found = {
+        row["phase"]: row["adds_up"] for row in times.rows(Measured(Sleeper(), timings, watches, np.zeros((4, 3))))
+    }
+    assert found == {"step": None, ITERATION: expected} | dict.fromkeys(phases, expected)

@@ -1,0 +1,38 @@
+"""The table of planted lies fits the sources as they are; `python -m tests.mutations` plants them."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.mutations.base import ROOT, Mutation, Stale
+from tests.mutations.table import TABLE
+
+
+def test_there_are_sixty_of_them_and_each_has_a_name_of_its_own():
+    assert len(TABLE) >= 60
+    assert len({lie.name for lie in TABLE}) == len(TABLE)
+    assert len({(lie.file, lie.fragment, lie.replacement) for lie in TABLE}) == len(TABLE)
+
+
+@pytest.mark.parametrize("lie", TABLE, ids=lambda lie: lie.name)
+def test_each_can_be_planted_and_names_tests_that_exist(lie: Mutation):
+    changed = lie.applied(ROOT)
+    ast.parse(changed)
+    assert changed != (ROOT / lie.file).read_text()
+    for test in lie.tests:
+        path, _, name = test.partition("::")
+        assert f"def {name or 'test_'}" in (ROOT / path).read_text()
+
+
+def test_what_stands_elsewhere_or_twice_is_refused(tmp_path: Path):
+    lie = replace(TABLE[0], file="here.py", fragment="x = 1")
+    with pytest.raises(Stale, match=r"there is no here\.py"):
+        lie.applied(tmp_path)
+    for text, times in (("y = 1\n", 0), ("x = 1\nx = 1\n", 2)):
+        (tmp_path / "here.py").write_text(text)
+        with pytest.raises(Stale, match=f"stands {times} times in here.py"):
+            lie.applied(tmp_path)
