@@ -115,7 +115,8 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
 
     other_code: the ids of the runs that were done by other code than today's, which are marked.
     """
-    out = Table(box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
+    title = "times are medians over the rounds and over the steps"
+    out = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     for name in ("scene", "size", "solver"):
         out.add_column(name, overflow="fold", justify="right" if name == "size" else "left", min_width=len(name))
     for name in _NUMBERS:

@@ -34,7 +34,7 @@ def draw(found: Sequence[Figures], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     here = machine.describe()
     loads = [f.load for f in found if f.load is not None]
-    facts = ["least of all rounds, candidates in turns", f"{here.cores} cores", here.cpu]
+    facts = ["median over the rounds, candidates in turns", f"{here.cores} cores", here.cpu]
     if loads:
         facts.append(f"load {min(loads):.1f} to {max(loads):.1f}")
     for scene in dict.fromkeys(f.scene for f in found):
