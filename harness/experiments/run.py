@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from harness.base import machine, rows
 from harness.base.errors import InputError, RunFailed
 from harness.base.files import CannotWrite, replacing
+from harness.base.stated import stated
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts, solver_class
 from harness.record.base import RecordingInfo
@@ -276,6 +277,7 @@ def asked(run: RunSpec) -> dict[str, Any]:
         "size": run.size,
         "solver": run.solver.name,
         "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
+        **stated(run.solver.name),
         "time_step": run.scene.time_step,
         "integrator": run.integrator,
         "first_guess": run.first_guess,

@@ -19,12 +19,14 @@ from harness.base.progress import Display
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts
 from harness.experiments.run import Files, execute
-from harness.record.compare import side_by_side
+from harness.record.compare import Look, side_by_side
 from harness.record.reader import read_replay
 from harness.record.sound import whole_messages
 from harness.report import opengl
 from harness.report.comparison import draw_comparison
+from harness.report.references import write_bibtex
 from harness.report.run_picture import draw_run
+from harness.report.style import shades
 from harness.report.timing_plot import draw_timing
 
 DONE, MISSING = "done", "missing"
@@ -166,6 +168,7 @@ def _draw(
     say: Callable[[str], None],
 ) -> None:
     """Pictures of runs, and what compares runs, where it is missing or older than a recording that it shows."""
+    write_bibtex(folder / "references.bib", table["reference"].to_pylist())
     drawn = [p for p in planned if p.run.record and p.files.recording.exists()]
     missing = opengl.problem() if any(p.run.pictures for p in drawn) else None
     if missing:
@@ -182,7 +185,13 @@ def _draw(
         recording = folder / "recordings" / f"{label}-solvers.rrd"
         picture = folder / "pictures" / f"{label}-solvers.png"
         if _stale(recording, recordings.values()):
-            side_by_side(recording, recordings, label.replace("-", " "))
+            found = shades((_distinct(p, group), p.run.solver.name) for p in group)
+            side_by_side(
+                recording,
+                recordings,
+                label.replace("-", " "),
+                {name: Look(mark.color, mark.marker) for name, mark in found.items()},
+            )
         if group[0].run.pictures and not missing and _stale(picture, recordings.values()):
             draw_comparison({key: read_replay(path) for key, path in recordings.items()}, picture)
     if any(p.run.pictures for p in planned):

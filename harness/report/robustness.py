@@ -67,7 +67,8 @@ _ENDED = {"unsupported": REFUSED, "diverged": DIVERGED, "failed": FAILED}
 @dataclass(frozen=True, slots=True)
 class Cell:
     """One run: its case, its solver, what became of it and why; worst: the largest `beyond` of a step, or where
-    `graded` is "distance" the largest distance from the reference, None where there is none; recording: where it is."""
+    `graded` is "distance" the largest distance from the reference, None where there is none; recording: where it is;
+    reference: where the solver comes from, as rows have it."""
 
     case: str
     solver: str
@@ -76,6 +77,7 @@ class Cell:
     graded: str
     reason: str
     recording: Path | None
+    reference: str = ""
 
     @property
     def figure(self) -> str:
@@ -110,7 +112,7 @@ def read_cells(folder: Path) -> list[Cell]:
         case, solver = _case(run[0], firsts), _solver(run[0], firsts)
         outcome, worst, graded, reason = judged(run)
         recording = next((folder / "recordings").glob(f"*-{run[0]['run_id']}.rrd"), None)
-        cells[case, solver] = Cell(case, solver, outcome, worst, graded, reason, recording)
+        cells[case, solver] = Cell(case, solver, outcome, worst, graded, reason, recording, run[0]["reference"] or "")
     order = [*SOLVERS, *(first["solver"] for first in firsts)]
     return sorted(cells.values(), key=lambda cell: (cell.case, order.index(cell.solver.split()[0]), cell.solver))
 

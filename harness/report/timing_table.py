@@ -16,6 +16,7 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from harness.report.page import count, quantity
+from harness.report.references import cited
 
 
 class Run(NamedTuple):
@@ -116,7 +117,15 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
     other_code: the ids of the runs that were done by other code than today's, which are marked.
     """
     title = "times are medians over the rounds and over the steps"
-    out = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
+    out = Table(
+        title=title,
+        title_justify="left",
+        caption="\n".join(_methods(table)),
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        collapse_padding=True,
+        pad_edge=False,
+    )
     for name in ("scene", "size", "solver"):
         out.add_column(name, overflow="fold", justify="right" if name == "size" else "left", min_width=len(name))
     for name in _NUMBERS:
@@ -142,6 +151,12 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
     # Lines longer than a narrow terminal keep their numbers; Rich would cut them to ellipses.
     out.width = Measurement.get(wide := Console(width=1000), wide.options, out).maximum
     return out
+
+
+def _methods(table: pa.Table) -> list[str]:
+    """Where each solver comes from."""
+    known = dict(zip(*(table[name].to_pylist() for name in ("solver", "reference")), strict=True))
+    return [f"{solver}: {cited(reference)}" for solver, reference in known.items() if reference]
 
 
 def _number(value, words) -> str:

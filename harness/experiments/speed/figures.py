@@ -63,6 +63,7 @@ class Figures(NamedTuple):
     solves_faster: Interval | None = None
     apart: float | None = None
     load: float | None = None
+    solver: str = ""
 
 
 class Machine:
@@ -143,6 +144,7 @@ def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], m
     known = Figures(
         *(first["scene"], first["size"], first["vertices"], label, first["threads"]),
         *(first["status"], first["reason"], first["choice"]),
+        solver=first["solver"],
     )
     if first["status"] != "ok":
         return known

@@ -50,6 +50,6 @@ def _series(members: Sequence[Figures], picture: Picture) -> list[Series]:
     for label in dict.fromkeys(f.label for f in members):
         mine = [f for f in members if f.label == label]
         points = sorted((f.vertices, value) for f in mine if (value := picture.value(f)) is not None)
-        family = label.removesuffix(f" x{mine[0].threads}")
-        lines.append(Series(label, family, [n for n, _ in points], [value for _, value in points]))
+        alone = label.removesuffix(f" x{mine[0].threads}")
+        lines.append(Series(label, alone, mine[0].solver, [n for n, _ in points], [value for _, value in points]))
     return lines
