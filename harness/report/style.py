@@ -95,7 +95,8 @@ def _shipped() -> dict[str, Mark]:
 def shade(color: str, by: float) -> str:
     """A colour mixed with white, or with black where `by` is negative."""
     end = 1.0 if by > 0.0 else 0.0
-    return to_hex([(1.0 - abs(by)) * part + abs(by) * end for part in to_rgb(color)])
+    red, green, blue = ((1.0 - abs(by)) * part + abs(by) * end for part in to_rgb(color))
+    return to_hex((red, green, blue))
 
 
 def looks(labelled: Iterable[tuple[str, str]]) -> dict[str, Mark]:
