@@ -13,7 +13,7 @@ from harness.config.sweep import RunSpec
 from harness.experiments.ablation.cases import cases
 from harness.experiments.ablation.difference import Motion, difference, rest_length
 from harness.experiments.ablation.rows import SCHEMA
-from harness.experiments.ablation.suggest import Seen, suggestions
+from harness.experiments.ablation.suggest import seen, suggestions
 from harness.experiments.ablation.turns import Turn, cost, motion, seconds, turns
 from harness.experiments.run import asked, failure, provenance
 from harness.scenes.bind import Scene, build
@@ -44,8 +44,11 @@ def ablate(sweep: Sweep, folder: Path, *, pairs: bool, tick: Callable[[str], Non
         assert whole.scene is not None
         told = [_whole(whole), *(_without(whole, turn) for turn in found[1:])]
         told += _errors(run, whole, settings, tick)
-        seen = Seen(whole.scene, {effect.kind for effect in run.scene.effects}, whole.positions, whole.velocities)
-        told += [{"kind": "suggestion", "name": s.effect, "reason": s.evidence} for s in suggestions(seen)]
+        kinds = {effect.kind for effect in run.scene.effects}
+        motion_seen = seen(whole.scene, kinds, whole.positions, whole.velocities)
+        told += [
+            {"kind": "suggestion", "name": s.effect, "reason": s.evidence} for s in suggestions(motion_seen, kinds)
+        ]
     path = folder / "ablation" / f"{run.label(machine.describe().id)}.parquet"
     path.parent.mkdir(parents=True, exist_ok=True)
     rows.write(path, _shared(run, whole.scene, told), SCHEMA)
