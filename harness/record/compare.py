@@ -30,9 +30,10 @@ _SHOWN = 3
 _CURVE = "/convergence/log10_residual/frame_"
 
 
+_Shape = rr.components.MarkerShape
 _SHAPES = {
-    "o": "circle", "s": "square", "D": "diamond", "^": "up", "v": "down", "<": "left", ">": "right", "P": "plus",
-    "X": "cross", "*": "asterisk",
+    "o": _Shape.Circle, "s": _Shape.Square, "D": _Shape.Diamond, "^": _Shape.Up, "v": _Shape.Down, "<": _Shape.Left,
+    ">": _Shape.Right, "P": _Shape.Plus, "X": _Shape.Cross, "*": _Shape.Asterisk,
 }  # fmt: skip
 """The viewer's markers by Matplotlib's; it has no others, and draws circles for those."""
 
@@ -88,7 +89,7 @@ def _copy(file: PartialFile, path: Path, name: str, k: int, look: Look) -> _Run:
             file.stream.log(run.root + entity, rr.SeriesLines(names=name, colors=colour, widths=1.5), static=True)
         if entity.startswith(_CURVE):
             points = rr.SeriesPoints(
-                names=name, colors=colour, markers=_SHAPES.get(look.marker, "circle"), marker_sizes=3
+                names=name, colors=colour, markers=_SHAPES.get(look.marker, _Shape.Circle), marker_sizes=3
             )
             file.stream.log(run.root + entity, points, static=True)
     file.flush()

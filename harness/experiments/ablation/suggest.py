@@ -1,7 +1,7 @@
 """Effects that a scene does not list and its motion calls for, each with the evidence.
 
-An effect's class says itself by what evidence a motion calls for it (`harness.scenes.effects.base.Effect`); here stands what
-calls for an effect that there is not.
+An effect's class says itself by what evidence a motion calls for it (`harness.scenes.effects.base.Effect`); here
+stands what calls for an effect that there is not.
 """
 
 from __future__ import annotations

@@ -114,7 +114,7 @@ def _grid(path: Path, scene: SceneSpec, size: int, horizon: float, time_limit: f
     steps = max(1, round(horizon / scene.time_step))
     time_steps = [horizon / round(steps * factor) for factor in REFINEMENTS if round(steps * factor)]
     shared = {"horizon": horizon, "time_step": time_steps, "time_limit": time_limit} | ({"size": size} if size else {})
-    work = [shared | way for way in candidates()]
+    work: list[dict[str, Any]] = [shared | way for way in candidates()]
     solvers = list(dict.fromkeys(name for way in work for name in way["solver"]))
     data = {"scenes": [path.name], "solvers": solvers, "work": work}
     document = Document(path, data)
