@@ -16,12 +16,12 @@ from harness.config.load import load_any, load_sweep
 from harness.config.sweep import RunSpec, SolverSpec
 from harness.experiments.speed import candidates, limits, turns, yardstick
 from harness.experiments.speed.candidates import Reading, average
-from harness.experiments.speed.figures import figures
 from harness.experiments.speed.report import run_speed
 from harness.experiments.speed.rest import apart, rest_of
-from harness.experiments.speed.table import remarks, speed_table
 from harness.experiments.speed.turns import PREPARES, Past, measure, name, predicted
-from harness.experiments.speed.work import count
+from harness.report.speed.counts import count
+from harness.report.speed.figures import figures
+from harness.report.speed.table import remarks, speed_table
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Unsupported
 from tests.scenes import cloth, first_problem

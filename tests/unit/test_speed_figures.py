@@ -8,9 +8,9 @@ import pyarrow as pa
 import pytest
 
 from harness.base.rows import SCHEMA
-from harness.experiments.speed.figures import Figures, Machine, figures
-from harness.experiments.speed.table import exponents, remarks
-from harness.experiments.speed.work import count
+from harness.report.speed.counts import count
+from harness.report.speed.figures import Figures, Machine, figures
+from harness.report.speed.table import exponents, remarks
 
 
 def machine_row(phase: str, seconds: float, *, bytes: float = 0.0, flops: float = 0.0, working_set: float = 0.0):

@@ -12,7 +12,7 @@ import pytest
 from harness.base.errors import RunFailed
 from harness.experiments.speed import yardstick
 from harness.experiments.speed.yardstick import CHEAP_TEMPORARIES, Yardstick, build
-from harness.report.size_plot import Series, draw_by_size
+from harness.report.speed.size_plot import Series, draw_by_size
 from harness.report.style import HEIGHT, WIDTH
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule, Unsupported

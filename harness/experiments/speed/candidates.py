@@ -12,9 +12,10 @@ from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
 from harness.config.sweep import RunSpec
-from harness.experiments.speed import limits, work
+from harness.experiments.speed import limits
 from harness.experiments.speed.rest import Rest, apart, precision
 from harness.experiments.speed.yardstick import Yardstick
+from harness.report.speed.counts import Counted, count
 from harness.scenes.bind import Scene
 from solvers.problem import Positions, Prepared, StepProblem, StopRule
 from solvers.registry import SOLVERS, load
@@ -67,7 +68,7 @@ class SolverCandidate:
         self._solver = load(SOLVERS[run.solver.name])(**run.solver.parameters)
         self._prepared: Prepared | None = None
         self._positions: Positions | None = None
-        self._work: dict[str, work.Work] = {}
+        self._work: dict[str, Counted] = {}
 
     def prepare(self) -> float:
         """See Candidate. Raises Unsupported, NotPositiveDefinite, MemoryError."""
@@ -77,7 +78,7 @@ class SolverCandidate:
         if self._prepared is None:
             self._prepared = prepared = self._shared.setdefault(str(self._solver), prepared)
             counts = self._scene.system.vertices, len(self._scene.springs.edges)
-            self._work = work.count(prepared.facts, *counts, precision(self.run))
+            self._work = count(prepared.facts, *counts, precision(self.run))
             self.columns = {name: int(value) for name, value in prepared.facts.items()}
             self.columns["choice"] = prepared.choice
             if self._rest and precision(self.run) != "float64":

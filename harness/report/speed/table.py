@@ -11,8 +11,8 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from harness.base.statistics import Interval
-from harness.experiments.speed.figures import STEP, Figures
 from harness.report.page import count, quantity
+from harness.report.speed.figures import STEP, Figures
 
 _NUMBERS = (
     "prepare\ncold ms",

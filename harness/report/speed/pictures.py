@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from harness.base import machine
-from harness.experiments.speed.figures import STEP, Figures
-from harness.report.size_plot import Series, draw_by_size
+from harness.report.speed.figures import STEP, Figures
+from harness.report.speed.size_plot import Series, draw_by_size
 
 
 class Picture(NamedTuple):

@@ -12,8 +12,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from harness.base.statistics import Interval, ratio
-from harness.experiments.speed import work
-from harness.experiments.speed.report import MACHINE, YARDSTICK
+from harness.report.speed.counts import Counted, count
+
+MACHINE, YARDSTICK = "machine", "eigen"
+"""What rows of candidates that are no solvers have as their solver."""
 
 STEP = 50
 """Iterations of the step that all steps are stated as, however many were done."""
@@ -87,19 +89,19 @@ class Machine:
         kind = "float64" if precision == "float64" else "float32"
         return self._best[threads, f"fma {kind}"][0.0]
 
-    def limit(self, counted: work.Work, threads: int, precision: str) -> Limit:
+    def limit(self, counted: Counted, threads: int, precision: str) -> Limit:
         """What no order of reading goes below: each byte comes once from where the working set lies, and as often as
         it is moved besides from the nearest cache."""
         again = (counted.bytes - counted.working_set) / max(self._best[threads, "read"].values())
         far = counted.working_set / self.bandwidth(threads, counted.working_set)
         return self._binding(far + again, counted, threads, precision)
 
-    def passes(self, counted: work.Work, threads: int, precision: str) -> Limit:
+    def passes(self, counted: Counted, threads: int, precision: str) -> Limit:
         """The same where all that is moved comes from where the working set lies, each time."""
         far = counted.bytes / self.bandwidth(threads, counted.working_set)
         return self._binding(far, counted, threads, precision)
 
-    def _binding(self, moving: float, counted: work.Work, threads: int, precision: str) -> Limit:
+    def _binding(self, moving: float, counted: Counted, threads: int, precision: str) -> Limit:
         seconds = {"bandwidth": moving, "arithmetic": counted.flops / self.flops(threads, precision)}
         binds = max(seconds, key=seconds.__getitem__)
         return Limit(binds, seconds[binds])
@@ -167,8 +169,8 @@ def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], m
         return known
     precision = json.loads(first["parameters"]).get("precision", "float64")
     counts, how = (first["vertices"], first["springs"], precision), (first["threads"], precision)
-    touched = work.count(facts, *counts)["iteration"]
-    bare = work.count({"nnz_factor": facts["nnz_factor"]}, *counts)["iteration"]
+    touched = count(facts, *counts)["iteration"]
+    bare = count({"nnz_factor": facts["nnz_factor"]}, *counts)["iteration"]
     limit, seconds = machine.limit(touched, *how), float(np.median(times["step"]))
     return known._replace(
         entries=facts["nnz_factor"],
