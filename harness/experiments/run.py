@@ -22,7 +22,7 @@ from harness.base import machine, rows
 from harness.base.errors import InputError, RunFailed
 from harness.base.files import CannotWrite, replacing
 from harness.base.stated import stated
-from harness.config.sweep import RunSpec
+from harness.config.sweep import OPTIONS, RunSpec
 from harness.experiments.code import code, parts, solver_class
 from harness.record.base import RecordingInfo
 from harness.record.obstacles import listed
@@ -278,11 +278,7 @@ def asked(run: RunSpec) -> dict[str, Any]:
         "solver": run.solver.name,
         "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
         **stated(run.solver.name),
-        "time_step": run.scene.time_step,
-        "integrator": run.integrator,
-        "first_guess": run.first_guess,
-        "max_iterations": run.iterations,
-        "tolerance": run.tolerance,
+        **{option.column: getattr(run, name) for name, option in OPTIONS.items() if option.column},
         "threads": machine.threads(run.threads).number,
     }
 

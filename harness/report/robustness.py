@@ -20,6 +20,7 @@ from rich.table import Table
 
 from harness.base import rows
 from harness.base.errors import InputError
+from harness.config.sweep import OPTIONS
 from solvers.registry import SOLVERS
 
 SLACK = 1.1
@@ -148,7 +149,7 @@ def judged(run: Sequence[dict[str, Any]]) -> tuple[Outcome, float | None, str, s
     return RIGHT, worst, "stationarity", ""
 
 
-_OPTIONS = ("size", "integrator", "time_step", "first_guess", "max_iterations", "tolerance", "threads")
+_OPTIONS = ("size", *(option.column for option in OPTIONS.values() if option.column))
 
 
 def _case(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:

@@ -19,7 +19,7 @@ from harness.report.page import count, quantity
 from harness.report.references import cited
 
 
-class Run(NamedTuple):
+class RunTimes(NamedTuple):
     """One run: what it was, and its times [ms]; None where the rows do not say.
 
     cold and warm: of preparing; step: median, its quartiles and the least of all steps; local, global_:
@@ -71,15 +71,15 @@ from numbered group by run_id order by min(place)
 """
 
 
-def runs(table: pa.Table) -> list[Run]:
+def runs(table: pa.Table) -> list[RunTimes]:
     """The runs in a table of rows (schema: `harness.base.rows.SCHEMA`), in the order of their first rows."""
     numbered = table.append_column("place", pa.array(np.arange(len(table))))
     with duckdb.connect() as connection:
         connection.register("numbered", numbered)
-        return [Run(*row) for row in connection.execute(_SUMMARY).fetchall()]
+        return [RunTimes(*row) for row in connection.execute(_SUMMARY).fetchall()]
 
 
-def labels(found: Sequence[Run]) -> dict[str, str]:
+def labels(found: Sequence[RunTimes]) -> dict[str, str]:
     """By run id, the solver's name and those of its settings in which the solver's runs differ."""
     settings = {run.run_id: {**json.loads(run.settings), **json.loads(run.parameters or "{}")} for run in found}
     values: dict[tuple[str, str], set[str]] = defaultdict(set)
