@@ -29,7 +29,7 @@ class About:
     """
 
     family: str
-    reference: Reference
+    reference: Reference | None = None
     own_steps: bool = False
     first: bool = False
 

@@ -6,17 +6,18 @@ import json
 from dataclasses import asdict
 from typing import Any
 
-from solvers.registry import SOLVERS, load
+from solvers.registry import EVERY, about, load, minimises
 
 
 def stated(solver: str) -> dict[str, Any]:
     """The columns `family`, `reference`, `minimises` and `own_steps` of a solver by name; none of what is no solver."""
-    if solver not in SOLVERS:
+    if solver not in EVERY:
         return {}
-    method = load(SOLVERS[solver])
+    method = load(EVERY[solver])
+    told = about(method, solver)
     return {
-        "family": method.about.family,
-        "reference": json.dumps(asdict(method.about.reference), ensure_ascii=False),
-        "minimises": method.minimises,
-        "own_steps": method.about.own_steps,
+        "family": told.family,
+        "reference": json.dumps(asdict(told.reference), ensure_ascii=False) if told.reference else None,
+        "minimises": minimises(method),
+        "own_steps": told.own_steps,
     }

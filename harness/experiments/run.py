@@ -219,8 +219,8 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
     here = machine.describe()
     properties = {
         "sweep": run.sweep,
-        **asked(run),
-        "tolerance": run.tolerance or 0.0,  # a property has no null
+        **{name: value for name, value in asked(run).items() if value is not None},  # a property has no null
+        "tolerance": run.tolerance or 0.0,
         "vertices": len(scene.mesh.rest),
         "springs": len(scene.springs.edges),
         "frames": run.frames,

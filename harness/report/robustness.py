@@ -21,7 +21,7 @@ from rich.table import Table
 from harness.base import rows
 from harness.base.errors import InputError
 from harness.config.sweep import OPTIONS
-from solvers.registry import SOLVERS
+from solvers.registry import OPTIONAL, SOLVERS
 
 SLACK = 1.1
 """On the tolerance: the oracle and a solver factorise the same matrix by different ways. Of 1372 runs of configs/hard
@@ -114,7 +114,7 @@ def read_cells(folder: Path) -> list[Cell]:
         outcome, worst, graded, reason = judged(run)
         recording = next((folder / "recordings").glob(f"*-{run[0]['run_id']}.rrd"), None)
         cells[case, solver] = Cell(case, solver, outcome, worst, graded, reason, recording, run[0]["reference"] or "")
-    order = [*SOLVERS, *(first["solver"] for first in firsts)]
+    order = [*SOLVERS, *OPTIONAL, *(first["solver"] for first in firsts)]
     return sorted(cells.values(), key=lambda cell: (cell.case, order.index(cell.solver.split()[0]), cell.solver))
 
 

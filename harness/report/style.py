@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from matplotlib.colors import LinearSegmentedColormap, to_hex, to_rgb
 
 from harness.record.shading import STRAIN_COLOURS
-from solvers.registry import SOLVERS, load
+from solvers.registry import OPTIONAL, SOLVERS, about, load
 
 WIDTH, HEIGHT, DPI = 1600, 900, 100
 """Every picture's size in pixels, and the dots per inch that turn it into a matplotlib figure."""
@@ -70,7 +70,7 @@ def marks(solvers: Iterable[str] = ()) -> dict[str, Mark]:
     looks = dict(_shipped())
     free = [Mark(color, marker, dash) for dash in _DASHES for color in _STRANGERS for marker in _MARKERS]
     taken: set[Mark] = set()
-    for name in sorted({*SOLVERS, *solvers} - set(looks)):
+    for name in sorted({*SOLVERS, *OPTIONAL, *solvers} - set(looks)):
         place = int(sha256(name.encode()).hexdigest(), 16) % (len(free) // len(_DASHES))
         looks[name] = next(look for look in free[place:] if look not in taken)
         taken.add(looks[name])
@@ -81,9 +81,9 @@ def marks(solvers: Iterable[str] = ()) -> dict[str, Mark]:
 def _shipped() -> dict[str, Mark]:
     """The marks of the registry's solvers: the colour of their family, a marker of their own; as many as there are."""
     families: dict[str, list[str]] = {}
-    for name, target in SOLVERS.items():
-        families.setdefault(load(target).about.family, []).append(name)
-    markers = dict(zip(SOLVERS, _MARKERS, strict=False))
+    for name, target in (SOLVERS | OPTIONAL).items():
+        families.setdefault(about(load(target), name).family, []).append(name)
+    markers = dict(zip((*SOLVERS, *OPTIONAL), _MARKERS, strict=False))
     return {
         name: Mark(shade(color, by), markers[name], dash)
         for color, members in zip(_FAMILIES, families.values(), strict=False)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from harness.base.errors import RunFailed
-from harness.experiments.speed import yardstick
 from harness.experiments.speed.yardstick import CHEAP_TEMPORARIES, Yardstick, build
 from harness.report.speed.size_plot import Series, draw_by_size
 from harness.report.style import HEIGHT, WIDTH
+from solvers.methods import eigen
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule, Unsupported
 from tests.scenes import cloth, first_problem
@@ -40,7 +40,7 @@ def echo(tmp_path: Path) -> Path:
 
 
 def test_without_a_compiler_it_is_unsupported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(yardstick.shutil, "which", lambda _: None)
+    monkeypatch.setattr(eigen.shutil, "which", lambda _: None)
     with pytest.raises(Unsupported, match=r"no C\+\+ compiler"):
         build(tmp_path)
 

@@ -19,7 +19,7 @@ from harness.experiments.run import asked, failure, provenance
 from harness.scenes.bind import Scene, build
 from harness.simulation.measure import Settings
 from solvers.problem import Solver, StopRule
-from solvers.registry import SOLVERS, load
+from solvers.registry import EVERY, SOLVERS, load
 
 Row = dict[str, Any]
 
@@ -37,7 +37,7 @@ def ablate(sweep: Sweep, folder: Path, *, pairs: bool, tick: Callable[[str], Non
     (run,) = sweep.runs()
     run.scene.require_even_steps()
     settings = Settings(StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
-    solver: Solver = load(SOLVERS[run.solver.name])(**run.solver.parameters)
+    solver: Solver = load(EVERY[run.solver.name])(**run.solver.parameters)
     with machine.pinned_threads(machine.threads(run.threads).number):
         found = turns(cases(run.scene, pairs=pairs), run.size, run.integrator, solver, settings, tick)
         whole = found[0]

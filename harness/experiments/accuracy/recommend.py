@@ -30,7 +30,7 @@ from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
 from solvers.about import LOCAL_GLOBAL
 from solvers.integrators import INTEGRATORS
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, about, load
 
 REFINEMENTS = (0.5, 1, 2, 4, 8)
 """Steps in the horizon, relative to those of the scene's own time step."""
@@ -39,9 +39,9 @@ REFINEMENTS = (0.5, 1, 2, 4, 8)
 def candidates() -> list[dict[str, Any]]:
     """What is measured where nothing was, of each family's first: steps solved to a tolerance, and steps of 50
     iterations or substeps."""
-    first = {name: about for name, target in SOLVERS.items() if (about := load(target).about).first}
-    implicit = [name for name, about in first.items() if not about.own_steps]
-    fixed = [name for name, about in first.items() if about.own_steps or about.family == LOCAL_GLOBAL]
+    first = {name: told for name, target in SOLVERS.items() if (told := about(load(target), name)).first}
+    implicit = [name for name, told in first.items() if not told.own_steps]
+    fixed = [name for name, told in first.items() if told.own_steps or told.family == LOCAL_GLOBAL]
     return [
         {"solver": implicit, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": list(INTEGRATORS)},
         {"solver": fixed, "iterations": 50},

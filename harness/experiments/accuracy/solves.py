@@ -24,7 +24,7 @@ from harness.reference.store import Store
 from harness.scenes.bind import Scene
 from harness.simulation.step import FIRST_GUESSES
 from solvers.problem import Positions, Prepared, Solver, System
-from solvers.registry import SOLVERS, load
+from solvers.registry import EVERY, load
 
 Row = dict[str, Any]
 
@@ -133,7 +133,7 @@ def curve_rows(unit: CurveUnit, graded: Graded, folder: Path, tick: Callable[[],
 
     folder: of the config's results; tick: called after each curve. What a solver raises is a row.
     """
-    solver: Solver = load(SOLVERS[unit.solver.name])(**unit.solver.parameters)
+    solver: Solver = load(EVERY[unit.solver.name])(**unit.solver.parameters)
     shared = graded.common()
     try:
         with machine.pinned_threads(unit.how.threads):

@@ -18,7 +18,7 @@ from harness.experiments.speed.yardstick import Yardstick
 from harness.report.speed.counts import Counted, count
 from harness.scenes.bind import Scene
 from solvers.problem import Positions, Prepared, StepProblem, StopRule
-from solvers.registry import SOLVERS, load
+from solvers.registry import EVERY, load
 
 LEAST = 0.02
 """Seconds that a phase is repeated for in each turn: a clock's overhead is nothing then, and a first call that finds
@@ -65,7 +65,7 @@ class SolverCandidate:
         self.run, self._shared, self._rest = run, prepared, rest
         self.columns: dict[str, Any] = {}
         self._scene, self._problem = scene, problem
-        self._solver = load(SOLVERS[run.solver.name])(**run.solver.parameters)
+        self._solver = load(EVERY[run.solver.name])(**run.solver.parameters)
         self._prepared: Prepared | None = None
         self._positions: Positions | None = None
         self._work: dict[str, Counted] = {}
