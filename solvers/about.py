@@ -1,4 +1,4 @@
-"""What a solver tells of itself, for tables and pictures: its family, and where it comes from."""
+"""What a solver may tell of itself, as a class variable `about`, for tables and pictures."""
 
 from __future__ import annotations
 

@@ -20,8 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from solvers.about import About
-
 Positions = NDArray[np.float64]
 """Positions [m], shape (n, 3), float64, C-contiguous."""
 
@@ -293,7 +291,6 @@ class Solver(Protocol):
 
     minimises: ClassVar[bool]
     descends: ClassVar[bool]
-    about: ClassVar[About]
 
     def prepare(self, system: System) -> Prepared:
         """Factorise, colour, compile.

@@ -24,7 +24,7 @@ from harness.report.accuracy import draw, sheet
 from harness.report.accuracy.reading import read
 from harness.report.accuracy.time_plot import draw_times
 from harness.report.style import HEIGHT, PAGE, WIDTH, marks
-from solvers.registry import SOLVERS, load
+from solvers.registry import EVERY, load
 from tests import accuracy_rows as made
 
 SCRIPT = Path(__file__).with_name("accuracy_page.js")
@@ -184,7 +184,7 @@ def luminance(color: Sequence[float]) -> float:
     return float(np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4) @ [0.2126, 0.7152, 0.0722])
 
 
-@pytest.mark.parametrize("name", [*SOLVERS, *(f"a stranger {k}" for k in range(12))])
+@pytest.mark.parametrize("name", [*EVERY, *(f"a stranger {k}" for k in range(12))])
 def test_one_look_is_seen_on_the_light_page_and_on_the_dark_ground_of_the_viewer(name: str) -> None:
     color = luminance(to_rgb(marks([name])[name].color))
     page, ground = luminance(to_rgb(PAGE)), luminance([part / 255 for part in BACKGROUND])
@@ -195,7 +195,7 @@ def test_one_look_is_seen_on_the_light_page_and_on_the_dark_ground_of_the_viewer
 
 def test_every_solver_has_a_look_and_a_marker_of_its_own() -> None:
     looks = marks([])
-    assert set(looks) == set(SOLVERS)
+    assert set(looks) == set(EVERY)
     assert len({look.marker for look in looks.values()}) == len(looks)
 
 
@@ -203,6 +203,6 @@ def test_solvers_of_a_family_have_one_hue() -> None:
     hues: dict[str, set[int]] = {}
     for name, look in marks([]).items():
         hue, saturation, _ = rgb_to_hsv(to_rgb(look.color))
-        hues.setdefault(load(SOLVERS[name]).about.family, set()).add(round(360 * hue) if saturation > 0.1 else -1)
+        hues.setdefault(load(EVERY[name]).about.family, set()).add(round(360 * hue) if saturation > 0.1 else -1)
     # Two hexadecimal digits round a hue by a degree or two.
     assert all(max(found) - min(found) <= 3 for found in hues.values())
