@@ -86,7 +86,7 @@ def _library() -> ctypes.CDLL:
 class _Compiled:
     """The local step and the factor of one system."""
 
-    nonzeros = None
+    nonzeros: int | None = None
 
     def __init__(self, library: ctypes.CDLL, system: System, springs: Springs) -> None:
         """Raises NotPositiveDefinite."""

@@ -19,7 +19,6 @@ from harness.experiments.accuracy.run import run_accuracy
 from harness.record.reader import read_replay
 from harness.reference import store
 from harness.reference.minimiser import ROUGH, Reference, certify
-from solvers.about import LIU_2013, About
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Positions, Prepared, System
 from solvers.registry import SOLVERS
@@ -223,7 +222,6 @@ class Broken:
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
-    about: ClassVar[About] = About("tests", LIU_2013)
 
     def prepare(self, system: System) -> Prepared:
         prepared: Any = SparseLocalGlobal().prepare(system)

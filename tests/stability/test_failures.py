@@ -17,7 +17,6 @@ from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.record.reader import read_replay
-from solvers.about import LIU_2013, About
 from solvers.linear.factors import DenseCholesky
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.methods.symplectic_euler import PreparedSymplecticEuler, SymplecticEuler
@@ -73,7 +72,6 @@ class _Breaking:
 class Indefinite:
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
-    about: ClassVar[About] = About("tests", LIU_2013)
 
     def prepare(self, system: System) -> Prepared:
         return _Breaking(SparseLocalGlobal().prepare(system), lambda: DenseCholesky(-np.eye(3)))
@@ -83,7 +81,6 @@ class Indefinite:
 class OutOfMemory:
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
-    about: ClassVar[About] = About("tests", LIU_2013)
 
     def prepare(self, system: System) -> Prepared:
         return _Breaking(SparseLocalGlobal().prepare(system), lambda: np.empty(2**55))
@@ -95,7 +92,6 @@ class PastItsLimit:
 
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
-    about: ClassVar[About] = About("tests", LIU_2013)
 
     def prepare(self, system: System) -> PreparedSymplecticEuler:
         slow = SymplecticEuler().prepare(replace(system, time_step=1e-9))

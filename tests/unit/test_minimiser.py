@@ -26,7 +26,6 @@ from harness.reference.minimiser import (
     polish,
 )
 from harness.reference.store import Store
-from solvers.about import LIU_2013, About
 from solvers.energies.springs import Springs
 from solvers.integrators import Motion
 from solvers.methods.newton import Newton
@@ -48,7 +47,6 @@ class Stays:
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
-    about: ClassVar[About] = About("tests", LIU_2013)
     choice: ClassVar[str] = ""
     facts: ClassVar[dict[str, float]] = {}
 

@@ -19,7 +19,7 @@ from harness.scenes.bind import Scene
 
 
 class Step(Protocol):
-    """A frozen step: when it was, its scene, and what is known of its minima."""
+    """A frozen step: when it was, and what is known of its minima."""
 
     @property
     def moment(self) -> str:
@@ -32,20 +32,15 @@ class Step(Protocol):
         ...
 
     @property
-    def scene(self) -> Scene:
-        """With all pins exact."""
-        ...
-
-    @property
     def reference(self) -> Reference:
         """The minima."""
         ...
 
 
-def record(unit: CurveUnit, graded: Step, first_guess: str, curve: Curve, folder: Path) -> Path:
+def record(unit: CurveUnit, graded: Step, scene: Scene, first_guess: str, curve: Curve, folder: Path) -> Path:
     """Write the recording of a curve under `folder`/recordings and return its path. Raises RunFailed."""
     path = folder / "recordings" / f"{unit.label()}-{first_guess}.rrd"
-    problem, scene = graded.frozen.problem, graded.scene
+    problem = graded.frozen.problem
     info = RecordingInfo(
         title=f"{unit.case.title}, {graded.moment}: {unit.solver.name} from the {first_guess} positions",
         run_id=f"{unit.unit_id(machine.describe().id)}-{first_guess}",

@@ -184,7 +184,7 @@ def _curve(unit: CurveUnit, prepared: Prepared, graded: Graded, first_guess: str
     if reached:
         shared["branch"] = reference.branch(reached)
     if unit.recordings and first_guess == unit.first_guesses[0]:
-        shared["recording"] = str(record(unit, graded, first_guess, curve, folder).relative_to(folder))
+        shared["recording"] = str(record(unit, graded, graded.scene, first_guess, curve, folder).relative_to(folder))
     against = reached or next(iter(reference.minima), None)
     return [shared | row for row in _points(curve, graded.frozen.problem.system, against)]
 
