@@ -99,10 +99,10 @@ def speed(
     """Time a sweep's solvers in turns, beside a yardstick in C++ and the machine's own limits."""
     from harness.base.claim import claimed
     from harness.config.load import load_sweep
-    from harness.experiments.speed.figures import figures
-    from harness.experiments.speed.pictures import draw
     from harness.experiments.speed.report import run_speed
-    from harness.experiments.speed.table import remarks, speed_table
+    from harness.report.speed.figures import figures
+    from harness.report.speed.pictures import draw
+    from harness.report.speed.table import remarks, speed_table
 
     if not 0.0 < budget < math.inf:
         raise InputError(Mistake(f"came {budget:g}; wanted a number of seconds above 0", key="--budget"))

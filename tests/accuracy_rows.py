@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from harness.base.stated import stated
 from harness.experiments.accuracy.rows import SCHEMA
 from harness.report.accuracy.paper import FIGURE_2, FIGURE_3, ITERATIONS
 
@@ -42,6 +43,7 @@ def shared(scene: str, size: int, **more: Any) -> dict[str, Any]:
         "time_step": 1 / 30,
         "status": "ok",
         **MACHINE,
+        **(stated(more["solver"]) if "solver" in more else {}),
         **more,
     }
 

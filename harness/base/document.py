@@ -7,7 +7,7 @@ directive is refused, and so is a file that exceeds the limits below once its al
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -66,7 +66,7 @@ class Document:
                 self.report(" or ".join([said[0], *others]), at + key)
             return None
 
-    def choose(self, data: Any, table: dict[str, Any], tag: str, at: Key) -> tuple[str, dict[str, Any]] | None:
+    def choose(self, data: Any, table: Mapping[str, Any], tag: str, at: Key) -> tuple[str, dict[str, Any]] | None:
         """Split the mapping `data` into the name under its key `tag`, one of `table`, and its other keys."""
         if not isinstance(data, dict) or not isinstance(data.get(tag), str):
             place = (*at, tag) if isinstance(data, dict) and tag in data else at

@@ -16,7 +16,7 @@ from harness.config.load import check_name, misfits, scenes_of, solvers_of
 from harness.config.sweep import SolverSpec
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
-from solvers.registry import SOLVERS, load, minimises
+from solvers.registry import EVERY, load, minimises
 
 MAX_UNITS = 20_000
 
@@ -87,7 +87,7 @@ class _Expansion:
     def curves(self, study: CurveStudy, at: Key) -> Iterator[CurveUnit]:
         """One for each problem and solver; solvers that do not minimise have none."""
         how = How(study.threads, study.rounds, study.time_limit)
-        solvers = [solver for solver in self._solvers(study, at) if minimises(load(SOLVERS[solver.name]))]
+        solvers = [solver for solver in self._solvers(study, at) if minimises(load(EVERY[solver.name]))]
         for case, moment, solver in product(self._cases(study, at), study.moment, solvers):
             if isinstance(moment, int) and moment > case.scene.frames:
                 problem = f"frame {moment} is not among the {case.scene.frames} frames of {case.scene_name}"

@@ -9,13 +9,11 @@ from typing import Any
 
 from harness.base.document import Document, Key, quote
 from harness.base.errors import did_you_mean
-from harness.config.sweep import Exclude, Grid, Include, RunSpec, SolverSpec, SweepFields
+from harness.config.sweep import OPTIONS, Exclude, Include, RunSpec, SolverSpec, SweepFields
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
 
 MAX_RUNS = 10_000
-
-GRID = tuple(Grid.model_fields)
 
 
 class Expansion:
@@ -38,7 +36,7 @@ class Expansion:
     def runs(self) -> tuple[RunSpec, ...]:
         """The runs without duplicates, the grid's first; empty after mistakes were noted."""
         self._check_names()
-        options = self.fields.options.model_dump(include=set(GRID))
+        options = self.fields.options.model_dump(include=set(OPTIONS))
         jobs = [(scene, self._sizes(scene), self.solvers, options) for scene in self.scenes]
         extra = [job for i, entry in enumerate(self.fields.include) for job in self._included(i, entry, options)]
         count = sum(len(s) * len(v) * prod(map(len, o.values())) for _, s, v, o in [*jobs, *extra])
@@ -61,7 +59,7 @@ class Expansion:
         options: Mapping[str, Sequence[Any]],
     ) -> Iterable[RunSpec]:
         scene = self.scenes[scene_name]
-        fixed = {k: v for k, v in self.fields.options if k not in GRID}
+        fixed = {k: v for k, v in self.fields.options if k not in OPTIONS}
         usual = {"frames": scene.frames, "first_guess": scene.first_guess, "time_step": scene.time_step}
         for size, solver, values in product(sizes, solvers, product(*options.values())):
             chosen: dict[str, Any] = dict(zip(options, values, strict=True))
@@ -90,7 +88,7 @@ class Expansion:
         return sizes
 
     def _included(self, i: int, entry: Include, options: Mapping[str, Sequence[Any]]) -> Iterable[Any]:
-        chosen = {key: getattr(entry, key) or values[:1] for key, values in options.items()}
+        chosen = {key: entry.stated(key) or values[:1] for key, values in options.items()}
         solvers = [s for s in self.solvers if s.name in (entry.solver or [s.name])]
         for scene_name in entry.scene or self.scenes:
             if scene_name not in self.scenes:
@@ -144,9 +142,9 @@ def check_size(document: Document, scene_name: str, scene: SceneSpec, size: int,
 
 def _matches(entry: Exclude, run: RunSpec) -> bool:
     named = {"scene": run.scene_name, "size": run.size, "solver": run.solver.name}
-    values = named | {key: getattr(run, key) for key in GRID}
+    values = named | {key: getattr(run, key) for key in OPTIONS}
     return (
-        all(not getattr(entry, key) or value in getattr(entry, key) for key, value in values.items())
+        all(not entry.stated(key) or value in entry.stated(key) for key, value in values.items())
         and (entry.size_above is None or run.size > entry.size_above)
         and (entry.size_below is None or run.size < entry.size_below)
     )

@@ -23,7 +23,7 @@ from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.mesh.table import MESHES
 from harness.scenes.spec import NAME, SceneFile, SceneSpec
-from solvers.registry import SOLVERS, load
+from solvers.registry import EVERY, load
 
 ASSIGNMENT_FRAMES = 30
 DEFAULT_SOLVER = "numba"
@@ -225,11 +225,11 @@ def misfits(scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:
 def _solver(document: Document, entry: str | dict[str, Any], at: Key) -> SolverSpec | None:
     """A solver with all of its parameters; they are the fields of its dataclass."""
     data = {"name": entry} if isinstance(entry, str) else entry
-    chosen = document.choose(data, SOLVERS, "name", at)
+    chosen = document.choose(data, EVERY, "name", at)
     if chosen is None:
         return None
     name, given = chosen
-    solver = load(SOLVERS[name])
+    solver = load(EVERY[name])
     parameters = document.check(parameters_model(name, solver), given, at)
     if parameters is None:
         return None

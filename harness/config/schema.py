@@ -17,15 +17,15 @@ from harness.config.sweep import SweepFields
 from harness.scenes.effects.table import EFFECTS
 from harness.scenes.mesh.table import MESHES
 from harness.scenes.spec import SceneFile
-from solvers.registry import SOLVERS, load
+from solvers.registry import EVERY, load
 
 
 def schema() -> dict[str, Any]:
     """The schema of a config: a scene, a sweep or an accuracy config; it names every mesh, effect and solver."""
     mesh = _one_of({kind: load(target) for kind, target in MESHES.items()}, "kind")
     effect = _one_of({kind: load(target) for kind, target in EFFECTS.items()}, "kind")
-    solver = _one_of({name: parameters_model(name, load(target)) for name, target in SOLVERS.items()}, "name")
-    names: Any = Literal[tuple(SOLVERS)]
+    solver = _one_of({name: parameters_model(name, load(target)) for name, target in EVERY.items()}, "name")
+    names: Any = Literal[tuple(EVERY)]
     scene = create_model(
         "Scene",
         __base__=SceneFile,

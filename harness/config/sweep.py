@@ -6,9 +6,9 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from harness.base.model import Many, Model
 from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, Size, TimeStep
@@ -20,28 +20,45 @@ AUTO: Literal["auto"] = "auto"
 Rounds = Annotated[int, Field(ge=1, le=1000)]
 
 
-class Grid(Model):
+class Option(NamedTuple):
+    """What is known of an option besides its type: how its value is named where space is short, and its column of rows
+    ("" for none)."""
+
+    short: str
+    column: str = ""
+
+
+class Varied(Model):
     """Options that a sweep can vary: one value, or a list of values to run each of."""
 
-    iterations: Many[Iterations] = (50,)
+    iterations: Annotated[Many[Iterations], Option("{} it.", "max_iterations")] = (50,)
     """Iteration limit of a step."""
-    tolerance: Many[Tolerance] = (None,)
+    tolerance: Annotated[Many[Tolerance], Option("tol. {}", "tolerance")] = (None,)
     """Relative tolerance that ends a step's iterations; null does all of them."""
-    integrator: Many[IntegratorName] = ("implicit-euler",)
+    integrator: Annotated[Many[IntegratorName], Option("{}", "integrator")] = ("implicit-euler",)
     """How time is integrated."""
-    time_step: Many[TimeStep | None] = (None,)
+    time_step: Annotated[Many[TimeStep | None], Option("dt {:.3g}", "time_step")] = (None,)
     """Time step [s]; null takes the scene's."""
-    first_guess: Many[FirstGuess | None] = (None,)
+    first_guess: Annotated[Many[FirstGuess | None], Option("{}", "first_guess")] = (None,)
     """Where a step's iteration starts; null is `assignment` for JSON scenes, else `current`."""
-    threads: Many[Threads | Literal["auto"]] = (1,)
+    threads: Annotated[Many[Threads | Literal["auto"]], Option("{} thr.", "threads")] = (1,)
     """Threads of Numba and of BLAS; auto: as many as there are cores that nobody else uses."""
-    frames: Many[Frames | None] = (None,)
+    frames: Annotated[Many[Frames | None], Option("{} frames")] = (None,)
     """Number of steps; null takes the scene's."""
-    rounds: Many[Rounds] = (2,)
+    rounds: Annotated[Many[Rounds], Option("{} rounds")] = (2,)
     """How often the timed part is repeated."""
 
 
-class Options(Grid):
+OPTIONS: dict[str, Option] = {
+    name: option
+    for name, field in Varied.model_fields.items()
+    for option in field.metadata
+    if isinstance(option, Option)
+}
+"""By name. What a sweep varies, what its entries match, how runs and their rows are named follow from it."""
+
+
+class Options(Varied):
     """Options of a sweep's runs."""
 
     convergence_frames: tuple[Annotated[int, Field(ge=1)], ...] | None = None
@@ -56,8 +73,16 @@ class Options(Grid):
     """Whether an oracle judges each step's answer in the rows: for `springbench report`, on small meshes."""
 
 
-class Include(Model):
+def _without_defaults(schema: dict[str, Any]) -> None:
+    """What an entry leaves out is not the default of a sweep."""
+    for described in schema["properties"].values():
+        described.pop("default", None)
+
+
+class Include(Varied):
     """Runs beside the grid: what is left out means every scene, every solver, and an option's first value."""
+
+    model_config = ConfigDict(json_schema_extra=_without_defaults)
 
     scene: Many[str] = ()
     """Names of scenes, the stems of their files."""
@@ -65,22 +90,10 @@ class Include(Model):
     """Mesh sizes; they need not be among the sweep's."""
     solver: Many[str] = ()
     """Names of solvers that the sweep lists."""
-    iterations: Many[Iterations] = ()
-    """Iteration limits of a step."""
-    tolerance: Many[Tolerance] = ()
-    """Relative tolerances; null is the run without one."""
-    integrator: Many[IntegratorName] = ()
-    """How time is integrated."""
-    time_step: Many[TimeStep] = ()
-    """Time steps [s]."""
-    first_guess: Many[FirstGuess] = ()
-    """Where a step's iteration starts."""
-    threads: Many[Threads | Literal["auto"]] = ()
-    """Numbers of threads."""
-    frames: Many[Frames] = ()
-    """Numbers of steps."""
-    rounds: Many[Rounds] = ()
-    """Repetitions of the timed part."""
+
+    def stated(self, key: str) -> tuple[Any, ...]:
+        """The values that the entry lists under a key; none where it leaves it out."""
+        return getattr(self, key) if key in self.model_fields_set else ()
 
 
 class Exclude(Include):

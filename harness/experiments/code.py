@@ -7,7 +7,7 @@ from typing import Any
 
 from harness.config.sweep import RunSpec
 from solvers import sources
-from solvers.registry import SOLVERS, load
+from solvers.registry import EVERY, SOLVERS, load
 
 _RUN = Path(__file__).with_name("run.py")
 """What does a run, whatever its parts."""
@@ -15,7 +15,7 @@ _RUN = Path(__file__).with_name("run.py")
 
 def solver_class(run: RunSpec) -> Any:
     """The class of a run's solver; its module is imported."""
-    return load(SOLVERS[run.solver.name])
+    return load(EVERY[run.solver.name])
 
 
 def parts(run: RunSpec) -> frozenset[type]:

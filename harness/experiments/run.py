@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from harness.base import machine, rows
 from harness.base.errors import InputError, RunFailed
 from harness.base.files import CannotWrite, replacing
-from harness.config.sweep import RunSpec
+from harness.base.stated import stated
+from harness.config.sweep import OPTIONS, RunSpec
 from harness.experiments.code import code, parts, solver_class
 from harness.experiments.standing import standing
 from harness.record.base import RecordingInfo
@@ -217,8 +218,8 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
     here = machine.describe()
     properties = {
         "sweep": run.sweep,
-        **asked(run),
-        "tolerance": run.tolerance or 0.0,  # a property has no null
+        **{name: value for name, value in asked(run).items() if value is not None},  # a property has no null
+        "tolerance": run.tolerance or 0.0,
         "vertices": len(scene.mesh.rest),
         "springs": len(scene.springs.edges),
         "frames": run.frames,
@@ -266,11 +267,8 @@ def asked(run: RunSpec) -> dict[str, Any]:
         "size": run.size,
         "solver": run.solver.name,
         "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
-        "time_step": run.scene.time_step,
-        "integrator": run.integrator,
-        "first_guess": run.first_guess,
-        "max_iterations": run.iterations,
-        "tolerance": run.tolerance,
+        **stated(run.solver.name),
+        **{option.column: getattr(run, name) for name, option in OPTIONS.items() if option.column},
         "threads": machine.threads(run.threads).number,
     }
 

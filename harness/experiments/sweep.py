@@ -19,13 +19,8 @@ from harness.base.progress import Display
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts
 from harness.experiments.run import Files, execute
-from harness.record.compare import side_by_side
-from harness.record.reader import read_replay
 from harness.record.sound import whole_messages
-from harness.report import opengl
-from harness.report.comparison import draw_comparison
-from harness.report.run_picture import draw_run
-from harness.report.timing_plot import draw_timing
+from harness.report.sweep import Pictured, draw_sweep
 
 DONE, MISSING = "done", "missing"
 NEEDED = ("run_id", "scene", "size", "solver", "status", "code")
@@ -128,7 +123,8 @@ def run_sweep(
         finally:
             display.end()
         table = rows.read((p.files.rows for p in planned), needed=NEEDED)
-        _draw(name, planned, folder, table, say)
+        pictured = [Pictured(p.run, p.files.recording, p.files.picture) for p in planned]
+        draw_sweep(name, pictured, folder, table, say)
     return table
 
 
@@ -156,74 +152,6 @@ def _outcome(found: list[dict[str, Any]]) -> str:
         return f"{found[0]['status']}: {found[0]['reason']}"
     best = min(row["seconds"] for row in found if row["phase"] == "step")
     return f"{1e3 * best:.3g} ms a step"
-
-
-def _draw(
-    name: str,
-    planned: list[Planned],
-    folder: Path,
-    table: pa.Table,
-    say: Callable[[str], None],
-) -> None:
-    """Pictures of runs, and what compares runs, where it is missing or older than a recording that it shows."""
-    drawn = [p for p in planned if p.run.record and p.files.recording.exists()]
-    missing = opengl.problem() if any(p.run.pictures for p in drawn) else None
-    if missing:
-        say(missing)
-    wanting = [p for p in drawn if p.run.pictures and _stale(p.files.picture, [p.files.recording])]
-    if wanting and not missing:
-        say(f"drawing the pictures of {len(wanting)} runs")
-        for p in wanting:
-            camera = p.run.scene.camera
-            angles = (camera.azimuth, camera.elevation) if camera else None
-            draw_run(read_replay(p.files.recording), p.files.picture, camera=angles)
-    for label, group in _groups(drawn).items():
-        recordings = {_distinct(p, group): p.files.recording for p in group}
-        recording = folder / "recordings" / f"{label}-solvers.rrd"
-        picture = folder / "pictures" / f"{label}-solvers.png"
-        if _stale(recording, recordings.values()):
-            side_by_side(recording, recordings, label.replace("-", " "))
-        if group[0].run.pictures and not missing and _stale(picture, recordings.values()):
-            draw_comparison({key: read_replay(path) for key, path in recordings.items()}, picture)
-    if any(p.run.pictures for p in planned):
-        draw_timing(table, folder / "pictures" / "timing.png", name)
-
-
-def _stale(made: Path, sources: Iterable[Path]) -> bool:
-    """Whether a file is missing, or older than one of those it was made from."""
-    return not made.exists() or any(made.stat().st_mtime_ns < source.stat().st_mtime_ns for source in sources)
-
-
-def _groups(drawn: list[Planned]) -> dict[str, list[Planned]]:
-    """Runs that differ in nothing but their solver or its settings, by scene and size."""
-    groups: dict[str, list[Planned]] = {}
-    for p in drawn:
-        groups.setdefault(f"{p.run.scene_name}-{p.run.size}", []).append(p)
-    return {label: group for label, group in groups.items() if len(group) > 1}
-
-
-def _distinct(p: Planned, group: list[Planned]) -> str:
-    """The solver's name, with the parameters and options in which the group's runs of this solver differ."""
-
-    def settings(run: RunSpec) -> dict[str, Any]:
-        return {**run.solver.parameters, **{option: getattr(run, option) for option in _SHORT}}
-
-    own = [settings(other.run) for other in group if other.run.solver.name == p.run.solver.name]
-    varied = [(k, v) for k, v in settings(p.run).items() if any(other[k] != v for other in own)]
-    return ", ".join([p.run.solver.name, *(_SHORT.get(k, f"{k} {{}}").format(v) for k, v in varied)])
-
-
-_SHORT = {
-    "iterations": "{} it.",
-    "tolerance": "tol. {}",
-    "integrator": "{}",
-    "time_step": "dt {:.3g}",
-    "first_guess": "{}",
-    "threads": "{} thr.",
-    "frames": "{} frames",
-    "rounds": "{} rounds",
-}
-"""How an option's value is named where space is short."""
 
 
 def failures(table: pa.Table) -> list[str]:

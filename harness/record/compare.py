@@ -8,12 +8,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import rerun as rr
 import rerun.blueprint as rrb
 
-from harness.record.blueprint import COLOURS, Box, panels, plot, scale_view, scene_view
+from harness.record.blueprint import Box, panels, plot, scale_view, scene_view
 from harness.record.partial import PartialFile
 from harness.record.reader import Source, network, open_recording, positions, properties, triangles
 
@@ -30,14 +30,29 @@ _SHOWN = 3
 _CURVE = "/convergence/log10_residual/frame_"
 
 
-def side_by_side(out: Path, recordings: Mapping[str, Path], title: str) -> None:
-    """Write to `out` the recordings, by solver, side by side on one time line.
+_Shape = rr.components.MarkerShape
+_SHAPES = {
+    "o": _Shape.Circle, "s": _Shape.Square, "D": _Shape.Diamond, "^": _Shape.Up, "v": _Shape.Down, "<": _Shape.Left,
+    ">": _Shape.Right, "P": _Shape.Plus, "X": _Shape.Cross, "*": _Shape.Asterisk,
+}  # fmt: skip
+"""The viewer's markers by Matplotlib's; it has no others, and draws circles for those."""
+
+
+class Look(NamedTuple):
+    """How a run's lines are drawn: a colour such as `#0072b2`, and one of Matplotlib's markers."""
+
+    color: str
+    marker: str
+
+
+def side_by_side(out: Path, recordings: Mapping[str, Path], title: str, looks: Mapping[str, Look]) -> None:
+    """Write to `out` the recordings, by solver, side by side on one time line; looks: by the same names.
 
     Raises InputError for a file that is not the recording of a run, RunFailed when `out` cannot be written.
     """
     file = PartialFile(out, f"springbench side by side {title}", title, title)
     try:
-        runs = [_copy(file, path, name, k) for k, (name, path) in enumerate(recordings.items())]
+        runs = [_copy(file, path, name, k, looks[name]) for k, (name, path) in enumerate(recordings.items())]
         document = rr.TextDocument(_table(title, runs), media_type=rr.MediaType.MARKDOWN)
         file.stream.log("/runs", document, static=True)
         file.finish(_layout(runs))
@@ -62,18 +77,20 @@ class _Run:
             self.box.add(p)
 
 
-def _copy(file: PartialFile, path: Path, name: str, k: int) -> _Run:
+def _copy(file: PartialFile, path: Path, name: str, k: int, look: Look) -> _Run:
     with open_recording(path) as source:
         run = _Run(name, k, source)
         for chunk in source.chunks(content="/**"):
             run.entities.add(chunk.entity_path)
             file.stream.send_chunks(chunk.with_entity_path(run.root + chunk.entity_path))
-    colour = COLOURS[k % len(COLOURS)]
+    colour = int(look.color[1:] + "ff", 16)
     for entity in run.entities:
         if entity in _QUANTITIES or entity.startswith(_CURVE):
             file.stream.log(run.root + entity, rr.SeriesLines(names=name, colors=colour, widths=1.5), static=True)
         if entity.startswith(_CURVE):
-            points = rr.SeriesPoints(names=name, colors=colour, marker_sizes=3)
+            points = rr.SeriesPoints(
+                names=name, colors=colour, markers=_SHAPES.get(look.marker, _Shape.Circle), marker_sizes=3
+            )
             file.stream.log(run.root + entity, points, static=True)
     file.flush()
     return run

@@ -2,6 +2,9 @@
 
 The stream has no batching thread of its own, which would slow down what runs beside it and lose its last
 batch in a kill: what is logged reaches the disk with `flush`.
+
+The library has no public call that ends a stream's threads once it is gone, that writes a layout without leaving
+threads, or that lets go of a stream whose writer has died. `tests/contracts/test_rerun_gaps.py` tells when it has.
 """
 
 from __future__ import annotations

@@ -17,6 +17,8 @@ from rich.table import Table
 
 Row = Mapping[str, Any]
 
+CAPTION = "CPU time: mean over frames of medians over rounds; displacements in mean rest lengths, energy of the largest"
+
 
 def read(path: Path) -> list[dict[str, Any]]:
     """The rows of an ablation."""
@@ -79,7 +81,7 @@ def ablation_table(rows: Sequence[Row]) -> Table:
     """A row an effect: its price, and what leaving it out changes."""
     (whole,) = of_kind(rows, "whole")
     headings = ("without", "ms a step", "% of the step", "95 %", "KiB", "nnz(L)", "largest", "RMS", "energy", "centre")
-    table = Table(box=SIMPLE_HEAD, caption="displacements in mean rest lengths, energy of the largest")
+    table = Table(box=SIMPLE_HEAD, caption=CAPTION)
     for i, heading in enumerate(headings):
         table.add_column(heading, justify="right" if i else "left")
     size = f"{whole['bytes'] / 1024:,.0f}"

@@ -15,7 +15,7 @@ from matplotlib.ticker import FuncFormatter
 
 from harness.report.ablation import Row, known_error, of_kind
 from harness.report.page import axes, header, new_page, quantity, save, text
-from harness.report.style import INK, MUTED, RC, RULE, WARNING, mark
+from harness.report.style import INK, MUTED, RC, RULE, WARNING, numbered
 
 _ERRORS = {"solver": "error of the solver", "time-step": "error of the time step"}
 _NOTHING = 1e-6
@@ -72,7 +72,7 @@ def _effects(ax: Axes, points: Sequence[Row], whole: float) -> None:
     """One point an effect with its interval and its name; names that would meet are moved apart."""
     taken: list[tuple[float, float]] = []
     for i, row in enumerate(sorted(points, key=lambda row: -row["largest"])):
-        look, y = mark(i), max(row["largest"], _NOTHING)
+        look, y = numbered(i), max(row["largest"], _NOTHING)
         x, low, high = (100.0 * row[key] / whole for key in ("cost", "cost_low", "cost_high"))
         ax.plot([low, high], [y, y], color=look.color, linewidth=1.6, alpha=0.6, solid_capstyle="butt")
         ax.plot([x], [y], marker=look.marker, color=look.color, markersize=9, linestyle="none")

@@ -21,7 +21,8 @@ from rich.table import Table
 
 from harness.base import rows
 from harness.base.errors import InputError
-from solvers.registry import SOLVERS
+from harness.config.sweep import OPTIONS
+from solvers.registry import OPTIONAL, SOLVERS
 
 SLACK = 1.1
 """On the tolerance: the oracle and a solver factorise the same matrix by different ways. Of 1372 runs of configs/hard
@@ -69,7 +70,8 @@ _ENDED = {"unsupported": REFUSED, "diverged": DIVERGED, "failed": FAILED, "dispu
 @dataclass(frozen=True, slots=True)
 class Cell:
     """One run: its case, its solver, what became of it and why; worst: the largest `beyond` of a step, or where
-    `graded` is "distance" the largest distance from the reference, None where there is none; recording: where it is."""
+    `graded` is "distance" the largest distance from the reference, None where there is none; recording: where it is;
+    reference: where the solver comes from, as rows have it."""
 
     case: str
     solver: str
@@ -78,6 +80,7 @@ class Cell:
     graded: str
     reason: str
     recording: Path | None
+    reference: str = ""
 
     @property
     def figure(self) -> str:
@@ -112,8 +115,8 @@ def read_cells(folder: Path) -> list[Cell]:
         case, solver = _case(run[0], firsts), _solver(run[0], firsts)
         outcome, worst, graded, reason = judged(run)
         recording = next((folder / "recordings").glob(f"*-{run[0]['run_id']}.rrd"), None)
-        cells[case, solver] = Cell(case, solver, outcome, worst, graded, reason, recording)
-    order = [*SOLVERS, *(first["solver"] for first in firsts)]
+        cells[case, solver] = Cell(case, solver, outcome, worst, graded, reason, recording, run[0]["reference"] or "")
+    order = [*SOLVERS, *OPTIONAL, *(first["solver"] for first in firsts)]
     return sorted(cells.values(), key=lambda cell: (cell.case, order.index(cell.solver.split()[0]), cell.solver))
 
 
@@ -148,7 +151,7 @@ def judged(run: Sequence[dict[str, Any]]) -> tuple[Outcome, float | None, str, s
     return RIGHT, worst, "stationarity", ""
 
 
-_OPTIONS = ("size", "integrator", "time_step", "first_guess", "max_iterations", "tolerance", "threads")
+_OPTIONS = ("size", *(option.column for option in OPTIONS.values() if option.column))
 
 
 def _case(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from harness.report.references import cited
 from harness.report.robustness import DIVERGED, FAILED, OUTCOMES, RIGHT, WRONG, Cell, Outcome, percent, scores
 from harness.report.style import DPI, INK, MUTED, PAGE, RULE
 
@@ -143,7 +144,8 @@ def write_page(cells: Sequence[Cell], path: Path, title: str) -> None:
         for case in cases
     )
     legend = "".join(f'<li><span style="background:{o.color}"></span>{o.words}: {o.meaning}</li>' for o in OUTCOMES)
-    head = "".join(f"<th>{escape(solver)}</th>" for solver in solvers)
+    references = {cell.solver: cited(cell.reference) for cell in cells}
+    head = "".join(f'<th title="{escape(references[name], quote=True)}">{escape(name)}</th>' for name in solvers)
     found = scores(cells)
     rows = {
         "right": [percent(score.right) for score in found],

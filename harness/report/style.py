@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import cache
+from hashlib import sha256
 from typing import Any, NamedTuple
 
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import LinearSegmentedColormap, to_hex, to_rgb
 
 from harness.record.shading import STRAIN_COLOURS
-from solvers.registry import SOLVERS
+from solvers.registry import OPTIONAL, SOLVERS, about, load
 
 WIDTH, HEIGHT, DPI = 1600, 900, 100
 """Every picture's size in pixels, and the dots per inch that turn it into a matplotlib figure."""
@@ -49,38 +51,82 @@ class Mark(NamedTuple):
 
 
 DASHED, DOTTED, DASH_DOTTED = (0, (5, 2)), (0, (1, 1.6)), (0, (6, 2, 1, 2))
+_DASHES = ("-", DASHED, DOTTED, DASH_DOTTED)
 
-# Okabe and Ito's palette, less its yellow and black, which vanish on a light page or in the text.
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#6d4c9f", "#7a7a7a")
-_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "h")
+_MARKERS = ("s", "o", "D", "^", "v", "P", "X", "p", "*", "<", ">", "h", "d", "H", "8")
 
-# The solvers of a family share a colour and differ in line style; no two share a marker.
-_SOLVERS = {
-    "dense": Mark("#0072b2", "s", DOTTED),
-    "sparse": Mark("#0072b2", "o"),
-    "numba": Mark("#56b4e9", "D"),
-    "anderson": Mark("#009e73", "^"),
-    "chebyshev": Mark("#009e73", "v", DASHED),
-    "lbfgs": Mark("#e69f00", "P"),
-    "newton": Mark("#d55e00", "X"),
-    "newton-cg": Mark("#d55e00", "p", DASHED),
-    "hybrid": Mark(INK, "*"),
-    "xpbd": Mark("#cc79a7", "<"),
-    "xpbd-small-steps": Mark("#cc79a7", ">", DASHED),
-    "vbd": Mark("#882255", "h"),
-    "symplectic-euler": Mark("#7a7a7a", "d", DASH_DOTTED),
-}
+# Okabe and Ito's palette, less its yellow and black, and four more: for families in the order of the registry.
+_FAMILIES = ("#0072b2", "#00a878", "#e69f00", "#d55e00", "#9a86e0", "#cc79a7", "#a8326e", "#858585")
+_MEMBERS: tuple[tuple[float, Any], ...] = ((0.0, "-"), (-0.25, DASHED), (0.4, "-"), (0.2, DASH_DOTTED))
+"""How much lighter the members of a family are drawn, or darker where negative, and in which line style."""
+_STRANGERS = ("#8a8a00", "#00a0a0", "#8c564b", "#4c6ef5", "#5a9e2f", "#c9506b")
 
 
-def marks(solvers: Iterable[str]) -> dict[str, Mark]:
-    """A mark for each of the registry's solvers and of these; of names without one of their own by alphabet."""
-    names = {*SOLVERS, *solvers}
-    strangers = sorted(names - set(_SOLVERS))
-    looks = _SOLVERS | {name: mark(i) for i, name in enumerate(strangers)}
-    return {name: look for name, look in looks.items() if name in names}
+def marks(solvers: Iterable[str] = ()) -> dict[str, Mark]:
+    """The mark of each of the registry's solvers, and of these others: always the same, and nobody else's.
+
+    What other solvers get follows from their names; where two would get the same, the later by alphabet gets the next.
+    """
+    looks = dict(_shipped())
+    free = [Mark(color, marker, dash) for dash in _DASHES for color in _STRANGERS for marker in _MARKERS]
+    taken: set[Mark] = set()
+    for name in sorted({*SOLVERS, *OPTIONAL, *solvers} - set(looks)):
+        place = int(sha256(name.encode()).hexdigest(), 16) % (len(free) // len(_DASHES))
+        looks[name] = next(look for look in free[place:] if look not in taken)
+        taken.add(looks[name])
+    return looks
 
 
-def mark(number: int) -> Mark:
-    """The mark of this number, from 0: 64 different ones, the first 8 in different colours; no solver's own."""
+@cache
+def _shipped() -> dict[str, Mark]:
+    """The marks of the registry's solvers: the colour of their family, a marker of their own; as many as there are."""
+    families: dict[str, list[str]] = {}
+    for name, target in (SOLVERS | OPTIONAL).items():
+        families.setdefault(about(load(target), name).family, []).append(name)
+    markers = dict(zip((*SOLVERS, *OPTIONAL), _MARKERS, strict=False))
+    return {
+        name: Mark(shade(color, by), markers[name], dash)
+        for color, members in zip(_FAMILIES, families.values(), strict=False)
+        for name, (by, dash) in zip(members, _MEMBERS, strict=False)
+        if name in markers
+    }
+
+
+def shade(color: str, by: float) -> str:
+    """A colour mixed with white, or with black where `by` is negative."""
+    end = 1.0 if by > 0.0 else 0.0
+    red, green, blue = ((1.0 - abs(by)) * part + abs(by) * end for part in to_rgb(color))
+    return to_hex((red, green, blue))
+
+
+def looks(labelled: Iterable[tuple[str, str]]) -> dict[str, Mark]:
+    """A mark for each label of (label, solver); further labels of a solver keep its colour and marker."""
+
+    def dashed(own: Mark, k: int, _: int) -> Mark:
+        return own._replace(dash=[own.dash, *(dash for dash in _DASHES if dash != own.dash)][k % len(_DASHES)])
+
+    return _varied(labelled, dashed)
+
+
+def shades(labelled: Iterable[tuple[str, str]]) -> dict[str, Mark]:
+    """The same where labels are many: those of a solver differ in how light its colour is."""
+
+    def shaded(own: Mark, k: int, count: int) -> Mark:
+        return own._replace(color=shade(own.color, 1.1 * k / count - 0.45) if count > 1 else own.color)
+
+    return _varied(labelled, shaded)
+
+
+def _varied(labelled: Iterable[tuple[str, str]], vary: Callable[[Mark, int, int], Mark]) -> dict[str, Mark]:
+    pairs = sorted(set(labelled))
+    own, found = marks(solver for _, solver in pairs), {}
+    for solver, mark in own.items():
+        labels = [label for label, its in pairs if its == solver]
+        found |= {label: vary(mark, k, len(labels)) for k, label in enumerate(labels)}
+    return found
+
+
+def numbered(number: int) -> Mark:
+    """The mark of what is no solver, by its number from 0: 64 different ones, the first 8 in different colours."""
     # The marker moves on once more with each turn of the colours.
-    return Mark(_COLORS[number % 8], _MARKERS[(number + number // 8) % 8], (0, (3, 1.2)))
+    return Mark(_FAMILIES[number % 8], _MARKERS[(number + number // 8) % 8], (0, (3, 1.2)))

@@ -16,7 +16,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocat
 from harness.report.labels import LINE, direct_labels
 from harness.report.page import axes, count, header, new_page, quantity, save, shorten, text
 from harness.report.style import DASH_DOTTED, DASHED, DOTTED, HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark, marks
-from harness.report.timing_table import Run, labels, runs
+from harness.report.timing_table import RunTimes, labels, runs
 
 _LEFT, _TOP, _RIGHT, _BOTTOM = 40, 118, WIDTH - 40, HEIGHT - 30
 _COLUMNS = 4  # scenes side by side
@@ -62,7 +62,7 @@ def _facts(table: pa.Table) -> list[str]:
 def _scene(
     page: Figure,
     scene: str,
-    found: Sequence[Run],
+    found: Sequence[RunTimes],
     names: Mapping[str, str],
     looks: Mapping[str, Mark],
     box: tuple[float, float, float, float],
@@ -80,7 +80,7 @@ def _scene(
     prepare = axes(page, left + 48, below, width - 48, lower)
     here = [run for run in found if run.scene == scene and run.vertices]
     failed = [run for run in here if run.status != "ok"]
-    series: dict[str, list[Run]] = {}
+    series: dict[str, list[RunTimes]] = {}
     for run in here:
         if run.status == "ok":
             series.setdefault(names[run.run_id], []).append(run)
@@ -102,7 +102,7 @@ def _scene(
         step.text(0.5, 0.5, "no run succeeded", transform=step.transAxes, ha="center", color=MUTED)
 
 
-def _variants(series: Mapping[str, Sequence[Run]], looks: Mapping[str, Mark]) -> list:
+def _variants(series: Mapping[str, Sequence[RunTimes]], looks: Mapping[str, Mark]) -> list:
     """A line style for each series: the solver's own for the first of a solver."""
     dashes = []
     solvers = [members[0].solver for members in series.values()]
@@ -113,7 +113,7 @@ def _variants(series: Mapping[str, Sequence[Run]], looks: Mapping[str, Mark]) ->
     return dashes
 
 
-def _times(found: Sequence[Run], *fields: str) -> list[float]:
+def _times(found: Sequence[RunTimes], *fields: str) -> list[float]:
     """All times [ms] in these fields of the runs; at least two, so that there is always a scale."""
     times = [getattr(run, field) for run in found for field in fields]
     return [time for time in times if time] or [0.1, 10.0]
@@ -154,7 +154,7 @@ def _apart(ax: Axes, sizes: Sequence[int]) -> list[int]:
     return kept
 
 
-def _draw_steps(ax: Axes, name: str, members: Sequence[Run], look: Mark, dash) -> list:
+def _draw_steps(ax: Axes, name: str, members: Sequence[RunTimes], look: Mark, dash) -> list:
     """One line with its quartile band; returns where its direct label belongs, with its words and colour."""
     timed = sorted((run for run in members if run.step), key=lambda run: run.vertices or 0)
     if not timed:
@@ -173,7 +173,7 @@ def _draw_steps(ax: Axes, name: str, members: Sequence[Run], look: Mark, dash) -
     return [(n[-1], middle[-1], words, look.color)]
 
 
-def _draw_prepare(ax: Axes, members: Sequence[Run], look: Mark) -> None:
+def _draw_prepare(ax: Axes, members: Sequence[RunTimes], look: Mark) -> None:
     for field, dash, face in (("cold", (0, (2, 2)), PAGE), ("warm", "-", look.color)):
         timed = sorted((run.vertices, getattr(run, field)) for run in members if getattr(run, field))
         if timed:
@@ -190,7 +190,7 @@ def _draw_prepare(ax: Axes, members: Sequence[Run], look: Mark) -> None:
             )
 
 
-def _crosses(ax: Axes, failed: Sequence[Run], looks: Mapping[str, Mark]) -> None:
+def _crosses(ax: Axes, failed: Sequence[RunTimes], looks: Mapping[str, Mark]) -> None:
     """A cross at the upper edge for each failed run; those of one size below each other."""
     taken: dict[int, int] = {}
     for run in failed:
@@ -204,7 +204,7 @@ def _crosses(ax: Axes, failed: Sequence[Run], looks: Mapping[str, Mark]) -> None
         status.set(color=color, fontsize=8, va="center")
 
 
-def _notes(page: Figure, failed: Sequence[Run], names: Mapping[str, str], top: float) -> None:
+def _notes(page: Figure, failed: Sequence[RunTimes], names: Mapping[str, str], top: float) -> None:
     """Which runs failed and why, at the foot of the page."""
     for k, run in enumerate(failed[:_NOTES]):
         where = f"{run.scene}, size {run.size}" if run.size else run.scene

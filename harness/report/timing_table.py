@@ -16,9 +16,10 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from harness.report.page import count, quantity
+from harness.report.references import cited
 
 
-class Run(NamedTuple):
+class RunTimes(NamedTuple):
     """One run: what it was, and its times [ms]; None where the rows do not say.
 
     cold and warm: of preparing; step: median, its quartiles and the least of all steps; local, global_:
@@ -73,15 +74,15 @@ from numbered group by run_id order by min(place)
 """
 
 
-def runs(table: pa.Table) -> list[Run]:
+def runs(table: pa.Table) -> list[RunTimes]:
     """The runs in a table of rows (schema: `harness.base.rows.SCHEMA`), in the order of their first rows."""
     numbered = table.append_column("place", pa.array(np.arange(len(table))))
     with duckdb.connect() as connection:
         connection.register("numbered", numbered)
-        return [Run(*row) for row in connection.execute(_SUMMARY).fetchall()]
+        return [RunTimes(*row) for row in connection.execute(_SUMMARY).fetchall()]
 
 
-def labels(found: Sequence[Run]) -> dict[str, str]:
+def labels(found: Sequence[RunTimes]) -> dict[str, str]:
     """By run id, the solver's name and those of its settings in which the solver's runs differ."""
     settings = {run.run_id: {**json.loads(run.settings), **json.loads(run.parameters or "{}")} for run in found}
     values: dict[tuple[str, str], set[str]] = defaultdict(set)
@@ -112,7 +113,6 @@ _NUMBERS = (
     "largest\nstrain",
 )
 
-
 INTERRUPTED = "! the process was interrupted while steps were timed: its least time is nearest to the truth"
 APART = "~ local and global, timed alone, do not add up to an iteration within 15 %"
 """What the marks in the table mean."""
@@ -123,7 +123,15 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
 
     other_code: the ids of the runs that were done by other code than today's, which are marked.
     """
-    out = Table(box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False, caption_justify="left")
+    title = "times are medians over the rounds and over the steps"
+    out = Table(
+        title=title,
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        collapse_padding=True,
+        pad_edge=False,
+    )
     for name in ("scene", "size", "solver"):
         out.add_column(name, overflow="fold", justify="right" if name == "size" else "left", min_width=len(name))
     for name in _NUMBERS:
@@ -148,15 +156,21 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
             _number(run.largest_strain, lambda strain: f"{100 * strain:.3g} %"),
         )
     marks = {INTERRUPTED: any(run.interrupted for run in found), APART: any(_apart(run, run.local) for run in found)}
-    out.caption = "\n".join(words for words, there in marks.items() if there) or None
+    out.caption = "\n".join([*(words for words, there in marks.items() if there), *_methods(table)]) or None
     # Lines longer than a narrow terminal keep their numbers; Rich would cut them to ellipses.
     out.width = Measurement.get(wide := Console(width=1000), wide.options, out).maximum
     return out
 
 
-def _apart(run: Run, value: float | None) -> str:
+def _apart(run: RunTimes, value: float | None) -> str:
     """The mark of a phase's time where the phases do not add up to an iteration."""
     return "~" if value is not None and run.adds_up is False else ""
+
+
+def _methods(table: pa.Table) -> list[str]:
+    """Where each solver comes from."""
+    known = dict(zip(*(table[name].to_pylist() for name in ("solver", "reference")), strict=True))
+    return [f"{solver}: {cited(reference)}" for solver, reference in known.items() if reference]
 
 
 def _number(value, words) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from solvers.about import About, Reference
 from solvers.kernels.accelerate_coefficients import ANDERSON, require_pairs
 from solvers.linear.choice import Linear, Precision
 from solvers.methods.quasi_newton import Method, PreparedAccelerated, prepare
@@ -25,6 +26,15 @@ class Anderson:
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
+    about: ClassVar[About] = About(
+        "accelerated local-global",
+        Reference(
+            "Peng, Yue and Deng, Bailin and Zhang, Juyong and Geng, Fanyu and Qin, Wenjie and Liu, Ligang",
+            2018,
+            "Anderson acceleration for geometry optimization and physics simulation",
+            "10.1145/3197517.3201290",
+        ),
+    )
 
     pairs: int = 5
     linear: Linear = "auto"

@@ -18,6 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from solvers.about import About, Reference
 from solvers.kernels.accelerate_coefficients import CHEBYSHEV
 from solvers.linear.choice import Linear, Precision
 from solvers.methods.quasi_newton import Method, PreparedAccelerated, prepare
@@ -30,6 +31,15 @@ class Chebyshev:
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
+    about: ClassVar[About] = About(
+        "accelerated local-global",
+        Reference(
+            "Wang, Huamin",
+            2015,
+            "A Chebyshev semi-iterative approach for accelerating projective and position-based dynamics",
+            "10.1145/2816795.2818063",
+        ),
+    )
 
     linear: Linear = "auto"
     precision: Precision = "float64"

@@ -24,6 +24,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from solvers.about import About, Reference
 from solvers.core.descent import DECREASE, Metric, Point, PreparedDescent, dot, search
 from solvers.core.objective import Hessian, Objective, StepObjective
 from solvers.methods.lbfgs import Lbfgs
@@ -60,6 +61,16 @@ class Hybrid:
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
+    about: ClassVar[About] = About(
+        "hybrid",
+        Reference(
+            "Tournier, Maxime and Nesme, Matthieu and Gilles, Benjamin and Faure, François",
+            2015,
+            "Stable constrained dynamics",
+            "10.1145/2766969",
+        ),
+        first=True,
+    )
 
     def prepare(self, system: System) -> PreparedDescent:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""

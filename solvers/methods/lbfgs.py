@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from solvers.about import About, Reference
 from solvers.kernels.accelerate_coefficients import LBFGS, require_pairs
 from solvers.linear.choice import Linear, Precision
 from solvers.methods.quasi_newton import Method, PreparedAccelerated, prepare
@@ -27,6 +28,16 @@ class Lbfgs:
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
+    about: ClassVar[About] = About(
+        "quasi-Newton",
+        Reference(
+            "Liu, Tiantian and Bouaziz, Sofien and Kavan, Ladislav",
+            2017,
+            "Quasi-Newton methods for real-time simulation of hyperelastic materials",
+            "10.1145/2990496",
+        ),
+        first=True,
+    )
 
     pairs: int = 5
     linear: Linear = "auto"

@@ -22,6 +22,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from solvers import matrices, memory
+from solvers.about import LIU_2013, LOCAL_GLOBAL, About
 from solvers.contact.touching import without_contact
 from solvers.energies.springs import TINY, Springs
 from solvers.linear.factors import DenseCholesky, Factor, SparseLU
@@ -172,6 +173,7 @@ class DenseLocalGlobal:
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
+    about: ClassVar[About] = About(LOCAL_GLOBAL, LIU_2013)
 
     def prepare(self, system: System) -> PreparedLocalGlobal:
         """Raises Unsupported for energies other than springs, NotPositiveDefinite."""
@@ -220,6 +222,7 @@ class SparseLocalGlobal:
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
+    about: ClassVar[About] = About(LOCAL_GLOBAL, LIU_2013)
 
     def prepare(self, system: System) -> Prepared:
         """Raises Unsupported for energies that are not projective, NotPositiveDefinite."""

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from solvers.about import LIU_2013, LOCAL_GLOBAL, About
 from solvers.contact.touching import without_contact
 from solvers.core.parts import Parts, split
 from solvers.energies.springs import Springs
@@ -45,6 +46,7 @@ class CompiledLocalGlobal:
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
+    about: ClassVar[About] = About(LOCAL_GLOBAL, LIU_2013, first=True)
 
     linear: Linear = "auto"
     precision: Precision = "float64"

@@ -17,6 +17,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from solvers.about import About, Reference
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.objective import Objective, StepObjective
 from solvers.core.saddles import certified, leave
@@ -35,6 +36,11 @@ class Newton:
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
+    about: ClassVar[About] = About(
+        "Newton",
+        Reference("Nocedal, Jorge and Wright, Stephen J.", 2006, "Numerical Optimization", "10.1007/978-0-387-40065-5"),
+        first=True,
+    )
 
     def prepare(self, system: System) -> PreparedDescent:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""

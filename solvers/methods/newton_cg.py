@@ -14,6 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from solvers.about import About, Reference
 from solvers.contact.touching import without_contact
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.objective import Objective, StepObjective
@@ -36,6 +37,15 @@ class NewtonCG:
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
+    about: ClassVar[About] = About(
+        "Newton",
+        Reference(
+            "Dembo, Ron S. and Steihaug, Trond",
+            1983,
+            "Truncated-Newton algorithms for large-scale unconstrained optimization",
+            "10.1007/BF02592055",
+        ),
+    )
 
     def prepare(self, system: System) -> PreparedDescent:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported for contact, and where Q fits

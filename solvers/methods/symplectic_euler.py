@@ -22,6 +22,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from solvers.about import About, Reference
 from solvers.core import vertex_terms as blocks
 from solvers.energies.springs import Springs
 from solvers.kernels.explicit import advance
@@ -48,6 +49,17 @@ class SymplecticEuler:
 
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
+    about: ClassVar[About] = About(
+        "explicit",
+        Reference(
+            "Hairer, Ernst and Lubich, Christian and Wanner, Gerhard",
+            2006,
+            "Geometric Numerical Integration",
+            "10.1007/3-540-30666-8",
+        ),
+        own_steps=True,
+        first=True,
+    )
 
     def prepare(self, system: System) -> PreparedSymplecticEuler:
         """Raises Unsupported for energies other than springs, integrators other than implicit Euler, vertices without

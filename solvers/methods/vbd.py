@@ -25,6 +25,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from solvers.about import About, Reference
 from solvers.contact.touching import ContactEnergy, touching, without_contact
 from solvers.core import colouring
 from solvers.core import vertex_terms as blocks
@@ -52,6 +53,15 @@ class VertexBlockDescent:
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
+    about: ClassVar[About] = About(
+        "vertex block descent",
+        Reference(
+            "Chen, Anka He and Liu, Ziheng and Yang, Yin and Yuksel, Cem",
+            2024,
+            "Vertex block descent",
+            "10.1145/3658179",
+        ),
+    )
 
     spectral_radius: float = 0.999
 

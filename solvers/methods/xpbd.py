@@ -25,6 +25,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from solvers.about import About, Reference
 from solvers.core import colouring
 from solvers.core import vertex_terms as blocks
 from solvers.kernels import xpbd as kernels
@@ -38,6 +39,15 @@ class Xpbd:
 
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
+    about: ClassVar[About] = About(
+        "position-based",
+        Reference(
+            "Macklin, Miles and Müller, Matthias and Chentanez, Nuttapong",
+            2016,
+            "XPBD: position-based simulation of compliant constrained dynamics",
+            "10.1145/2994258.2994272",
+        ),
+    )
 
     def prepare(self, system: System) -> PreparedXpbd:
         """Raises Unsupported for energies other than springs, and for vertices without mass that are not pinned."""
@@ -53,6 +63,18 @@ class XpbdSmallSteps:
 
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
+    about: ClassVar[About] = About(
+        "position-based",
+        Reference(
+            "Macklin, Miles and Storey, Kier and Lu, Michelle and Terdiman, Pierre and Chentanez, Nuttapong and "
+            "Jeschke, Stefan and Müller, Matthias",
+            2019,
+            "Small steps in physics simulation",
+            "10.1145/3309486.3340247",
+        ),
+        own_steps=True,
+        first=True,
+    )
 
     def prepare(self, system: System) -> PreparedSmallSteps:
         """Raises Unsupported as `Xpbd` does, and for integrators other than implicit Euler."""

@@ -5,8 +5,7 @@ wanders by one or two. Each ratio comes from a turn A B A, in which a steady dri
 
     ratio = (A_before + A_after) / 2 / B
 
-Turns share no times, so their ratios are independent, and the median gets its 95 % interval from a percentile
-bootstrap (Efron 1979).
+Turns share no times, so their ratios are independent, and `harness.base.statistics` gives the median's 95 % interval.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pytest_benchmark.fixture import BenchmarkFixture
 
-RESAMPLES = 4000
-"""Resamples of the bootstrap: with so many, the ends of an interval repeat to a few per cent of its width."""
+from harness.base.statistics import ratio
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,14 +32,9 @@ class Ratio:
 
     @classmethod
     def of(cls, candidate: ArrayLike, yardstick: ArrayLike) -> Ratio:
-        """The ratio of times (turns, 2), before and after, to times (turns,).
-
-        The resampling is seeded, so the same times give the same interval.
-        """
-        ratios = np.asarray(candidate, float).mean(axis=1) / np.asarray(yardstick, float)
-        resampled = np.random.default_rng(0).choice(ratios, (RESAMPLES, len(ratios)))
-        low, high = np.quantile(np.median(resampled, axis=1), [0.025, 0.975])
-        return cls(float(np.median(ratios)), float(low), float(high), len(ratios))
+        """The ratio of times (turns, 2), before and after, to times (turns,)."""
+        before_and_after = np.asarray(candidate, float).mean(axis=1)
+        return cls(*ratio(before_and_after, yardstick), len(before_and_after))
 
     def exceeds(self, limit: float) -> bool:
         """Whether the whole interval lies above the limit."""

@@ -36,8 +36,8 @@ COUNT = len(REFINEMENTS) * 3
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """A grid of six simulations."""
-    for name, value in (("WAYS", WAYS), ("REFINEMENTS", REFINEMENTS), ("IMPLICIT", ["sparse"]), ("EXPLICIT", [])):
-        monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(module, "candidates", lambda: WAYS)
+    monkeypatch.setattr(module, "REFINEMENTS", REFINEMENTS)
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from rerun.chunk import RrdReader
 from harness.base.errors import InputError
 from harness.base.files import CannotWrite
 from harness.record.base import Frame
-from harness.record.compare import side_by_side
+from harness.record.compare import Look, side_by_side
 from harness.record.reader import open_recording, read_replay, summary
 from harness.record.rerun import SCALARS, RerunRecorder
 from harness.record.shading import LEVELS, palette
@@ -217,7 +217,7 @@ def test_solvers_stand_side_by_side_in_one_file(tmp_path: Path):
     paths = {"dense, 5 x": tmp_path / "a.rrd", "dense 5 x": tmp_path / "b.rrd"}
     for k, path in enumerate(paths.values()):
         record(path, amplitude=0.1 * (k + 1))
-    side_by_side(tmp_path / "both.rrd", paths, "cloth 6")
+    side_by_side(tmp_path / "both.rrd", paths, "cloth 6", dict.fromkeys(paths, Look("#0072b2", "s")))
     found = summary(tmp_path / "both.rrd")
     assert found.complete
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.rrd", "b.rrd", "both.rrd"]
@@ -232,8 +232,9 @@ def test_solvers_stand_side_by_side_in_one_file(tmp_path: Path):
 def test_nothing_is_left_of_a_comparison_with_a_stranger(tmp_path: Path):
     record(tmp_path / "a.rrd")
     foreign(tmp_path / "b.rrd")
+    paths = {name: tmp_path / f"{name}.rrd" for name in "ab"}
     with pytest.raises(InputError, match="not of one run"):
-        side_by_side(tmp_path / "both.rrd", {"a": tmp_path / "a.rrd", "b": tmp_path / "b.rrd"}, "both")
+        side_by_side(tmp_path / "both.rrd", paths, "both", dict.fromkeys(paths, Look("#0072b2", "h")))
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.rrd", "b.rrd"]
 
 

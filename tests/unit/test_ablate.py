@@ -17,11 +17,12 @@ from harness.base.rows import COLUMNS as RUN_COLUMNS
 from harness.base.rows import Column
 from harness.cli import app
 from harness.config.load import load_any, load_scene
+from harness.experiments.ablation import suggest
 from harness.experiments.ablation.cases import Case, cases
 from harness.experiments.ablation.command import SOLVER
 from harness.experiments.ablation.rows import COLUMNS
 from harness.experiments.ablation.run import ablate
-from harness.experiments.ablation.suggest import Seen, suggestions
+from harness.experiments.ablation.suggest import Suggestion
 from harness.experiments.ablation.turns import Turn, cost
 from harness.report.ablation import read, sentences, verdict
 from harness.scenes.bind import Scene
@@ -187,9 +188,12 @@ def test_where_no_error_is_known_the_verdict_does_not_judge():
     assert "error of the solver: unknown (lost)" in sentences([WHOLE, *unknown])
 
 
-def seen(made: Scene, kinds: set[str], positions: np.ndarray, speed: float = 0.0) -> Seen:
-    """A motion that passes through positions (n, 3) for 12 frames."""
-    return Seen(made, kinds, np.tile(positions, (12, 1, 1)), np.full((12, *positions.shape), speed))
+def asked(
+    made: Scene, kinds: set[str], positions: np.ndarray, velocities: np.ndarray | float = 0.0
+) -> list[Suggestion]:
+    """What a motion calls for that passes through positions (n, 3) for 12 frames."""
+    places = np.tile(positions, (12, 1, 1))
+    return suggest.suggestions(suggest.seen(made, kinds, places, np.broadcast_to(velocities, places.shape)), kinds)
 
 
 def folded(made: Scene, angle: float) -> np.ndarray:
@@ -201,13 +205,13 @@ def folded(made: Scene, angle: float) -> np.ndarray:
 
 def still() -> Scene:
     made = replace(cloth(), forces=(), moving=())
-    assert suggestions(seen(made, set(), made.mesh.rest)) == []
+    assert asked(made, set(), made.mesh.rest) == []
     return made
 
 
 def test_a_motion_that_asks_for_nothing_gets_no_suggestion():
     made = still()
-    assert suggestions(seen(made, set(), folded(made, np.deg2rad(20.0)))) == []
+    assert asked(made, set(), folded(made, np.deg2rad(20.0))) == []
 
 
 @pytest.mark.parametrize(
@@ -222,38 +226,37 @@ def test_a_suggestion_comes_with_its_evidence_unless_the_effect_is_listed(effect
     made = still()
     places = {"strain-limits": 1.12 * made.mesh.rest, "bending": folded(made, 0.8 * np.pi), "air-drag": made.mesh.rest}
     speed = 1.0 if effect == "air-drag" else 0.0
-    found = {s.effect: s.evidence for s in suggestions(seen(made, set(), places[effect], speed))}
+    found = {s.effect: s.evidence for s in asked(made, set(), places[effect], speed)}
     assert evidence in found[effect]
-    assert effect not in {s.effect for s in suggestions(seen(made, {listed}, places[effect], speed))}
+    assert effect not in {s.effect for s in asked(made, {listed}, places[effect], speed)}
 
 
 def test_a_corner_alone_asks_for_no_effect():
     made = scene(Grid(), Springs(stretch=300.0, shear=60.0), size=20)
     p, h = made.mesh.rest.copy(), made.mesh.spacing
     p[0] += [-h, 2 * h, -h]  # three springs of 1482, and two edges of 1083
-    assert suggestions(seen(made, set(), p)) == []
+    assert asked(made, set(), p) == []
     p[made.mesh.parts["left"]] += [0.0, 3 * h, 0.0]
-    assert {s.effect for s in suggestions(seen(made, set(), p))} == {"strain-limits", "bending"}
+    assert {s.effect for s in asked(made, set(), p)} == {"strain-limits", "bending"}
 
 
 def test_vertices_that_come_close_are_counted():
     made = still()
-    found = {s.effect: s.evidence for s in suggestions(seen(made, set(), folded(made, np.pi * 0.99)))}
+    found = {s.effect: s.evidence for s in asked(made, set(), folded(made, np.pi * 0.99))}
     # Of 6 columns the inner two are joined by springs; each outer pair lies on each other in all 6 rows.
     assert found["self-contact"].startswith("12 pairs of vertices without a spring")
 
 
 def test_a_body_that_flies_as_a_whole_is_not_asked_to_rest():
     free = scene(Grid(), Springs(stretch=300.0), size=4)
-    flying = seen(free, set(), free.mesh.rest, 1.0)
-    assert suggestions(flying) == []
-    swelling = replace(flying, velocities=np.tile(free.mesh.rest, (12, 1, 1)))
-    assert [s.effect for s in suggestions(swelling)] == ["air-drag"]
+    assert asked(free, set(), free.mesh.rest, 1.0) == []
+    swelling = asked(free, set(), free.mesh.rest, free.mesh.rest)
+    assert [s.effect for s in swelling] == ["air-drag"]
 
 
 def test_a_driven_motion_is_not_asked_to_rest():
     made = replace(still(), forces=(lambda p, v, t: p,))
-    assert suggestions(seen(made, set(), made.mesh.rest, 1.0)) == []
+    assert asked(made, set(), made.mesh.rest, 1.0) == []
 
 
 def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: Path):

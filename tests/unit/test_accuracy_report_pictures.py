@@ -7,22 +7,24 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import plotly.graph_objects as go
 import pytest
-from matplotlib.colors import to_rgb
+from matplotlib.colors import rgb_to_hsv, to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
+from harness.record.blueprint import BACKGROUND
 from harness.report import page
 from harness.report.accuracy import draw, sheet
 from harness.report.accuracy.reading import read
 from harness.report.accuracy.time_plot import draw_times
-from harness.report.style import HEIGHT, WIDTH, marks
-from solvers.registry import SOLVERS
+from harness.report.style import HEIGHT, PAGE, WIDTH, marks
+from solvers.registry import EVERY, load
 from tests import accuracy_rows as made
 
 SCRIPT = Path(__file__).with_name("accuracy_page.js")
@@ -177,7 +179,30 @@ def test_solvers_differ_in_colour_or_line_to_the_colour_blind_too(matrix: list[l
         assert apart > 10 or one.dash != other.dash, f"{a} and {b}: {apart:.1f}"
 
 
+def luminance(color: Sequence[float]) -> float:
+    rgb = np.array(color)
+    return float(np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4) @ [0.2126, 0.7152, 0.0722])
+
+
+@pytest.mark.parametrize("name", [*EVERY, *(f"a stranger {k}" for k in range(12))])
+def test_one_look_is_seen_on_the_light_page_and_on_the_dark_ground_of_the_viewer(name: str) -> None:
+    color = luminance(to_rgb(marks([name])[name].color))
+    page, ground = luminance(to_rgb(PAGE)), luminance([part / 255 for part in BACKGROUND])
+    # Contrast as the W3C defines it; 1.5 is that of a hairline, and lines are thick.
+    assert (page + 0.05) / (color + 0.05) > 1.5
+    assert (color + 0.05) / (ground + 0.05) > 1.5
+
+
 def test_every_solver_has_a_look_and_a_marker_of_its_own() -> None:
     looks = marks([])
-    assert set(looks) == set(SOLVERS)
+    assert set(looks) == set(EVERY)
     assert len({look.marker for look in looks.values()}) == len(looks)
+
+
+def test_solvers_of_a_family_have_one_hue() -> None:
+    hues: dict[str, set[int]] = {}
+    for name, look in marks([]).items():
+        hue, saturation, _ = rgb_to_hsv(to_rgb(look.color))
+        hues.setdefault(load(EVERY[name]).about.family, set()).add(round(360 * hue) if saturation > 0.1 else -1)
+    # Two hexadecimal digits round a hue by a degree or two.
+    assert all(max(found) - min(found) <= 3 for found in hues.values())

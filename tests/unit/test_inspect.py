@@ -16,7 +16,7 @@ import pyvista as pv
 from rich.console import Console
 
 from harness.base.errors import InputError, RunFailed
-from harness.record.compare import side_by_side
+from harness.record.compare import Look, side_by_side
 from harness.record.reader import read_replay
 from harness.report import inspect as module
 from harness.report.inspect import inspect, view
@@ -117,7 +117,8 @@ def test_two_equal_recordings_do_not_differ(cloth: Path, tmp_path: Path):
 
 def test_recordings_side_by_side_can_be_inspected(cloth: Path, tmp_path: Path):
     both = tmp_path / "both.rrd"
-    side_by_side(both, {"dense": cloth, "sparse": cloth}, "cloth 6")
+    paths = {"dense": cloth, "sparse": cloth}
+    side_by_side(both, paths, "cloth 6", dict.fromkeys(paths, Look("#0072b2", "s")))
     assert "/1-dense/milliseconds/step 1 6 10.5" in printed(both)
     with pytest.raises(InputError, match="not of one run"):
         printed(both, cloth)

@@ -21,7 +21,7 @@ from harness.report.labels import LINE, spread
 from harness.report.style import HEIGHT, WIDTH, marks
 from harness.report.timing_plot import draw_timing
 from harness.report.timing_table import APART, INTERRUPTED, labels, runs, summary_table
-from solvers.registry import SOLVERS
+from solvers.registry import EVERY
 
 POWERS = {"sparse": 1.0, "dense": 2.0, "xpbd": 1.5}  # of the vertices, in the times of each solver
 EXPLOSION = "the positions are not finite from frame 3 on"
@@ -179,8 +179,8 @@ def test_direct_labels_do_not_overlap_and_stay_on_the_panel(wanted: list[float])
 
 def test_solvers_have_marks_of_their_own_that_stay_the_same() -> None:
     names = [f"method-{k:02}" for k in range(20)]
-    assert len(set(marks(names).values())) == 20 + len(SOLVERS), "colour and marker together tell solvers apart"
-    for solver in SOLVERS:
+    assert len(set(marks(names).values())) == 20 + len(EVERY), "colour and marker together tell solvers apart"
+    for solver in EVERY:
         assert marks([])[solver] == marks(names)[solver]
     assert marks(names) == marks(reversed(names))
 

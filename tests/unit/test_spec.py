@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,11 @@ import numpy as np
 import pytest
 
 from harness.base.errors import InputError
+from harness.base.rows import SCHEMA
+from harness.cli import run
 from harness.config.load import Sweep, load_any, load_scene, load_sweep
 from harness.config.schema import schema
-from harness.config.sweep import RunSpec
+from harness.config.sweep import OPTIONS, Include, RunSpec, Varied
 from harness.scenes.bind import build
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -266,3 +269,17 @@ def test_mistakes_of_two_scenes_are_reported_together(folder: Path) -> None:
     with pytest.raises(InputError) as caught:
         sweep_of(folder, SWEEP.replace("cloth.yaml, file.yaml", "one.yaml, two.yaml"))
     assert [mistake.file for mistake in caught.value.mistakes] == [folder / "one.yaml", folder / "two.yaml"]
+
+
+def test_each_option_that_a_sweep_varies_is_one_of_a_run_of_the_command_line_and_of_rows() -> None:
+    assert set(OPTIONS) == set(Varied.model_fields), "what it is called for short, and its column"
+    assert set(OPTIONS) <= {field.name for field in fields(RunSpec)}
+    assert set(OPTIONS) <= set(signature(run).parameters)
+    assert {option.column for option in OPTIONS.values()} - {""} <= set(SCHEMA.names)
+
+
+@pytest.mark.parametrize(("key", "value"), [("tolerance", None), ("threads", 2), ("size", [4, 8])])
+def test_an_entry_states_what_it_lists_and_nothing_else(key: str, value: object) -> None:
+    entry = Include.model_validate({key: value})
+    assert entry.stated(key) == (tuple(value) if isinstance(value, list) else (value,))
+    assert not any(entry.stated(other) for other in Include.model_fields if other != key)

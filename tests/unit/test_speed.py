@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter, thread_time
@@ -15,14 +16,14 @@ from harness.base.errors import InputError, RunFailed
 from harness.base.rows import alone
 from harness.config.load import load_any, load_sweep
 from harness.config.sweep import RunSpec, SolverSpec
-from harness.experiments.speed import candidates, limits, turns, yardstick
+from harness.experiments.speed import candidates, limits, turns
 from harness.experiments.speed.candidates import Reading, average
-from harness.experiments.speed.figures import figures
 from harness.experiments.speed.report import run_speed
 from harness.experiments.speed.rest import apart, rest_of
-from harness.experiments.speed.table import remarks, speed_table
 from harness.experiments.speed.turns import PREPARES, Past, measure, name, predicted
-from harness.experiments.speed.work import count
+from harness.report.speed.counts import count
+from harness.report.speed.figures import figures
+from harness.report.speed.table import remarks, speed_table
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Unsupported
 from tests.scenes import cloth, first_problem
@@ -186,7 +187,7 @@ def sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A small sweep on a machine without a compiler, with few and short probes and no repetitions."""
     (tmp_path / "small.yaml").write_text(SWEEP)
     (tmp_path / SCENE.name).write_bytes(SCENE.read_bytes())
-    monkeypatch.setattr(yardstick.shutil, "which", lambda _: None)
+    monkeypatch.setattr(shutil, "which", lambda _: None)
     monkeypatch.setattr(limits, "WORKING_SETS", (1 << 14, 1 << 16))
     monkeypatch.setattr(limits.probes, "__defaults__", ((1 << 14, 1 << 16),))
     monkeypatch.setattr(candidates.average, "__defaults__", (0.0,))

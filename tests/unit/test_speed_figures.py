@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pytest
 
 from harness.base.rows import SCHEMA
-from harness.experiments.speed.figures import Figures, Machine, figures, interval
-from harness.experiments.speed.table import exponents, remarks
-from harness.experiments.speed.work import count
+from harness.report.speed.counts import count
+from harness.report.speed.figures import Figures, Machine, figures
+from harness.report.speed.table import exponents, remarks
 
 
 def machine_row(phase: str, seconds: float, *, bytes: float = 0.0, flops: float = 0.0, working_set: float = 0.0):
@@ -83,14 +82,14 @@ def test_figures_say_how_near_the_binding_limit_is():
     assert list(found) == ["eigen default", "eigen cheap", "numba cholespy", "numba supernodal"]
     ours = found["numba supernodal"]
     assert ours.iterations == 10
-    # 1 s an iteration at best, so a step of 50 takes 50 s.
-    assert (ours.cold, ours.warm, ours.local, ours.step) == (1e3, 1e3, 1e3, 5e4)
+    # 1 s an iteration in the median, so a step of 50 takes 50 s.
+    assert (ours.cold, ours.warm, ours.local, ours.step) == (1e3, 1.5e3, 1e3, 5e4)
     assert ours.faster is not None
-    assert ours.faster.ratio == 8.0
+    assert ours.faster.middle == 8.0
     assert ours.cheap_faster is not None
-    assert ours.cheap_faster.ratio == 4.0
+    assert ours.cheap_faster.middle == 4.0
     assert ours.solves_faster is not None
-    assert ours.solves_faster.ratio == 3.0
+    assert ours.solves_faster.middle == 3.0
     work = count({"nnz_factor": 100, "flops_per_solve": 2400}, 16, 42)["iteration"]
     bandwidth = Machine(LIMITS).bandwidth(1, work.working_set)
     assert (ours.binds, ours.touched) == ("bandwidth", work.bytes)
@@ -100,21 +99,6 @@ def test_figures_say_how_near_the_binding_limit_is():
     bare = count({"nnz_factor": 100}, 16, 42)["iteration"]
     assert ours.passes == pytest.approx(bare.bytes / Machine(LIMITS).bandwidth(1, bare.working_set), rel=1e-12)
     assert found["numba cholespy"].reached is None
-
-
-def test_the_interval_holds_the_ratio_and_is_the_same_each_time():
-    theirs, ours = np.exp(0.1 * np.random.default_rng(1).standard_normal((2, 15)))
-    found = interval(3.0 * theirs, ours)
-    assert found.low < found.ratio < found.high
-    assert found.low < 3.0 < found.high
-    assert interval(3.0 * theirs, ours) == found
-    assert interval(np.full(5, 2.0), np.ones(5)) == (2.0, 2.0, 2.0)
-
-
-def test_rounds_that_were_disturbed_do_not_move_the_ratio():
-    ours = np.ones(15)
-    ours[[2, 3, 7, 8, 9, 11]] = 40.0
-    assert interval(np.full(15, 6.0), ours).ratio == 6.0
 
 
 def test_the_growth_of_a_solve_is_the_power_in_its_times():

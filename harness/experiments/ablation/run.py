@@ -13,13 +13,13 @@ from harness.config.sweep import RunSpec
 from harness.experiments.ablation.cases import cases
 from harness.experiments.ablation.difference import Motion, difference, rest_length
 from harness.experiments.ablation.rows import SCHEMA
-from harness.experiments.ablation.suggest import Seen, suggestions
+from harness.experiments.ablation.suggest import seen, suggestions
 from harness.experiments.ablation.turns import Turn, cost, motion, seconds, turns
 from harness.experiments.run import asked, failure, provenance
 from harness.scenes.bind import Scene, build
 from harness.simulation.measure import Settings
 from solvers.problem import Solver, StopRule
-from solvers.registry import SOLVERS, load
+from solvers.registry import EVERY, SOLVERS, load
 
 Row = dict[str, Any]
 
@@ -37,15 +37,18 @@ def ablate(sweep: Sweep, folder: Path, *, pairs: bool, tick: Callable[[str], Non
     (run,) = sweep.runs()
     run.scene.require_even_steps()
     settings = Settings(StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
-    solver: Solver = load(SOLVERS[run.solver.name])(**run.solver.parameters)
+    solver: Solver = load(EVERY[run.solver.name])(**run.solver.parameters)
     with machine.pinned_threads(machine.threads(run.threads).number):
         found = turns(cases(run.scene, pairs=pairs), run.size, run.integrator, solver, settings, tick)
         whole = found[0]
         assert whole.scene is not None
         told = [_whole(whole), *(_without(whole, turn) for turn in found[1:])]
         told += _errors(run, whole, settings, tick)
-        seen = Seen(whole.scene, {effect.kind for effect in run.scene.effects}, whole.positions, whole.velocities)
-        told += [{"kind": "suggestion", "name": s.effect, "reason": s.evidence} for s in suggestions(seen)]
+        kinds = {effect.kind for effect in run.scene.effects}
+        motion_seen = seen(whole.scene, kinds, whole.positions, whole.velocities)
+        told += [
+            {"kind": "suggestion", "name": s.effect, "reason": s.evidence} for s in suggestions(motion_seen, kinds)
+        ]
     path = folder / "ablation" / f"{run.label(machine.describe().id)}.parquet"
     path.parent.mkdir(parents=True, exist_ok=True)
     rows.write(path, _shared(run, whole.scene, told), SCHEMA)

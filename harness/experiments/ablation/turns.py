@@ -6,7 +6,7 @@ of an effect is a difference of times of the same frame in the same round:
 
     cost = mean over frames of the median over rounds of (whole - without)
 
-A percentile bootstrap (Efron 1979), which resamples the rounds of each frame, gives its 95 % interval.
+`harness.base.statistics` gives its 95 % interval.
 """
 
 from __future__ import annotations
@@ -20,14 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base.errors import InputError
+from harness.base.statistics import Interval, added
 from harness.experiments.ablation.cases import Case
 from harness.scenes.bind import Scene, build
 from harness.simulation.measure import Settings, StepFailed, steps
 from harness.simulation.step import Step, prepare
 from solvers.problem import NotPositiveDefinite, Prepared, Solver, Unsupported
-
-RESAMPLES = 2000
-"""Resamples of the bootstrap: with so many, the ends of an interval repeat to a few per cent of its width."""
 
 Array = NDArray[np.float64]
 
@@ -75,18 +73,9 @@ def turns(
     return found
 
 
-def cost(whole: Turn, without: Turn) -> tuple[float, float, float]:
-    """What a step of the whole scene takes more of CPU time [s], and the ends of the 95 % interval.
-
-    The resampling is seeded, so the same times give the same interval.
-    """
-    more = np.array(whole.seconds) - np.array(without.seconds)
-    rounds = len(more)
-    rng, means = np.random.default_rng(0), np.empty(RESAMPLES)
-    for k in range(RESAMPLES):
-        means[k] = np.median(np.take_along_axis(more, rng.integers(rounds, size=more.shape), axis=0), axis=0).mean()
-    low, high = np.quantile(means, [0.025, 0.975])
-    return float(np.median(more, axis=0).mean()), float(low), float(high)
+def cost(whole: Turn, without: Turn) -> Interval:
+    """What a step of the whole scene takes more of CPU time [s]."""
+    return added(np.array(whole.seconds) - np.array(without.seconds))
 
 
 def seconds(turn: Turn) -> float:

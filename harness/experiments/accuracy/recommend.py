@@ -28,17 +28,24 @@ from harness.experiments.accuracy.work import work_rows
 from harness.reference.store import Store
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
+from solvers.about import LOCAL_GLOBAL
 from solvers.integrators import INTEGRATORS
+from solvers.registry import SOLVERS, about, load
 
 REFINEMENTS = (0.5, 1, 2, 4, 8)
 """Steps in the horizon, relative to those of the scene's own time step."""
 
-IMPLICIT, EXPLICIT = ["numba", "lbfgs", "newton", "hybrid"], ["symplectic-euler", "xpbd-small-steps"]
-WAYS: list[dict[str, Any]] = [
-    {"solver": IMPLICIT, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": list(INTEGRATORS)},
-    {"solver": ["numba", *EXPLICIT], "iterations": 50},
-]
-"""What is measured where nothing was: steps solved to a tolerance, and steps of 50 iterations or substeps."""
+
+def candidates() -> list[dict[str, Any]]:
+    """What is measured where nothing was, of each family's first: steps solved to a tolerance, and steps of 50
+    iterations or substeps."""
+    first = {name: told for name, target in SOLVERS.items() if (told := about(load(target), name)).first}
+    implicit = [name for name, told in first.items() if not told.own_steps]
+    fixed = [name for name, told in first.items() if told.own_steps or told.family == LOCAL_GLOBAL]
+    return [
+        {"solver": implicit, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": list(INTEGRATORS)},
+        {"solver": fixed, "iterations": 50},
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +114,9 @@ def _grid(path: Path, scene: SceneSpec, size: int, horizon: float, time_limit: f
     steps = max(1, round(horizon / scene.time_step))
     time_steps = [horizon / round(steps * factor) for factor in REFINEMENTS if round(steps * factor)]
     shared = {"horizon": horizon, "time_step": time_steps, "time_limit": time_limit} | ({"size": size} if size else {})
-    work = [shared | way for way in WAYS]
-    data = {"scenes": [path.name], "solvers": [*IMPLICIT, *EXPLICIT], "work": work}
+    work: list[dict[str, Any]] = [shared | way for way in candidates()]
+    solvers = list(dict.fromkeys(name for way in work for name in way["solver"]))
+    data = {"scenes": [path.name], "solvers": solvers, "work": work}
     document = Document(path, data)
     fields = document.check(AccuracyFields, data)
     solvers = solvers_of(document)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -13,15 +13,34 @@ from harness.experiments.accuracy.curves import Curve
 from harness.experiments.accuracy.scales import round_off
 from harness.record.base import Frame, RecordingInfo
 from harness.record.rerun import RerunRecorder
+from harness.reference.frozen import Frozen
+from harness.reference.minimiser import Reference
+from harness.scenes.bind import Scene
 
-if TYPE_CHECKING:
-    from harness.experiments.accuracy.solves import Graded
+
+class Step(Protocol):
+    """A frozen step: when it was, and what is known of its minima."""
+
+    @property
+    def moment(self) -> str:
+        """In words."""
+        ...
+
+    @property
+    def frozen(self) -> Frozen:
+        """The problem."""
+        ...
+
+    @property
+    def reference(self) -> Reference:
+        """The minima."""
+        ...
 
 
-def record(unit: CurveUnit, graded: Graded, first_guess: str, curve: Curve, folder: Path) -> Path:
+def record(unit: CurveUnit, graded: Step, scene: Scene, first_guess: str, curve: Curve, folder: Path) -> Path:
     """Write the recording of a curve under `folder`/recordings and return its path. Raises RunFailed."""
     path = folder / "recordings" / f"{unit.label()}-{first_guess}.rrd"
-    problem, scene = graded.frozen.problem, graded.scene
+    problem = graded.frozen.problem
     info = RecordingInfo(
         title=f"{unit.case.title}, {graded.moment}: {unit.solver.name} from the {first_guess} positions",
         run_id=f"{unit.unit_id(machine.describe().id)}-{first_guess}",
@@ -57,7 +76,7 @@ def record(unit: CurveUnit, graded: Graded, first_guess: str, curve: Curve, fold
         recorder.abandon()
 
 
-def _curves(curve: Curve, graded: Graded, lowest: float) -> dict[str, list[float]]:
+def _curves(curve: Curve, graded: Step, lowest: float) -> dict[str, list[float]]:
     problem = graded.frozen.problem
     gap = (np.array(curve.g) - lowest) / max(problem.value(problem.current) - lowest, round_off(problem))
     return {"energy gap": gap.tolist(), "stationarity": curve.stationarity}

@@ -31,6 +31,7 @@ COLUMNS = (
     Column("kind", _TEXT, "", "problem, minimum, prepare, curve or work"),
     Column("unit", _TEXT, "", "hash of all that determines the unit's result and timing"),
     *_as_in_runs("sweep", "scene", "size", "vertices", "springs", "solver", "parameters", "integrator", "time_step"),
+    *_as_in_runs("family", "reference", "minimises", "own_steps"),
     *_as_in_runs("first_guess", "threads"),
     Column(
         "status",

@@ -16,6 +16,7 @@ from typing import Any
 from harness.base import machine, rows
 from harness.base.errors import InputError
 from harness.base.progress import Display
+from harness.base.stated import stated
 from harness.config.accuracy import CurveUnit, Unit, WorkUnit
 from harness.config.accuracy_load import Accuracy
 from harness.experiments.accuracy.failures import lost
@@ -159,6 +160,7 @@ class _Run:
             "time_step": case.scene.time_step,
             "solver": unit.solver.name,
             "parameters": json.dumps(dict(unit.solver.parameters), sort_keys=True),
+            **stated(unit.solver.name),
             "threads": unit.how.threads,
             **provenance(),
         }

@@ -24,7 +24,7 @@ from harness.reference.store import Store
 from harness.scenes.bind import Scene
 from harness.simulation.step import FIRST_GUESSES
 from solvers.problem import Positions, Prepared, Solver, System
-from solvers.registry import SOLVERS, load
+from solvers.registry import EVERY, load
 
 Row = dict[str, Any]
 
@@ -133,7 +133,7 @@ def curve_rows(unit: CurveUnit, graded: Graded, folder: Path, tick: Callable[[],
 
     folder: of the config's results; tick: called after each curve. What a solver raises is a row.
     """
-    solver: Solver = load(SOLVERS[unit.solver.name])(**unit.solver.parameters)
+    solver: Solver = load(EVERY[unit.solver.name])(**unit.solver.parameters)
     shared = graded.common()
     try:
         with machine.pinned_threads(unit.how.threads):
@@ -184,7 +184,7 @@ def _curve(unit: CurveUnit, prepared: Prepared, graded: Graded, first_guess: str
     if reached:
         shared["branch"] = reference.branch(reached)
     if unit.recordings and first_guess == unit.first_guesses[0]:
-        shared["recording"] = str(record(unit, graded, first_guess, curve, folder).relative_to(folder))
+        shared["recording"] = str(record(unit, graded, graded.scene, first_guess, curve, folder).relative_to(folder))
     against = reached or next(iter(reference.minima), None)
     return [shared | row for row in _points(curve, graded.frozen.problem.system, against)]
 

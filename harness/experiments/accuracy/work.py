@@ -23,7 +23,7 @@ from harness.simulation.clock import Watch
 from harness.simulation.measure import Diverged
 from harness.simulation.step import prepare, simulate
 from solvers.problem import Positions, Prepared, Solver, StopRule
-from solvers.registry import SOLVERS, load
+from solvers.registry import EVERY, load
 
 Row = dict[str, Any]
 
@@ -56,7 +56,7 @@ def work_rows(unit: WorkUnit, trajectory: Trajectory | Exception, tick: Callable
 def _simulated(unit: WorkUnit, trajectory: Trajectory, tick: Callable[[], None]) -> Row:
     case = unit.case
     scene = bind(case.scene, case.size, case.integrator)
-    solver: Solver = load(SOLVERS[unit.solver.name])(**unit.solver.parameters)
+    solver: Solver = load(EVERY[unit.solver.name])(**unit.solver.parameters)
     prepared = prepare(scene, solver)
     row: Row = {"vertices": scene.system.vertices, "springs": len(scene.springs.edges), "seconds": []}
     frames = round(unit.horizon / case.scene.time_step)

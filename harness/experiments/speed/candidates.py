@@ -14,13 +14,14 @@ from typing import Any, NamedTuple, Protocol
 import numba
 
 from harness.config.sweep import RunSpec
-from harness.experiments.speed import limits, work
+from harness.experiments.speed import limits
 from harness.experiments.speed.rest import Rest, apart, precision
 from harness.experiments.speed.yardstick import Yardstick
+from harness.report.speed.counts import Counted, count
 from harness.scenes.bind import Scene
 from harness.simulation.clock import Watch, working
 from solvers.problem import Positions, Prepared, StepProblem, StopRule
-from solvers.registry import SOLVERS, load
+from solvers.registry import EVERY, load
 
 LEAST = 0.02
 """Seconds that a phase is repeated for in each turn: a clock's overhead is nothing then, and a first call that finds
@@ -67,10 +68,10 @@ class SolverCandidate:
         self.run, self._shared, self._rest = run, prepared, rest
         self.columns: dict[str, Any] = {}
         self._scene, self._problem = scene, problem
-        self._solver = load(SOLVERS[run.solver.name])(**run.solver.parameters)
+        self._solver = load(EVERY[run.solver.name])(**run.solver.parameters)
         self._prepared: Prepared | None = None
         self._positions: Positions | None = None
-        self._work: dict[str, work.Work] = {}
+        self._work: dict[str, Counted] = {}
 
     def prepare(self) -> float:
         """See Candidate. Raises Unsupported, NotPositiveDefinite, MemoryError."""
@@ -83,7 +84,7 @@ class SolverCandidate:
         if self._prepared is None:
             self._prepared = prepared = self._shared.setdefault(str(self._solver), prepared)
             counts = self._scene.system.vertices, len(self._scene.springs.edges)
-            self._work = work.count(prepared.facts, *counts, precision(self.run))
+            self._work = count(prepared.facts, *counts, precision(self.run))
             self.columns = {name: int(value) for name, value in prepared.facts.items()}
             self.columns["choice"] = prepared.choice
             if self._rest and precision(self.run) != "float64":

@@ -22,11 +22,10 @@ from harness.experiments.speed import yardstick
 from harness.experiments.speed.candidates import Candidate, MachineCandidate, SolverCandidate, YardstickCandidate
 from harness.experiments.speed.rest import precision, rest_of
 from harness.experiments.speed.turns import Past, measure, name
+from harness.report.speed.figures import MACHINE, YARDSTICK
 from harness.scenes.bind import build
 from harness.simulation.step import problem, start
 from solvers.problem import Prepared
-
-MACHINE, YARDSTICK = "machine", "eigen"
 
 TEMPORARIES = {"default": "", "cheap": yardstick.CHEAP_TEMPORARIES}
 """How the yardstick's memory is set up: as it comes, or so that temporaries cost least."""

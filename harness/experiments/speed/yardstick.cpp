@@ -1,28 +1,17 @@
-// The yardstick: local-global steps as a course's assignment has them written, with Eigen's SimplicialLLT.
+// The yardstick: one step of the local-global iterations of `eigen.hpp`, timed again and again.
 //
-//     y = M target/dt^2 + f + w C'p_pin        once a step
-//     local step   d_e = r_e (A p)_e / |(A p)_e|
-//     global step  Q p = A'K d + y             Q = A'K A + M/dt^2 + w C'C, factorised once
-//
-// Plain code on purpose: Eigen's matrices of doubles, column by column as they come (p is n x 3), products of sparse
-// matrices, one loop over the springs. The scene comes from the file named first (see `harness.speed.yardstick`).
+// The scene comes from the file named first (see `harness.experiments.speed.yardstick`).
 // It answers with the seconds of its preparation. Each line of the input is a number of iterations: a step from the
 // first guess, answered by seconds of wall time: of the step, of its local steps, of its global steps. The end of
 // the input writes the last positions, row by row, to the file named second.
 
-#include <Eigen/Sparse>
+#include "eigen.hpp"
 
 #include <chrono>
-#include <cstdint>
 #include <cstdio>
 #include <fstream>
 #include <iostream>
-#include <vector>
 
-using Eigen::MatrixXd;
-using Eigen::VectorXd;
-using Sparse = Eigen::SparseMatrix<double>;
-using Triplet = Eigen::Triplet<double>;
 using Clock = std::chrono::steady_clock;
 
 static std::ifstream scene;
@@ -34,22 +23,11 @@ static std::vector<T> read(std::size_t count) {
     return values;
 }
 
-static VectorXd vector(std::size_t count) {
-    const std::vector<double> values = read<double>(count);
-    return Eigen::Map<const VectorXd>(values.data(), static_cast<Eigen::Index>(count));
-}
-
 // Points lie in the file as x, y, z of one vertex after the other.
 static MatrixXd points(std::size_t count) {
     const std::vector<double> values = read<double>(3 * count);
     using Rows = Eigen::Matrix<double, Eigen::Dynamic, 3, Eigen::RowMajor>;
     return Eigen::Map<const Rows>(values.data(), static_cast<Eigen::Index>(count), 3);
-}
-
-static Sparse matrix(std::size_t rows, std::size_t columns, const std::vector<Triplet>& entries) {
-    Sparse built(static_cast<Eigen::Index>(rows), static_cast<Eigen::Index>(columns));
-    built.setFromTriplets(entries.begin(), entries.end());
-    return built;
 }
 
 static double since(Clock::time_point began) {
@@ -63,24 +41,16 @@ int main(int count, char** arguments) {
     const std::size_t n = sizes[0], m = sizes[1], q = sizes[2];
     const double dt = read<double>(1)[0];
     const std::vector<std::int64_t> edges = read<std::int64_t>(2 * m), pinned = read<std::int64_t>(q);
-    const VectorXd k = vector(m), r = vector(m), mass = vector(n), w = vector(q);
+    const std::vector<double> k = read<double>(m), r = read<double>(m), mass = read<double>(n), w = read<double>(q);
     const MatrixXd target = points(n), force = points(n), first_guess = points(n), pins = points(q);
     if (!scene) return 3;
 
     const Clock::time_point began = Clock::now();
-    std::vector<Triplet> a, c, diagonal;
-    for (std::size_t e = 0; e < m; ++e) {
-        a.emplace_back(e, edges[2 * e], 1.0);
-        a.emplace_back(e, edges[2 * e + 1], -1.0);
-    }
-    for (std::size_t i = 0; i < q; ++i) c.emplace_back(i, pinned[i], 1.0);
-    for (std::size_t i = 0; i < n; ++i) diagonal.emplace_back(i, i, mass[i] / (dt * dt));
-    const Sparse A = matrix(m, n, a), C = matrix(q, n, c), M = matrix(n, n, diagonal);
-    const Sparse AtK = A.transpose() * k.asDiagonal();
-    const Sparse CtW = C.transpose() * w.asDiagonal();
-    const Sparse Q = AtK * A + M + CtW * C;
-    const Eigen::SimplicialLLT<Sparse> solver(Q);
-    if (solver.info() != Eigen::Success) return 4;
+    std::vector<double> inertia(n);
+    for (std::size_t i = 0; i < n; ++i) inertia[i] = mass[i] / (dt * dt);
+    const LocalGlobal steps(n, m, q, n, edges.data(), pinned.data(), nullptr, k.data(), r.data(), inertia.data(),
+                            w.data());
+    if (!steps.factorised()) return 4;
     std::printf("%.9g\n", since(began));
     std::fflush(stdout);
 
@@ -88,15 +58,13 @@ int main(int count, char** arguments) {
     for (int iterations; std::cin >> iterations;) {
         const Clock::time_point start = Clock::now();
         p = first_guess;
-        const MatrixXd y = M * target + force + CtW * pins;
+        const MatrixXd y = steps.constant(target, force, pins);
         double local = 0.0, global = 0.0;
         for (int iteration = 0; iteration < iterations; ++iteration) {
             const Clock::time_point before = Clock::now();
-            MatrixXd d = A * p;
-            for (std::size_t e = 0; e < m; ++e) d.row(e) = r[e] * d.row(e).normalized();
-            const MatrixXd b = AtK * d + y;
+            const MatrixXd b = steps.local(p, y);
             const Clock::time_point between = Clock::now();
-            p = solver.solve(b);
+            p = steps.global(b);
             local += std::chrono::duration<double>(between - before).count();
             global += since(between);
         }

@@ -6,9 +6,7 @@ length (m,), mass (n,), pin weight (q,), target, force, first guess (n, 3), pin 
 
 from __future__ import annotations
 
-import hashlib
 import os
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -16,12 +14,10 @@ import numpy as np
 
 from harness.base.errors import RunFailed
 from solvers.energies.springs import Springs
+from solvers.methods.eigen import compile_cpp
 from solvers.problem import Positions, StepProblem, Unsupported
 
 SOURCE = Path(__file__).with_name("yardstick.cpp")
-FLAGS = ("-O3", "-march=native", "-DNDEBUG", "-std=c++17")
-EIGEN = "/usr/include/eigen3"
-"""Where Debian's libeigen3-dev is; one that the compiler finds by itself (CPATH) will do as well."""
 
 CHEAP_TEMPORARIES = ":".join(
     f"glibc.malloc.{setting}"
@@ -34,22 +30,7 @@ MALFORMED = {2: "wanted a scene and a file for positions", 3: "the scene's file 
 
 def build(folder: Path) -> Path:
     """The compiled yardstick in `folder`, made anew when its source has changed. Raises Unsupported: why not."""
-    compiler = next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), "c++", "g++", "clang++"))), None)
-    if compiler is None:
-        raise Unsupported("there is no C++ compiler (c++, g++, clang++, or CXX)")
-    name = hashlib.sha256(" ".join([compiler, *FLAGS]).encode() + SOURCE.read_bytes()).hexdigest()[:12]
-    program = folder.resolve() / f"yardstick-{name}"
-    if not program.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        partial = program.with_suffix(".partial")
-        command = [compiler, *FLAGS, "-isystem", EIGEN, str(SOURCE), "-o", str(partial)]
-        told = subprocess.run(command, capture_output=True, text=True)
-        if told.returncode:
-            first = next((line for line in told.stderr.splitlines() if "error" in line), "no message")
-            wanted = "it needs Eigen 3.4 (Debian: libeigen3-dev) and C++17"
-            raise Unsupported(f"the yardstick does not compile: {first.strip()}; {wanted}")
-        os.replace(partial, program)
-    return program
+    return compile_cpp(SOURCE, folder)
 
 
 class Yardstick:

@@ -17,6 +17,7 @@ from harness.report.accuracy.reading import read
 from harness.report.accuracy.table import without_short
 from harness.report.accuracy.time_plot import draw_times
 from harness.report.accuracy.work_plot import draw_work
+from harness.report.references import write_bibtex
 
 
 def draw(folder: Path, files: Iterable[Path] | None = None) -> list[Path]:
@@ -50,4 +51,5 @@ def draw(folder: Path, files: Iterable[Path] | None = None) -> list[Path]:
         findings=list(chain.from_iterable(chapters.values())),
         failures=failed,
     )
-    return [*pictures, words, numbers, page]
+    books = write_bibtex(out / "references.bib", [each.reference for each in (*table.curves, *table.works)])
+    return [*pictures, words, numbers, books, page]

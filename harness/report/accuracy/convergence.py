@@ -22,14 +22,13 @@ from harness.report.accuracy.sheet import (
     limits,
     line,
     log_axis,
-    looks,
     notes,
     panel,
     sheet,
 )
 from harness.report.accuracy.table import Curve, Problem, Table, Values, step_words
 from harness.report.page import count, quantity, text
-from harness.report.style import INK, MUTED, PAGE, WARNING, WIDTH, Mark
+from harness.report.style import INK, MUTED, PAGE, WARNING, WIDTH, Mark, looks
 
 GUESSES = {"current": "from the current positions", "inertial": "from the inertial target"}
 """The first guesses, in words."""

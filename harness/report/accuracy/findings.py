@@ -16,6 +16,7 @@ from harness.report.accuracy.paper import FAR, FIGURE_2, ITERATIONS, Comparison,
 from harness.report.accuracy.profiles import least_ratios
 from harness.report.accuracy.table import Curve, Table, without_short
 from harness.report.accuracy.times import STEPS, TARGETS, crossings, power, races, reach, seconds_to
+from harness.report.references import cited
 
 Chapters = dict[str, list[str]]
 
@@ -32,6 +33,7 @@ def findings(table: Table) -> Chapters:
         "References that are not certified": [f"{p.name}: {p.doubt}" for p in table.problems if p.doubt],
         "Other minima": [f"{c.problem.name}: {words}" for c in table.curves if c.branch for words in remarks([c])],
     }
+    chapters["Methods"] = list(_methods(table))
     return {title: sentences for title, sentences in chapters.items() if sentences}
 
 
@@ -106,6 +108,14 @@ def _entry(curve: Curve) -> dict[str, Any]:
 
 def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
+
+
+def _methods(table: Table) -> Iterator[str]:
+    """Where each solver comes from."""
+    references = {each.solver: each.reference for each in (*table.curves, *table.works)}
+    for solver, reference in references.items():
+        if reference:
+            yield f"{solver}: {cited(reference)}."
 
 
 def _times(table: Table) -> Iterator[str]:

@@ -20,7 +20,6 @@ from harness.report.accuracy.sheet import (
     limits,
     line,
     log_axis,
-    looks,
     notes,
     panel,
     sheet,
@@ -29,6 +28,7 @@ from harness.report.accuracy.table import Curve, Table
 from harness.report.accuracy.time_plot import middle
 from harness.report.accuracy.times import left_out, power
 from harness.report.labels import direct_labels
+from harness.report.style import looks
 
 TARGET = 1e-3
 

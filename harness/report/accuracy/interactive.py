@@ -19,17 +19,17 @@ from harness.base.files import replacing
 from harness.report.accuracy.convergence import GUESSES
 from harness.report.accuracy.growth import TARGET, growths
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
-from harness.report.accuracy.sheet import looks
 from harness.report.accuracy.table import Curve, Table, Work, step_words
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
-from harness.report.style import DASH_DOTTED, DASHED, DOTTED, Mark
+from harness.report.references import cited
+from harness.report.style import DASH_DOTTED, DASHED, DOTTED, Mark, looks
 
 Item = dict[str, Any]
 
 _SYMBOLS = {
     "o": "circle", "s": "square", "^": "triangle-up", "v": "triangle-down", "<": "triangle-left",
     ">": "triangle-right", "D": "diamond", "d": "diamond-tall", "P": "cross", "X": "x", "p": "pentagon",
-    "h": "hexagon", "*": "star",
+    "h": "hexagon", "*": "star", "H": "hexagon2", "8": "octagon",
 }  # fmt: skip
 _DASHES = {"-": "solid", DASHED: "dash", DOTTED: "dot", DASH_DOTTED: "dashdot"}
 
@@ -53,6 +53,7 @@ def write_page(
     labels = [(c.label, c.solver) for c in table.curves] + [(w.label, w.solver) for w in table.works]
     data = {
         "marks": {label: _mark(mark) for label, mark in looks(labels).items()},
+        "references": {each.label: cited(each.reference) for each in (*table.curves, *table.works)},
         "charts": [
             _convergence(table, pictures, path.parent),
             _times(table, pictures),

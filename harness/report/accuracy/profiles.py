@@ -28,7 +28,6 @@ from harness.report.accuracy.sheet import (
     legend,
     line,
     log_axis,
-    looks,
     notes,
     panel,
     sheet,
@@ -36,9 +35,8 @@ from harness.report.accuracy.sheet import (
 from harness.report.accuracy.table import Curve, Table, Values
 from harness.report.accuracy.times import TARGETS, askable, contested, left_out, power, races, seconds_to
 from harness.report.page import text
-from harness.report.style import Mark
-
-_YARDSTICKS = ("sparse", "numba", "dense")
+from harness.report.style import Mark, looks
+from solvers.about import LOCAL_GLOBAL
 
 
 def least_ratios(table: Table, target: float) -> dict[str, Values]:
@@ -71,10 +69,10 @@ def partly_tried(table: Table) -> dict[str, int]:
 
 
 def yardstick(table: Table) -> str:
-    """The backend of the plain local-global iteration that data profiles count in, one that ran on most problems; ""
-    where none was measured."""
-    tried = Counter(curve.solver for curve in table.curves if curve.solver in _YARDSTICKS)
-    return max(tried, key=lambda name: (tried[name], -_YARDSTICKS.index(name)), default="")
+    """The backend of the plain local-global iteration that data profiles count in: of those that ran on most problems
+    the last by alphabet; "" where none was measured."""
+    tried = Counter(curve.solver for curve in table.curves if curve.family == LOCAL_GLOBAL)
+    return max(tried, key=lambda name: (tried[name], name), default="")
 
 
 def not_shown(table: Table) -> list[str]:

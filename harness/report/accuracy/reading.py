@@ -34,8 +34,9 @@ def read(folder: Path, files: Iterable[Path] | None = None) -> Table:
     if not tables:
         raise InputError(Mistake("holds no accuracy rows; run `springbench accuracy CONFIG` first", folder))
     kinds: dict[str, list[_Row]] = defaultdict(list)
+    missing = dict.fromkeys(("family", "reference", "minimises", "own_steps"))  # in rows made before there were any
     for row in pa.concat_tables(tables, promote_options="permissive").to_pylist():
-        kinds[row["kind"]].append(row)
+        kinds[row["kind"]].append(missing | row)
     for rows in kinds.values():  # files come by their names, 122 before 22
         rows.sort(key=lambda row: (row["scene"], row["size"]))
     label = _labels(kinds["curve"] + kinds["work"])
@@ -124,6 +125,8 @@ def _curve(problem: Problem, rows: Sequence[_Row], prepared: _Row, label: str) -
     return Curve(
         problem=problem,
         solver=rows[0]["solver"],
+        family=rows[0]["family"] or "",
+        reference=rows[0]["reference"] or "",
         label=label,
         parameters=rows[0]["parameters"] or "{}",
         first_guess=rows[0]["first_guess"] or "",
@@ -146,6 +149,10 @@ def _work(row: _Row, label: _Label) -> Work:
     names = ("scene", "size", "solver", "parameters", "integrator", "time_step", "tolerance", "iterations")
     return Work(
         **{name: row[name] for name in (*names, "first_guess", "status")},
+        family=row["family"] or "",
+        reference=row["reference"] or "",
+        minimises=row["minimises"] is not False,
+        own_steps=bool(row["own_steps"]),
         label=label(row),
         horizon=_number(row["horizon"]),
         error=_number(row["error"]),

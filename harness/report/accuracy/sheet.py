@@ -17,7 +17,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogFormatterMathtext,
 from harness.base.files import replacing
 from harness.report.accuracy.times import duration
 from harness.report.page import axes, header, new_page, quantity, save, shorten, text
-from harness.report.style import DASH_DOTTED, DASHED, DOTTED, HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark, marks
+from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark
 
 LEFT, TOP, RIGHT, BOTTOM = 40, 118, 1384, HEIGHT - 34
 """Where panels may be, in pixels; right of it stands the legend."""
@@ -42,18 +42,6 @@ def sheet(stem: Path, title: str, facts: Sequence[str]) -> Iterator[Figure]:
 def files(stem: Path) -> list[Path]:
     """The files that `sheet` leaves."""
     return [stem.with_suffix(".png"), stem.with_suffix(".svg")]
-
-
-def looks(labelled: Iterable[tuple[str, str]]) -> dict[str, Mark]:
-    """A mark for each label of (label, solver); further labels of a solver keep its colour and marker."""
-    found: dict[str, Mark] = {}
-    pairs = sorted(set(labelled))
-    own = marks(solver for _, solver in pairs)
-    for solver, mark in own.items():
-        styles = [mark.dash, *(dash for dash in ("-", DASHED, DOTTED, DASH_DOTTED) if dash != mark.dash)]
-        labels = [label for label, its in pairs if its == solver]
-        found |= {label: mark._replace(dash=styles[k % len(styles)]) for k, label in enumerate(labels)}
-    return found
 
 
 def line(ax: Axes, x, y, look: Mark, *, spaced: bool = True, **more) -> None:

@@ -73,7 +73,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """One solver's way to the minimum of one problem.
+    """One solver's way to the minimum of one problem; family, reference: what it states of itself.
 
     iterations, gap, largest [mean rest lengths], stationarity (k,); seconds (rounds, k), nan where not timed;
     warm, cold: seconds to prepare, nan where not known; branch: the minimum that was reached;
@@ -82,6 +82,8 @@ class Curve:
 
     problem: Problem
     solver: str
+    family: str
+    reference: str
     label: str
     parameters: str
     first_guess: str
@@ -101,11 +103,18 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """One simulation of a horizon [s]: its relative error, and wall seconds a simulated second (nan if it failed)."""
+    """One simulation of a horizon [s]: its relative error, and wall seconds a simulated second (nan if it failed).
+
+    family, reference, minimises, own_steps: what the solver states of itself.
+    """
 
     scene: str
     size: int
     solver: str
+    family: str
+    reference: str
+    minimises: bool
+    own_steps: bool
     label: str
     parameters: str
     integrator: str
@@ -129,12 +138,8 @@ class Work:
     def setting(self) -> str:
         """What was chosen, in words."""
         stop = f"{self.iterations} iterations" if self.tolerance is None else f"tolerance {self.tolerance:g}"
-        steps = "" if self.solver in OWN_STEPS else f"{self.integrator}, "
+        steps = "" if self.own_steps else f"{self.integrator}, "
         return f"{self.label}, {steps}dt {step_words(self.time_step)}, {stop}"
-
-
-OWN_STEPS = ("xpbd-small-steps", "symplectic-euler")
-"""Methods that integrate time in substeps of their own, whatever the integrator of the frame."""
 
 
 @dataclass(frozen=True, slots=True)

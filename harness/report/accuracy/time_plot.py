@@ -22,7 +22,6 @@ from harness.report.accuracy.sheet import (
     limits,
     line,
     log_axis,
-    looks,
     notes,
     panel,
     sheet,
@@ -30,7 +29,7 @@ from harness.report.accuracy.sheet import (
 from harness.report.accuracy.table import Curve, Problem, Table
 from harness.report.accuracy.times import STEPS, TARGETS, askable, crossings, left_out, power, seconds_to
 from harness.report.page import count, text
-from harness.report.style import INK, Mark
+from harness.report.style import INK, Mark, looks
 
 _COLUMNS = {None: "the step alone", **{n: f"set-up over {count(n)} step{'s' if n > 1 else ''}" for n in STEPS}}
 

@@ -18,7 +18,6 @@ from harness.report.accuracy.sheet import (
     legend,
     limits,
     log_axis,
-    looks,
     notes,
     panel,
     sheet,
@@ -27,10 +26,8 @@ from harness.report.accuracy.sheet import (
 from harness.report.accuracy.table import Table, Work, step_words
 from harness.report.accuracy.times import duration, power
 from harness.report.page import quantity, text
-from harness.report.style import INK, MUTED, PAGE, Mark
-
-NOT_MINIMISING = ("xpbd", "xpbd-small-steps", "symplectic-euler")
-"""Methods whose iterates do not tend to a minimum of the step's objective: graded on trajectories alone."""
+from harness.report.style import INK, MUTED, PAGE, Mark, looks
+from solvers.about import LOCAL_GLOBAL
 
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 
@@ -40,7 +37,7 @@ ERRORS = (0.1, 0.03, 0.01, 0.003, 0.001)
 
 def is_default(work: Work) -> bool:
     """Whether this is the assignment's default: implicit Euler at 1/30 s with 50 iterations of local-global."""
-    same_method = work.solver in ("dense", "sparse", "numba") and work.integrator == "implicit-euler"
+    same_method = work.family == LOCAL_GLOBAL and work.integrator == "implicit-euler"
     return same_method and work.tolerance is None and work.iterations == 50 and abs(30 * work.time_step - 1) < 1e-9
 
 
@@ -130,11 +127,9 @@ def _draw(stem: Path, mesh: str, works: list[Work], marked: dict[str, Mark], mac
             ax.set_xlabel("wall time a simulated second", fontsize=9, loc="left")
             if column:
                 ax.tick_params(labelleft=False)
-        used = {work.label for work in works}
+        minimises = {work.label: work.minimises for work in works}
         names = {
-            f"{label} †" if label.partition(",")[0] in NOT_MINIMISING else label: mark
-            for label, mark in marked.items()
-            if label in used
+            label if minimises[label] else f"{label} †": mark for label, mark in marked.items() if label in minimises
         }
         legend(page, names, below=_meanings(sizes))
         notes(page, words)
@@ -195,7 +190,7 @@ def _stop(tolerance: float | None) -> str:
 
 def _notes(works: Sequence[Work]) -> list[str]:
     words = ["Joined points differ in the time step alone: " + ", ".join(map(step_words, _steps(works)))]
-    if any(work.solver in NOT_MINIMISING for work in works):
+    if not all(work.minimises for work in works):
         words.append("† does not minimise the step's objective: its limit is not the integrator's own solution")
     failed = [work for work in works if work.status != "ok"]
     return words + [f"× {work.setting}: {work.status}{': ' if work.reason else ''}{work.reason}" for work in failed]

@@ -5,21 +5,26 @@ on the velocity before each step, by the exact solution of m dv/dt = -c |v| v ov
 unconditionally stable too. Wind on triangles drags as well, by their area and how they face the air.
 """
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat
 
 from harness.base.model import Model
-from harness.scenes.effects.base import Contribution, VelocityFilter
+from harness.scenes.effects.base import Contribution, Seen, VelocityFilter
 from harness.scenes.mesh.base import Mesh
 from solvers.energies.quadratic import AirDrag as Energy
 from solvers.problem import Positions
 
+ALIVE = 0.1
+"""Of the largest kinetic energy: more than this, on average over the last quarter, and the scene does not rest."""
+
 
 class AirDrag(Model):
     """Drag of the air on the vertices, spread as the mass is."""
+
+    damps: ClassVar[bool] = True
 
     kind: Literal["air-drag"] = "air-drag"
     law: Literal["linear", "quadratic"] = "linear"
@@ -37,6 +42,24 @@ class AirDrag(Model):
             return Contribution(energies=(Energy.of_vertices(c),))
         return Contribution(filters=(_quadratic(mass, c * time_step),))
 
+    @classmethod
+    def called_for(cls, seen: Seen) -> str:
+        """See `harness.scenes.effects.base.Effect`: nothing drives the motion, and it does not end."""
+        mass, v = seen.mass, seen.velocities
+        if seen.driven or seen.damped or len(v) < 8:
+            return ""
+        most = float(_kinetic(mass, v).max())
+        if not seen.held:  # what nothing holds may fly, fall or slide on as a whole
+            v = v - np.einsum("i,fix->fx", mass / mass.sum(), v)[:, None]
+        late = float(_kinetic(mass, v[-len(v) // 4 :]).mean())
+        if not most or late <= ALIVE * most:
+            return ""
+        return (
+            f"nothing drives the motion or damps it; in the last quarter of {seen.time(len(v) - 1):.2f} s it still "
+            f"has {100 * late / most:.0f} % of its largest kinetic energy, and only the time integrator's own "
+            "damping, which depends on the time step, would ever bring it to rest"
+        )
+
 
 def _quadratic(mass: NDArray[np.float64], c: NDArray[np.float64]) -> VelocityFilter:
     """The filter for masses (n,) [kg] and c dt (n,) [kg s/m]."""
@@ -46,3 +69,8 @@ def _quadratic(mass: NDArray[np.float64], c: NDArray[np.float64]) -> VelocityFil
         return v * np.divide(mass, mass + drag, out=np.ones_like(mass), where=drag > 0.0)[:, None]
 
     return slow
+
+
+def _kinetic(mass: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The kinetic energy in each frame [J]."""
+    return 0.5 * np.einsum("i,fix,fix->f", mass, v, v)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.motion import Motion
+from solvers.energies.springs import Springs
 from solvers.problem import Energy, Positions
 
 
@@ -82,7 +83,12 @@ class Contribution:
 
 
 class Effect(Protocol):
-    """A pydantic model with a literal `kind`."""
+    """A pydantic model with a literal `kind`.
+
+    Its class may state `damps`, a class variable, True where it takes energy out of any motion; `usual`, True where
+    nearly every scene has it; and `called_for(seen: Seen) -> str`, a class method: by what evidence the motion of a
+    scene that does not list it asks for it, "" where it does not.
+    """
 
     @property
     def kind(self) -> str:
@@ -95,6 +101,36 @@ class Effect(Protocol):
         Raises InputError when the effect does not fit the mesh.
         """
         ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """What was seen of a scene, for effects that it does not list.
+
+    springs: with (m, 2) ends and their (m,) rest lengths [m]; length: the mean of these, or the mesh's spacing [m];
+    mass: (n,) [kg]; held: whether pins hold it; driven: whether forces or obstacles keep it moving; damped: whether an
+    effect takes energy out of it; positions [m], velocities [m/s]: (frames, n, 3).
+    """
+
+    mesh: Mesh
+    springs: Springs
+    length: float
+    mass: NDArray[np.float64]
+    time_step: float
+    held: bool
+    driven: bool
+    damped: bool
+    positions: NDArray[np.float64]
+    velocities: NDArray[np.float64]
+
+    def time(self, frame: int) -> float:
+        """Of a frame's end [s]; counted from 0."""
+        return (frame + 1) * self.time_step
+
+
+FEW = 0.01
+"""Of springs, and of edges: fewer are the corners that hang on a pin, where strain and curvature grow without bound as
+the mesh is refined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,9 +8,12 @@ from pydantic import NonNegativeFloat
 
 from harness.base.errors import InputError
 from harness.base.model import Model
-from harness.scenes.effects.base import Contribution
+from harness.scenes.effects.base import FEW, Contribution, Seen
 from harness.scenes.mesh.base import Mesh
 from solvers.energies import bending
+
+SHARP = np.deg2rad(60.0)
+"""More than this from triangle to triangle, and the mesh shows its edges."""
 
 
 class Bending(Model):
@@ -39,3 +42,45 @@ class Bending(Model):
                 f"bending: more than two triangles meet at the edge {shared[count > 2][0].tolist()}; repair the mesh"
             )
         return Contribution(energies=(bending.Bending.of(mesh.rest, triangles, self.stiffness),))
+
+    @classmethod
+    def called_for(cls, seen: Seen) -> str:
+        """See `harness.scenes.effects.base.Effect`: folds as sharp as the mesh."""
+        mesh = seen.mesh
+        hinges = _hinges(mesh.triangles)
+        if mesh.dimension != 2 or not len(hinges):
+            return ""
+        flat = _angles(mesh.rest, hinges)
+        turned = np.array([np.abs(_angles(p, hinges) - flat) for p in seen.positions[-len(seen.positions) // 4 :]])
+        turned = np.minimum(turned, 2.0 * np.pi - turned)
+        share = float((turned > SHARP).mean())
+        if share <= FEW:
+            return ""
+        return (
+            f"over the last quarter of the motion {100 * share:.1f} % of the edges between triangles are bent by more "
+            f"than {np.rad2deg(SHARP):.0f} degrees, the sharpest by {np.rad2deg(turned.max()):.0f}: folds as sharp as "
+            "the mesh"
+        )
+
+
+def _hinges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The edges that two triangles share, with the corners across: (k, 4)."""
+    if not len(triangles):
+        return np.empty((0, 4), np.int64)
+    rolled = np.concatenate([np.roll(triangles, -k, axis=1) for k in range(3)])  # an edge, then the corner across
+    ends = np.sort(rolled[:, :2], axis=1)
+    code = ends[:, 0] * (int(triangles.max()) + 1) + ends[:, 1]  # one number for an edge, whichever end comes first
+    order = np.argsort(code, kind="stable")
+    twice = np.flatnonzero(code[order][1:] == code[order][:-1])
+    first, second = rolled[order[twice]], rolled[order[twice + 1]]
+    return np.column_stack([first, second[:, 2]])
+
+
+def _angles(p: NDArray[np.float64], hinges: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The signed angle by which the second triangle turns away from the plane of the first [rad], (k,)."""
+    a, b, c, d = (p[corner] for corner in hinges.T)
+    edge = b - a
+    left, right = np.cross(edge, c - a), np.cross(d - a, edge)
+    length = np.linalg.norm(edge, axis=1)
+    along = np.einsum("ij,ij->i", np.cross(left, right), edge / np.where(length > 0.0, length, 1.0)[:, None])
+    return np.arctan2(along, np.einsum("ij,ij->i", left, right))

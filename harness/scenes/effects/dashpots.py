@@ -1,6 +1,6 @@
 """Dashpots: damping along the mesh's springs, f = -c n n'(v_i - v_j), by a rule of `scenes.material` like springs."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from solvers.energies import dashpots
 
 class Dashpots(Model):
     """Damping of the speed at which springs change their length; motion of the mesh as a whole is not damped."""
+
+    damps: ClassVar[bool] = True
 
     kind: Literal["dashpots"] = "dashpots"
     rule: Literal["continuum", "fixed", "liu2013"] = "continuum"

@@ -1,7 +1,7 @@
 """Ether drag (Liu et al. 2013, section 5): before each step the velocity decays, v <- exp(-c dt) v."""
 
 from math import exp
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from solvers.problem import Positions
 
 class EtherDrag(Model):
     """Damping of the velocity relative to space at rest, the same at any time step."""
+
+    damps: ClassVar[bool] = True
 
     kind: Literal["ether-drag"] = "ether-drag"
     rate: NonNegativeFloat

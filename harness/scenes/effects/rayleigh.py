@@ -6,7 +6,7 @@ strain limits and attachments have no share.
 """
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ from solvers.problem import Energy, LaggedEnergy
 
 class Rayleigh(Model):
     """Damping in proportion to masses and to stiffness."""
+
+    damps: ClassVar[bool] = True
 
     kind: Literal["rayleigh"] = "rayleigh"
     mass: NonNegativeFloat = 0.0

@@ -7,11 +7,14 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 
 from harness.base.model import Model
-from harness.scenes.effects.base import Contribution
+from harness.scenes.effects.base import FEW, Contribution, Seen
 from harness.scenes.material import spring_stiffness
 from harness.scenes.mesh.base import Mesh
 from solvers.energies import strain_limits
 from solvers.energies.edges import rest_directions
+
+STRETCH = 0.1
+"""Cloth that stretches further than this looks like rubber (Provot 1995)."""
 
 
 class StrainLimits(Model):
@@ -45,3 +48,19 @@ class StrainLimits(Model):
         rest, direction = rest_directions(mesh.rest, edges)
         limits = self.shortest * rest, self.longest * rest
         return Contribution(energies=(strain_limits.StrainLimits(edges, k[k > 0.0], *limits, direction),))
+
+    @classmethod
+    def called_for(cls, seen: Seen) -> str:
+        """See `harness.scenes.effects.base.Effect`: springs stretch as no cloth does."""
+        rest = seen.springs.rest_length
+        if not rest.any():
+            return ""
+        strain = np.array([seen.springs.lengths(p)[rest > 0.0] / rest[rest > 0.0] - 1.0 for p in seen.positions])
+        ever = int((strain.max(axis=0) > STRETCH).sum())
+        if ever <= FEW * len(rest):
+            return ""
+        frame = int(strain.max(axis=1).argmax())
+        return (
+            f"{ever} of {len(rest)} springs stretch by more than {100 * STRETCH:.0f} %, one by "
+            f"{100 * strain.max():.0f} % at {seen.time(frame):.2f} s"
+        )

@@ -10,8 +10,9 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from harness.experiments.speed.figures import STEP, Figures, Interval
+from harness.base.statistics import Interval
 from harness.report.page import count, quantity
+from harness.report.speed.figures import STEP, Figures
 
 _NUMBERS = (
     "prepare\ncold ms",
@@ -34,7 +35,8 @@ _NUMBERS = (
 
 def speed_table(found: Sequence[Figures]) -> Table:
     """A line for each candidate at each size; ratios with their 95 % intervals."""
-    table = Table(box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
+    title = "medians over the rounds, and of the ratios round by round with their 95 % intervals"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     table.add_column("scene", justify="right")
     table.add_column("candidate", no_wrap=True)
     for words in _NUMBERS:
@@ -84,7 +86,7 @@ def _share(value: float | None) -> str:
 
 
 def _ratio(interval: Interval | None) -> str:
-    return "–" if interval is None else f"{interval.ratio:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
+    return "–" if interval is None else f"{interval.middle:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
 
 
 def remarks(found: Sequence[Figures]) -> list[str]:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from harness.base import machine
-from harness.experiments.speed.figures import STEP, Figures
-from harness.report.size_plot import Series, draw_by_size
+from harness.report.speed.figures import STEP, Figures
+from harness.report.speed.size_plot import Series, draw_by_size
 
 
 class Picture(NamedTuple):
@@ -34,7 +34,7 @@ def draw(found: Sequence[Figures], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     here = machine.describe()
     loads = [f.load for f in found if f.load is not None]
-    facts = ["least of all rounds, candidates in turns", f"{here.cores} cores", here.cpu]
+    facts = ["median over the rounds, candidates in turns", f"{here.cores} cores", here.cpu]
     if loads:
         facts.append(f"load {min(loads):.1f} to {max(loads):.1f}")
     for scene in dict.fromkeys(f.scene for f in found):
@@ -50,6 +50,6 @@ def _series(members: Sequence[Figures], picture: Picture) -> list[Series]:
     for label in dict.fromkeys(f.label for f in members):
         mine = [f for f in members if f.label == label]
         points = sorted((f.vertices, value) for f in mine if (value := picture.value(f)) is not None)
-        family = label.removesuffix(f" x{mine[0].threads}")
-        lines.append(Series(label, family, [n for n, _ in points], [value for _, value in points]))
+        alone = label.removesuffix(f" x{mine[0].threads}")
+        lines.append(Series(label, alone, mine[0].solver, [n for n, _ in points], [value for _, value in points]))
     return lines

@@ -11,23 +11,16 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from harness.experiments.speed import work
-from harness.experiments.speed.report import MACHINE, YARDSTICK
+from harness.base.statistics import Interval, ratio
+from harness.report.speed.counts import Counted, count
+
+MACHINE, YARDSTICK = "machine", "eigen"
+"""What rows of candidates that are no solvers have as their solver."""
 
 STEP = 50
 """Iterations of the step that all steps are stated as, however many were done."""
 
-RESAMPLES = 4000
-
 Row = dict[str, Any]
-
-
-class Interval(NamedTuple):
-    """A ratio of times and its 95 % interval."""
-
-    ratio: float
-    low: float
-    high: float
 
 
 class Limit(NamedTuple):
@@ -38,7 +31,7 @@ class Limit(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """One candidate at one size. Times [ms]: the least of all rounds; None: not measured or not known.
+    """One candidate at one size. Times [ms]: the median over the rounds; None: not measured or not known.
 
     step: of STEP iterations; entries: of the factor L; touched: bytes a second of an iteration, by what the
     factor's panels hold; binds: the limit that binds; reached: the part of it that an iteration reaches, by those
@@ -72,6 +65,7 @@ class Figures(NamedTuple):
     solves_faster: Interval | None = None
     apart: float | None = None
     load: float | None = None
+    solver: str = ""
 
 
 class Machine:
@@ -95,19 +89,19 @@ class Machine:
         kind = "float64" if precision == "float64" else "float32"
         return self._best[threads, f"fma {kind}"][0.0]
 
-    def limit(self, counted: work.Work, threads: int, precision: str) -> Limit:
+    def limit(self, counted: Counted, threads: int, precision: str) -> Limit:
         """What no order of reading goes below: each byte comes once from where the working set lies, and as often as
         it is moved besides from the nearest cache."""
         again = (counted.bytes - counted.working_set) / max(self._best[threads, "read"].values())
         far = counted.working_set / self.bandwidth(threads, counted.working_set)
         return self._binding(far + again, counted, threads, precision)
 
-    def passes(self, counted: work.Work, threads: int, precision: str) -> Limit:
+    def passes(self, counted: Counted, threads: int, precision: str) -> Limit:
         """The same where all that is moved comes from where the working set lies, each time."""
         far = counted.bytes / self.bandwidth(threads, counted.working_set)
         return self._binding(far, counted, threads, precision)
 
-    def _binding(self, moving: float, counted: work.Work, threads: int, precision: str) -> Limit:
+    def _binding(self, moving: float, counted: Counted, threads: int, precision: str) -> Limit:
         seconds = {"bandwidth": moving, "arithmetic": counted.flops / self.flops(threads, precision)}
         binds = max(seconds, key=seconds.__getitem__)
         return Limit(binds, seconds[binds])
@@ -152,6 +146,7 @@ def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], m
     known = Figures(
         *(first["scene"], first["size"], first["vertices"], label, first["threads"]),
         *(first["status"], first["reason"], first["choice"]),
+        solver=first["solver"],
     )
     if first["status"] != "ok":
         return known
@@ -159,10 +154,10 @@ def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], m
     known = known._replace(
         iterations=next(row["iterations"] for row in found if row["phase"] == "step"),
         cold=1e3 * times["prepare"][0],
-        warm=1e3 * float(times["prepare"][1:].min()) if len(times["prepare"]) > 1 else None,
-        local=1e3 * float(times["local"].min()),
-        global_=1e3 * float(times["global"].min()),
-        step=1e3 * STEP * float(times["step"].min()),
+        warm=1e3 * float(np.median(times["prepare"][1:])) if len(times["prepare"]) > 1 else None,
+        local=1e3 * float(np.median(times["local"])),
+        global_=1e3 * float(np.median(times["global"])),
+        step=1e3 * STEP * float(np.median(times["step"])),
         faster=_against(group, f"{YARDSTICK} default", "step", times),
         cheap_faster=_against(group, f"{YARDSTICK} cheap", "step", times),
         solves_faster=_against(group, _cholespy(group), "global", times),
@@ -174,9 +169,9 @@ def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], m
         return known
     precision = json.loads(first["parameters"]).get("precision", "float64")
     counts, how = (first["vertices"], first["springs"], precision), (first["threads"], precision)
-    touched = work.count(facts, *counts)["iteration"]
-    bare = work.count({"nnz_factor": facts["nnz_factor"]}, *counts)["iteration"]
-    limit, seconds = machine.limit(touched, *how), float(times["step"].min())
+    touched = count(facts, *counts)["iteration"]
+    bare = count({"nnz_factor": facts["nnz_factor"]}, *counts)["iteration"]
+    limit, seconds = machine.limit(touched, *how), float(np.median(times["step"]))
     return known._replace(
         entries=facts["nnz_factor"],
         bytes=touched.bytes,
@@ -212,16 +207,4 @@ def _against(
     """How many times faster than a yardstick in the same rounds; None where that has no times."""
     theirs = _times(group.get(yardstick, ()), phase)
     rounds = min(len(theirs), len(times[phase]))
-    return interval(theirs[:rounds], times[phase][:rounds]) if rounds else None
-
-
-def interval(theirs: NDArray[np.float64], ours: NDArray[np.float64]) -> Interval:
-    """The ratio of the lower quartiles of times, round by round the same turns.
-
-    A busy machine delays many rounds and speeds up none: a quartile moves less than a median, and, unlike a minimum,
-    it has an interval by resampling the rounds (percentile bootstrap, Efron 1979; seeded).
-    """
-    chosen = np.random.default_rng(0).integers(0, len(ours), (RESAMPLES, len(ours)))
-    quartiles = [np.quantile(times[chosen], 0.25, axis=1) for times in (theirs, ours)]
-    low, high = np.quantile(quartiles[0] / quartiles[1], [0.025, 0.975])
-    return Interval(float(np.quantile(theirs, 0.25) / np.quantile(ours, 0.25)), float(low), float(high))
+    return ratio(theirs[:rounds], times[phase][:rounds]) if rounds else None

@@ -25,7 +25,7 @@ _VECTORS = 80
 """Bytes of the vectors that there are at each vertex: b and p, or in an iteration y and p, and the work vector."""
 
 
-class Work(NamedTuple):
+class Counted(NamedTuple):
     """bytes moved, flops computed, and the bytes that are gone through again and again."""
 
     bytes: float
@@ -33,18 +33,18 @@ class Work(NamedTuple):
     working_set: float
 
 
-def count(facts: Mapping[str, float], vertices: int, springs: int, precision: str = "float64") -> dict[str, Work]:
+def count(facts: Mapping[str, float], vertices: int, springs: int, precision: str = "float64") -> dict[str, Counted]:
     """The work of one local step, one global step and one iteration, which is both; what is not known is left out.
 
     facts: of a prepared solver (`nnz_factor`, `panel_bytes`, `flops_per_solve`).
     """
     moved = _SPRING_BYTES * springs + _LOCAL_BYTES * vertices
-    local = Work(moved, _SPRING_FLOPS * springs, moved)
+    local = Counted(moved, _SPRING_FLOPS * springs, moved)
     if "nnz_factor" not in facts:
         return {"local": local}
     entry = _ENTRY[precision]
     flops = facts.get("flops_per_solve", 12 * facts["nnz_factor"])
     stored = facts.get("panel_bytes", entry * facts["nnz_factor"])
-    whole = Work(flops / 6 * entry + _GLOBAL_BYTES * vertices, flops, stored + _VECTORS * vertices)
-    both = Work(local.bytes + whole.bytes, local.flops + flops, whole.working_set + _SPRING_BYTES * springs)
+    whole = Counted(flops / 6 * entry + _GLOBAL_BYTES * vertices, flops, stored + _VECTORS * vertices)
+    both = Counted(local.bytes + whole.bytes, local.flops + flops, whole.working_set + _SPRING_BYTES * springs)
     return {"local": local, "global": whole, "iteration": both}

@@ -12,19 +12,17 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MultipleLocator, NullLocator
 
 from harness.report.page import axes, count, header, new_page, quantity, save, shorten
-from harness.report.style import DASH_DOTTED, DOTTED, HEIGHT, PAGE, RC, WIDTH, mark
-
-_DASHES = (((0, (4, 2)), "-"), (DOTTED, DASH_DOTTED))
-"""Of a family's other members and of its namesake; the ninth family has the colour of the first, and other dashes."""
+from harness.report.style import HEIGHT, PAGE, RC, WIDTH, shades
 
 _LEFT, _TOP, _NAMES, _BELOW = 110, 130, 400, 70
 
 
 class Series(NamedTuple):
-    """The line of a candidate: its name, the family that shares its colour, vertices and values (k,) each."""
+    """The line of a candidate: its name, what it is called with one thread, its solver, vertices and values (k,)."""
 
     name: str
-    family: str
+    alone: str
+    solver: str
     vertices: Sequence[int]
     values: Sequence[float]
 
@@ -32,24 +30,24 @@ class Series(NamedTuple):
 def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[Series], *, share: bool) -> None:
     """Draw to `path`, WIDTH x HEIGHT pixels, PNG; `share`: values are parts of a whole, drawn in percent.
 
-    The line of a family's namesake is solid, those of its other members are dashed (dash-dotted and dotted from the
-    ninth family on). A series without values is not
-    drawn; it keeps its family's colour free, so that pictures of the same candidates have the same colours.
+    Candidates have the colour and the marker of their solver, in shades where there are several of one; with more
+    threads than one they are dashed. A series without values is not drawn; it keeps its shade free, so that pictures
+    of the same candidates have the same colours.
     """
     drawn = [line for line in series if line.values]
-    looks = {family: mark(k) for k, family in enumerate(dict.fromkeys(line.family for line in series))}
+    looks = shades((line.alone, line.solver) for line in series)
     with matplotlib.rc_context(RC):
         page = new_page()
         header(page, title, facts, letters=84)
         ax = axes(page, _LEFT, _TOP, WIDTH - _LEFT - _NAMES, HEIGHT - _TOP - _BELOW)
         handles: list[tuple[float, Line2D]] = []
         for line in drawn:
-            look = looks[line.family]
+            look = looks[line.alone]
             (handle,) = ax.plot(
                 line.vertices,
                 line.values,
                 color=look.color,
-                linestyle=_DASHES[list(looks).index(line.family) // 8 % 2][line.name == line.family],
+                linestyle="-" if line.name == line.alone else (0, (4, 2)),
                 linewidth=1.8,
                 marker=look.marker,
                 markersize=6,

@@ -1,0 +1,54 @@
+"""Where methods come from: in a line for tables and what appears on hovering, and as BibTeX.
+
+Rows carry a solver's reference as JSON (authors as BibTeX has them, year, title, doi), so none of its code is needed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+
+def cited(reference: str | None) -> str:
+    """The reference in a line: family names, year, title, doi; nothing for none."""
+    if not reference:
+        return ""
+    found = json.loads(reference)
+    *others, last = _families(found)
+    names = f"{', '.join(others)} and {last}" if others else last
+    doi = f", doi:{found['doi']}" if found["doi"] else ""
+    return f"{names} {found['year']}, {found['title']}{doi}"
+
+
+def bibtex(references: Iterable[str | None]) -> str:
+    """An entry for each different reference, in the order of their keys; Unicode, for biber and recent BibTeX."""
+    known = sorted({reference for reference in references if reference}, key=lambda r: (_key(json.loads(r)), r))
+    entries, keys = [], [_key(json.loads(reference)) for reference in known]
+    for k, reference in enumerate(known):
+        found = json.loads(reference)
+        letter = chr(ord("a") + keys[:k].count(keys[k])) if keys.count(keys[k]) > 1 else ""
+        fields = {"author": found["authors"], "title": f"{{{found['title']}}}", "year": found["year"]}
+        fields |= {"doi": found["doi"]} if found["doi"] else {}
+        lines = "".join(f"  {name} = {{{value}}},\n" for name, value in fields.items())
+        entries.append(f"@misc{{{keys[k]}{letter},\n{lines}}}\n")
+    return "\n".join(entries)
+
+
+def write_bibtex(path: Path, references: Iterable[str | None]) -> Path:
+    """Write the entries and return the path."""
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(bibtex(references), encoding="utf-8")
+    os.replace(partial, path)
+    return path
+
+
+def _families(found: dict[str, Any]) -> list[str]:
+    return [author.split(",")[0].strip() for author in found["authors"].split(" and ")]
+
+
+def _key(found: dict[str, Any]) -> str:
+    return re.sub(r"[^a-z]", "", _families(found)[0].lower()) + str(found["year"])

@@ -1,0 +1,89 @@
+"""The pictures of a sweep: of each run, of what compares runs, and of their times; its recordings side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+
+from harness.config.sweep import OPTIONS, RunSpec
+from harness.record.compare import Look, side_by_side
+from harness.record.reader import read_replay
+from harness.report import opengl
+from harness.report.comparison import draw_comparison
+from harness.report.references import write_bibtex
+from harness.report.run_picture import draw_run
+from harness.report.style import shades
+from harness.report.timing_plot import draw_timing
+
+
+class Pictured(NamedTuple):
+    """A run, and where its recording and its picture are to be."""
+
+    run: RunSpec
+    recording: Path
+    picture: Path
+
+
+def draw_sweep(
+    name: str, pictured: Sequence[Pictured], folder: Path, table: pa.Table, say: Callable[[str], None]
+) -> None:
+    """Pictures of runs, and what compares runs, where it is missing or older than a recording that it shows.
+
+    table: the rows of all of them; say: prints a remark.
+    """
+    write_bibtex(folder / "references.bib", table["reference"].to_pylist())
+    drawn = [p for p in pictured if p.run.record and p.recording.exists()]
+    missing = opengl.problem() if any(p.run.pictures for p in drawn) else None
+    if missing:
+        say(missing)
+    wanting = [p for p in drawn if p.run.pictures and _stale(p.picture, [p.recording])]
+    if wanting and not missing:
+        say(f"drawing the pictures of {len(wanting)} runs")
+        for p in wanting:
+            camera = p.run.scene.camera
+            angles = (camera.azimuth, camera.elevation) if camera else None
+            draw_run(read_replay(p.recording), p.picture, camera=angles)
+    for label, group in _groups(drawn).items():
+        recordings = {_distinct(p, group): p.recording for p in group}
+        recording = folder / "recordings" / f"{label}-solvers.rrd"
+        picture = folder / "pictures" / f"{label}-solvers.png"
+        if _stale(recording, recordings.values()):
+            found = shades((_distinct(p, group), p.run.solver.name) for p in group)
+            side_by_side(
+                recording,
+                recordings,
+                label.replace("-", " "),
+                {name: Look(mark.color, mark.marker) for name, mark in found.items()},
+            )
+        if group[0].run.pictures and not missing and _stale(picture, recordings.values()):
+            draw_comparison({key: read_replay(path) for key, path in recordings.items()}, picture)
+    if any(p.run.pictures for p in pictured):
+        draw_timing(table, folder / "pictures" / "timing.png", name)
+
+
+def _stale(made: Path, sources: Iterable[Path]) -> bool:
+    """Whether a file is missing, or older than one of those it was made from."""
+    return not made.exists() or any(made.stat().st_mtime_ns < source.stat().st_mtime_ns for source in sources)
+
+
+def _groups(drawn: list[Pictured]) -> dict[str, list[Pictured]]:
+    """Runs that differ in nothing but their solver or its settings, by scene and size."""
+    groups: dict[str, list[Pictured]] = {}
+    for p in drawn:
+        groups.setdefault(f"{p.run.scene_name}-{p.run.size}", []).append(p)
+    return {label: group for label, group in groups.items() if len(group) > 1}
+
+
+def _distinct(p: Pictured, group: list[Pictured]) -> str:
+    """The solver's name, with the parameters and options in which the group's runs of this solver differ."""
+
+    def settings(run: RunSpec) -> dict[str, Any]:
+        return {**run.solver.parameters, **{option: getattr(run, option) for option in OPTIONS}}
+
+    own = [settings(other.run) for other in group if other.run.solver.name == p.run.solver.name]
+    varied = [(k, v) for k, v in settings(p.run).items() if any(other[k] != v for other in own)]
+    short = {name: option.short for name, option in OPTIONS.items()}
+    return ", ".join([p.run.solver.name, *(short.get(k, f"{k} {{}}").format(v) for k, v in varied)])

@@ -1,0 +1,160 @@
+"""A new solver and a new effect are one file each: nothing else knows any of them by name."""
+
+from __future__ import annotations
+
+import ast
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from harness.base.model import Model
+from harness.config.accuracy_load import load_accuracy
+from harness.config.load import load_any
+from harness.config.schema import schema
+from harness.experiments.ablation.suggest import seen, suggestions
+from harness.experiments.accuracy.run import run_accuracy
+from harness.experiments.run import Files, execute
+from harness.report.accuracy import draw
+from harness.report.robustness import RIGHT, read_cells
+from harness.report.style import marks
+from harness.report.timing_plot import draw_timing
+from harness.report.timing_table import summary_table
+from harness.scenes.effects.base import Contribution, Seen, steady
+from harness.scenes.effects.table import EFFECTS
+from harness.scenes.mesh.base import Mesh
+from solvers.about import About, Reference
+from solvers.methods.local_global import SparseLocalGlobal
+from solvers.registry import SOLVERS
+from tests.contracts.test_accuracy import Quiet
+from tests.scenes import cloth
+
+ROOT = Path(__file__).resolve().parents[2]
+
+DEFAULTS = {"numba", "hybrid", "newton"}
+"""Solvers that run where nobody says which, or that judge others: all that is known by name, and in no report."""
+
+SCENE = """
+mesh: {kind: chain, length: 2.0}
+mass: 1.0
+time_step: 1/30
+frames: 2
+default_size: 4
+effects: [{kind: springs, stretch: 200}, {kind: hum, force: 0.5}, {kind: pins, at: [ends]}]
+"""
+SWEEP = """
+scenes: [chain.yaml]
+solvers: [mine, sparse]
+options: {tolerance: 1e-8, iterations: 3000, record: false, pictures: false, judge: true, rounds: 1}
+"""
+ACCURACY = """
+scenes: [chain.yaml]
+solvers: [mine, sparse]
+curves: [{moment: 1, first_guess: current, rounds: 1, iterations: 200}]
+work: [{horizon: 0.1, rounds: 1}]
+"""
+
+
+@dataclass(frozen=True)
+class Mine(SparseLocalGlobal):
+    """A method that somebody else wrote."""
+
+    about: ClassVar[About] = About("of my own", Reference("Noether, Emmy", 1918, "Invariante Variationsprobleme"))
+
+
+class Hum(Model):
+    """A force on every vertex, and what calls for it."""
+
+    kind: Literal["hum"] = "hum"
+    force: float
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        return Contribution(forces=steady(np.full_like(mesh.rest, self.force)))
+
+    @classmethod
+    def called_for(cls, seen: Seen) -> str:
+        return f"nothing is heard in {len(seen.positions)} frames"
+
+
+@pytest.fixture(autouse=True)
+def added(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SOLVERS, "mine", f"{__name__}:Mine")
+    monkeypatch.setitem(EFFECTS, "hum", f"{__name__}:Hum")
+
+
+@pytest.fixture
+def configs(tmp_path: Path) -> Path:
+    for name, text in (("chain", SCENE), ("sweep", SWEEP), ("accuracy", ACCURACY)):
+        (tmp_path / f"{name}.yaml").write_text(text)
+    return tmp_path
+
+
+def constants(folder: str) -> set[str]:
+    """All strings in the code of a folder, documentation apart where it says more than a name."""
+    trees = (ast.parse(path.read_text()) for path in (ROOT / folder).rglob("*.py"))
+    return {
+        n.value for tree in trees for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str)
+    }
+
+
+def test_no_report_and_little_else_knows_a_solver_by_name():
+    assert not constants("harness/report") & set(SOLVERS)
+    assert constants("harness") & set(SOLVERS) == DEFAULTS
+
+
+def test_no_report_knows_an_effect_by_name():
+    # `springs` is a column of rows: how many a mesh has.
+    assert constants("harness/report") & set(EFFECTS) <= {"springs"}
+
+
+def test_a_sweep_and_its_reports_take_a_new_solver_and_effect(configs: Path):
+    import pyarrow as pa
+
+    from harness.base.rows import SCHEMA
+
+    found = []
+    (configs / "rows").mkdir()
+    for run in load_any(configs / "sweep.yaml").runs():
+        found += execute(run, Files.of(run, configs), lambda phase: None)
+    mine = next(row for row in found if row["solver"] == "mine")
+    assert (mine["status"], mine["family"], mine["minimises"]) == ("ok", "of my own", True)
+    assert json.loads(mine["reference"])["year"] == 1918
+    cells = {cell.solver: cell for cell in read_cells(configs)}
+    assert cells["mine"].outcome == cells["sparse"].outcome == RIGHT
+    table = pa.Table.from_pylist(found, schema=SCHEMA)
+    draw_timing(table, configs / "timing.png", "Time")
+    assert "mine: Noether 1918" in str(summary_table(table).caption)
+
+
+def test_the_accuracy_report_takes_a_new_solver_and_effect(configs: Path):
+    asked = load_accuracy(configs / "accuracy.yaml")
+    files = run_accuracy(asked, configs / "results", Quiet(), lambda line: None)
+    drawn = {path.name: path for path in draw(configs / "results", files)}
+    assert "@misc{noether1918," in drawn["references.bib"].read_text()
+    assert "mine: Noether 1918, Invariante Variationsprobleme" in drawn["findings.md"].read_text()
+    assert "Noether 1918" in drawn["report.html"].read_text()
+
+
+def test_a_new_solver_has_a_look_that_nobody_else_has():
+    looks = marks()
+    assert looks["mine"] not in [look for name, look in looks.items() if name != "mine"]
+    assert looks["mine"].color not in {look.color for name, look in looks.items() if name != "mine"}
+    assert looks["mine"] == marks(["another", "and one more"])["mine"]
+
+
+def test_a_motion_calls_for_a_new_effect():
+    made = cloth(3)
+    still = np.tile(made.mesh.rest, (2, 1, 1))
+    found = {s.effect: s.evidence for s in suggestions(seen(made, set(), still, 0.0 * still), set())}
+    assert found["hum"] == "nothing is heard in 2 frames"
+    assert "hum" not in {s.effect for s in suggestions(seen(made, {"hum"}, still, 0.0 * still), {"hum"})}
+
+
+def test_the_schema_has_both():
+    text = json.dumps(schema())
+    assert '"mine"' in text
+    assert '"hum"' in text

@@ -1,0 +1,93 @@
+"""What Rerun has no public call for, and why `harness/record` goes round it.
+
+Each test fails as soon as the public way works: then the way round is to go.
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+
+STREAM = """
+import gc, os, resource, signal, sys
+import rerun as rr, rerun.blueprint as rrb, rerun_bindings
+
+def write(path, layout=False, clean=False):
+    stream = rr.RecordingStream("app", batcher_config=rr.ChunkBatcherConfig.NEVER(), send_properties=False)
+    stream.save(path)
+    stream.log("a", rr.Scalars(1.0))
+    if layout:
+        stream.send_blueprint(rrb.Blueprint(auto_views=False))
+    stream.flush()
+    stream.disconnect()
+    del stream
+    gc.collect()
+    if clean:
+        rerun_bindings.flush_and_cleanup_orphaned_recordings()
+
+def left(**how):
+    write(sys.argv[1], clean=True)  # what the library keeps for good is there now
+    before = len(os.listdir("/proc/self/task"))
+    write(sys.argv[1], **how)
+    return len(os.listdir("/proc/self/task")) - before
+"""
+
+
+def told(code: str, path: Path) -> int:
+    command = [sys.executable, "-c", f"{STREAM}\nprint({code})", path]
+    return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def test_a_stream_that_is_gone_leaves_threads_which_no_public_call_ends(tmp_path: Path):
+    # Way round: `flush_and_cleanup_orphaned_recordings` of the bindings.
+    assert told("left(clean=True)", tmp_path / "a.rrd") == 0
+    assert told("left()", tmp_path / "a.rrd") > 0, "streams end their threads by themselves: leave the bindings alone"
+
+
+def test_the_public_call_for_layouts_leaves_threads_that_nothing_ends(tmp_path: Path):
+    # Way round: `PartialFile.lay_out`.
+    found = told("left(layout=True, clean=True)", tmp_path / "a.rrd")
+    assert found > 0, "send_blueprint leaves no threads any more: call it instead"
+
+
+DEAD = """
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))
+stream = rr.RecordingStream("app", batcher_config=rr.ChunkBatcherConfig.NEVER(), send_properties=False)
+stream.save(sys.argv[1])
+try:
+    for _ in range(200):
+        stream.log("a", rr.Points3D([[0.0, 0.0, 0.0]] * 2000))
+        stream.flush(timeout_sec=30)
+except Exception:
+    pass
+stream.disconnect()
+"""
+PATIENCE = 8.0
+"""Seconds to wait for what waits for ever; a shorter wait, or a slower machine, only overlooks that it ends now."""
+
+
+def test_a_stream_whose_writer_has_died_is_waited_for_for_ever(tmp_path: Path):
+    # Way round: such a stream is never disconnected nor dropped (`PartialFile._failure`).
+    command = [sys.executable, "-c", STREAM + DEAD, tmp_path / "a.rrd"]
+    with pytest.raises(subprocess.TimeoutExpired):
+        subprocess.run(command, capture_output=True, timeout=PATIENCE)
+
+
+def test_a_file_that_was_cut_within_a_message_is_not_read_at_all(tmp_path: Path):
+    # Way round: `whole_messages` finds where the last whole message ends.
+    path = tmp_path / "a.rrd"
+    stream = rr.RecordingStream("app", batcher_config=rr.ChunkBatcherConfig.NEVER(), send_properties=False)
+    stream.save(path)
+    for frame in range(20):
+        stream.set_time("frame", sequence=frame)
+        stream.log("a", rr.Scalars(float(frame)))
+    stream.flush()
+    middle = path.stat().st_size - 100  # in the last frame, long after the first
+    stream.disconnect()
+    path.write_bytes(path.read_bytes()[:middle])
+    with pytest.warns(Warning, match="no footer"), pytest.raises(RuntimeError, match="decode"):
+        RrdReader(path).recordings()

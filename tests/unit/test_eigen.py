@@ -1,0 +1,94 @@
+"""The yardstick as a solver: the iterates of the others, or a reason why there are none."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from harness.base.stated import stated
+from harness.config.load import load_any
+from solvers.about import LOCAL_GLOBAL
+from solvers.methods import eigen
+from solvers.methods.eigen import EigenLocalGlobal
+from solvers.methods.local_global import PreparedLocalGlobal, SparseLocalGlobal
+from solvers.problem import NotPositiveDefinite, Positions, StopRule, System, Unsupported
+from solvers.registry import OPTIONAL, SOLVERS
+from tests.scenes import cloth, first_problem
+
+SCENE = """
+mesh: {kind: chain, length: 2.0}
+mass: 1.0
+time_step: 1/30
+frames: 2
+default_size: 4
+effects: [{kind: springs, stretch: 200}]
+"""
+
+
+def made(system: System) -> PreparedLocalGlobal:
+    """The real one; where it cannot be compiled it refuses with the reason, and there is nothing to compare."""
+    try:
+        return EigenLocalGlobal().prepare(system)
+    except Unsupported as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("weight", [1e10, "exact"])
+def test_its_iterates_are_those_of_the_others(weight: float | str):
+    scene = cloth(12, weight=weight)
+    problem = first_problem(scene)
+    ours = SparseLocalGlobal().prepare(scene.system)
+    theirs = made(scene.system)
+    for p, q in islice(zip(ours.iterates(problem), theirs.iterates(problem), strict=True), 30):
+        # Two factorisations of a matrix with weights from 1e2 to 1e10: round-off in positions of a metre.
+        np.testing.assert_allclose(q, p, rtol=0, atol=1e-11)
+    stop = StopRule(1000, 1e-3)
+    assert theirs.solve(problem, stop).iterations == ours.solve(problem, stop).iterations
+
+
+def test_a_matrix_without_a_factor_is_refused():
+    scene = cloth(3)
+    made(scene.system)
+    loose = System(np.full(9, -1.0), scene.system.time_step, scene.system.energies)
+    with pytest.raises(NotPositiveDefinite):
+        EigenLocalGlobal().prepare(loose)
+
+
+def test_other_energies_are_refused_before_anything_is_compiled(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(eigen, "_library", lambda: pytest.fail("compiled"))
+    system = cloth(3).system
+    with pytest.raises(Unsupported, match="eigen: knows springs only"):
+        EigenLocalGlobal().prepare(System(system.mass, system.time_step, (*system.energies, _Other())))
+
+
+class _Other:
+    def value(self, p: Positions) -> float:
+        return 0.0
+
+    def add_gradient(self, p: Positions, out: Positions) -> None:
+        return None
+
+    def hessian(self, p: Positions) -> csr_array:
+        return csr_array((p.size, p.size))
+
+
+def test_without_a_compiler_the_row_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from harness.experiments.run import Files, execute
+
+    monkeypatch.setattr(eigen.shutil, "which", lambda _: None)
+    (tmp_path / "chain.yaml").write_text(SCENE)
+    (run,) = load_any(tmp_path / "chain.yaml", solvers=["eigen"]).runs()
+    (tmp_path / "rows").mkdir()
+    (row,) = execute(run, Files.of(run, tmp_path), lambda phase: None)
+    assert (row["status"], row["family"]) == ("unsupported", LOCAL_GLOBAL)
+    assert "there is no C++ compiler" in row["reason"]
+
+
+def test_it_is_not_among_those_that_are_everywhere():
+    assert set(OPTIONAL) == {"eigen"}
+    assert not set(OPTIONAL) & set(SOLVERS)
+    assert stated("eigen")["minimises"]
