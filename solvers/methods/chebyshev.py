@@ -18,9 +18,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from solvers.core.acceleration import Scheme
 from solvers.kernels.accelerate_coefficients import CHEBYSHEV
 from solvers.linear.choice import Linear, Precision
-from solvers.methods.quasi_newton import Method, PreparedAccelerated, prepare
+from solvers.methods.quasi_newton import PreparedAccelerated, prepare
 from solvers.problem import System
 
 
@@ -36,4 +37,4 @@ class Chebyshev:
 
     def prepare(self, system: System) -> PreparedAccelerated:
         """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
-        return prepare(system, Method("chebyshev", CHEBYSHEV, 1, 0, True), self.linear, self.precision)
+        return prepare(system, Scheme("chebyshev", CHEBYSHEV, 1, 0, True), self.linear, self.precision)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from harness.simulation.trace import EnergyNorm, trace
+from solvers.core.prefactored import only_springs
 from solvers.matrices import assemble
-from solvers.methods.local_global import SparseLocalGlobal, only_springs
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from tests.scenes import cloth, first_problem, frozen, random_problem
 
