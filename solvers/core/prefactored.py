@@ -71,8 +71,17 @@ class PreparedLocalGlobal(Iterative):
         constant, b = self.constant(problem), np.empty_like(problem.target)
         p = self.placed(problem.first_guess, problem)
         out, project = p.copy(), self.local(problem)
-        project(p, constant, b)
-        return {"local": lambda: project(p, constant, b), "global": lambda: self.toward(b, p, out)}
+
+        def local() -> Positions:
+            project(p, constant, b)
+            return b
+
+        def whole() -> Positions:
+            self.toward(b, p, out)
+            return out
+
+        local()
+        return {"local": local, "global": whole}
 
     def local(self, problem: StepProblem) -> Project:
         """The local step of one problem."""
@@ -88,8 +97,9 @@ class PreparedLocalGlobal(Iterative):
             y[s.free] -= self.coupling @ problem.pin_targets[s.pins.exact]
         return y
 
-    def correction(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b, by the factor as it is, to `out`, both (n, 3); exactly pinned vertices keep what is there."""
+    def correction(self, b: Positions, out: Positions) -> Positions:
+        """Write Q^-1 b, by the factor as it is, to `out`, which it returns, both (n, 3); exactly pinned vertices keep
+        what is there."""
         free = self.system.free
         if len(free) == len(b):
             self.factor.solve(b, out)
@@ -97,6 +107,7 @@ class PreparedLocalGlobal(Iterative):
             solved = np.empty((len(free), 3))
             self.factor.solve(b[free], solved)
             out[free] = solved
+        return out
 
     def toward(self, b: Positions, p: Positions, out: Positions) -> None:
         """Write where Q p = b leads from p to `out`, (n, 3) all, as `correction` does; by a rounded factor, nearer."""
