@@ -42,6 +42,7 @@ def test_a_solver_may_yield_the_same_array_every_time():
 
     class Reusing:
         choice, facts, solve, phases = prepared.choice, prepared.facts, prepared.solve, prepared.phases
+        residual_at = prepared.residual_at
 
         def iterates(self, problem):
             out = np.empty_like(problem.target)
