@@ -115,8 +115,9 @@ def require_numbers(by_frame: Mapping[int, dict[str, Any]], *, minimises: bool, 
 
     minimises, yardstick: whether the solver has a residual, and the stop rule a yardstick; else they become null.
     """
+    known = {"residual": minimises, "last_residual": minimises, "yardstick": yardstick}
     for frame, columns in by_frame.items():
-        columns.update({name: None for name, has in (("residual", minimises), ("yardstick", yardstick)) if not has})
+        columns.update({name: None for name, has in known.items() if name in columns and not has})
         for name, value in columns.items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise StepFailed(frame) from Diverged(f"{name} is {value} from frame {frame} on, of finite positions")
