@@ -31,4 +31,5 @@ inner_options: Any = {**_bare, "no_cpython_wrapper": True, "no_cfunc_wrapper": T
 
 kernel: Any = kept(**_bare)
 inner: Any = kept(**inner_options)
+inner_closure: Any = njit(**inner_options)  # has no name on disk; kept within what calls it
 inner_in_parallel: Any = kept(**inner_options, parallel=True)

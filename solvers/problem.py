@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,10 @@ from scipy.sparse import csr_array
 
 Positions = NDArray[np.float64]
 """Positions [m], shape (n, 3), float64, C-contiguous."""
+
+ResidualOf = Literal["returned", "previous", "none"]
+"""The iterate that a residual belongs to: the positions that a solve returns, or those before its last iteration; none
+where there is no residual."""
 
 
 class Unsupported(Exception):
@@ -239,10 +243,10 @@ class Solution:
     """Where a solve ended.
 
     positions: (n, 3) [m]; iterations: how many were done; residual: |Q^-1 grad g|_Q [J^(1/2)] over the unpinned
-    vertices, at these positions or at those before the last iteration, where that is what the method knows (nan for
-    one that does not minimise); yardstick: the same at the current positions (nan when the rule had no tolerance);
-    stopped: "iterations", "tolerance", "floor", or "stalled" where round-off lets nothing descend any more;
-    velocity: (n, 3) [m/s] at the step's end, of a method that keeps its own.
+    vertices, by which the rule judged (nan for a method that does not minimise); yardstick: the same at the current
+    positions (nan when the rule had no tolerance); stopped: "iterations", "tolerance", "floor", or "stalled" where
+    round-off lets nothing descend any more; velocity: (n, 3) [m/s] at the step's end, of a method that keeps its own;
+    residual_of: which iterate the residual belongs to.
     """
 
     positions: Positions
@@ -251,6 +255,7 @@ class Solution:
     yardstick: float
     stopped: str
     velocity: Positions | None = None
+    residual_of: ResidualOf = "returned"
 
 
 class Prepared(Protocol):
@@ -275,6 +280,10 @@ class Prepared(Protocol):
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """The same iterates on the fast path, up to where `stop` ends them."""
+        ...
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """|Q^-1 grad g|_Q [J^(1/2)] at p (n, 3) [m], which may take an iteration; nan where none is known."""
         ...
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:

@@ -89,9 +89,16 @@ COLUMNS = (
         "residual",
         _REAL,
         "J^(1/2)",
-        "|Q^-1 grad g|_Q where the step's last iteration began or ended, unpinned vertices; null where the solver "
-        "does not minimise",
+        "|Q^-1 grad g|_Q over the unpinned vertices at the positions that the step's solve returned; taken in the "
+        "untimed pass where the solver knows that of the iterate before alone; null where it does not minimise",
     ),
+    Column(
+        "last_residual",
+        _REAL,
+        "J^(1/2)",
+        "the last one that the solve computed, by which the stop rule judged; null as the residual is",
+    ),
+    Column("residual_of", _TEXT, "", "the iterate that last_residual belongs to: returned, previous or none"),
     Column("yardstick", _REAL, "J^(1/2)", "the residual at the step's start, which the tolerance refers to"),
     Column(
         "stationarity",

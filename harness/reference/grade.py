@@ -57,6 +57,10 @@ class Graded:
         """The solver's."""
         return self._prepared.phases(problem)
 
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """The solver's."""
+        return self._prepared.residual_at(problem, p)
+
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """The solver's answer; raises RunFailed where it claims what is not so."""
         found = self._prepared.solve(problem, stop)

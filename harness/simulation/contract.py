@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
 from solvers import sources
+from solvers.core.driver import Iterative
 from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule, System
 
 Arrays = dict[str, NDArray[Any]]
@@ -64,6 +65,10 @@ class Checked:
         """The solver's."""
         return self._prepared.phases(problem)
 
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """The solver's."""
+        return self._prepared.residual_at(problem, p)
+
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """The solver's answer; raises RunFailed where it is none, or something was written to."""
         before = {name: array.copy() for name, array in _of_problem(problem).items()}
@@ -107,6 +112,8 @@ def where(error: BaseException, own: Collection[str]) -> str:
 
 def _line(of: type, method: str) -> str:
     function: Callable[..., Any] | None = getattr(of, method, None)
+    if getattr(function, "__module__", "") == Iterative.__module__:  # the loop is not the solver's own
+        function = getattr(of, "begin", None)
     code = getattr(function, "__code__", None)
     return f"{Path(code.co_filename).name}:{code.co_firstlineno}" if code else f"{of.__module__}.{of.__name__}.{method}"
 

@@ -45,7 +45,7 @@ def observe(
     """
     found: dict[int, dict[str, Any]] = {}
 
-    def look(step: Step) -> None:
+    def look(step: Step, residual: float) -> None:
         p, s = step.positions, step.solution
         terms = step.problem.terms(s.positions)
         found[step.index] = {
@@ -56,7 +56,9 @@ def observe(
             "penetration": penetration(scene, p, scene.time(step.index)),
             "iterations": s.iterations,
             "stopped": s.stopped,
-            "residual": s.residual,
+            "residual": residual,
+            "last_residual": s.residual,
+            "residual_of": s.residual_of,
             "yardstick": s.yardstick,
             "digest": digest(p),
             **(judge(step) if judge else {}),
@@ -64,7 +66,7 @@ def observe(
         if stored is not None:
             stored[step.index - 1] = p
         if recorder:
-            recorder.frame(Frame(step.index, scene.time(step.index), p, terms, s.residual, s.iterations))
+            recorder.frame(Frame(step.index, scene.time(step.index), p, terms, residual, s.iterations))
 
     with ThreadPoolExecutor(1) as beside:
         looked: Future[None] | None = None
@@ -73,7 +75,8 @@ def observe(
         for step in steps(scene, prepared, settings):
             if looked:
                 looked.result()  # raises here what went wrong there
-            looked = beside.submit(look, step)
+            # A solver's memory is one solve's: not beside the next step.
+            looked = beside.submit(look, step, returned_residual(prepared, step))
             if recorder and step.index in convergence:
                 norm = EnergyNorm(step.problem.system)
                 curve = trace(prepared, step.problem, norm, step.solution.iterations)
@@ -92,6 +95,15 @@ def penetration(scene: Scene, p: Positions, time: float) -> float | None:
     return float(max(inside)) if inside else None
 
 
+def returned_residual(prepared: Prepared, step: Step) -> float:
+    """The residual [J^(1/2)] at the positions that a step's solve returned: an iteration's work where it knows that of
+    the iterate before alone."""
+    solution = step.solution
+    if solution.residual_of == "previous":
+        return prepared.residual_at(step.problem, solution.positions)
+    return solution.residual
+
+
 def largest_strain(scene: Scene, p: Positions) -> float:
     """The largest |length / rest length - 1| of a spring at p (n, 3) [m]; 0 without springs."""
     of_spring, _ = strains(p, scene.springs.edges, scene.springs.rest_length)
@@ -103,8 +115,9 @@ def require_numbers(by_frame: Mapping[int, dict[str, Any]], *, minimises: bool, 
 
     minimises, yardstick: whether the solver has a residual, and the stop rule a yardstick; else they become null.
     """
+    known = {"residual": minimises, "last_residual": minimises, "yardstick": yardstick}
     for frame, columns in by_frame.items():
-        columns.update({name: None for name, has in (("residual", minimises), ("yardstick", yardstick)) if not has})
+        columns.update({name: None for name, has in known.items() if name in columns and not has})
         for name, value in columns.items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise StepFailed(frame) from Diverged(f"{name} is {value} from frame {frame} on, of finite positions")

@@ -117,6 +117,9 @@ class _Turns:
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         return self._of(problem).solve(problem, stop)
 
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        return self._of(problem).residual_at(problem, p)
+
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         return self._of(problem).phases(problem)
 

@@ -11,8 +11,9 @@ repeated with all of the majorant, and shortened.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,10 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array, csr_array
 
 from solvers.contact.touching import ContactEnergy, Rows, touching, without_contact
+from solvers.core.driver import Iterating, Iterative, largest
 from solvers.core.objective import Objective, StepObjective
-from solvers.methods.local_global import PreparedLocalGlobal
-from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule, System
+from solvers.core.prefactored import PreparedLocalGlobal
+from solvers.problem import Positions, Prepared, ResidualOf, Solver, StepProblem, System
 
 _FEW = 900
 """Rows up to which their matrix is factorised: 300 vertices that stick. It takes as long as conjugate gradients do."""
@@ -33,10 +35,18 @@ _ITERATIONS, _TOLERANCE = 60, 1e-3
 """Of conjugate gradients, in the norm of Q^-1."""
 
 
+class Idle(Prepared, Protocol):
+    """A local-global method, ready for a system without contact."""
+
+    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+        """See Iterative."""
+        ...
+
+
 def local_global(solver: Solver, system: System) -> PreparedContact:
     """A local-global method with contact; raises what the solver raises for the system without it."""
-    idle = solver.prepare(without_contact(system))
-    base = idle if isinstance(idle, PreparedLocalGlobal) else idle.base  # pyright: ignore[reportAttributeAccessIssue]
+    idle: Any = solver.prepare(without_contact(system))
+    base = idle if isinstance(idle, PreparedLocalGlobal) else idle.base
     return PreparedContact(replace(base, system=system), idle, Objective(system), Corrections(base))
 
 
@@ -60,9 +70,7 @@ class Corrections:
 
     def residual(self, plain: Positions) -> float:
         """|plain|_Q [J^(1/2)] over the unpinned vertices."""
-        e = plain.copy()
-        e[self._base.system.pins.vertices] = 0.0
-        return self._base.norm(e)
+        return self._base.residual(plain.copy())
 
     def around(
         self, contacts: list[ContactEnergy], p: Positions, gradient: Positions, plain: Positions, *, cautious: bool
@@ -141,11 +149,13 @@ def _columns(rows: Rows, n: int) -> csr_array:
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedContact:
+class PreparedContact(Iterative):
     """Local-global iterations with contact. base: the prefactored Q; idle: the method while nothing is touched."""
 
+    residual_of: ClassVar[ResidualOf] = "previous"
+
     base: PreparedLocalGlobal
-    idle: Prepared
+    idle: Idle
     objective: Objective
     corrections: Corrections
 
@@ -159,31 +169,21 @@ class PreparedContact:
         """The linear solver in words."""
         return f"{self.idle.choice}; contact by Woodbury's formula, beyond {_FEW} rows by conjugate gradients"
 
-    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The iterates from `problem.first_guess`."""
-        contacts = touching(problem)
-        return (p for p, _ in self._points(problem, contacts)) if contacts else self.idle.iterates(problem)
-
-    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Iterate until `stop` says so; the residual is that before the last iteration."""
+    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+        """See Iterative."""
         contacts = touching(problem)
         if not contacts:
-            return self.idle.solve(problem, stop)
-        limit, yardstick, every = 0.0, float("nan"), stop.tolerance is not None
-        if stop.tolerance is not None:
-            yardstick = self.gauge(problem)(problem.current)
-            limit = stop.tolerance * yardstick
-        floor = stop.floor * float(np.abs(problem.first_guess).max(initial=0.0)) * self.base.trace**0.5
-        points, residual, iteration, stopped = self._points(problem, contacts), float("nan"), 0, "iterations"
-        p = problem.first_guess
-        for iteration in range(1, stop.iterations + 1):
-            p, plain = next(points)
-            if every or iteration == stop.iterations:
-                residual = self._residual(plain)
-            if every and residual <= max(limit, floor):
-                stopped = "tolerance" if residual <= limit else "floor"
-                break
-        return Solution(p, iteration, residual, yardstick, stopped)
+            return self.idle.begin(problem, guess)
+        step = StepObjective(self.objective, problem)
+        return _Iterating(self.corrections, step, contacts, step.placed(guess))
+
+    def scale(self, problem: StepProblem) -> float:
+        """See Iterative."""
+        return largest(problem) * self.base.trace**0.5
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """See Iterative; it takes no iteration where something is touched."""
+        return self.gauge(problem)(p) if touching(problem) else self.idle.residual_at(problem, p)
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Those of the method while nothing is touched; with contact an iteration has no parts that stand alone."""
@@ -192,33 +192,40 @@ class PreparedContact:
     def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
         """What tells the residual [J^(1/2)] at positions (n, 3)."""
         step = StepObjective(self.objective, problem)
-        return lambda p: self._residual(self.corrections.plain(step.gradient(p)))
+        return lambda p: self.corrections.residual(self.corrections.plain(step.gradient(p)))
 
-    def _residual(self, plain: Positions) -> float:
-        return self.corrections.residual(plain)
 
-    def _points(self, problem: StepProblem, contacts: list[ContactEnergy]) -> Iterator[tuple[Positions, Positions]]:
-        """The iterates, each with Q^-1 grad g at the one before."""
-        step = StepObjective(self.objective, problem)
-        p = step.placed(problem.first_guess)
-        while True:
-            gradient = step.gradient(p)
-            plain = self.corrections.plain(gradient)
-            p = self._following(step, contacts, p, gradient, plain)
-            yield p, plain
+class _Iterating(Iterating):
+    """Each position is no higher than the one before."""
 
-    def _following(
-        self, step: StepObjective, contacts: list[ContactEnergy], p: Positions, gradient: Positions, plain: Positions
-    ) -> Positions:
+    def __init__(
+        self, corrections: Corrections, step: StepObjective, contacts: list[ContactEnergy], p: Positions
+    ) -> None:
+        self._corrections, self._step, self._contacts = corrections, step, contacts
+        self.positions = p
+        self._plain: Positions | None = None
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        gradient = self._step.gradient(self.positions)
+        self._plain = self._corrections.plain(gradient)
+        self.positions = self._following(self.positions, gradient, self._plain)
+        return True
+
+    def residual(self) -> float:
+        """That of the previous positions."""
+        return float("nan") if self._plain is None else self._corrections.residual(self._plain)
+
+    def _following(self, p: Positions, gradient: Positions, plain: Positions) -> Positions:
         """A position that is no higher than p: p itself where round-off lets nothing descend."""
         x, length = np.zeros_like(p), 1.0
         for attempt in range(2 + _HALVINGS):
             if attempt < 2:
-                x, _ = self.corrections.around(contacts, p, gradient, plain, cautious=attempt > 0)
+                x, _ = self._corrections.around(self._contacts, p, gradient, plain, cautious=attempt > 0)
             else:
                 length *= 0.5
-            q = step.placed(p + length * x)
-            rise, noise = step.rise(p, q)
+            q = self._step.placed(p + length * x)
+            rise, noise = self._step.rise(p, q)
             if rise <= noise:
                 return q
         return p

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from solvers.contact.local_global import Corrections
 from solvers.contact.touching import ContactEnergy, Rows, touching
+from solvers.core.acceleration import Accelerating, Engine, Interpreted, Scheme
 from solvers.core.objective import Objective, StepObjective
+from solvers.core.prefactored import PreparedLocalGlobal
 from solvers.kernels import accelerate
-from solvers.kernels.accelerate import Window
-from solvers.methods.local_global import PreparedLocalGlobal
-from solvers.methods.quasi_newton import Engine, InterpretedRun, Method, Run, window_for
 from solvers.problem import Positions, StepProblem
 
 _ALIKE = 2.0
@@ -25,25 +24,24 @@ _ALIKE = 2.0
 class Touching:
     """See Engine. idle: the engine while nothing is touched."""
 
-    def __init__(self, method: Method, base: PreparedLocalGlobal, idle: Engine) -> None:
-        self._method, self._base, self._idle = method, base, idle
+    def __init__(self, scheme: Scheme, base: PreparedLocalGlobal, idle: Engine) -> None:
+        self._scheme, self._base, self._idle = scheme, base, idle
         self._objective, self._corrections = Objective(base.system), Corrections(base)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Run:
+    def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
         """See Engine."""
         contacts = touching(problem)
         if not contacts:
             return self._idle.begin(problem, guess)
-        window = window_for(self._method, guess.size, guess.size)
         step = StepObjective(self._objective, problem)
-        return _ContactRun(self._base, window, step, guess, contacts, self._corrections)
+        return _Touching(self._base, self._scheme, step, guess, contacts, self._corrections)
 
 
-class _ContactRun(InterpretedRun):
+class _Touching(Interpreted):
     def __init__(
         self,
         base: PreparedLocalGlobal,
-        window: Window,
+        scheme: Scheme,
         step: StepObjective,
         guess: Positions,
         contacts: list[ContactEnergy],
@@ -52,7 +50,7 @@ class _ContactRun(InterpretedRun):
         self._contacts, self._corrections = contacts, corrections
         self._rows: Rows | None = None
         self._begun = True
-        super().__init__(base, window, step, guess)
+        super().__init__(base, scheme, step, guess)
 
     def _solved(self) -> NDArray[np.float64]:
         """The correction at the trial point, by the rows of before where they will do."""
@@ -72,7 +70,8 @@ class _ContactRun(InterpretedRun):
         correction = self._solved()
         (accelerate.begin if self._begun else accelerate.accept)(self._window, correction)
 
-    def _residual(self) -> float:
+    def residual(self) -> float:
+        """See Iterating."""
         return self._corrections.residual(self._plain)
 
 

@@ -1,4 +1,4 @@
-"""What methods with exact gradients share: the stop rule, and a line search that tells a descent from round-off.
+"""What methods with exact gradients share: their points, and a line search that tells a descent from round-off.
 
 The line search halves a step until the objective falls by at least DECREASE of what the slope promises (Armijo 1966).
 The rise is computed from differences (see `solvers.kernels.objective`), so that this works until the gradient itself
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import islice
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -18,19 +17,17 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers import matrices
+from solvers.core.driver import Iterating, Iterative, largest
 from solvers.core.objective import Objective, StepObjective
 from solvers.linear.choice import factorise
 from solvers.linear.factors import DenseCholesky
-from solvers.problem import Positions, ProjectiveEnergy, Solution, StepProblem, StopRule, System
+from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
 
 DECREASE = 1e-4
 """Of what the slope promises, the least that a step must bring."""
 
 _HALVINGS = 60
 """A step so often halved has no digit left."""
-
-_CLOSE = 1e-5
-"""A tolerance from which on the last point should be a minimum; a greater one asks for less than that."""
 
 
 class Point(NamedTuple):
@@ -129,7 +126,7 @@ class Metric:
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedDescent:
+class PreparedDescent(Iterative):
     """A method, ready for a system."""
 
     objective: Objective
@@ -138,45 +135,45 @@ class PreparedDescent:
     choice: str
     facts: dict[str, float]
 
-    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The iterates from `problem.first_guess`; where the method stalls it stays."""
-        step, start = self._begin(problem)
-        point = start
-        for point in self.method.points(step, start):
-            yield point.positions
-        while True:
-            yield point.positions
+    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+        """See Iterative."""
+        return _Iterating(self, *self._begin(problem, guess))
 
-    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Iterate until `stop` says so, or until nothing descends any more."""
-        step, start = self._begin(problem)
-        point = start
-        every, limit, yardstick = stop.tolerance is not None, 0.0, float("nan")
-        if stop.tolerance is not None:
-            yardstick = self.metric.residual(step.gradient(problem.current))
-            limit = stop.tolerance * yardstick
-        close = stop.tolerance is not None and stop.tolerance <= _CLOSE
-        floor = stop.floor * float(np.abs(point.positions).max(initial=0.0)) * self.metric.trace**0.5
-        residual, iteration, stopped = float("nan"), 0, "iterations"
-        for point in islice(self.method.points(step, start), stop.iterations):
-            iteration += 1
-            if every:
-                residual = self.metric.residual(point.gradient)
-                if residual <= max(limit, floor) and (not close or self.method.certifies(step, point)):
-                    stopped = "tolerance" if residual <= limit else "floor"
-                    break
-            if point.stalled:
-                stopped = "stalled"
-                break
-        if not every:
-            residual = self.metric.residual(point.gradient)
-        return Solution(point.positions.copy(), iteration, residual, yardstick, stopped)
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """See Iterative."""
+        return self.metric.residual(StepObjective(self.objective, problem).gradient(p))
+
+    def scale(self, problem: StepProblem) -> float:
+        """See Iterative."""
+        return largest(problem) * self.metric.trace**0.5
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """What iterations are made of, at the first guess."""
-        return self.method.phases(*self._begin(problem))
+        return self.method.phases(*self._begin(problem, problem.first_guess))
 
-    def _begin(self, problem: StepProblem) -> tuple[StepObjective, Point]:
+    def _begin(self, problem: StepProblem, guess: Positions) -> tuple[StepObjective, Point]:
         step = StepObjective(self.objective, problem)
-        p = step.placed(problem.first_guess)
+        p = step.placed(guess)
         return step, Point(p, step.gradient(p))
+
+
+class _Iterating(Iterating):
+    """From point to point; one at which the method stalls is the one before."""
+
+    def __init__(self, prepared: PreparedDescent, step: StepObjective, start: Point) -> None:
+        self._metric, self._method, self._step = prepared.metric, prepared.method, step
+        self._points, self._point, self.positions = prepared.method.points(step, start), start, start.positions
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        before, self._point = self._point, next(self._points, self._point)
+        self.positions = self._point.positions
+        return not self._point.stalled or self.positions is not before.positions
+
+    def residual(self) -> float:
+        """See Iterating."""
+        return self._metric.residual(self._point.gradient)
+
+    def certifies(self) -> bool:
+        """See Iterating."""
+        return self._method.certifies(self._step, self._point)

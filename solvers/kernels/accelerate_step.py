@@ -15,6 +15,7 @@ from solvers.compiling import inner, kernel
 from solvers.kernels.accelerate import AGAIN, STALLED, Window, accept, begin, judge, propose
 from solvers.kernels.accelerate_springs import Shares, descend
 from solvers.kernels.edges import add_edges, energy
+from solvers.kernels.loop import compiled_over
 from solvers.kernels.springs import Bundles, squared_norm
 from solvers.kernels.step import Plan
 from solvers.kernels.step_ends import Rows, fetch, place, state
@@ -48,9 +49,9 @@ class Step(NamedTuple):
 
 @kernel
 def start(step: Step, edges, window: Window, target, force, pin_targets, guess):
-    """Begin a step's solve; edges: strain limits and dashpots, or None. Returns the guess's largest coordinate."""
+    """Begin a step's solve; edges: strain limits and dashpots, or None."""
     state(step.rows, target, force, pin_targets, step.right)
-    largest = place(step.rows, guess, pin_targets, window.trial)
+    place(step.rows, guess, pin_targets, window.trial)
     step.objective[0] = _evaluate(step, edges, window)
     size = step.shares.size
     for k in range(len(window.direction)):
@@ -59,37 +60,24 @@ def start(step: Step, edges, window: Window, target, force, pin_targets, guess):
     _solve(step.plan, window.descent_there, len(window.direction), step.x)
     begin(window, step.x)
     window.now[0].fallen = 0.0
-    return largest
 
 
-@kernel
-def run(step: Step, edges, window: Window, iterations, limit, floor, every, out):
-    """Iterate, and put the positions to `out` (n, 3).
-
-    every: whether to end once a residual is at most `limit` or `floor`; limit: nan where no residual is wanted. Returns
-    how many iterations were done, the last one's residual [J^(1/2)], and whether round-off ended them.
-    """
-    now, count, verdict, there = window.now[0], 0, AGAIN, 0.0
-    residual = _residual(step, window) if iterations == 0 else np.inf
-    while count < iterations and not (every and (residual <= limit or residual <= floor)):
-        propose(window)
-        verdict = AGAIN
-        while verdict == AGAIN:
-            there = _evaluate(step, edges, window)
-            before, size = abs(step.objective[0]) + 2.0 * step.objective[2], step.objective[1]
-            now.rise, now.noise = there - step.objective[0], NOISE * (before + np.sqrt(2.0 * before * size))
-            verdict = judge(window)
-        if verdict == STALLED:
-            residual = _residual(step, window)
-            break
-        count += 1
-        step.objective[0] = there
-        _solve(step.plan, window.descent_there, len(window.direction), step.x)
-        accept(window, step.x)
-        if every or (count == iterations and not np.isnan(limit)):
-            residual = _residual(step, window)
-    fetch(step.rows, window.position, out)
-    return count, residual, verdict == STALLED
+@inner
+def _advance(state):
+    step, edges, window = state
+    now, there, verdict = window.now[0], 0.0, AGAIN
+    propose(window)
+    while verdict == AGAIN:
+        there = _evaluate(step, edges, window)
+        before, size = abs(step.objective[0]) + 2.0 * step.objective[2], step.objective[1]
+        now.rise, now.noise = there - step.objective[0], NOISE * (before + np.sqrt(2.0 * before * size))
+        verdict = judge(window)
+    if verdict == STALLED:
+        return False
+    step.objective[0] = there
+    _solve(step.plan, window.descent_there, len(window.direction), step.x)
+    accept(window, step.x)
+    return True
 
 
 @inner
@@ -101,12 +89,24 @@ def _evaluate(step, edges, window):
 
 
 @inner
-def _residual(step, window):
+def _residual(state):
     """|c|_Q [J^(1/2)] over the vertices that no pin holds."""
+    step, _, window = state
     for i in range(len(window.correction) // 4):
         for k in range(4 * i, 4 * i + 3):
             step.e[k] = step.plan.loose[i] * window.correction[k]
     return np.sqrt(squared_norm(step.form, 0, len(step.form.start) - 1, step.e, step.plan.measure))
+
+
+_iterate = compiled_over(_advance, _residual)
+
+
+@kernel
+def run(step: Step, edges, window: Window, limits, out):
+    """Iterate as `solvers.kernels.loop` does, and put the positions to `out` (n, 3)."""
+    answer = _iterate((step, edges, window), limits)
+    fetch(step.rows, window.position, out)
+    return answer
 
 
 @inner

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, inner_in_parallel, kernel
 from solvers.kernels.edges import add_edges
+from solvers.kernels.loop import EACH, ITERATIONS, LAST, verdict
 from solvers.kernels.springs import add_descent, add_projection, squared_norm
 from solvers.linear.supernodal_solve import backwards, forwards
 from solvers.linear.team import claim, finish, following, go_on, last, start
@@ -164,6 +165,18 @@ def _squared(plan, form, part, e):
 
 
 @kernel
+def length(plan, form, x, before, p, e):
+    """What `iterate` calls the residual [J^(1/2)] of one iteration, from its vectors; e: scratch."""
+    groups = plan.top[2]
+    for part in range(groups + 1):
+        _displace(plan, part, x, before, p, e)
+    total = _squared(plan, form, groups, e)
+    for group in range(groups):
+        total += _squared(plan, form, group, e)
+    return np.sqrt(total)
+
+
+@kernel
 def local(plan, bundles, edges, x, right, p, out):
     """The local step alone, of all blocks."""
     for k in range(len(out)):
@@ -181,7 +194,7 @@ def local(plan, bundles, edges, x, right, p, out):
 
 
 @inner
-def _share(plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, team, first):
+def _share(plan, bundles, edges, form, vectors, right, p, limits, team, first):
     """A thread's share of the iterations: the groups from `first` on that no other thread does, and what follows them.
 
     Phase 2 k is iteration k, phase 2 k + 1 measures it where that is wanted.
@@ -202,16 +215,16 @@ def _share(plan, bundles, edges, form, vectors, right, p, iterations, limit, flo
                     _displace(plan, group, a, c, p, e)
                     team.sums[group] = _squared(plan, form, group, e)
                 else:
-                    _group(plan, bundles, edges, group, a, right, p, b, k > 0, k < iterations)
+                    _group(plan, bundles, edges, group, a, right, p, b, k > 0, k < limits.iterations)
                 if last(team):
-                    enough = k == iterations
+                    enough = k == limits.iterations
                     if measures:
                         total = _squared(plan, form, groups, e)
                         for value in team.sums:
                             total += value
                         team.found[1] = np.sqrt(total)
-                        enough = enough or team.found[1] <= max(limit, floor)
-                    elif k > 0 and (every or (enough and not np.isnan(limit))):
+                        enough = enough or verdict(team.found[1], limits) != ITERATIONS
+                    elif k > 0 and (limits.wanted == EACH or (enough and limits.wanted == LAST)):
                         _displace(plan, groups, a, c, p, e)
                         go_on(team, phase + 1)
                         continue
@@ -225,31 +238,27 @@ def _share(plan, bundles, edges, form, vectors, right, p, iterations, limit, flo
 
 
 @inner_in_parallel
-def _side_by_side(plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, team, threads):
+def _side_by_side(plan, bundles, edges, form, vectors, right, p, limits, team, threads):
     for thread in prange(threads):
-        _share(
-            plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, team,
-            thread * plan.top[2] // threads,
-        )  # fmt: skip
+        _share(plan, bundles, edges, form, vectors, right, p, limits, team, thread * plan.top[2] // threads)
 
 
 @kernel
-def iterate(plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, threads, team):
+def iterate(plan, bundles, edges, form, vectors, right, p, limits, threads, team):
     """Iterate from the positions in the first vector, or from p where that is given, which then takes the positions.
 
     edges: strain limits and dashpots, or None; form: the bundles of |e|_Q^2, with pairs for all that is not a spring;
     vectors: three that take turns, and one for scratch, of float64; right: the constant right-hand side (see
-    `Bundles.right`); every: whether the iterations end once a residual is at most `limit` or `floor`; threads: None
-    for one.
+    `Bundles.right`); limits: see `solvers.kernels.loop`; threads: None for one.
     Returns how many were done, the last one's residual |p^k - p^(k-1)|_Q [J^(1/2)] over the vertices that no pin
-    holds (nan where none was wanted: limit is nan), and the last vector.
+    holds (nan where none was wanted), and the last vector.
     """
     start(team)
     team.found[1] = np.nan
     if threads is None:
-        _share(plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, team, 0)
+        _share(plan, bundles, edges, form, vectors, right, p, limits, team, 0)
     else:
-        _side_by_side(plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, team, threads)
+        _side_by_side(plan, bundles, edges, form, vectors, right, p, limits, team, threads)
     x0, x1, x2, _ = vectors
     done = int(team.found[0])
     return done, team.found[1], (x0, x1, x2)[done % 3]

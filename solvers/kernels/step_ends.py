@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
+from solvers.kernels.loop import verdict
 from solvers.kernels.step import iterate
 from solvers.vectors.intrinsics import ask_for
 from solvers.vectors.springs import LANES
@@ -68,18 +69,12 @@ def pin(rows, pin_targets, x):
 
 @inner
 def place(rows, positions, pin_targets, x):
-    """Positions to the rows of x, exactly pinned vertices on their targets; returns the largest coordinate."""
+    """Positions to the rows of x, exactly pinned vertices on their targets."""
     for v in range(len(positions)):
         _ask_ahead(rows, v, x)
         for c in range(3):
             x[4 * rows.row[v] + c] = positions[v, c]
     pin(rows, pin_targets, x)
-    largest = 0.0
-    for v in range(len(positions)):
-        _ask_ahead(rows, v, x)
-        for c in range(3):
-            largest = max(largest, abs(x[4 * rows.row[v] + c]))
-    return largest
 
 
 @kernel
@@ -93,30 +88,28 @@ def fetch(rows, x, out):
 
 @kernel
 def start(rows, vectors, p, positions, pin_targets):
-    """Put the positions to where the iterations begin; returns the largest coordinate."""
+    """Put the positions to where the iterations begin."""
     if p is not None:
-        return place(rows, positions, pin_targets, p)
+        place(rows, positions, pin_targets, p)
+        return
     pin(rows, pin_targets, vectors[1])
     pin(rows, pin_targets, vectors[2])
-    return place(rows, positions, pin_targets, vectors[0])
+    place(rows, positions, pin_targets, vectors[0])
 
 
 @kernel
 def solve(
-    plan, bundles, edges, form, rows, vectors, right, p, target, force, pin_targets, guess,
-    iterations, limit, floor, every, threads, team, out,
-):  # fmt: skip
-    """A whole step; `limit`, `floor` and `every` as in `iterate`, but `floor` for a largest coordinate of one.
+    plan, bundles, edges, form, rows, vectors, right, p, target, force, pin_targets, guess, limits, threads, team, out
+):
+    """A whole step; limits: see `solvers.kernels.loop`.
 
-    Returns the count of iterations, the residual [J^(1/2)], and whether it is at most `limit`, or `floor`.
+    Returns the count of iterations, the residual [J^(1/2)] and what ended them.
     """
     state(rows, target, force, pin_targets, right)
-    floor *= start(rows, vectors, p, guess, pin_targets)
-    count, residual, x = iterate(
-        plan, bundles, edges, form, vectors, right, p, iterations, limit, floor, every, threads, team
-    )
+    start(rows, vectors, p, guess, pin_targets)
+    count, residual, x = iterate(plan, bundles, edges, form, vectors, right, p, limits, threads, team)
     if p is None:
         fetch(rows, x, out)
     else:
         fetch(rows, p, out)
-    return count, residual, residual <= limit, residual <= floor
+    return count, residual, verdict(residual, limits)

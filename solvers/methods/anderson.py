@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from solvers.about import About, Reference
+from solvers.core.acceleration import Scheme
 from solvers.kernels.accelerate_coefficients import ANDERSON, require_pairs
 from solvers.linear.choice import Linear, Precision
-from solvers.methods.quasi_newton import Method, PreparedAccelerated, prepare
+from solvers.methods.quasi_newton import PreparedAccelerated, prepare
 from solvers.problem import System
 
 
@@ -46,4 +47,4 @@ class Anderson:
 
     def prepare(self, system: System) -> PreparedAccelerated:
         """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
-        return prepare(system, Method("anderson", ANDERSON, self.pairs, 0, True), self.linear, self.precision)
+        return prepare(system, Scheme("anderson", ANDERSON, self.pairs, 0, True), self.linear, self.precision)

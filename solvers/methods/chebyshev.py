@@ -19,9 +19,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from solvers.about import About, Reference
+from solvers.core.acceleration import Scheme
 from solvers.kernels.accelerate_coefficients import CHEBYSHEV
 from solvers.linear.choice import Linear, Precision
-from solvers.methods.quasi_newton import Method, PreparedAccelerated, prepare
+from solvers.methods.quasi_newton import PreparedAccelerated, prepare
 from solvers.problem import System
 
 
@@ -46,4 +47,4 @@ class Chebyshev:
 
     def prepare(self, system: System) -> PreparedAccelerated:
         """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
-        return prepare(system, Method("chebyshev", CHEBYSHEV, 1, 0, True), self.linear, self.precision)
+        return prepare(system, Scheme("chebyshev", CHEBYSHEV, 1, 0, True), self.linear, self.precision)

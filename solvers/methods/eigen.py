@@ -23,8 +23,8 @@ from scipy.sparse import csr_array
 
 from solvers import matrices
 from solvers.about import LIU_2013, LOCAL_GLOBAL, About
+from solvers.core.prefactored import PreparedLocalGlobal, only_springs
 from solvers.energies.springs import Springs
-from solvers.methods.local_global import PreparedLocalGlobal, only_springs
 from solvers.problem import NotPositiveDefinite, Positions, System, Unsupported
 
 HEADERS = Path(__file__).parent

@@ -25,11 +25,13 @@ from typing import ClassVar
 import numpy as np
 
 from solvers.about import About, Reference
+from solvers.core.acceleration import Accelerating
 from solvers.core.descent import DECREASE, Metric, Point, PreparedDescent, dot, search
 from solvers.core.objective import Hessian, Objective, StepObjective
+from solvers.kernels.loop import NEVER, STALLED, Limits, at_most
 from solvers.methods.lbfgs import Lbfgs
 from solvers.methods.newton import NewtonMethod
-from solvers.methods.quasi_newton import PreparedAccelerated, Run
+from solvers.methods.quasi_newton import PreparedAccelerated
 from solvers.problem import Positions, System
 
 _PROBE, _ROUND, _RELAXED = 4, 10, 5
@@ -109,18 +111,18 @@ class HybridMethod:
         """The points after `start`, until the exact method does better."""
         point = start
         predicting = _Predicting(self, step, start)
-        run: Run | None = self._lbfgs.engine.begin(step.problem, point.positions)
-        _, before, _ = run.advance(0, 0.0, 0.0, False)
-        _, residual, _ = run.advance(_PROBE, 0.0, 0.0, False)
+        run: Accelerating | None = self._lbfgs.begin(step.problem, point.positions)
+        before = run.residual()
+        _, residual, _ = run.iterate(at_most(_PROBE))
         gain, newton_gain = (np.inf, 0.0) if residual <= _QUICK * before else (0.0, np.inf)
         iterations, fallen, ended = _ROUND - _PROBE, 0.0, False
         while not ended:
             if gain > newton_gain:
                 if run is None:
-                    run, fallen = self._lbfgs.engine.begin(step.problem, point.positions), 0.0
-                _, residual, ended = run.advance(iterations, 0.0, 0.0, False)
+                    run, fallen = self._lbfgs.begin(step.problem, point.positions), 0.0
+                _, residual, verdict = run.iterate(at_most(iterations))
                 following, iterations = _reached(run), _ROUND
-                ended |= residual**2 <= self.metric.round_off(following.positions)
+                ended = verdict == STALLED or residual**2 <= self.metric.round_off(following.positions)
                 last, gain, fallen = gain, run.fallen - fallen or _gain(step, point, following), run.fallen
                 if newton_gain == 0.0 and (gain == 0.0 or gain > _SLOW * last):
                     newton_gain = np.inf
@@ -143,8 +145,8 @@ class HybridMethod:
 
     def relaxed(self, step: StepObjective, p: Positions) -> Point:
         """Where some iterations of L-BFGS lead from p."""
-        run = self._lbfgs.engine.begin(step.problem, p)
-        run.advance(_RELAXED, float("nan"), 0.0, False)
+        run = self._lbfgs.begin(step.problem, p)
+        run.iterate(Limits(_RELAXED, 0.0, 0.0, NEVER))
         return _reached(run)
 
 
@@ -220,5 +222,5 @@ def _lower(step: StepObjective, start: Point) -> Point:
     return Point(fall, step.gradient(fall)) if step.rise(start.positions, fall)[0] < 0.0 else start
 
 
-def _reached(run: Run) -> Point:
+def _reached(run: Accelerating) -> Point:
     return Point(run.positions.copy(), run.gradient())

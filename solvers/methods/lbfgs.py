@@ -16,9 +16,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from solvers.about import About, Reference
+from solvers.core.acceleration import Scheme
 from solvers.kernels.accelerate_coefficients import LBFGS, require_pairs
 from solvers.linear.choice import Linear, Precision
-from solvers.methods.quasi_newton import Method, PreparedAccelerated, prepare
+from solvers.methods.quasi_newton import PreparedAccelerated, prepare
 from solvers.problem import System
 
 
@@ -49,4 +50,4 @@ class Lbfgs:
 
     def prepare(self, system: System) -> PreparedAccelerated:
         """Raises NotPositiveDefinite, and Unsupported where Q fits nowhere."""
-        return prepare(system, Method("lbfgs", LBFGS, self.pairs, 5, False), self.linear, self.precision)
+        return prepare(system, Scheme("lbfgs", LBFGS, self.pairs, 5, False), self.linear, self.precision)

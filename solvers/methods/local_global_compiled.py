@@ -7,7 +7,7 @@ digits, and only the way there differs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
@@ -19,19 +19,21 @@ from scipy.sparse import csr_array
 
 from solvers.about import LIU_2013, LOCAL_GLOBAL, About
 from solvers.contact.touching import without_contact
+from solvers.core.driver import Iterating, Iterative, largest
 from solvers.core.parts import Parts, split
+from solvers.core.prefactored import PreparedLocalGlobal, Project, prepared, projective
 from solvers.energies.springs import Springs
 from solvers.kernels import springs as kernels
 from solvers.kernels import step, step_ends
 from solvers.kernels.edges import Edges
+from solvers.kernels.loop import ONE, Limits
 from solvers.kernels.plan import Order, of_inverse, of_supernodal, vectors
 from solvers.linear.choice import Linear, Precision, factorise
 from solvers.linear.inverse import Inverse
 from solvers.linear.supernodal import Supernodal
 from solvers.linear.team import Team
 from solvers.memory import aligned
-from solvers.methods.local_global import PreparedLocalGlobal, Project, prepared, projective
-from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System
+from solvers.problem import Positions, Prepared, ResidualOf, StepProblem, System
 
 FAR = 1e100
 """Where the springs end that fill up bundles: at no vertex, whatever the unit of length."""
@@ -95,7 +97,7 @@ def compiled(base: PreparedLocalGlobal, *, corrects: bool = False) -> PreparedCo
     )
 
 
-class _Work(NamedTuple):
+class Work(NamedTuple):
     """What the kernels write to: three vectors and scratch, the right-hand side, positions to be corrected or None."""
 
     vectors: tuple[NDArray[Any], ...]
@@ -104,13 +106,15 @@ class _Work(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedCompiled:
+class PreparedCompiled(Iterative):
     """The iterations over a factor's own rows (see `solvers.kernels.step`).
 
     base: the same, step by step; parts: of the energies; plan: of an iteration; bundles: of the springs
     in its local step; edges: beside them; form: of
     |e|_Q^2; rows: of the vertices; far: the last row.
     """
+
+    residual_of: ClassVar[ResidualOf] = "previous"
 
     base: PreparedLocalGlobal
     parts: Parts
@@ -189,65 +193,27 @@ class PreparedCompiled:
     @property
     def choice(self) -> str:
         """The linear solver in words, and how many of the allowed threads a step uses where that is not all."""
-        allowed, used = numba.get_num_threads(), self._threads() or 1
+        allowed, used = numba.get_num_threads(), self.threads() or 1
         if used == allowed:
             return self.base.choice
         why = "the system is too small for a second thread to pay" if used == 1 else f"its factor comes in {used} parts"
         return f"{self.base.choice}; {used} of {allowed} threads: {why}"
 
-    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The iterates from `problem.first_guess`; the yielded array is overwritten by the next one."""
-        (a, b, c, e), right, p = work = self._new()
-        team = Team.of(int(self.plan.top[2]))
-        target, force, pins, _, guess = self._arrays(problem)
-        step_ends.state(self.rows, target, force, pins, right)
-        step_ends.start(self.rows, work.vectors, p, guess, pins)
-        out, edges = np.empty_like(target), self.parts.begun(self.edges, problem)
-        while True:
-            step.iterate(
-                self.plan,
-                self.bundles,
-                edges,
-                self.form,
-                (a, b, c, e),
-                right,
-                p,
-                1,
-                np.nan,
-                0.0,
-                False,
-                self._threads(),
-                team,
-            )
-            a, b = b, a
-            step_ends.fetch(self.rows, a if p is None else p, out)
-            yield out
+    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+        """See Iterative."""
+        return _Iterating(self, problem, guess)
 
-    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Iterate until `stop` says so; without a tolerance only the last residual is computed."""
-        target, force, pins, current, guess = self._arrays(problem)
-        out = np.empty_like(target)
-        edges = self.parts.begun(self.edges, problem)
-        fixed = self.plan, self.bundles, edges, self.form, self.rows, *self._work, target, force, pins
-        threads = self._threads()
-        floor = stop.floor * self.base.trace**0.5
-        limit, yardstick, every = 0.0, float("nan"), stop.tolerance is not None
-        if stop.tolerance is not None:
-            _, yardstick, _, _ = step_ends.solve(*fixed, current, 1, 0.0, 0.0, False, threads, self._team, out)
-            limit = stop.tolerance * yardstick
-        count, residual, enough, at_rest = step_ends.solve(
-            *fixed, guess, stop.iterations, limit, floor, every, threads, self._team, out
-        )
-        stopped = "iterations" if not every or not (enough or at_rest) else "tolerance" if enough else "floor"
-        return Solution(out, count, residual, yardstick, stopped)
+    def scale(self, problem: StepProblem) -> float:
+        """See Iterative."""
+        return largest(problem) * self.base.trace**0.5
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """The local step over all springs at the first guess, and a solve with the factor as it is, once.
 
         Within a step neither is done alone: blocks take turns at both.
         """
-        (a, b, _, _), right, p = work = self._new()
-        target, force, pins, _, guess = self._arrays(problem)
+        (a, b, _, _), right, p = work = self.memory()
+        target, force, pins, guess = self.arrays(problem, problem.first_guess)
         step_ends.state(self.rows, target, force, pins, right)
         step_ends.start(self.rows, work.vectors, p, guess, pins)
 
@@ -260,32 +226,76 @@ class PreparedCompiled:
         y, out = self.base.system.inertia[:, None] * target + force, np.zeros_like(target)
         return {"local": local, "global": lambda: self.base.correction(y, out)}
 
-    def _arrays(self, problem: StepProblem) -> list[Positions]:
-        """The problem's arrays. The kernels are compiled for arrays that may be written to: what may not is copied."""
-        p = problem
-        given = (p.target, self.parts.force(p), p.pin_targets, p.current, p.first_guess)
+    def arrays(self, problem: StepProblem, guess: Positions) -> list[Positions]:
+        """The problem's target, force and pin targets, and the guess. The kernels are compiled for arrays that may be
+        written to: what may not is copied."""
+        given = (problem.target, self.parts.force(problem), problem.pin_targets, guess)
         return [x if x.flags.carray else np.array(x, np.float64, order="C") for x in given]
 
     @cached_property
-    def _team(self) -> Team:
+    def team(self) -> Team:
+        """The threads of whole solves."""
         return Team.of(int(self.plan.top[2]))
 
     @cached_property
-    def _work(self) -> _Work:
-        return self._new()
+    def work(self) -> Work:
+        """The memory of whole solves, one after the other."""
+        return self.memory()
 
-    def _new(self) -> _Work:
+    def memory(self) -> Work:
+        """Memory for one solve."""
         rows, dtype = len(self.plan.held), self.plan.squares.dtype
         arrays = vectors(dtype, rows)
         p = None if dtype == np.float64 else aligned(4 * rows)
         for x in arrays[:3] if p is None else [p]:
             x[4 * self.far] = FAR
-        return _Work(arrays, self.bundles.right(self.plan.held), p)
+        return Work(arrays, self.bundles.right(self.plan.held), p)
 
-    def _threads(self) -> int | None:
+    def threads(self) -> int | None:
         """As many as are allowed and as there are groups of subtrees; None for one."""
         threads = min(numba.get_num_threads(), int(self.plan.top[2]))
         return threads if threads > 1 else None
+
+
+class _Iterating(Iterating):
+    """A solve is one call, in memory that all solves share; who advances by hand instead has memory of his own."""
+
+    def __init__(self, prepared: PreparedCompiled, problem: StepProblem, guess: Positions) -> None:
+        self._prepared, self._problem, self._guess = prepared, problem, guess
+        self._arrays, self._edges = prepared.arrays(problem, guess), prepared.parts.begun(prepared.edges, problem)
+        self.positions = np.empty_like(problem.target)
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating; from the first guess on."""
+        made = self._prepared
+        fixed = made.plan, made.bundles, self._edges, made.form, made.rows, *made.work, *self._arrays
+        return step_ends.solve(*fixed, limits, made.threads(), made.team, self.positions)
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        made = self._prepared
+        (a, b, c, e), right, p = self._own
+        fixed = made.plan, made.bundles, self._edges, made.form, (a, b, c, e), right, p
+        step.iterate(*fixed, ONE, made.threads(), self._team)
+        self._own = Work((b, a, c, e), right, p)
+        step_ends.fetch(made.rows, b if p is None else p, self.positions)
+        return True
+
+    def residual(self) -> float:
+        """|p - LG(p)|_Q of the previous positions p."""
+        (a, b, _, e), _, p = self._own
+        return step.length(self._prepared.plan, self._prepared.form, a, b, p, e)
+
+    @cached_property
+    def _own(self) -> Work:
+        work, (target, force, pins, guess) = self._prepared.memory(), self._arrays
+        step_ends.state(self._prepared.rows, target, force, pins, work.right)
+        step_ends.start(self._prepared.rows, work.vectors, work.p, guess, pins)
+        return work
+
+    @cached_property
+    def _team(self) -> Team:
+        return Team.of(int(self._prepared.plan.top[2]))
 
 
 def _projection(springs: Springs, n: int) -> Project:

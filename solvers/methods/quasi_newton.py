@@ -12,89 +12,49 @@ tells, the solve has "stalled", and its iterates stay where they are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from solvers.contact.touching import without_contact
+from solvers.core.acceleration import Accelerating, Engine, Interpreted, Scheme, window_for
+from solvers.core.driver import Iterative, largest
 from solvers.core.objective import Objective, StepObjective
 from solvers.core.parts import Parts
-from solvers.kernels import accelerate, accelerate_step, step_ends
+from solvers.core.prefactored import PreparedLocalGlobal, prepared, projective
+from solvers.kernels import accelerate_step, step_ends
 from solvers.kernels.accelerate import Window
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.edges import Edges
+from solvers.kernels.loop import ONE, Limits, at_most
 from solvers.linear.choice import Linear, Precision, factorise
 from solvers.memory import aligned
-from solvers.methods.local_global import PreparedLocalGlobal, prepared, projective
 from solvers.methods.local_global_compiled import FAR, PreparedCompiled, compiled
-from solvers.problem import Positions, ProjectiveEnergy, Solution, StepProblem, StopRule, System
+from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
 
 
-@dataclass(frozen=True)
-class Method:
-    """name: in the registry; coefficients: which, see `accelerate_coefficients`; pairs: kept in the window; retries:
-    shorter steps along a direction before the plain correction; projective: whether other energies are refused."""
-
-    name: str
-    coefficients: int
-    pairs: int
-    retries: int
-    projective: bool
-
-
-class Run(Protocol):
-    """A solve that has begun. positions (n, 3): where it is; largest: coordinate of the first guess."""
-
-    positions: Positions
-    largest: float
-
-    @property
-    def fallen(self) -> float:
-        """By how much the objective fell so far [J], where round-off does not hide it."""
-        ...
-
-    def advance(self, iterations: int, limit: float, floor: float, every: bool) -> tuple[int, float, bool]:
-        """Iterate, as `accelerate_step.run` does."""
-        ...
-
-    def gradient(self) -> Positions:
-        """That of the objective [N], (n, 3), where it is."""
-        ...
-
-
-def prepare(system: System, method: Method, linear: Linear, precision: Precision) -> PreparedAccelerated:
+def prepare(system: System, scheme: Scheme, linear: Linear, precision: Precision) -> PreparedAccelerated:
     """Factorise Q and compile. Raises Unsupported for energies that the method does not take, NotPositiveDefinite."""
     bare = without_contact(system)
     energies = (
-        projective(bare, method.name)
-        if method.projective
+        projective(bare, scheme.name)
+        if scheme.projective
         else [energy for energy in bare.energies if isinstance(energy, ProjectiveEnergy)]
     )
     base = prepared(bare, energies, lambda Q: factorise(Q, linear, precision))
     found = compiled(base, corrects=True)
     known = isinstance(found, PreparedCompiled)
     base = found.base if known else replace(base, choice=f"{base.choice}; {found}")
-    engine: Engine = _Compiled(method, found) if known else _Interpreted(method, base)
+    engine: Engine = _Compiled(scheme, found) if known else _Any(scheme, base)
     if bare is not system:
         from solvers.contact.quasi_newton import Touching  # for those who need it
 
-        engine = Touching(method, base, engine)
+        engine = Touching(scheme, base, engine)
     return PreparedAccelerated(base, engine)
 
 
-class Engine(Protocol):
-    """Begins solves."""
-
-    def begin(self, problem: StepProblem, guess: Positions) -> Run:
-        """A run from a first guess (n, 3)."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
-class PreparedAccelerated:
+class PreparedAccelerated(Iterative):
     """A method, ready for a system. base: the prefactored Q; engine: what iterates."""
 
     base: PreparedLocalGlobal
@@ -110,54 +70,20 @@ class PreparedAccelerated:
         """The linear solver in words."""
         return self.base.choice
 
-    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The iterates from `problem.first_guess`; the yielded array is overwritten by the next one."""
-        run = self.engine.begin(problem, problem.first_guess)
-        while True:
-            run.advance(1, np.nan, 0.0, False)
-            yield run.positions
+    def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
+        """See Iterative."""
+        return self.engine.begin(problem, guess)
 
-    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Iterate until `stop` says so, or round-off; without a tolerance only the last residual is computed."""
-        every, limit, yardstick = stop.tolerance is not None, 0.0, float("nan")
-        if stop.tolerance is not None:
-            _, yardstick, _ = self.engine.begin(problem, problem.current).advance(0, 0.0, 0.0, False)
-            limit = stop.tolerance * yardstick
-        run = self.engine.begin(problem, problem.first_guess)
-        floor = stop.floor * run.largest * self.base.trace**0.5
-        count, residual, stalled = run.advance(stop.iterations, limit, floor, every)
-        stopped = "iterations"
-        if every and count and residual <= max(limit, floor):
-            stopped = "tolerance" if residual <= limit else "floor"
-        elif stalled:
-            stopped = "stalled"
-        return Solution(run.positions, count, residual, yardstick, stopped)
-
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """None: an iteration has no parts that stand alone."""
-        return {}
-
-
-def window_for(method: Method, entries: int, whole: int, precision: Any = np.float64) -> Window:
-    """Memory for the unknowns' entries, in vectors that have `whole` of them; precision: the factor's."""
-    m = method.pairs
-    now = np.zeros(1, accelerate.NOW)
-    now["method"], now["retries"] = method.coefficients, method.retries
-    steps, images, correction, direction = (aligned(k * entries, precision) for k in (m, m, 1, 1))
-    position, trial, descent, there = (aligned(whole) for _ in range(4))
-    sy, wy = np.zeros((2, m, m))
-    sg, wg, a, b = np.zeros((4, m))
-    block = aligned(accelerate.BLOCK)
-    return Window(
-        steps, images, position, trial, descent, there, correction, direction, block, sy, wy, sg, wg, a, b, now
-    )
+    def scale(self, problem: StepProblem) -> float:
+        """See Iterative."""
+        return largest(problem) * self.base.trace**0.5
 
 
 class _Compiled:
     """Springs and what is like them, over a factor that is cut into blocks."""
 
-    def __init__(self, method: Method, compiled: PreparedCompiled) -> None:
-        self._method = method
+    def __init__(self, scheme: Scheme, compiled: PreparedCompiled) -> None:
+        self._scheme = scheme
         self._parts, self._edges, self._form = compiled.parts, compiled.edges, compiled.form
         plan, bundles, self._rows = compiled.plan, compiled.bundles, compiled.rows
         pins = compiled.base.system.pins
@@ -168,24 +94,25 @@ class _Compiled:
 
     def _new(self) -> _State:
         whole = 4 * len(self._plan.held)
-        window = window_for(self._method, self._entries, whole, self._plan.squares.dtype)
+        window = window_for(self._scheme, self._entries, whole, self._plan.squares.dtype)
         window.trial[4 * self._far] = FAR
         x = aligned(whole, self._plan.squares.dtype)
         vectors = self._bundles.right(self._plan.held), x, aligned(whole), np.zeros(3)
         return accelerate_step.Step(self._plan, self._bundles, self._form, self._shares, self._rows, *vectors), window
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Run:
+    def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
         """See Engine."""
         state = self._idle.pop() if self._idle else self._new()
-        return _CompiledRun(self._idle, state, self._parts, self._parts.begun(self._edges, problem), problem, guess)
+        edges, given = self._parts.begun(self._edges, problem), (problem, guess)
+        return _CompiledAccelerating(self._idle, state, self._parts, edges, *given)
 
 
 _State = tuple[accelerate_step.Step, Window]
 """The memory of a run."""
 
 
-class _CompiledRun:
-    """See Run. idle: where its memory goes when it is not needed any more."""
+class _CompiledAccelerating(Accelerating):
+    """See Accelerating. idle: where its memory goes when it is not needed any more."""
 
     def __init__(
         self,
@@ -199,24 +126,32 @@ class _CompiledRun:
         self._idle, self._memory = idle, state
         step, window = state
         self._state = step, edges, window
-        given = (problem.target, parts.force(problem), problem.pin_targets, guess)
+        # The kernels are compiled for arrays that may be written to.
+        given = [np.array(x, order="C") for x in (problem.target, parts.force(problem), problem.pin_targets, guess)]
         step.objective[2] = parts.negative(guess)
         self.positions = np.empty_like(guess)
-        # The kernels are compiled for arrays that may be written to.
-        self.largest = accelerate_step.start(*self._state, *(np.array(x, order="C") for x in given))
+        accelerate_step.start(*self._state, *given)
         step.objective[1] += parts.size(guess)
 
-    def advance(self, iterations: int, limit: float, floor: float, every: bool) -> tuple[int, float, bool]:
-        """See Run."""
-        return accelerate_step.run(*self._state, iterations, limit, floor, every, self.positions)
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating."""
+        return accelerate_step.run(*self._state, limits, self.positions)
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        return self.iterate(ONE)[0] == 1
+
+    def residual(self) -> float:
+        """See Iterating."""
+        return self.iterate(at_most(0))[1]
 
     @property
     def fallen(self) -> float:
-        """See Run."""
+        """See Accelerating."""
         return float(self._state[-1].now["fallen"][0])
 
     def gradient(self) -> Positions:
-        """See Run."""
+        """See Accelerating."""
         step, _, window = self._state
         out = np.empty_like(self.positions)
         step_ends.fetch(step.rows, window.descent, out)
@@ -226,73 +161,12 @@ class _CompiledRun:
         self._idle.append(self._memory)
 
 
-class _Interpreted:
+class _Any:
     """Any energies, and any factor."""
 
-    def __init__(self, method: Method, base: PreparedLocalGlobal) -> None:
-        self._method, self._base, self._objective = method, base, Objective(base.system)
+    def __init__(self, scheme: Scheme, base: PreparedLocalGlobal) -> None:
+        self._scheme, self._base, self._objective = scheme, base, Objective(base.system)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Run:
+    def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
         """See Engine."""
-        window = window_for(self._method, guess.size, guess.size)
-        return InterpretedRun(self._base, window, StepObjective(self._objective, problem), guess)
-
-
-class InterpretedRun:
-    """See Run."""
-
-    def __init__(self, base: PreparedLocalGlobal, window: Window, objective: StepObjective, guess: Positions) -> None:
-        self._base, self._window, self._objective = base, window, objective
-        self.positions, self._trial, self._there = (
-            x.reshape(-1, 3) for x in (window.position, window.trial, window.descent_there)
-        )
-        self._image = np.zeros_like(self._trial)
-        self._trial[:] = objective.placed(guess)
-        self.largest = float(np.abs(self._trial).max(initial=0.0))
-        self._look()
-        accelerate.begin(window, self._solved())
-
-    def _look(self) -> None:
-        np.negative(self._objective.gradient(self._trial), out=self._there)
-
-    def _solved(self) -> NDArray[np.float64]:
-        self._base.correction(self._there, self._image)
-        return self._image.ravel()
-
-    def _accept(self) -> None:
-        accelerate.accept(self._window, self._solved())
-
-    def _residual(self) -> float:
-        e = self._window.correction.reshape(-1, 3).copy()
-        e[self._base.system.pins.vertices] = 0.0
-        return self._base.norm(e)
-
-    @property
-    def fallen(self) -> float:
-        """See Run."""
-        return float(self._window.now["fallen"][0])
-
-    def gradient(self) -> Positions:
-        """See Run."""
-        return -self._window.descent.reshape(-1, 3)
-
-    def advance(self, iterations: int, limit: float, floor: float, every: bool) -> tuple[int, float, bool]:
-        """See Run; the loop of `accelerate_step.run`."""
-        window, now = self._window, self._window.now
-        residual = self._residual() if iterations == 0 else np.inf
-        count, verdict = 0, accelerate.AGAIN
-        while count < iterations and not (every and residual <= max(limit, floor)):
-            accelerate.propose(window)
-            verdict = accelerate.AGAIN
-            while verdict == accelerate.AGAIN:
-                self._look()
-                rise, noise = self._objective.rise(self.positions, self._trial)
-                now["rise"], now["noise"] = rise, noise
-                verdict = accelerate.judge(window)
-            if verdict == accelerate.STALLED:
-                return count, self._residual(), True
-            count += 1
-            self._accept()
-            if every or count == iterations:
-                residual = self._residual()
-        return count, residual, False
+        return Interpreted(self._base, self._scheme, StepObjective(self._objective, problem), guess)

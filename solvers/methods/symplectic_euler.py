@@ -14,7 +14,6 @@ omega of a sheet, and 1.28 times that of a solid.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from math import ceil
 from typing import ClassVar
@@ -23,13 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.about import About, Reference
-from solvers.core import vertex_terms as blocks
+from solvers.core import vertex_terms
+from solvers.core.driver import Iterating, Iterative
+from solvers.core.prefactored import only_springs
 from solvers.energies.springs import Springs
 from solvers.kernels.explicit import advance
+from solvers.kernels.loop import ITERATIONS, Limits
 from solvers.kernels.springs import Bundles
 from solvers.memory import aligned
-from solvers.methods.local_global import only_springs
-from solvers.problem import Positions, Solution, StepProblem, StopRule, System, Unsupported
+from solvers.problem import Positions, ResidualOf, StepProblem, System, Unsupported
 
 _SAFETY = 0.95
 """Of the limit's h: at the limit itself a vibration neither grows nor keeps its size, and springs are not linear."""
@@ -65,8 +66,8 @@ class SymplecticEuler:
         """Raises Unsupported for energies other than springs, integrators other than implicit Euler, vertices without
         mass that are not pinned, and steps that would take too many substeps."""
         springs, n = only_springs(system, "symplectic-euler"), system.vertices
-        blocks.require_implicit_euler(system, "symplectic-euler")
-        blocks.require_mass(system, np.where(system.unpinned, system.mass, np.inf), "symplectic-euler")
+        vertex_terms.require_implicit_euler(system, "symplectic-euler")
+        vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), "symplectic-euler")
         omega = frequency_bound(system, springs)
         needed = max(1.0, ceil(system.time_step * omega / (2.0 * _SAFETY)))
         if needed * max(1, len(springs.edges)) > _MOST:
@@ -92,8 +93,10 @@ def frequency_bound(system: System, springs: Springs) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedSymplecticEuler:
+class PreparedSymplecticEuler(Iterative):
     """bundles: of the springs at unpinned vertices; substeps: of a step."""
+
+    residual_of: ClassVar[ResidualOf] = "none"
 
     system: System
     bundles: Bundles
@@ -101,20 +104,9 @@ class PreparedSymplecticEuler:
     choice: str
     facts: dict[str, float] = field(default_factory=dict)
 
-    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The positions after the step, again and again."""
-        p, _ = self._step(problem)
-        while True:
-            yield p
-
-    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """The positions and the velocity after the step."""
-        p, v = self._step(problem)
-        return Solution(p, 1, np.nan, np.nan, "iterations", v)
-
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """None: there are no iterations."""
-        return {}
+    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+        """See Iterative; the whole step."""
+        return _Done(*self._step(problem))
 
     def _step(self, problem: StepProblem) -> tuple[Positions, Positions]:
         s, pins, start = self.system, self.system.pins.vertices, problem.start
@@ -135,3 +127,18 @@ class PreparedSymplecticEuler:
         out = aligned(4 * (self.system.vertices + 2))
         out.reshape(-1, 4)[: self.system.vertices, :3] = x
         return out
+
+
+class _Done(Iterating):
+    """The only iterate, again and again."""
+
+    def __init__(self, p: Positions, v: Positions) -> None:
+        self.positions, self.velocity = p, v
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        return True
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating."""
+        return 1, float("nan"), ITERATIONS

@@ -18,7 +18,7 @@ again at w_1. With these restarts rho needs no tuning: too large a one is no wor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -27,16 +27,17 @@ from numpy.typing import NDArray
 
 from solvers.about import About, Reference
 from solvers.contact.touching import ContactEnergy, touching, without_contact
-from solvers.core import colouring
-from solvers.core import vertex_terms as blocks
+from solvers.core import colouring, vertex_terms
+from solvers.core.driver import Iterating, Iterative, largest
 from solvers.core.parts import Parts, split
 from solvers.kernels import vbd as kernels
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.half_spaces import HalfSpaces
+from solvers.kernels.loop import EACH, ITERATIONS, LAST, Limits
 from solvers.kernels.springs import Bundles
 from solvers.memory import aligned
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, System, Unsupported
+from solvers.problem import Positions, Prepared, StepProblem, System, Unsupported
 from solvers.vectors.springs import LANES
 from solvers.vectors.vbd import NUMBERS
 
@@ -88,7 +89,7 @@ class VertexBlockDescent:
         colour[pinned] = -1
         bundles, _ = Bundles.of(parts.whole, row, colour, coloured.colours, n, n + 1)
         held, majorant = np.zeros(n + 2), np.ones(n + 2)
-        held[: len(order)] = majorant[: len(order)] = (blocks.held(system) + parts.held)[order]
+        held[: len(order)] = majorant[: len(order)] = (vertex_terms.held(system) + parts.held)[order]
         ends = np.repeat(bundles.own.reshape(-1, LANES), np.diff(bundles.start), axis=0)
         np.add.at(majorant, ends.ravel() // 4, bundles.each()[1])
         shares = Shares.of(bundles, held, row[pinned])
@@ -106,7 +107,7 @@ class VertexBlockDescent:
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedVertexBlockDescent:
+class PreparedVertexBlockDescent(Iterative):
     """parts: of the energies; blocks: of the free vertices; row (n,): where each vertex is in them; held: what
     inertia and pins hold each row with [N/m]; trace: of the majorant, over vertices that no pin holds [N/m]; measure:
     one iteration of local-global from p tells the residual at p, and is asked for nothing else."""
@@ -126,67 +127,73 @@ class PreparedVertexBlockDescent:
         """Exact counts of what was built."""
         return self.measure.facts
 
-    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The iterates from `problem.first_guess`."""
-        advance = self._begin(problem, touching(problem))
-        while True:
-            yield advance(1)
+    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+        """See Iterative."""
+        return _Iterating(self, problem, guess)
 
-    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Iterate until `stop` says so; the residual is that of the positions."""
-        contacts = touching(problem)
-        advance, gauge = self._begin(problem, contacts), self._gauge(problem, contacts)
-        if stop.tolerance is None:
-            p = advance(stop.iterations)
-            return Solution(p, stop.iterations, gauge(p), np.nan, "iterations")
-        p = problem.first_guess
-        floor = stop.floor * float(np.abs(p).max(initial=0.0)) * self.trace**0.5
-        yardstick = residual = gauge(problem.current)
-        limit = stop.tolerance * yardstick
-        for iteration in range(1, stop.iterations + 1):
-            p = advance(1)
-            residual = gauge(p)
-            if residual <= max(limit, floor):
-                return Solution(p, iteration, residual, yardstick, "tolerance" if residual <= limit else "floor")
-        return Solution(p, stop.iterations, residual, yardstick, "iterations")
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """See Iterative; by an iteration of local-global, where nothing is touched."""
+        return self.gauge(problem, touching(problem))(p)
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """None: an iteration has no parts."""
-        return {}
-
-    def _begin(self, problem: StepProblem, contacts: list[ContactEnergy]) -> Callable[[int], Positions]:
-        """A function that does the given number of iterations more and returns a copy of the positions it reached."""
-        pull = blocks.pull(replace(problem, force=self.parts.force(problem)))
-        p, y = (self._rows(x) for x in (blocks.placed(problem.first_guess, problem), pull))
-        right = self.blocks.bundles.right(self.held, y)
-        spaces = self._spaces(contacts) if contacts else None
-        p[-4] = _FAR
-        entries = int(np.diff(self.blocks.bundles.start).max(initial=0))
-        scratch = aligned(NUMBERS * LANES * entries)
-        work = kernels.Work(p.copy(), p.copy(), np.zeros_like(p), scratch, np.zeros(1), np.full(1, np.nan))
-
-        def advance(iterations: int) -> Positions:
-            kernels.iterate(self.blocks, spaces, right, self.spectral_radius, work, p, iterations)
-            return p.reshape(-1, 4)[self.row, :3].copy()
-
-        return advance
-
-    def _rows(self, x: Positions) -> NDArray[np.float64]:
-        """x (n, 3) in rows of four, and the two rows that fill up bundles."""
-        out = aligned(4 * (len(x) + 2))
-        out.reshape(-1, 4)[self.row, :3] = x
-        return out
-
-    def _spaces(self, contacts: list[ContactEnergy]) -> HalfSpaces:
-        from solvers.contact.bundles import half_spaces  # for those who need it
-
-        return half_spaces(contacts, self.row, self.blocks.bundles, self.blocks.unknowns)
-
-    def _gauge(self, problem: StepProblem, contacts: list[ContactEnergy]) -> Callable[[Positions], float]:
-        """What tells |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices."""
+    def gauge(self, problem: StepProblem, contacts: list[ContactEnergy]) -> Callable[[Positions], float]:
+        """What tells the residual [J^(1/2)] at positions (n, 3)."""
         if contacts:
             from solvers.contact.local_global import PreparedContact
 
             assert isinstance(self.measure, PreparedContact)
             return self.measure.gauge(problem)
-        return lambda p: self.measure.solve(replace(problem, first_guess=p), StopRule(1)).residual
+        return lambda p: self.measure.residual_at(problem, p)
+
+    def scale(self, problem: StepProblem) -> float:
+        """See Iterative."""
+        return largest(problem) * self.trace**0.5
+
+    def in_rows(self, x: Positions) -> NDArray[np.float64]:
+        """x (n, 3) in rows of four, and the two rows that fill up bundles."""
+        out = aligned(4 * (len(x) + 2))
+        out.reshape(-1, 4)[self.row, :3] = x
+        return out
+
+    def spaces(self, contacts: list[ContactEnergy]) -> HalfSpaces:
+        """What is touched."""
+        from solvers.contact.bundles import half_spaces  # for those who need it
+
+        return half_spaces(contacts, self.row, self.blocks.bundles, self.blocks.unknowns)
+
+
+class _Iterating(Iterating):
+    def __init__(self, prepared: PreparedVertexBlockDescent, problem: StepProblem, guess: Positions) -> None:
+        contacts, blocks = touching(problem), prepared.blocks
+        self._prepared, self._gauge = prepared, prepared.gauge(problem, contacts)
+        pull = vertex_terms.pull(replace(problem, force=prepared.parts.force(problem)))
+        p, y = (prepared.in_rows(x) for x in (vertex_terms.placed(guess, problem), pull))
+        self._right = blocks.bundles.right(prepared.held, y)
+        self._spaces = prepared.spaces(contacts) if contacts else None
+        p[-4] = _FAR
+        entries = int(np.diff(blocks.bundles.start).max(initial=0))
+        scratch = aligned(NUMBERS * LANES * entries)
+        self._work = kernels.Work(p.copy(), p.copy(), np.zeros_like(p), scratch, np.zeros(1), np.full(1, np.nan))
+        self._rows, self.positions = p, guess
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        self._sweep(1)
+        return True
+
+    def residual(self) -> float:
+        """See Iterating."""
+        return self._gauge(self.positions)
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating; all at once where no residual may end them."""
+        if limits.wanted == EACH:
+            return super().iterate(limits)
+        self._sweep(limits.iterations)
+        return limits.iterations, self.residual() if limits.wanted == LAST else float("nan"), ITERATIONS
+
+    def _sweep(self, iterations: int) -> None:
+        made = self._prepared
+        kernels.iterate(
+            made.blocks, self._spaces, self._right, made.spectral_radius, self._work, self._rows, iterations
+        )
+        self.positions = self._rows.reshape(-1, 4)[made.row, :3].copy()

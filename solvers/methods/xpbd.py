@@ -17,20 +17,19 @@ straight chain), and near to it where they turn little in a step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import count
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from solvers.about import About, Reference
-from solvers.core import colouring
-from solvers.core import vertex_terms as blocks
+from solvers.core import colouring, vertex_terms
+from solvers.core.driver import Iterating, Iterative
+from solvers.core.prefactored import only_springs
 from solvers.kernels import xpbd as kernels
-from solvers.methods.local_global import only_springs
-from solvers.problem import Positions, Solution, StepProblem, StopRule, System
+from solvers.kernels.loop import ITERATIONS, ONE, Limits
+from solvers.problem import Positions, ResidualOf, StepProblem, System
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class Xpbd:
 
     def prepare(self, system: System) -> PreparedXpbd:
         """Raises Unsupported for energies other than springs, and for vertices without mass that are not pinned."""
-        held = blocks.held(system)
+        held = vertex_terms.held(system)
         constraints, choice = _prepared(system, held, "xpbd")
         return PreparedXpbd(system, constraints, *_eased(constraints, held), choice)
 
@@ -78,14 +77,16 @@ class XpbdSmallSteps:
 
     def prepare(self, system: System) -> PreparedSmallSteps:
         """Raises Unsupported as `Xpbd` does, and for integrators other than implicit Euler."""
-        blocks.require_implicit_euler(system, "xpbd-small-steps")
-        constraints, choice = _prepared(system, blocks.held(system), "xpbd-small-steps")
+        vertex_terms.require_implicit_euler(system, "xpbd-small-steps")
+        constraints, choice = _prepared(system, vertex_terms.held(system), "xpbd-small-steps")
         return PreparedSmallSteps(system, constraints, choice)
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedXpbd:
+class PreparedXpbd(Iterative):
     """constraints: the springs by colour; compliance: 1/held (n,) [m/N]; ease (m,): see the kernels."""
+
+    residual_of: ClassVar[ResidualOf] = "none"
 
     system: System
     constraints: kernels.Constraints
@@ -94,51 +95,49 @@ class PreparedXpbd:
     choice: str
     facts: dict[str, float] = field(default_factory=dict)
 
-    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The positions after each pass over all springs; the yielded array is overwritten by the next one."""
-        p, tension = blocks.anchors(problem), np.zeros_like(self.ease)
-        while True:
-            kernels.iterate(self.constraints, self.ease, self.compliance, tension, p, 1)
-            yield p
+    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+        """See Iterative; from where the vertices would go without springs."""
+        return _Passes(self, vertex_terms.anchors(problem))
 
-    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """All of the iterations that `stop` allows."""
-        p, tension = blocks.anchors(problem), np.zeros_like(self.ease)
-        kernels.iterate(self.constraints, self.ease, self.compliance, tension, p, stop.iterations)
-        return Solution(p, stop.iterations, np.nan, np.nan, "iterations")
 
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """None: an iteration has no parts."""
-        return {}
+class _Passes(Iterating):
+    """One pass over all springs after another."""
+
+    def __init__(self, prepared: PreparedXpbd, p: Positions) -> None:
+        self._prepared, self._tension, self.positions = prepared, np.zeros_like(prepared.ease), p
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        self.iterate(ONE)
+        return True
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating."""
+        made = self._prepared
+        kernels.iterate(made.constraints, made.ease, made.compliance, self._tension, self.positions, limits.iterations)
+        return limits.iterations, float("nan"), ITERATIONS
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedSmallSteps:
+class PreparedSmallSteps(Iterative):
     """constraints: the springs by colour."""
+
+    residual_of: ClassVar[ResidualOf] = "none"
 
     system: System
     constraints: kernels.Constraints
     choice: str
     facts: dict[str, float] = field(default_factory=dict)
 
-    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The whole step in one substep, in two, and so on, each from the start."""
-        for substeps in count(1):
-            yield self._step(problem, substeps)[0]
+    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+        """See Iterative; from where the step starts."""
+        return _SmallSteps(self, problem)
 
-    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """The step in as many substeps as `stop` allows iterations, and the velocity at its end."""
-        p, v = self._step(problem, stop.iterations)
-        return Solution(p, stop.iterations, np.nan, np.nan, "iterations", v)
-
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """None: an iteration has no parts."""
-        return {}
-
-    def _step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
+    def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
+        """Positions [m] and velocity [m/s] after the step in so many substeps."""
         s, pins, start = self.system, self.system.pins, problem.start
         h = s.time_step / substeps
-        compliance, ease = _eased(self.constraints, blocks.held(replace(s, time_step=h)))
+        compliance, ease = _eased(self.constraints, vertex_terms.held(replace(s, time_step=h)))
         begin = start.positions[pins.vertices]
         pinned = kernels.Pinned(pins.vertices.copy(), pins.weight.copy(), begin, problem.pin_targets.copy())
         p, v = start.positions.copy(), start.velocity.copy()
@@ -147,10 +146,29 @@ class PreparedSmallSteps:
         return p, v
 
 
+class _SmallSteps(Iterating):
+    """The whole step in one substep, in two, and so on, each from the start."""
+
+    def __init__(self, prepared: PreparedSmallSteps, problem: StepProblem) -> None:
+        self._prepared, self._problem, self._substeps = prepared, problem, 0
+        self.positions = problem.start.positions
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        self.iterate(ONE)
+        return True
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating; substeps that nobody looks at are not taken."""
+        self._substeps += limits.iterations
+        self.positions, self.velocity = self._prepared.step(self._problem, self._substeps)
+        return limits.iterations, float("nan"), ITERATIONS
+
+
 def _prepared(system: System, held: NDArray[np.float64], solver: str) -> tuple[kernels.Constraints, str]:
     """The springs by colour, and that in words; self-loops, which stretch nothing, are left out."""
     springs = only_springs(system, solver)
-    blocks.require_mass(system, held, solver)
+    vertex_terms.require_mass(system, held, solver)
     keep = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])
     coloured = colouring.of_springs(springs.edges[keep], system.vertices)
     constraints = kernels.Constraints.of(springs, keep[coloured.order])

@@ -28,7 +28,7 @@ from harness.scenes.spec import SceneSpec
 from harness.simulation.measure import Settings
 from harness.simulation.observe import observe
 from harness.simulation.step import Step, simulate
-from solvers.methods.local_global import PreparedLocalGlobal
+from solvers.core.prefactored import PreparedLocalGlobal
 from solvers.problem import Positions, Prepared, Solution, StopRule
 from solvers.registry import SOLVERS, load
 

@@ -13,8 +13,9 @@ import pytest
 from harness.config.load import scene_from_assignment
 from harness.scenes.bind import Scene, build
 from harness.simulation.step import FIRST_GUESSES
+from solvers.core.prefactored import only_springs
 from solvers.linear.choice import Linear
-from solvers.methods.local_global import DenseLocalGlobal, only_springs
+from solvers.methods.local_global import DenseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, Solver
 from tests.scenes import BACKENDS, SCENES, first_problem, random_problem, trajectory

@@ -75,6 +75,9 @@ class _Busy:
         spent += perf_counter() - began
         return solution
 
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        return self.base.residual_at(problem, p)
+
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         return self.base.phases(problem) | Busy.lies
 

@@ -64,6 +64,9 @@ class _Breaking:
             self.happens()
         return self.sound.solve(problem, stop)
 
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        return self.sound.residual_at(problem, p)
+
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         return {}
 

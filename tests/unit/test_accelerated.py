@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, diags_array
 
+from solvers.core.driver import largest
+from solvers.kernels.loop import at_most
 from solvers.methods.anderson import Anderson
 from solvers.methods.chebyshev import Chebyshev
 from solvers.methods.lbfgs import Lbfgs
@@ -88,21 +90,21 @@ def test_a_step_compiled_as_a_whole_is_the_step_with_calls_in_between(method, na
 def test_a_run_tells_its_gradient_and_by_how_much_the_objective_fell(method, name, linear):
     problem = PROBLEMS[name]()
     prepared = method(linear=linear).prepare(problem.system)
-    run = prepared.engine.begin(problem, problem.first_guess)
-    run.advance(0, np.nan, 0.0, False)
+    run = prepared.begin(problem, problem.first_guess)
+    run.iterate(at_most(0))
     # Of a gradient some units in the last place of stiffness times position: at a pin of its weight times that.
     pins, exact = problem.system.pins, problem.system.pins.exact
     stiffness = np.full(len(problem.target), prepared.base.trace)
     stiffness[pins.vertices[~exact]] += pins.weight[~exact]
     start, size = problem.value(run.positions), problem.magnitude(run.positions)
     for _ in range(2):
-        run.advance(6, np.nan, 0.0, False)
+        run.iterate(at_most(6))
         # A dozen differences, each of which may be round-off of the terms, here or where the run started.
         size = max(size, problem.magnitude(run.positions))
         assert abs(start - problem.value(run.positions) - run.fallen) <= 12 * 4 * np.finfo(float).eps * size
         wanted = problem.gradient(run.positions)
         wanted[pins.vertices[exact]] = 0.0
-        assert (np.abs(run.gradient() - wanted) <= 1e-15 * stiffness[:, None] * run.largest).all()
+        assert (np.abs(run.gradient() - wanted) <= 1e-15 * stiffness[:, None] * largest(problem)).all()
 
 
 @methods

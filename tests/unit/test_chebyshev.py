@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
+from solvers.kernels.loop import EACH, Limits
 from solvers.matrices import assemble
 from solvers.methods.chebyshev import Chebyshev
 from solvers.methods.quasi_newton import PreparedAccelerated
@@ -41,8 +42,8 @@ def test_the_estimate_tends_to_the_radius_of_convergence_and_not_beyond(name):
     problem = PROBLEMS[name]()
     prepared = Chebyshev("cholespy").prepare(problem.system)
     assert isinstance(prepared, PreparedAccelerated)
-    run = prepared.engine.begin(problem, problem.first_guess)
-    run.advance(4000, 1e-9 * run.advance(0, 0.0, 0.0, False)[1], 0.0, True)
+    run = prepared.begin(problem, problem.first_guess)
+    run.iterate(Limits(4000, 1e-9 * run.residual(), 0.0, EACH))
     now = run._window.now  # type: ignore[attr-defined]  the runs of every engine have one
     wanted, found = radius(problem, run.positions), float(now["radius"][0])
     # The rate goes with the root of 1 - rho: twice too far from 1 costs 1.4 times the iterations, half as far too.

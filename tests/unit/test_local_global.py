@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
+from solvers.core.prefactored import only_springs
 from solvers.energies.springs import TINY, Springs
 from solvers.matrices import assemble
-from solvers.methods.local_global import DenseLocalGlobal, SparseLocalGlobal, only_springs
+from solvers.methods.local_global import DenseLocalGlobal, SparseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import NotPositiveDefinite, Pins, Positions, StepProblem, StopRule, System, Unsupported
 from tests.scenes import BACKENDS, SCENES, begun, cloth, first_problem, random_network, random_problem

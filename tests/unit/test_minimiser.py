@@ -59,6 +59,9 @@ class Stays:
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         return Solution(problem.first_guess.copy(), 1, 0.0, 0.0, "tolerance")
 
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        return 0.0
+
     def phases(self, problem: StepProblem) -> dict:
         return {}
 

@@ -45,6 +45,9 @@ class Pushed:
         self.asked.append((problem, stop))
         return Solution(problem.first_guess + 1.0, 3, 0.0, 0.0, "tolerance")
 
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        return 0.0
+
     def phases(self, problem: StepProblem) -> dict:
         return {}
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from harness.simulation.trace import EnergyNorm, trace
-from solvers.methods.local_global import only_springs
+from solvers.core.prefactored import only_springs
 from solvers.problem import StepProblem, StopRule
 from tests.scenes import BACKENDS, cloth, first_problem, random_problem
 

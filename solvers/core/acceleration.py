@@ -1,0 +1,120 @@
+"""What accelerated first-order methods iterate on, whatever the energies and the factor of Q: kernels of
+`solvers.kernels.accelerate` take turns with the energies' own values and gradients, and with the factor's own solve.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.core.driver import Iterating
+from solvers.core.objective import StepObjective
+from solvers.core.prefactored import PreparedLocalGlobal
+from solvers.kernels import accelerate
+from solvers.kernels.accelerate import Window
+from solvers.memory import aligned
+from solvers.problem import Positions, StepProblem
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """name: in the registry; coefficients: which, see `accelerate_coefficients`; pairs: kept in the window; retries:
+    shorter steps along a direction before the plain correction; projective: whether other energies are refused."""
+
+    name: str
+    coefficients: int
+    pairs: int
+    retries: int
+    projective: bool
+
+
+class Accelerating(Iterating):
+    """A solve that has begun, and knows more of where it is."""
+
+    @property
+    @abstractmethod
+    def fallen(self) -> float:
+        """By how much the objective fell so far [J], where round-off does not hide it."""
+
+    @abstractmethod
+    def gradient(self) -> Positions:
+        """That of the objective [N], (n, 3), where it is."""
+
+
+class Engine(Protocol):
+    """Begins solves."""
+
+    def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
+        """A solve from a first guess (n, 3)."""
+        ...
+
+
+def window_for(scheme: Scheme, entries: int, whole: int, precision: Any = np.float64) -> Window:
+    """Memory for the unknowns' entries, in vectors that have `whole` of them; precision: the factor's."""
+    m = scheme.pairs
+    now = np.zeros(1, accelerate.NOW)
+    now["method"], now["retries"] = scheme.coefficients, scheme.retries
+    steps, images, correction, direction = (aligned(k * entries, precision) for k in (m, m, 1, 1))
+    position, trial, descent, there = (aligned(whole) for _ in range(4))
+    sy, wy = np.zeros((2, m, m))
+    sg, wg, a, b = np.zeros((4, m))
+    block = aligned(accelerate.BLOCK)
+    return Window(
+        steps, images, position, trial, descent, there, correction, direction, block, sy, wy, sg, wg, a, b, now
+    )
+
+
+class Interpreted(Accelerating):
+    """Any energies, and any factor."""
+
+    def __init__(self, base: PreparedLocalGlobal, scheme: Scheme, objective: StepObjective, guess: Positions) -> None:
+        window = window_for(scheme, guess.size, guess.size)
+        self._base, self._window, self._objective = base, window, objective
+        self.positions, self._trial, self._there = (
+            x.reshape(-1, 3) for x in (window.position, window.trial, window.descent_there)
+        )
+        self._image = np.zeros_like(self._trial)
+        self._trial[:] = objective.placed(guess)
+        self._look()
+        accelerate.begin(window, self._solved())
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        window, now = self._window, self._window.now
+        accelerate.propose(window)
+        verdict = accelerate.AGAIN
+        while verdict == accelerate.AGAIN:
+            self._look()
+            now["rise"], now["noise"] = self._objective.rise(self.positions, self._trial)
+            verdict = accelerate.judge(window)
+        if verdict == accelerate.STALLED:
+            return False
+        self._accept()
+        return True
+
+    def residual(self) -> float:
+        """See Iterating."""
+        return self._base.residual(self._window.correction.reshape(-1, 3).copy())
+
+    @property
+    def fallen(self) -> float:
+        """See Accelerating."""
+        return float(self._window.now["fallen"][0])
+
+    def gradient(self) -> Positions:
+        """See Accelerating."""
+        return -self._window.descent.reshape(-1, 3)
+
+    def _look(self) -> None:
+        np.negative(self._objective.gradient(self._trial), out=self._there)
+
+    def _solved(self) -> NDArray[np.float64]:
+        self._base.correction(self._there, self._image)
+        return self._image.ravel()
+
+    def _accept(self) -> None:
+        accelerate.accept(self._window, self._solved())

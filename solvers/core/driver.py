@@ -1,0 +1,122 @@
+"""The driver: it owns the iteration loop, the stop rule, its limits and what a solve answers.
+
+    run = begin(problem, guess);    advance(run), advance(run), ...    while residual(run) > tolerance * yardstick
+
+A method is these three: `Iterative` makes a prepared solver of its `begin`, and `Iterating` a solve of its `advance`
+and `residual`. A method whose loop is compiled overrides `iterate`, with what `solvers.kernels.loop` has for kernels.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from operator import methodcaller
+from typing import ClassVar
+
+import numpy as np
+
+from solvers.kernels import loop
+from solvers.kernels.loop import Limits, at_most
+from solvers.problem import Positions, ResidualOf, Solution, StepProblem, StopRule
+
+_STOPPED = {
+    loop.ITERATIONS: "iterations",
+    loop.TOLERANCE: "tolerance",
+    loop.FLOOR: "floor",
+    loop.STALLED: "stalled",
+}
+
+_CLOSE = 1e-5
+"""A tolerance from which on the last point should be a minimum; a greater one asks for less than that."""
+
+
+_loop = loop.over(methodcaller("advance"), methodcaller("residual"))
+
+
+class Iterating(ABC):
+    """A solve that has begun.
+
+    positions: where it is (n, 3) [m]; the next iteration may overwrite them. velocity: at the step's end (n, 3) [m/s],
+    of a method that keeps its own.
+    """
+
+    positions: Positions
+    velocity: Positions | None = None
+
+    @abstractmethod
+    def advance(self) -> bool:
+        """Do one iteration; False where round-off lets nothing descend, and the positions stay."""
+
+    def residual(self) -> float:
+        """|Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices, at the iterate that the method's `residual_of` names;
+        nan of a method that does not minimise, and before the first iteration where it belongs to the previous one."""
+        return float("nan")
+
+    def certifies(self) -> bool:
+        """Whether a stationary point where it is may be the last: whether it is a minimum, for all the method knows."""
+        return True
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """As many iterations as the limits allow; see `solvers.kernels.loop`."""
+        return _loop(self, limits)
+
+
+class Iterative(ABC):
+    """A method that is ready for a system; with `choice` and `facts` a `solvers.problem.Prepared`.
+
+    residual_of: the iterate that its residuals belong to. It is the previous one of a method that tells them by its
+    iteration, |p - LG(p)|; "none" of a method that does not minimise, and does all iterations.
+    """
+
+    residual_of: ClassVar[ResidualOf] = "returned"
+
+    @abstractmethod
+    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+        """A solve from a first guess (n, 3) [m], which is not written to."""
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """The iterates from `problem.first_guess`; a yielded array may be overwritten by the next one."""
+        run = self.begin(problem, problem.first_guess)
+        while True:
+            run.advance()
+            yield run.positions
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """Iterate until `stop` says so, or until nothing descends; without a tolerance only the last residual is
+        computed."""
+        run = self.begin(problem, problem.first_guess)
+        limits, yardstick, close = at_most(stop.iterations), float("nan"), False
+        if stop.tolerance is not None and self.residual_of != "none":
+            yardstick = self.residual_at(problem, problem.current)
+            limits = Limits(stop.iterations, stop.tolerance * yardstick, stop.floor * self.scale(problem), loop.EACH)
+            close = stop.tolerance <= _CLOSE
+        count, residual, ended = run.iterate(limits)
+        while close and ended in (loop.TOLERANCE, loop.FLOOR) and not run.certifies():
+            more, residual, ended = run.iterate(limits._replace(iterations=stop.iterations - count))
+            count += more
+            if not more and ended != loop.ITERATIONS:
+                ended = loop.STALLED
+        return Solution(run.positions, count, residual, yardstick, _STOPPED[ended], run.velocity, self.residual_of)
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """The residual [J^(1/2)] at positions p (n, 3) [m]: an iteration's work for one of the previous iterate."""
+        if self.residual_of == "none":
+            return float("nan")
+        return self.begin(problem, p).iterate(at_most(int(self.residual_of == "previous")))[1]
+
+    def scale(self, problem: StepProblem) -> float:
+        """The residual [J^(1/2)] that a mean displacement of the first guess's largest coordinate would cause."""
+        return 0.0
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """The parts of an iteration; none, where a method does not say."""
+        return {}
+
+
+def largest(problem: StepProblem) -> float:
+    """The first guess's largest coordinate [m], exactly pinned vertices on their targets."""
+    pins, p = problem.system.pins, problem.first_guess
+    if pins.exact.any():
+        p = p.copy()
+        p[pins.vertices[pins.exact]] = problem.pin_targets[pins.exact]
+    return float(np.abs(p).max(initial=0.0))
