@@ -1,0 +1,79 @@
+"""`springbench gate`: against another revision, from a table, or between two stored results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from harness.console import out, say
+from harness.errors import InputError
+
+
+def gate(
+    what: Annotated[
+        list[Path] | None,
+        typer.Argument(help="With --against: a scene or a sweep. Without: two stored results, the old one first."),
+    ] = None,
+    against: Annotated[str | None, typer.Option(help="A git revision to be no slower than.")] = None,
+    name: Annotated[str, typer.Option("-k", help="With --against: the tree's own gates whose name holds this.")] = "",
+    budget: Annotated[float | None, typer.Option(help="Seconds that a gate may take; 120 if left out.")] = None,
+    limit: Annotated[float | None, typer.Option(help="Ratio of times that counts as slower; 1.03 if left out.")] = None,
+    clock: Annotated[str | None, typer.Option(help="cpu or wall; what suits the work if left out.")] = None,
+    solver: Annotated[list[str] | None, typer.Option(help="For a scene: solvers; repeatable.")] = None,
+    size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
+    iterations: Annotated[int | None, typer.Option(help="For a scene: iteration limit of a step.")] = None,
+    tolerance: Annotated[float | None, typer.Option(help="For a scene: relative tolerance of a step.")] = None,
+) -> None:
+    """Find what became slower. Exit code 1: something did; 3: cannot tell; 0: all gates hold."""
+    files = what or []
+    timed = {"--budget": budget, "--limit": limit, "--clock": clock}
+    chosen = {"--solver": solver, "--size": size, "--iterations": iterations, "--tolerance": tolerance}
+    if against is not None:
+        asked = {"iterations": iterations, "tolerance": tolerance}
+        options = _options(budget, limit, clock)
+        raise typer.Exit(
+            _against(against, files, name, options, {"solvers": solver or [], "sizes": size or [], **asked})
+        )
+    if name:
+        raise InputError("-k: chooses gates to compare with another revision; wanted --against REVISION beside it")
+    for option, value in (timed | chosen).items():
+        if value:
+            raise InputError(
+                f"{option}: nothing is timed between stored results; give --against REVISION, or leave it out"
+            )
+    if len(files) != 2:
+        wanted = "wanted --against REVISION, or two stored results, the old one first"
+        raise InputError(f"gate: came {len(files)} file{'s' * (len(files) != 1)}; {wanted}")
+    from harness.report.gate import compare
+
+    raise typer.Exit(compare(files[0], files[1], out))
+
+
+def _options(budget: float | None, limit: float | None, clock: str | None) -> Any:
+    from harness.experiments.gates.against import LIMIT, Options
+    from harness.experiments.gates.sequential import Rule
+    from harness.experiments.gates.turns import BUDGET
+
+    if clock not in (None, "cpu", "wall"):
+        raise InputError(f"--clock: came {clock}; wanted cpu or wall")
+    if budget is not None and not budget > 0:
+        raise InputError(f"--budget: came {budget}; wanted seconds")
+    try:
+        Rule(limit or LIMIT)
+    except ValueError as error:
+        raise InputError(f"--{error}") from error
+    return Options(budget or BUDGET, limit or LIMIT, clock=clock)
+
+
+def _against(revision: str, files: list[Path], name: str, options: Any, asked: dict[str, Any]) -> int:
+    from harness.experiments.gates import revisions
+    from harness.experiments.gates.against import exit_code, requests_of_config, requests_of_gates, run_gates
+
+    if len(files) > 1 or (files and name):
+        raise InputError("gate --against: wanted one scene, one sweep, or -k NAME; came several of them")
+    both = revisions.sides(revisions.root(Path.cwd()), revision)
+    requests = requests_of_config(both, files[0], asked) if files else requests_of_gates(both, name)
+    found = run_gates(both, requests, options, say)
+    return exit_code([result.answer for _, result in found])
