@@ -14,7 +14,7 @@ from harness.errors import InputError
 def gate(
     what: Annotated[
         list[Path] | None,
-        typer.Argument(help="With --against: a scene or a sweep. Without: two stored results, the old one first."),
+        typer.Argument(help="With --against a scene or a sweep; else a table of gates, or two stored results."),
     ] = None,
     against: Annotated[str | None, typer.Option(help="A git revision to be no slower than.")] = None,
     name: Annotated[str, typer.Option("-k", help="With --against: the tree's own gates whose name holds this.")] = "",
@@ -28,7 +28,6 @@ def gate(
 ) -> None:
     """Find what became slower. Exit code 1: something did; 3: cannot tell; 0: all gates hold."""
     files = what or []
-    timed = {"--budget": budget, "--limit": limit, "--clock": clock}
     chosen = {"--solver": solver, "--size": size, "--iterations": iterations, "--tolerance": tolerance}
     if against is not None:
         asked = {"iterations": iterations, "tolerance": tolerance}
@@ -36,19 +35,31 @@ def gate(
         raise typer.Exit(
             _against(against, files, name, options, {"solvers": solver or [], "sizes": size or [], **asked})
         )
+    if len(files) == 1:
+        for option, value in {**chosen, "--limit": limit, "--clock": clock, "-k": name}.items():
+            if value:
+                raise InputError(
+                    f"{option}: a table of gates says so itself; change {files[0]}, or give --against REVISION"
+                )
+        raise typer.Exit(_table(files[0], _options(budget, limit, clock).budget))
     if name:
         raise InputError("-k: chooses gates to compare with another revision; wanted --against REVISION beside it")
-    for option, value in (timed | chosen).items():
+    for option, value in {"--budget": budget, "--limit": limit, "--clock": clock, **chosen}.items():
         if value:
-            raise InputError(
-                f"{option}: nothing is timed between stored results; give --against REVISION, or leave it out"
-            )
+            raise InputError(f"{option}: nothing is timed between stored results; leave it out")
     if len(files) != 2:
-        wanted = "wanted --against REVISION, or two stored results, the old one first"
+        wanted = "wanted --against REVISION, a table of gates, or two stored results, the old one first"
         raise InputError(f"gate: came {len(files)} file{'s' * (len(files) != 1)}; {wanted}")
     from harness.report.gate import compare
 
     raise typer.Exit(compare(files[0], files[1], out))
+
+
+def _table(path: Path, budget: float) -> int:
+    from harness.experiments.gates.against import exit_code
+    from harness.experiments.gates.table import run_table
+
+    return exit_code([result.answer for _, result in run_table(path, budget, say)])
 
 
 def _options(budget: float | None, limit: float | None, clock: str | None) -> Any:

@@ -22,9 +22,6 @@ from harness.errors import InputError
 
 WORKER = Path(__file__).with_name("worker.py")
 
-AGREEMENT = 1e-9
-"""How far the answers may lie apart, in their own size: round-off of some hundred iterations in another order."""
-
 
 @dataclass(frozen=True, slots=True)
 class Side:
@@ -144,18 +141,6 @@ def workers(*sides: Side) -> Iterator[list[Worker]]:
         finally:
             for worker in alive:
                 worker.close()
-
-
-def check(new: Held, old: Held, names: tuple[str, str], tolerance: float = AGREEMENT) -> None:
-    """Raise InputError where two answers differ by more than a part of the old one's size: speed is no answer then."""
-    if new.answer.shape != old.answer.shape:
-        shapes = f"{new.answer.shape} and {old.answer.shape}"
-        raise InputError(f"{names[0]} and {names[1]} answer differently: arrays of {shapes}; nothing was timed")
-    size = float(np.ptp(old.answer, axis=0).max(initial=0.0)) or 1.0
-    apart = float(np.abs(new.answer - old.answer).max(initial=0.0)) / size
-    if not apart <= tolerance:
-        said = f"they lie {apart:.1e} of the answer's size apart, wanted {tolerance:g}"
-        raise InputError(f"{names[0]} and {names[1]} answer differently: {said}; nothing was timed")
 
 
 def changes(new: Held, old: Held) -> list[str]:

@@ -8,7 +8,7 @@ pair, started anew, is found to be slower too.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from random import Random, SystemRandom
@@ -24,7 +24,7 @@ BUDGET = 120.0
 
 CALL = 0.01
 """Seconds of work that a call should hold: a clock's overhead is nothing then. Longer calls are not steadier: with
-seven other programs on two cores turns of 10 and of 40 ms spread alike, and there are five times as many of the first."""
+seven other programs on two cores turns of 10 and of 40 ms spread alike, and five times as many of them fit."""
 
 Clock = Literal["cpu", "wall"]
 Timed = Callable[[], float]
@@ -88,10 +88,25 @@ def race(a: Timed, b: Timed, rule: Rule, *, budget: float = BUDGET, coin: Random
 
     coin: what decides the orders; the system's own where none is given, which nothing on the machine can follow.
     """
+    game = playing(b, rule, budget=budget, coin=coin)
+    next(game)
+    while True:
+        try:
+            game.send(a())
+        except StopIteration as done:
+            return done.value
+
+
+def playing(
+    b: Timed, rule: Rule, *, budget: float = BUDGET, coin: Random | None = None
+) -> Generator[None, float, Result]:
+    """The same for a caller that times A itself: each time this yields it wants the seconds of one call of A."""
     began, turns = perf_counter(), list[Turn]()
-    calls = {"A": a, "B": b}
     for order in orders(coin):
-        turns.append(Turn(order, tuple(calls[who]() for who in order)))
+        seconds = []
+        for who in order:
+            seconds.append((yield) if who == "A" else b())
+        turns.append(Turn(order, tuple(seconds)))
         answer, elapsed = rule.judge([t.log_ratio for t in turns]), perf_counter() - began
         if answer is not Answer.UNDECIDED or elapsed >= budget:
             return result(rule, turns, elapsed)
