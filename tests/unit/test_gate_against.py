@@ -187,7 +187,7 @@ def test_a_run_of_a_scene_is_held_with_its_exact_facts_and_each_revision_has_its
 def test_a_worker_that_dies_is_told_with_its_last_words(tmp_path: Path):
     (tmp_path / "json.py").write_text("raise SystemExit('there is no more json')")
     request = Request("a gate", "gate", {"name": "a gate"})
-    from harness.errors import InputError
+    from harness.base.errors import InputError
     from harness.experiments.gates.against import Options
 
     with (

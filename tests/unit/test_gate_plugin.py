@@ -89,7 +89,7 @@ def test_where_benchmarks_are_disabled_only_the_answers_are_compared(tmp_path: P
 def test_solvers_race_on_a_scene_and_one_of_them_may_be_ones_own(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(SCENE)
     test = """
-from solvers.local_global import SparseLocalGlobal
+from solvers.methods.local_global import SparseLocalGlobal
 def test_named(race): race.solvers("cloth.yaml", "sparse", {"name": "dense"}, limit=1e6, iterations=20)
 def test_own(race): race.solvers("cloth.yaml", SparseLocalGlobal(), "sparse", limit=1e6, agree=0.0)
 def test_other_answers(race): race.solvers("cloth.yaml", "xpbd", "sparse", limit=1e6)

@@ -14,7 +14,7 @@ from math import ceil
 from pathlib import Path
 from typing import Any
 
-from harness.errors import InputError
+from harness.base.errors import InputError
 from harness.experiments.gates.agreement import difference
 from harness.experiments.gates.pair import Held, Side, Worker, changes, workers
 from harness.experiments.gates.sequential import ALPHA, Answer, Rule

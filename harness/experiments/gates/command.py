@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from harness.console import out, say
-from harness.errors import InputError
+from harness.base.console import out, say
+from harness.base.errors import InputError
 
 
 def gate(

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.errors import InputError
+from harness.base.errors import InputError
 
 WORKER = Path(__file__).with_name("worker.py")
 

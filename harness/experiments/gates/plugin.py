@@ -118,8 +118,8 @@ class Race:
         scene: its file, relative to the test's; agree: how far the positions may lie apart, in the scene's size;
         options: those of a run: iterations, tolerance, frames, integrator, time_step, first_guess.
         """
+        from harness.base.machine import pinned_threads
         from harness.experiments.gates.scenes import pair
-        from harness.machine import pinned_threads
 
         with pinned_threads(1):
             both = pair(self._item.path.parent / Path(scene), solver, against, size=size, **options)

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from harness.errors import InputError
+from harness.base.errors import InputError
 from harness.experiments.gates.pair import Side
 
 KEPT = 6

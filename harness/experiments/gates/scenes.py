@@ -9,12 +9,12 @@ from math import ceil
 from pathlib import Path
 from typing import Any
 
-from harness.errors import InputError
+from harness.base.errors import InputError
+from harness.config.load import load_any
+from harness.config.sweep import RunSpec
 from harness.experiments.gates.turns import CALL, Clock, Timed
-from harness.load import load_any
-from harness.scene import build
-from harness.simulate import prepare, simulate
-from harness.spec import RunSpec
+from harness.scenes.bind import build
+from harness.simulation.step import prepare, simulate
 from solvers.problem import Positions, Solver, StopRule
 from solvers.registry import SOLVERS, load
 

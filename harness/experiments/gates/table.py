@@ -15,15 +15,16 @@ from typing import Any
 
 from pydantic import Field
 
-from harness.config import Document, read_yaml
-from harness.errors import InputError, Mistake
+from harness.base.document import Document, read_yaml
+from harness.base.errors import InputError, Mistake
+from harness.base.machine import pinned_threads
+from harness.base.model import Model
+from harness.config.sweep import Iterations, Tolerance
 from harness.experiments.gates.agreement import AGREEMENT, difference
 from harness.experiments.gates.scenes import calls_of, pair, timed
 from harness.experiments.gates.sequential import ALPHA, Rule
 from harness.experiments.gates.turns import Clock, Result, Timed, confirmed
-from harness.machine import pinned_threads
-from harness.model import Model
-from harness.spec import Frames, IntegratorName, Iterations, Size, Tolerance
+from harness.scenes.spec import Frames, IntegratorName, Size
 from solvers.problem import NotPositiveDefinite, Unsupported
 
 

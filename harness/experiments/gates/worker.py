@@ -43,8 +43,8 @@ class Worker:
 
         extra: so much more work than the run asks for, as a part of its iterations: a planted slowdown.
         """
-        from harness.scene import build
-        from harness.simulate import prepare, simulate
+        from harness.scenes.bind import build
+        from harness.simulation.step import prepare, simulate
         from solvers.problem import StopRule
         from solvers.registry import SOLVERS, load
 
@@ -102,14 +102,14 @@ class Worker:
         return {"facts": counts | after()}
 
     def _pin(self, threads: int) -> None:
-        from harness import machine
+        from harness.base import machine
 
         self._threads.close()
         self._threads.enter_context(machine.pinned_threads(threads))
 
 
 def _sweep(config: str, asked: dict[str, Any]) -> list[Any]:
-    from harness.load import load_any
+    from harness.config.load import load_any
 
     return load_any(Path(config), **asked).runs()
 
