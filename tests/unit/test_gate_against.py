@@ -132,8 +132,8 @@ def test_a_revision_whose_libraries_cannot_be_had_does_not_build(repository: Pat
         (("--against", "HEAD", "--limit", "-1"), "--limit: came -1.0; wanted a ratio of times"),
         (("-k", "old"), "-k: chooses gates to compare with another revision; wanted --against REVISION"),
         (("a.json", "b.json", "--budget", "3"), "--budget: nothing is timed between stored results"),
-        (("a.json",), "gate: came 1 file; wanted --against REVISION, or two stored results"),
-        ((), "gate: came 0 files; wanted --against REVISION, or two stored results"),
+        (("a.json",), "gate: came 1 file; wanted --against REVISION, a table of gates, or two stored"),
+        ((), "gate: came 0 files; wanted --against REVISION, a table of gates, or two stored"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )

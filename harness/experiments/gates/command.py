@@ -35,7 +35,7 @@ def gate(
         raise typer.Exit(
             _against(against, files, name, options, {"solvers": solver or [], "sizes": size or [], **asked})
         )
-    if len(files) == 1:
+    if len(files) == 1 and files[0].suffix.lower() in (".yaml", ".yml"):
         for option, value in {**chosen, "--limit": limit, "--clock": clock, "-k": name}.items():
             if value:
                 raise InputError(
