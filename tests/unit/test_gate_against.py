@@ -8,11 +8,10 @@ from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.experiments.gates.against import Request, _started, exit_code
-from harness.experiments.gates.pair import Side, workers
+from harness.experiments.gates.pair import Side, changes, workers
 from harness.experiments.gates.sequential import Answer
 
 GATES = """
-from time import process_time
 from types import SimpleNamespace
 
 def work(rounds, answer):
@@ -25,8 +24,8 @@ def work(rounds, answer):
     return run
 
 ALL = (
-    SimpleNamespace(name="adding", clock=process_time, candidate=lambda: work({rounds}, {answer})),
-    SimpleNamespace(name="{other}", clock=process_time, candidate=lambda: work(10, 0.0)),
+    SimpleNamespace(name="adding", clock="cpu", candidate=lambda: work({rounds}, {answer})),
+    SimpleNamespace(name="{other}", clock="cpu", candidate=lambda: work(10, 0.0)),
 )
 """
 
@@ -195,6 +194,13 @@ def test_a_worker_that_dies_is_told_with_its_last_words(tmp_path: Path):
         _started((Side("that", tmp_path), Side("this", tmp_path)), request, Options(1.0), print),
     ):
         pass
+
+
+def test_changes_of_exact_facts_are_told():
+    old = {"iterations": 200, "nnz_factor": 1000, "instructions": 1_000_000, "gone": 1}
+    new = {"iterations": 210, "nnz_factor": 1000, "instructions": 1_000_900, "come": 2}
+    assert changes(new, old) == ["iterations 200 -> 210 (+5.0%)"]
+    assert changes(new | {"instructions": 990_000}, old)[1] == "instructions 1,000,000 -> 990,000 (-1.0%)"
 
 
 @pytest.mark.parametrize(

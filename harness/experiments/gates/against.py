@@ -104,7 +104,8 @@ def _started(
         if said := difference(held[0].answer, held[1].answer):
             named = f"{request.title}: {sides[0].name} and {sides[1].name}"
             raise InputError(f"{named} answer differently: {said}; nothing was timed")
-        for change in changes(held[0], held[1]):
+        facts = [one.facts | _instructions(worker) for one, worker in zip(held, alive, strict=True)]
+        for change in changes(*facts):
             say(f"{request.title}: {change}")
         calls = max(1, ceil(CALL / max(once, 1e-6)))
         a, b = (partial(worker.seconds, calls, clock) for worker in alive)
@@ -120,6 +121,11 @@ def _held(alive: Sequence[Worker], request: Request, frames: int) -> list[Held]:
             more = {"config": str(worker.side.own(request.config)), "frames": frames, "extra": worker.side.extra}
         held.append(worker.hold(request.do, **request.arguments, **more))
     return held
+
+
+def _instructions(worker: Worker) -> dict[str, int]:
+    counted = worker.instructions()
+    return {} if counted is None else {"instructions": counted}
 
 
 def _first(listed: Sequence[Sequence[str]]) -> str:

@@ -92,6 +92,10 @@ class Worker:
         told = self.ask(do, positions=str(self._answer), **asked)
         return Held(np.load(self._answer), told["facts"], told["clock"], told.get("frames", 0))
 
+    def instructions(self) -> int | None:
+        """The instructions that one call of the work retires, None where the machine does not tell."""
+        return self.ask("instructions")["instructions"]
+
     def seconds(self, calls: int, clock: str) -> float:
         """The seconds that so many calls of the work take, together."""
         return self.ask("time", calls=calls, clock=clock)["seconds"]
@@ -143,7 +147,12 @@ def workers(*sides: Side) -> Iterator[list[Worker]]:
                 worker.close()
 
 
-def changes(new: Held, old: Held) -> list[str]:
-    """What differs of the exact facts, in words: iterations, entries, bytes, flops."""
-    both = [name for name in old.facts if name in new.facts and new.facts[name] != old.facts[name]]
-    return [f"{name} {old.facts[name]:,} -> {new.facts[name]:,}" for name in both]
+SAME = 0.001
+"""The part by which instructions may differ: the interpreter's own housekeeping."""
+
+
+def changes(new: dict[str, int], old: dict[str, int]) -> list[str]:
+    """What differs of exact facts, in words: iterations, entries, bytes, flops, instructions."""
+    allowed = {name: SAME * old[name] if name == "instructions" else 0 for name in old}
+    both = [name for name in old if name in new and abs(new[name] - old[name]) > allowed[name]]
+    return [f"{name} {old[name]:,} -> {new[name]:,} ({new[name] / old[name] - 1:+.1%})" for name in both if old[name]]

@@ -53,20 +53,21 @@ class Race:
         clock: Literal["cpu", "wall"] = "cpu",
         agree: float | None = 0.0,
         budget: float | None = None,
+        error: float | None = None,
         **told: Any,
     ) -> Result | None:
         """Fail where the candidate takes more than `limit` times as long as the yardstick.
 
         agree: how far their answers may lie apart, in their own size; None where they have none. clock: the process's
-        CPU time, or what one waits. budget: seconds, else --race-budget. told: goes to the benchmark's JSON as it is.
-        Returns what was found, None where nothing is timed.
+        CPU time, or what one waits. budget: seconds, else --race-budget. error: the probability of a wrong answer, .1 %
+        if left out. told: goes to the benchmark's JSON as it is. Returns what was found, None where nothing is timed.
         """
         from harness.experiments.gates.agreement import difference
         from harness.experiments.gates.scenes import calls_of, timed
-        from harness.experiments.gates.sequential import Answer, Rule
+        from harness.experiments.gates.sequential import ALPHA, Answer, Rule
         from harness.experiments.gates.turns import playing
 
-        rule, benchmark = Rule(limit), self._benchmark
+        rule, benchmark = Rule(limit, error or ALPHA), self._benchmark
         answer = benchmark.pedantic(candidate) if benchmark.disabled else candidate()
         if agree is not None:
             said = difference(answer, yardstick(), agree)

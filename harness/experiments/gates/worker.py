@@ -8,6 +8,7 @@ standard error. It imports from the tree alone: what is timed is all the revisio
     {"do": "gates"}                                           -> {"gates": ["numba-against-sparse-64", ...]}
     {"do": "gate", "name": "...", "positions": "..."}         -> {"facts": {...}, "clock": "cpu"}
     {"do": "time", "calls": n, "clock": "cpu"}                -> {"seconds": s}, all calls together
+    {"do": "instructions"}                                    -> {"instructions": n}, null where they are hidden
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import ExitStack
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -80,8 +82,7 @@ class Worker:
         """Hold the candidate of one of the tree's own gates."""
         self._pin(1)
         gate = _gates()[name]
-        clock = "wall" if gate.clock is time.perf_counter else "cpu"
-        return self._held(gate.candidate(), positions, {}, dict) | {"clock": clock}
+        return self._held(gate.candidate(), positions, {}, dict) | {"clock": gate.clock}
 
     def time(self, calls: int, clock: str) -> dict[str, Any]:
         """The seconds of so many calls."""
@@ -91,6 +92,16 @@ class Worker:
         for _ in range(calls):
             work()
         return {"seconds": now() - began}
+
+    def instructions(self) -> dict[str, Any]:
+        """The instructions of one call; the counter is the one beside this script, whatever the tree has."""
+        assert self._work is not None
+        place = spec_from_file_location("springbench_instructions", Path(__file__).with_name("instructions.py"))
+        assert place is not None
+        assert place.loader is not None
+        counter = module_from_spec(place)
+        place.loader.exec_module(counter)
+        return {"instructions": counter.count(self._work)}
 
     def _held(
         self, work: Callable[[], Any], positions: str, counts: dict[str, int], after: Callable[[], dict[str, int]]
