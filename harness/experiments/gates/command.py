@@ -21,6 +21,9 @@ def gate(
     budget: Annotated[float | None, typer.Option(help="Seconds that a gate may take; 120 if left out.")] = None,
     limit: Annotated[float | None, typer.Option(help="Ratio of times that counts as slower; 1.03 if left out.")] = None,
     clock: Annotated[str | None, typer.Option(help="cpu or wall; what suits the work if left out.")] = None,
+    yardstick: Annotated[
+        str | None, typer.Option(help="Between stored results: a solver whose multiples are compared instead of times.")
+    ] = None,
     solver: Annotated[list[str] | None, typer.Option(help="For a scene: solvers; repeatable.")] = None,
     size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
     iterations: Annotated[int | None, typer.Option(help="For a scene: iteration limit of a step.")] = None,
@@ -50,9 +53,21 @@ def gate(
     if len(files) != 2:
         wanted = "wanted --against REVISION, a table of gates, or two stored results, the old one first"
         raise InputError(f"gate: came {len(files)} file{'s' * (len(files) != 1)}; {wanted}")
-    from harness.report.gate import compare
+    raise typer.Exit(_stored(files[0], files[1], yardstick))
 
-    raise typer.Exit(compare(files[0], files[1], out))
+
+def _stored(old: Path, new: Path, yardstick: str | None) -> int:
+    from harness.report import gate as benchmarks
+    from harness.report import stored
+
+    ours = [path.suffix.lower() != ".json" for path in (old, new)]
+    if ours[0] != ours[1]:
+        raise InputError(f"{old} and {new} cannot be compared: one is of pytest-benchmark, the other is not")
+    if all(ours):
+        return stored.compare(old, new, out, yardstick)
+    if yardstick:
+        raise InputError("--yardstick: compares results of sweeps; a file of pytest-benchmark has its own ratios")
+    return benchmarks.compare(old, new, out)
 
 
 def _table(path: Path, budget: float) -> int:
