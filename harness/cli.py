@@ -22,6 +22,7 @@ from harness.base.errors import InputError, Mistake
 from harness.experiments.ablation.command import ablate
 from harness.experiments.gallery import gallery
 from harness.experiments.gates.command import gate
+from harness.experiments.gates.study_command import study
 
 app = typer.Typer(
     cls=Commands,
@@ -193,6 +194,7 @@ def report(
 app.command()(ablate)
 app.command()(gallery)
 app.command()(gate)
+app.add_typer(study, name="gate-study")
 
 
 @app.command("list")

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.experiments.gates.against import Request, _started, exit_code
+from harness.experiments.gates.against import Request, exit_code, started
 from harness.experiments.gates.pair import Side, changes, workers
 from harness.experiments.gates.sequential import Answer
 
@@ -191,7 +191,7 @@ def test_a_worker_that_dies_is_told_with_its_last_words(tmp_path: Path):
 
     with (
         pytest.raises(InputError, match="that: does not run: there is no more json"),
-        _started((Side("that", tmp_path), Side("this", tmp_path)), request, Options(1.0), print),
+        started((Side("that", tmp_path), Side("this", tmp_path)), request, Options(1.0), print),
     ):
         pass
 

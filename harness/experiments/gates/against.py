@@ -78,7 +78,7 @@ def run_gates(
     rule = Rule(options.limit, options.alpha / len(requests))
     found = []
     for request in requests:
-        result = confirmed(partial(_started, sides, request, options, say), rule, budget=options.budget)
+        result = confirmed(partial(started, sides, request, options, say), rule, budget=options.budget)
         say(f"{request.title}: {result}")
         found.append((request, result))
     return found
@@ -90,7 +90,7 @@ def exit_code(answers: Sequence[Answer]) -> int:
 
 
 @contextmanager
-def _started(
+def started(
     sides: tuple[Side, Side], request: Request, options: Options, say: Callable[[str], None]
 ) -> Iterator[tuple[Timed, Timed]]:
     """Both revisions in processes of their own, warm, with the same answer."""
