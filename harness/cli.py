@@ -1,6 +1,7 @@
 """The command line: `springbench run`, `speed`, `accuracy`, `recommend`, `list`, `query`, `schema`, `inspect` and more.
 
-Exit codes: 0 all is well, 1 a run failed or a gate found a regression, 2 the user's mistake, 130 stopped by Ctrl-C.
+Exit codes: 0 all is well, 1 a run failed or a gate found a regression, 2 the user's mistake, 3 a gate cannot tell,
+130 stopped by Ctrl-C.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from harness.base.console import say as _say
 from harness.base.errors import InputError, Mistake
 from harness.experiments.ablation.command import ablate
 from harness.experiments.gallery import gallery
+from harness.experiments.gates.command import gate
+from harness.experiments.gates.study_command import study
 
 app = typer.Typer(
     cls=Commands,
@@ -190,6 +193,8 @@ def report(
 
 app.command()(ablate)
 app.command()(gallery)
+app.command()(gate)
+app.add_typer(study, name="gate-study")
 
 
 @app.command("list")
@@ -264,17 +269,6 @@ def view(recordings: Recordings) -> None:
     from harness.report.inspect import view as view_recordings
 
     view_recordings(recordings)
-
-
-@app.command()
-def gate(
-    base: Annotated[Path, typer.Argument(help="Stored benchmarks to compare with (.json).")],
-    new: Annotated[Path, typer.Argument(help="Stored benchmarks to judge (.json).")],
-) -> None:
-    """Compare two stored benchmark files; exit code 1 on a regression."""
-    from harness.report.gate import compare
-
-    raise typer.Exit(compare(base, new, out))
 
 
 def _check_positions(path: Path | None) -> None:

@@ -25,7 +25,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     session: Any = getattr(config, "_benchmarksession", None)
     measured = [one for one in session.benchmarks if "limit" in one.extra_info] if session else []
     for one in measured:
-        ratio, limit, goal = (one.extra_info[key] for key in ("ratio", "limit", "goal"))
+        ratio, limit, goal = (one.extra_info.get(key) for key in ("ratio", "limit", "goal"))
         wanted = goal or limit
         verdict = "met" if ratio["high"] <= wanted else "NOT met" if ratio["low"] > wanted else "met, or not"
         kept = f", kept below {limit:.3g}" if goal else ""

@@ -1,18 +1,28 @@
-"""Gates on counts, which no noise can move: entries of matrices, iterations, bytes. They run in every test run.
+"""Gates on counts, which no noise can move: entries of matrices, iterations, flops, bytes, allocations, instructions.
+They run in every test run, and each timed gate names those that guard it.
 
 A number that changes with a new library or a better method is stored anew here, in the commit that changes it.
 """
 
+import gc
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from harness.base.machine import pinned_threads
+from harness.experiments.gates import instructions
 from harness.scenes.bind import Scene
-from harness.simulation.step import simulate
+from harness.simulation.step import problem, simulate, start
+from solvers.linear.block import BlockCholesky
 from solvers.linear.supernodal import Supernodal
 from solvers.problem import StopRule
-from tests.bench.gates import THREADS, prepare, record, sheet
+from solvers.registry import SOLVERS, load
+from tests.bench.contact import FAR, fallen
+from tests.bench.gates import STOP, THREADS, prepare, record, sheet, simulated, steps
 from tests.bench.solves import system_matrix
 from tests.scenes import SCENES
 
@@ -79,3 +89,97 @@ def test_a_recording_takes_at_most_20_bytes_a_vertex_and_frame(tmp_path: Path):
     assert per_vertex <= 20.0
     # The compressed size depends a little on the last bits of the positions and on the library's version.
     assert per_vertex == pytest.approx(15.6, rel=0.03)
+
+
+@dataclass
+class Factorisations:
+    """How often the Hessian was factorised: for later solves, and for one."""
+
+    kept: int = 0
+    once: int = 0
+
+
+@pytest.fixture
+def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
+    """Counts the factorisations of the test."""
+    found, kept, once = Factorisations(), BlockCholesky.factorise, BlockCholesky.solve_anew
+
+    def factorise(self: BlockCholesky, *given: Any) -> Any:
+        found.kept += 1
+        return kept(self, *given)
+
+    def solve_anew(self: BlockCholesky, *given: Any) -> Any:
+        found.once += 1
+        return once(self, *given)
+
+    monkeypatch.setattr(BlockCholesky, "factorise", factorise)
+    monkeypatch.setattr(BlockCholesky, "solve_anew", solve_anew)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("solver", "size", "iterations", "kept", "once"),
+    [
+        ("newton", 16, [6, 5, 5], 19, 0),
+        ("newton", 32, [8, 23, 11], 90, 0),
+        ("hybrid", 16, [22, 24, 20], 3, 2),
+        ("hybrid", 32, [23, 31, 22], 6, 34),
+    ],
+)
+def test_an_accuracy_takes_as_many_iterations_as_stored(
+    solver: str, size: int, iterations: list[int], kept: int, once: int, factorisations: Factorisations
+):
+    scene, stop = sheet(size), StopRule(iterations=1000, tolerance=1e-6)
+    with pinned_threads(THREADS):
+        prepared = load(SOLVERS[solver])().prepare(scene.system)
+        found = list(simulate(scene, prepared, stop, first_guess="current", frames=3))
+    assert {step.solution.stopped for step in found} == {"tolerance"}
+    # Newton's method converges quadratically, where round-off decides nothing. The hybrid begins with L-BFGS in
+    # float32, whose path may end an iteration earlier or later in each of its rounds on another processor.
+    room = 0 if solver == "newton" else 2
+    assert [step.solution.iterations for step in found] == pytest.approx(iterations, abs=room)
+    assert (factorisations.kept, factorisations.once) == pytest.approx((kept, once), abs=room)
+
+
+def peak(work: Callable[[], object]) -> int:
+    """The most bytes that are allocated at once in a call, as Python's allocators see it, after one to warm up."""
+    work()
+    gc.collect()
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        work()
+        return tracemalloc.get_traced_memory()[1] - before
+    finally:
+        tracemalloc.stop()
+
+
+def arrays(work: Callable[[], object], size: int) -> int:
+    """The same in whole arrays of the sheet's positions; what Python itself takes is less than half of one."""
+    return round(peak(work) / (24 * size**2))
+
+
+@pytest.mark.parametrize(("solver", "stated", "solved", "whole"), [("sparse", 3, 16, 19), ("numba", 3, 2, 6)])
+def test_a_step_allocates_as_many_arrays_as_stored(solver: str, stated: int, solved: int, whole: int):
+    scene = sheet(64)
+    prepared = prepare(solver, scene)
+    posed = problem(scene, start(scene), "current")
+    assert arrays(lambda: problem(scene, start(scene), "current"), 64) == stated
+    assert arrays(lambda: prepared.solve(posed, STOP), 64) == solved
+    assert arrays(lambda: steps(scene, prepared, 1), 64) == whole
+
+
+def test_idle_contact_allocates_no_array_more():
+    assert arrays(fallen(FAR, size=64, frames=3), 64) == arrays(fallen(size=64, frames=3), 64)
+
+
+@pytest.mark.parametrize(("solver", "frames"), [("numba", 4), ("sparse", 2)])
+def test_the_same_work_retires_the_same_instructions(solver: str, frames: int):
+    work = simulated(solver, 16, frames)
+    with pinned_threads(THREADS):
+        work()
+        first, second = instructions.count(work), instructions.count(work)
+    if first is None or second is None:
+        assert instructions.reason()  # it says why: a virtual machine hides the counter, or the kernel refuses it
+    else:
+        assert second == pytest.approx(first, rel=1e-3)  # the interpreter's own housekeeping, once in a while

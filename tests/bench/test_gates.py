@@ -1,40 +1,45 @@
 """Gates on ratios of times. Without `--benchmark-only` nothing is timed: candidate and yardstick must agree."""
 
-from dataclasses import asdict
-from functools import partial
-
-import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from harness.base.machine import pinned_threads
+from harness.experiments.gates.plugin import Race
+from harness.experiments.gates.scenes import CLOCKS
+from tests.bench import test_exact
 from tests.bench.accuracy import ACCURACY
 from tests.bench.contact import CONTACT
 from tests.bench.gates import GATES, THREADS, Gate
-from tests.bench.ratio import measure_ratio
 from tests.bench.solves import SOLVES
 
+ALL = (*GATES, *SOLVES, *CONTACT, *ACCURACY)
 
-@pytest.mark.parametrize(
-    "gate",
-    [
-        pytest.param(gate, id=gate.name, marks=pytest.mark.benchmark(timer=gate.clock))
-        for gate in (*GATES, *SOLVES, *CONTACT, *ACCURACY)
-    ],
-)
-def test_the_gate_holds(gate: Gate, benchmark: BenchmarkFixture):
+
+def marks(gate: Gate) -> list[pytest.MarkDecorator]:
+    """Marks of a gate's test: the clock of pytest-benchmark's own figures, and whether it is of the short set."""
+    return [pytest.mark.benchmark(timer=CLOCKS[gate.clock]), *([pytest.mark.short] if gate.short else [])]
+
+
+@pytest.mark.parametrize("gate", [pytest.param(gate, id=gate.name, marks=marks(gate)) for gate in ALL])
+def test_the_gate_holds(gate: Gate, benchmark: BenchmarkFixture, race: Race):
     with pinned_threads(THREADS):
         candidate = gate.candidate()
-        answer = (candidate if benchmark.enabled else partial(benchmark.pedantic, candidate))()
-        if gate.tolerance is None and not benchmark.enabled:
+        if gate.tolerance is None and benchmark.disabled:
+            benchmark.pedantic(candidate)
             return  # nothing to compare
-        yardstick = gate.yardstick()
-        wanted = yardstick()
-        if gate.tolerance is not None:
-            np.testing.assert_allclose(answer, wanted, rtol=0, atol=gate.tolerance)
-        if benchmark.enabled:
-            ratio = measure_ratio(benchmark, candidate, yardstick, turns=gate.turns, clock=gate.clock)
-            benchmark.extra_info |= {key: getattr(gate, key) for key in ("limit", "goal", "why")} | {
-                "ratio": asdict(ratio)
-            }
-            assert not ratio.exceeds(gate.limit), f"{ratio} lies above {gate.limit}: {gate.why}"
+        told = {key: getattr(gate, key) for key in ("goal", "why", "guards")}
+        race(
+            *(candidate, gate.yardstick()),
+            limit=gate.limit,
+            clock=gate.clock,
+            agree=gate.tolerance,
+            budget=gate.budget,
+            error=gate.error,
+            **told,
+        )
+
+
+@pytest.mark.parametrize("gate", ALL, ids=lambda gate: gate.name)
+def test_a_timed_gate_names_exact_ones_that_guard_it(gate: Gate):
+    assert gate.guards
+    assert [name for name in gate.guards if not callable(getattr(test_exact, name, None))] == []

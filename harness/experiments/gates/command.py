@@ -1,0 +1,105 @@
+"""`springbench gate`: against another revision, from a table, or between two stored results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from harness.base.console import out, say
+from harness.base.errors import InputError
+
+
+def gate(
+    what: Annotated[
+        list[Path] | None,
+        typer.Argument(help="With --against a scene or a sweep; else a table of gates, or two stored results."),
+    ] = None,
+    against: Annotated[str | None, typer.Option(help="A git revision to be no slower than.")] = None,
+    name: Annotated[str, typer.Option("-k", help="With --against: the tree's own gates whose name holds this.")] = "",
+    budget: Annotated[float | None, typer.Option(help="Seconds that a gate may take; 120 if left out.")] = None,
+    limit: Annotated[float | None, typer.Option(help="Ratio of times that counts as slower; 1.03 if left out.")] = None,
+    clock: Annotated[str | None, typer.Option(help="cpu or wall; what suits the work if left out.")] = None,
+    yardstick: Annotated[
+        str | None, typer.Option(help="Between stored results: a solver whose multiples are compared instead of times.")
+    ] = None,
+    solver: Annotated[list[str] | None, typer.Option(help="For a scene: solvers; repeatable.")] = None,
+    size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
+    iterations: Annotated[int | None, typer.Option(help="For a scene: iteration limit of a step.")] = None,
+    tolerance: Annotated[float | None, typer.Option(help="For a scene: relative tolerance of a step.")] = None,
+) -> None:
+    """Find what became slower. Exit code 1: something did; 3: cannot tell; 0: all gates hold."""
+    files = what or []
+    chosen = {"--solver": solver, "--size": size, "--iterations": iterations, "--tolerance": tolerance}
+    if against is not None:
+        asked = {"iterations": iterations, "tolerance": tolerance}
+        options = _options(budget, limit, clock)
+        raise typer.Exit(
+            _against(against, files, name, options, {"solvers": solver or [], "sizes": size or [], **asked})
+        )
+    if len(files) == 1 and files[0].suffix.lower() in (".yaml", ".yml"):
+        for option, value in {**chosen, "--limit": limit, "--clock": clock, "-k": name}.items():
+            if value:
+                raise InputError(
+                    f"{option}: a table of gates says so itself; change {files[0]}, or give --against REVISION"
+                )
+        raise typer.Exit(_table(files[0], _options(budget, limit, clock).budget))
+    if name:
+        raise InputError("-k: chooses gates to compare with another revision; wanted --against REVISION beside it")
+    for option, value in {"--budget": budget, "--limit": limit, "--clock": clock, **chosen}.items():
+        if value:
+            raise InputError(f"{option}: nothing is timed between stored results; leave it out")
+    if len(files) != 2:
+        wanted = "wanted --against REVISION, a table of gates, or two stored results, the old one first"
+        raise InputError(f"gate: came {len(files)} file{'s' * (len(files) != 1)}; {wanted}")
+    raise typer.Exit(_stored(files[0], files[1], yardstick))
+
+
+def _stored(old: Path, new: Path, yardstick: str | None) -> int:
+    from harness.report import gate as benchmarks
+    from harness.report import stored
+
+    ours = [path.suffix.lower() != ".json" for path in (old, new)]
+    if ours[0] != ours[1]:
+        raise InputError(f"{old} and {new} cannot be compared: one is of pytest-benchmark, the other is not")
+    if all(ours):
+        return stored.compare(old, new, out, yardstick)
+    if yardstick:
+        raise InputError("--yardstick: compares results of sweeps; a file of pytest-benchmark has its own ratios")
+    return benchmarks.compare(old, new, out)
+
+
+def _table(path: Path, budget: float) -> int:
+    from harness.experiments.gates.against import exit_code
+    from harness.experiments.gates.table import run_table
+
+    return exit_code([result.answer for _, result in run_table(path, budget, say)])
+
+
+def _options(budget: float | None, limit: float | None, clock: str | None) -> Any:
+    from harness.experiments.gates.against import LIMIT, Options
+    from harness.experiments.gates.sequential import Rule
+    from harness.experiments.gates.turns import BUDGET
+
+    if clock not in (None, "cpu", "wall"):
+        raise InputError(f"--clock: came {clock}; wanted cpu or wall")
+    if budget is not None and not budget > 0:
+        raise InputError(f"--budget: came {budget}; wanted seconds")
+    try:
+        Rule(limit or LIMIT)
+    except ValueError as error:
+        raise InputError(f"--{error}") from error
+    return Options(budget or BUDGET, limit or LIMIT, clock=clock)
+
+
+def _against(revision: str, files: list[Path], name: str, options: Any, asked: dict[str, Any]) -> int:
+    from harness.experiments.gates import revisions
+    from harness.experiments.gates.against import exit_code, requests_of_config, requests_of_gates, run_gates
+
+    if len(files) > 1 or (files and name):
+        raise InputError("gate --against: wanted one scene, one sweep, or -k NAME; came several of them")
+    both = revisions.sides(revisions.root(Path.cwd()), revision)
+    requests = requests_of_config(both, files[0], asked) if files else requests_of_gates(both, name)
+    found = run_gates(both, requests, options, say)
+    return exit_code([result.answer for _, result in found])

@@ -1,0 +1,197 @@
+"""Gates of one's own, in one's own tests: a plugin for pytest that comes with the package, on top of pytest-benchmark.
+
+    def test_mine_is_no_slower(race):
+        race(mine, theirs, limit=1.03)                                  # two functions of no arguments
+
+    def test_my_solver_is_no_slower(race):
+        race.solvers("cloth.yaml", Mine(), "numba", limit=1.0, agree=1e-6)      # on a scene
+
+Both must give the same answer, in every test run; with pytest-benchmark enabled they then take turns. What was found
+stands in pytest-benchmark's JSON. A gate that cannot tell is neither passed nor failed: it is counted as `undecided`,
+and a session of which nothing failed then ends with the exit code 13 (with 3 pytest itself ends where it breaks).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Generator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import pytest
+
+if TYPE_CHECKING:
+    from pytest_benchmark.fixture import BenchmarkFixture
+
+    from harness.experiments.gates.scenes import Given, Work
+    from harness.experiments.gates.turns import Result
+
+UNDECIDED = pytest.StashKey[bool]()
+EXIT_UNDECIDED = 13
+MOST = 10**9
+"""Rounds that pytest-benchmark is asked for; the race ends before."""
+
+
+class _Decided(BaseException):
+    """Ends pytest-benchmark's rounds; no Exception, which would mark the benchmark as failed."""
+
+
+class Race:
+    """The fixture: compare two programs, or two solvers on a scene. One race a test."""
+
+    def __init__(self, benchmark: BenchmarkFixture, item: pytest.Item) -> None:
+        self._benchmark, self._item = benchmark, item
+        self._budget: float = item.config.option.race_budget
+
+    def __call__(
+        self,
+        candidate: Work,
+        yardstick: Work,
+        *,
+        limit: float,
+        clock: Literal["cpu", "wall"] = "cpu",
+        agree: float | None = 0.0,
+        budget: float | None = None,
+        error: float | None = None,
+        **told: Any,
+    ) -> Result | None:
+        """Fail where the candidate takes more than `limit` times as long as the yardstick.
+
+        agree: how far their answers may lie apart, in their own size; None where they have none. clock: the process's
+        CPU time, or what one waits. budget: seconds, else --race-budget. error: the probability of a wrong answer, .1 %
+        if left out. told: goes to the benchmark's JSON as it is. Returns what was found, None where nothing is timed.
+        """
+        from harness.experiments.gates.agreement import difference
+        from harness.experiments.gates.scenes import calls_of, timed
+        from harness.experiments.gates.sequential import ALPHA, Answer, Rule
+        from harness.experiments.gates.turns import playing
+
+        rule, benchmark = Rule(limit, error or ALPHA), self._benchmark
+        answer = benchmark.pedantic(candidate) if benchmark.disabled else candidate()
+        if agree is not None:
+            said = difference(answer, yardstick(), agree)
+            if said:
+                pytest.fail(f"the answers differ, so nothing was timed: {said}", pytrace=False)
+        elif not benchmark.disabled:
+            yardstick()
+        if benchmark.disabled:
+            return None
+        calls = calls_of(candidate, yardstick)
+        a, b = (timed(work, calls, clock) for work in (candidate, yardstick))
+        found: list[Result] = []
+        last: list[float] = []
+        game = playing(b, rule, budget=budget or self._budget)
+
+        def before() -> None:
+            try:
+                game.send(last.pop()) if last else next(game)
+            except StopIteration as done:
+                found.append(done.value)
+                raise _Decided from None
+
+        with suppress(_Decided):
+            benchmark.pedantic(lambda: last.append(a()), setup=before, rounds=MOST)
+        (result,) = found
+        benchmark.extra_info |= told | _told(result, calls, clock)
+        if result.answer is Answer.UNDECIDED:
+            self._item.stash[UNDECIDED] = True
+            pytest.skip(str(result))
+        if result.answer is Answer.FAILS:
+            pytest.fail(str(result), pytrace=False)
+        return result
+
+    def solvers(
+        self,
+        scene: str | os.PathLike[str],
+        solver: Given,
+        against: Given,
+        *,
+        limit: float,
+        agree: float | None = 1e-9,
+        clock: Literal["cpu", "wall"] = "cpu",
+        budget: float | None = None,
+        size: int | None = None,
+        **options: Any,
+    ) -> Result | None:
+        """The same of two solvers on a scene: each a name, a mapping of name and parameters, or a solver itself.
+
+        scene: its file, relative to the test's; agree: how far the positions may lie apart, in the scene's size;
+        options: those of a run: iterations, tolerance, frames, integrator, time_step, first_guess.
+        """
+        from harness.base.machine import pinned_threads
+        from harness.experiments.gates.scenes import pair
+
+        with pinned_threads(1):
+            both = pair(self._item.path.parent / Path(scene), solver, against, size=size, **options)
+            return self(*both, limit=limit, clock=clock, agree=agree, budget=budget)
+
+
+def _told(result: Result, calls: int, clock: str) -> dict[str, Any]:
+    """What a race leaves in the benchmark's `extra_info`."""
+    found = result.interval
+    return {
+        "ratio": {"median": found.ratio, "low": max(found.low, 1e-300), "high": min(found.high, 1e300)},  # no inf
+        "limit": result.rule.limit,
+        "answer": result.answer.name.lower(),
+        "error": result.rule.alpha,
+        "turns": len(result.turns),
+        "calls": calls,
+        "clock": clock,
+        "load": round(result.load, 2),
+    }
+
+
+@pytest.fixture
+def race(benchmark: BenchmarkFixture, request: pytest.FixtureRequest) -> Race:
+    """Compare two programs, or two solvers on a scene: the same answer first, then who is faster."""
+    return Race(benchmark, request.node)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The options of races."""
+    group = parser.getgroup("springbench")
+    group.addoption("--race-budget", type=float, default=60.0, help="Seconds that a race may take; 60.")
+
+
+class _Count:
+    """Counts what could not be told; with xdist in the process that reports."""
+
+    def __init__(self) -> None:
+        self.undecided = 0
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.undecided += getattr(report, "undecided", False)
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_sessionfinish(self, session: pytest.Session, exitstatus: int) -> None:
+        if exitstatus == 0 and self.undecided:
+            session.exitstatus = EXIT_UNDECIDED
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Count from the start."""
+    config.pluginmanager.register(_Count(), "springbench-undecided")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Mark what could not be told."""
+    report = yield
+    if report.when == "call" and report.skipped and item.stash.get(UNDECIDED, False):
+        report.undecided = True  # type: ignore[attr-defined]
+    return report
+
+
+def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, tuple[str, dict[str, bool]]] | None:
+    """`?` for what could not be told."""
+    if getattr(report, "undecided", False):
+        return "undecided", "?", ("UNDECIDED", {"yellow": True})
+    return None
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """What could not be told, and why."""
+    for report in terminalreporter.stats.get("undecided", []):
+        said = report.longrepr[2].removeprefix("Skipped: ")
+        terminalreporter.write_line(f"UNDECIDED {report.nodeid}: {said}")

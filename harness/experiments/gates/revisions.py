@@ -1,0 +1,123 @@
+"""A git revision as something that can be run: a worktree of its own, and an environment where its libraries differ.
+
+Worktrees stay in the user's cache, so that what a revision compiles is compiled once; of the least recently used ones
+all but a few go.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from harness.base.errors import InputError
+from harness.experiments.gates.pair import Side
+
+KEPT = 6
+"""Worktrees that stay in the cache."""
+
+
+def cache() -> Path:
+    """Where worktrees are kept."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "springbench" / "revisions"
+
+
+def root(folder: Path) -> Path:
+    """The git checkout that holds a folder; raises InputError."""
+    told = _git(folder, "rev-parse", "--show-toplevel")
+    if told.returncode:
+        raise InputError(f"--against: {folder} is in no git checkout ({_last(told.stderr)}); go to one")
+    return Path(told.stdout.strip())
+
+
+def resolve(checkout: Path, revision: str) -> str:
+    """The commit that a revision names; raises InputError."""
+    told = _git(checkout, "rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}")
+    if told.returncode:
+        wanted = "wanted a commit, a branch or a tag, such as HEAD~1; `git log --oneline` lists them"
+        raise InputError(f"--against: unknown revision {revision!r}; {wanted}")
+    return told.stdout.strip()
+
+
+def sides(checkout: Path, revision: str) -> tuple[Side, Side]:
+    """The checkout as it stands, uncommitted changes included, and the revision. Raises InputError."""
+    commit = resolve(checkout, revision)
+    tree = worktree(checkout, commit)
+    name = f"revision {revision}" if commit.startswith(revision) else f"revision {revision} ({commit[:10]})"
+    return Side("this checkout", checkout), Side(name, tree, _python(checkout, tree, name), checkout)
+
+
+def worktree(checkout: Path, commit: str) -> Path:
+    """A clean worktree of a commit, from the cache or made there. Raises InputError."""
+    tree = cache() / commit[:16]
+    with _alone(cache()):
+        _git(checkout, "worktree", "prune")
+        if tree.exists():
+            clean = _git(tree, "status", "--porcelain", "--untracked-files=no")
+            if _git(tree, "rev-parse", "HEAD").stdout.strip() == commit and not clean.returncode and not clean.stdout:
+                os.utime(tree)
+                return tree
+            shutil.rmtree(tree)
+            _git(checkout, "worktree", "prune")
+        told = _git(checkout, "worktree", "add", "--detach", "--force", str(tree), commit)
+        if told.returncode:
+            raise InputError(f"--against: no worktree of {commit[:10]}: {_last(told.stderr)}")
+        for old in sorted(cache().glob("[0-9a-f]*"), key=lambda path: path.stat().st_mtime)[:-KEPT]:
+            shutil.rmtree(old, ignore_errors=True)
+    return tree
+
+
+def _python(checkout: Path, tree: Path, name: str) -> Path:
+    """This interpreter where both want the same libraries, else that of an environment of the revision's own."""
+    if _wanted(checkout) == _wanted(tree):
+        return Path(sys.executable)
+    own = tree / ".venv"
+    python = own / "bin" / "python"
+    if python.exists():
+        return python
+    for command in (
+        [sys.executable, "-m", "venv", str(own)],
+        [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-e", str(tree)],
+    ):
+        told = subprocess.run(command, cwd=tree, capture_output=True, text=True)
+        if told.returncode:
+            shutil.rmtree(own, ignore_errors=True)
+            raise InputError(f"{name}: does not build: {_last(told.stderr or told.stdout)}")
+    return python
+
+
+def _wanted(tree: Path) -> Any:
+    """What decides about a tree's libraries."""
+    try:
+        project = tomllib.loads((tree / "pyproject.toml").read_text())["project"]
+    except (OSError, KeyError, tomllib.TOMLDecodeError):
+        return None
+    return sorted(project.get("dependencies", ())), project.get("requires-python")
+
+
+def _git(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True)
+    except OSError as error:
+        raise InputError(f"--against: git cannot be run ({error}); install it") from error
+
+
+def _last(said: str) -> str:
+    """The last line that a program said."""
+    return next((line.strip() for line in reversed(said.splitlines()) if line.strip()), "it does not say why")
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """One process at a time makes worktrees."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield

@@ -1,0 +1,96 @@
+"""Two solvers on one scene, in one process: the same steps, the same answer, and then a race."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+from harness.base.errors import InputError
+from harness.config.load import load_any
+from harness.config.sweep import RunSpec
+from harness.experiments.gates.turns import CALL, Clock, Timed
+from harness.scenes.bind import build
+from harness.simulation.step import prepare, simulate
+from solvers.problem import Positions, Solver, StopRule
+from solvers.registry import SOLVERS, load
+
+CLOCKS: dict[Clock, Callable[[], float]] = {"cpu": time.process_time, "wall": time.perf_counter}
+
+Given = str | Mapping[str, Any] | Solver
+"""A solver: its name, a mapping of its name and parameters, or itself."""
+
+Work = Callable[[], Any]
+"""Does something once, and gives its answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """The first steps of a scene with a solver, prepared; a call does them and gives the last positions [m]."""
+
+    run: RunSpec
+    frames: int
+    _positions: Callable[[int], Positions]
+
+    def __call__(self) -> Positions:
+        return self._positions(self.frames)
+
+
+def pair(scene: Path, solver: Given, against: Given, *, size: int | None = None, **options: Any) -> tuple[Steps, Steps]:
+    """The same steps by two solvers, as many of the scene's as make a call long enough, both done once.
+
+    options: those of a run, such as iterations and tolerance. Raises InputError, Unsupported, NotPositiveDefinite.
+    """
+    both = [_steps(scene, given, size, options) for given in (solver, against)]
+    once = min(seconds_of(steps) for steps in both)
+    frames = min(both[0].run.frames, ceil(CALL / max(once, 1e-6)))
+    candidate, yardstick = (Steps(s.run, frames, s._positions) for s in both)
+    return candidate, yardstick
+
+
+def _steps(scene: Path, given: Given, size: int | None, options: dict[str, Any]) -> Steps:
+    asked: list[Any] = [dict(given) if isinstance(given, Mapping) else given if isinstance(given, str) else "sparse"]
+    runs = load_any(scene, solvers=asked, sizes=[size] if size else [], **{"threads": 1, **options}).runs()
+    if len(runs) != 1:
+        raise InputError(f"{scene}: a gate is on one run; came {len(runs)}")
+    (run,) = runs
+    named = isinstance(given, (str, Mapping))
+    solver: Solver = load(SOLVERS[run.solver.name])(**run.solver.parameters) if named else given
+    bound = build(run.scene, run.size, run.integrator)
+    prepared, stop = prepare(bound, solver), StopRule(run.iterations, run.tolerance)
+
+    def positions(frames: int) -> Positions:
+        p = bound.mesh.rest
+        for step in simulate(bound, prepared, stop, first_guess=run.first_guess, frames=frames):
+            p = step.positions
+        return p
+
+    return Steps(run, 1, positions)
+
+
+def timed(work: Work, calls: int, clock: Clock) -> Timed:
+    """The seconds of so many calls, together."""
+    now = CLOCKS[clock]
+
+    def seconds() -> float:
+        began = now()
+        for _ in range(calls):
+            work()
+        return now() - began
+
+    return seconds
+
+
+def seconds_of(work: Work) -> float:
+    """CPU seconds of one call, after one to warm up."""
+    work()
+    return timed(work, 1, "cpu")()
+
+
+def calls_of(candidate: Work, yardstick: Work) -> int:
+    """How often two warm programs are to be called in a row, so that a call is long enough for a clock."""
+    once = min(timed(work, 1, "wall")() for work in (candidate, yardstick))
+    return max(1, ceil(CALL / max(once, 1e-7)))

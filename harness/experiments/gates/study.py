@@ -1,0 +1,201 @@
+"""How often gates are wrong, and what they find: turns recorded once, and the gates' own rule replayed over them.
+
+A record holds the four times of each turn of two processes of the same code, start after start. A replay draws
+stretches of successive turns, so that bursts stay bursts, strings them together to as many turns as a budget has room
+for, makes the candidate's times so much longer as is asked, and lets the rule look after every turn; what fails it
+repeats on another start's turns, as a gate does.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from random import Random
+from time import perf_counter, process_time, sleep
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from scipy.stats import mannwhitneyu
+
+from harness.base import rows
+from harness.base.errors import InputError
+from harness.experiments.gates.against import Options, Request, started
+from harness.experiments.gates.pair import Side
+from harness.experiments.gates.sequential import Answer, Rule
+from harness.experiments.gates.turns import orders
+
+COLUMNS = (
+    rows.Column("gate", pa.string(), "", "what takes turns"),
+    rows.Column("condition", pa.string(), "", "what was run beside it: nothing, busy or bursty"),
+    rows.Column("start", pa.int64(), "", "which pair of processes, from 0"),
+    rows.Column("order", pa.string(), "", "ABBA or BAAB"),
+    *(rows.Column(f"call_{k}", pa.float64(), "s", f"time of the turn's call {k}") for k in range(4)),
+    rows.Column("wall", pa.float64(), "s", "wall time of the whole turn"),
+    rows.Column("load", pa.float64(), "", "load average over a minute"),
+    rows.Column("planted", pa.float64(), "", "extra work of A, as a part of its iterations"),
+)
+SCHEMA = rows.schema_of(COLUMNS)
+
+CONDITIONS = ("nothing", "busy", "bursty")
+STRETCH = 25
+"""Turns that a replay takes in one piece: seconds, as long as most bursts last."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """The turns of one pair of processes: log ratios (n,), the times of A and of B (n, 2) [s], wall [s] a turn, and the
+    machine's median load average."""
+
+    log_ratios: Array
+    a: Array
+    b: Array
+    wall: float
+    load: float
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Of many replays: the parts that fail, hold and are undecided, and the median seconds to an answer."""
+
+    fails: float
+    holds: float
+    undecided: float
+    seconds: float
+
+
+def record(
+    path: Path,
+    checkout: Path,
+    requests: Sequence[Request],
+    condition: str,
+    *,
+    seconds: float,
+    starts: int,
+    planted: float = 0.0,
+) -> None:
+    """Record so many seconds of turns of each request, in so many starts, beside what the condition says."""
+    found = []
+    with competing(condition):
+        for request in requests:
+            for start in range(starts):
+                sides = Side("the one", checkout, extra=planted), Side("the other", checkout)
+                with started(sides, request, Options(seconds), lambda line: None) as (a, b):
+                    began = perf_counter()
+                    for order in orders():
+                        at = perf_counter()
+                        calls = [{"A": a, "B": b}[who]() for who in order]
+                        row = {"gate": request.title, "condition": condition, "start": start, "order": order}
+                        row |= {f"call_{k}": call for k, call in enumerate(calls)}
+                        now = perf_counter()
+                        found.append(row | {"wall": now - at, "load": os.getloadavg()[0], "planted": planted})
+                        if now - began >= seconds / starts:
+                            break
+    rows.write(path, found, SCHEMA)
+
+
+@contextmanager
+def competing(condition: str) -> Iterator[None]:
+    """One process on each core beside what is recorded: always at work (busy), now and then (bursty), or none."""
+    if condition not in CONDITIONS:
+        raise InputError(f"--condition: came {condition}; wanted one of {', '.join(CONDITIONS)}")
+    with ExitStack() as cleanup:
+        for core in range(os.cpu_count() or 1 if condition != "nothing" else 0):
+            process = get_context("spawn").Process(target=_compete, args=(condition == "bursty", core), daemon=True)
+            process.start()
+            cleanup.callback(process.join)
+            cleanup.callback(process.terminate)
+        yield
+
+
+def _compete(bursts: bool, seed: int) -> None:
+    """Go through 16 MB again and again; in bursts of half a second to three, with pauses of one to six."""
+    rng, memory = Random(seed), np.ones(2**21)
+    while True:
+        until = process_time() + (rng.uniform(0.5, 3.0) if bursts else 60.0)
+        while process_time() < until:
+            memory *= 1.0
+        if bursts:
+            sleep(rng.uniform(1.0, 6.0))
+
+
+def read(paths: Sequence[Path]) -> dict[tuple[str, str], list[Start]]:
+    """The recorded starts by gate and condition. Raises InputError."""
+    table = rows.read(paths, SCHEMA).to_pylist()
+    by: dict[tuple[str, str, int], list[dict]] = {}
+    for row in table:
+        by.setdefault((row["gate"], row["condition"], row["start"]), []).append(row)
+    found: dict[tuple[str, str], list[Start]] = {}
+    for (gate, condition, _), turns in by.items():
+        times = np.array([[row[f"call_{k}"] for k in range(4)] for row in turns])
+        abba = np.array([row["order"] == "ABBA" for row in turns])[:, None]
+        outer, inner = times[:, [0, 3]], times[:, 1:3]
+        a, b = np.where(abba, outer, inner), np.where(abba, inner, outer)
+        wall = float(np.mean([row["wall"] for row in turns]))
+        load = float(np.median([row["load"] for row in turns]))
+        start = Start(np.log(a.sum(axis=1) / b.sum(axis=1)), a, b, wall, load)
+        found.setdefault((gate, condition), []).append(start)
+    return found
+
+
+def replay(starts: Sequence[Start], slower: float, rule: Rule, budget: float, replays: int, seed: int = 0) -> Found:
+    """What gates would have answered with A `slower` times as slow as it was, `replays` times over."""
+    rng, answers, seconds = np.random.default_rng(seed), list[Answer](), list[float]()
+    for _ in range(replays):
+        answer, spent = _race(rng, starts, slower, rule, budget)
+        if answer is Answer.FAILS:  # which is believed when it comes twice
+            again, more = _race(rng, starts, slower, rule, budget - spent)
+            answer, spent = (Answer.FAILS if again is Answer.FAILS else Answer.UNDECIDED), spent + more
+        answers.append(answer)
+        seconds.append(spent)
+    fails, holds, undecided = (answers.count(a) / replays for a in (Answer.FAILS, Answer.HOLDS, Answer.UNDECIDED))
+    return Found(fails, holds, undecided, float(np.median(seconds)))
+
+
+def _race(
+    rng: np.random.Generator, starts: Sequence[Start], slower: float, rule: Rule, budget: float
+) -> tuple[Answer, float]:
+    """The answer on some start's turns, and the seconds that it took."""
+    start = starts[int(rng.integers(len(starts)))]
+    turns = _stretches(rng, len(start.log_ratios), max(1, int(budget / start.wall)))
+    answer, used = rule.first(np.log(slower) + start.log_ratios[turns])
+    return answer, used * start.wall
+
+
+def _stretches(rng: np.random.Generator, length: int, turns: int) -> NDArray[np.int64]:
+    """The indices of stretches of successive turns, `turns` in all; a record is a ring."""
+    begins = rng.integers(length, size=max(1, -(-turns // STRETCH)))
+    return ((begins[:, None] + np.arange(STRETCH)) % length).ravel()[:turns]
+
+
+def _asv(new: Array, old: Array) -> bool:
+    """asv continuous with a factor of 1.05: the medians differ by it, and Mann and Whitney's test says p < .002."""
+    return float(np.median(new)) > 1.05 * float(np.median(old)) and mannwhitneyu(new, old).pvalue < 0.002
+
+
+OTHERS: dict[str, Callable[[Array, Array], bool]] = {
+    "pytest-benchmark, min:5%": lambda new, old: float(new.min()) > 1.05 * float(old.min()),
+    "pytest-benchmark, mean:5%": lambda new, old: float(new.mean()) > 1.05 * float(old.mean()),
+    "asv continuous, 1.05": _asv,
+}
+"""Comparisons of two sessions that ran one after the other: whether the new one is called slower."""
+
+
+def replay_other(
+    slower_than: Callable[[Array, Array], bool], starts: Sequence[Start], slower: float, seconds: float, replays: int
+) -> float:
+    """The part of comparisons that call A slower, each of two sessions of so many seconds, A's and then B's."""
+    rng, said = np.random.default_rng(0), 0
+    for _ in range(replays):
+        start = starts[int(rng.integers(len(starts)))]
+        turns = max(1, min(int(seconds / start.wall), len(start.a) // 2))
+        at = int(rng.integers(len(start.a)))
+        first, second = ((at + k * turns + np.arange(turns)) % len(start.a) for k in range(2))
+        said += slower_than(slower * start.a[first].ravel(), start.b[second].ravel())
+    return said / replays

@@ -1,0 +1,151 @@
+"""Two programs take turns, A B B A or B A A B by a coin, until the sequential test knows or the budget ends.
+
+A test sees what differs between two running programs, and two processes of the same code differ a little all their
+lives, by where their memory happens to lie (Mytkowicz et al. 2009). A slowdown is therefore believed only when a second
+pair, started anew, is found to be slower too.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from random import Random, SystemRandom
+from time import perf_counter
+from typing import Literal
+
+from harness.experiments.gates.sequential import Answer, Interval, Rule, interval, turn
+
+ORDERS = ("ABBA", "BAAB")
+
+BUDGET = 120.0
+"""Seconds that a gate may take until it says that it cannot tell."""
+
+CALL = 0.01
+"""Seconds of work that a call should hold: a clock's overhead is nothing then. Longer calls are not steadier: with
+seven other programs on two cores turns of 10 and of 40 ms spread alike, and five times as many of them fit."""
+
+Clock = Literal["cpu", "wall"]
+Timed = Callable[[], float]
+"""Does the work once; how long it took [s], by whatever clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One turn: its order, and the seconds of its four calls in that order."""
+
+    order: str
+    seconds: tuple[float, ...]
+
+    def of(self, who: str) -> list[float]:
+        """The two times of A, or of B [s]."""
+        return [seconds for name, seconds in zip(self.order, self.seconds, strict=True) if name == who]
+
+    @property
+    def log_ratio(self) -> float:
+        """Of A's time to B's."""
+        return turn(self.of("A"), self.of("B"))
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What came of a gate. elapsed: seconds that it took; load: the machine's load average at its end; starts: how many
+    pairs of programs were started, the second to confirm what the first found."""
+
+    answer: Answer
+    rule: Rule
+    interval: Interval
+    turns: tuple[Turn, ...]
+    elapsed: float
+    load: float
+    starts: int = 1
+
+    def __str__(self) -> str:
+        limit, (ratio, low, high) = self.rule.limit, (self.interval.ratio, self.interval.low, self.interval.high)
+        if self.answer is Answer.UNDECIDED:
+            held = f"{low:.3g} to {high:.3g}" if low > 0 else f"{len(self.turns)} turns are too few"
+            return (
+                f"cannot tell within {self.elapsed:.0f} s: {held} (limit {limit:.3g}), on a machine with {self._load}"
+            )
+        near = 0.9 <= limit <= 1.5 and ratio < 2
+        if self.answer is Answer.FAILS:
+            if near:
+                bounds = f"[{_percent(low)}, {_percent(high)}]"
+                return f"slower by {_percent(ratio)} % {bounds}: fails (limit {_percent(limit)} %)"
+            return f"ratio {ratio:.3g} [{low:.3g}, {high:.3g}]: fails (limit {limit:.3g})"
+        if near and high >= 1:
+            return f"no slower than {_percent(high)} %: holds (limit {_percent(limit)} %)"
+        return f"ratio {ratio:.3g} [{low:.3g}, {high:.3g}]: holds (limit {limit:.3g})"
+
+    @property
+    def _load(self) -> str:
+        return f"load {self.load:.0f}" if self.load >= 1 else "no load"
+
+
+def race(a: Timed, b: Timed, rule: Rule, *, budget: float = BUDGET, coin: Random | None = None) -> Result:
+    """Time `a` against `b`, both warm, until the rule answers or `budget` seconds have gone.
+
+    coin: what decides the orders; the system's own where none is given, which nothing on the machine can follow.
+    """
+    game = playing(b, rule, budget=budget, coin=coin)
+    next(game)
+    while True:
+        try:
+            game.send(a())
+        except StopIteration as done:
+            return done.value
+
+
+def playing(
+    b: Timed, rule: Rule, *, budget: float = BUDGET, coin: Random | None = None
+) -> Generator[None, float, Result]:
+    """The same for a caller that times A itself: each time this yields it wants the seconds of one call of A."""
+    began, turns = perf_counter(), list[Turn]()
+    for order in orders(coin):
+        seconds = []
+        for who in order:
+            seconds.append((yield) if who == "A" else b())
+        turns.append(Turn(order, tuple(seconds)))
+        answer, elapsed = rule.judge([t.log_ratio for t in turns]), perf_counter() - began
+        if answer is not Answer.UNDECIDED or elapsed >= budget:
+            return result(rule, turns, elapsed)
+    raise AssertionError("orders do not end")
+
+
+def orders(coin: Random | None = None) -> Iterator[str]:
+    """The orders of turns, without end."""
+    coin = coin or SystemRandom()
+    while True:
+        yield coin.choice(ORDERS)
+
+
+def result(rule: Rule, turns: list[Turn], elapsed: float) -> Result:
+    """What came of the turns so far, one at least, after so many seconds."""
+    x = [t.log_ratio for t in turns]
+    return Result(rule.judge(x), rule, interval(x, rule.alpha), tuple(turns), elapsed, os.getloadavg()[0])
+
+
+def confirmed(
+    start: Callable[[], AbstractContextManager[tuple[Timed, Timed]]], rule: Rule, *, budget: float = BUDGET
+) -> Result:
+    """A race between programs that `start` starts; one that fails is repeated with programs started anew.
+
+    Where the second race finds otherwise nothing is decided. The budget is that of both together.
+    """
+    with start() as (a, b):
+        first = race(a, b, rule, budget=budget)
+    if first.answer is not Answer.FAILS:
+        return first
+    with start() as (a, b):
+        second = race(a, b, rule, budget=max(budget - first.elapsed, 0.0))
+    answer = Answer.FAILS if second.answer is Answer.FAILS else Answer.UNDECIDED
+    both, elapsed = (*first.turns, *second.turns), first.elapsed + second.elapsed
+    # Each race's interval has its own error; the wider ends hold what both say.
+    low, high = (f(getattr(r.interval, end) for r in (first, second)) for f, end in ((min, "low"), (max, "high")))
+    found = Interval(interval([t.log_ratio for t in both], rule.alpha).ratio, low, high)
+    return Result(answer, rule, found, both, elapsed, second.load, starts=2)
+
+
+def _percent(ratio: float) -> str:
+    return f"{100 * (ratio - 1):.1f}"

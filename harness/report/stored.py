@@ -1,0 +1,213 @@
+"""Compares two stored results, folders or archives of rows: what became slower, and what else changed with it?
+
+Runs are paired by what they were asked to do. The time of a step is the least over its rounds, which the load of the
+machine moves least; two runs are compared by the ratios of their steps,
+
+    ratio = exp(median over frames of log(new / old)),
+
+with a 95 % interval by resampling frames (SciPy's percentile bootstrap). The load may have been another on the day of
+the other results, and no statistics sees that: hence a margin beyond the interval, and `springbench gate --against` for
+what is smaller. Times of two machines do not compare; with a yardstick, a solver that both ran, the ratios to it do.
+"""
+
+from __future__ import annotations
+
+import tarfile
+import zipfile
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from scipy.stats import bootstrap
+
+from harness.base import rows
+from harness.base.errors import InputError, Mistake
+
+MARGIN = 0.10
+"""Beyond the interval: minima of two runs of the same code lie up to 4 % apart on an idle machine,more on others."""
+
+ASKED = (
+    *("scene", "size", "solver", "parameters", "time_step", "integrator", "first_guess", "max_iterations"),
+    *("tolerance", "threads"),
+)
+"""The columns that pair two runs."""
+
+Row = Mapping[str, Any]
+Key = tuple[Any, ...]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """What the rows of a run say. seconds: of each frame's step, the least over its rounds; status: ok, or what it is;
+    machine, cpu: where it ran; iterations: of all frames; residual, error, digest: of the last frame, where known."""
+
+    row: Row
+    status: str
+    seconds: dict[int, float]
+    iterations: int | None
+    residual: float | None
+    error: float | None
+    digest: str | None
+
+    @property
+    def name(self) -> str:
+        """The run in words."""
+        size = f" {self.row['size']}" if self.row["size"] else ""
+        given = "" if self.row["parameters"] in (None, "{}") else f" {self.row['parameters']}"
+        return f"{self.row['scene']}{size} {self.row['solver']}{given}"
+
+
+def compare(old: Path, new: Path, console: Console, yardstick: str | None = None) -> int:
+    """Print what changed from `old` to `new`; 1 if anything became slower or fails now, else 0.
+
+    yardstick: the name of a solver; times are then its multiples, which compare between machines too.
+    Raises InputError where nothing can be compared, with the reasons.
+    """
+    was, now = read(old), read(new)
+    table = Table(
+        "run", "old", "new", "change", "verdict", "iterations", "residual", "error", "last positions", box=SIMPLE_HEAD
+    )
+    refused, bad, compared = dict[str, str](), 0, 0
+    for key in was | now:
+        if key not in was or key not in now:
+            side, lone = ("new", now[key]) if key not in was else ("vanished", was[key])
+            table.add_row(escape(lone.name), *("", "", "", side))
+            continue
+        before, after = was[key], now[key]
+        reason = _incomparable(before, after, yardstick)
+        units = (1e3, 1e3) if yardstick is None else tuple(_unit(runs, key, yardstick) for runs in (was, now))
+        if not reason and None in units:
+            reason = f"{yardstick} was not run beside it in both"
+        if reason:
+            refused[before.name] = reason
+            continue
+        compared += 1
+        figures, verdict = _judged(before, after, units)
+        bad += verdict in ("slower", "fails now")
+        table.add_row(escape(before.name), *figures, verdict, *_beside(before, after))
+    if not compared:
+        said = "; ".join(dict.fromkeys(refused.values())) or "they have no run in common"
+        raise InputError(f"{old} and {new} cannot be compared: {said}")
+    console.print(table)
+    for name, reason in refused.items():
+        console.print(f"not compared: {name}: {reason}", markup=False)
+    if yardstick:
+        console.print(f"times are multiples of those of {yardstick}", markup=False)
+    console.print(f"{bad} of {compared} became slower or fail now" if bad else f"nothing of {compared} became slower")
+    return 1 if bad else 0
+
+
+def read(path: Path) -> dict[Key, Run]:
+    """The runs of a folder of results or of an archive of one, by what they were asked to do. Raises InputError."""
+    with _folder(path) as folder:
+        files = sorted(folder.glob("**/rows/*.parquet"))
+        if not files:
+            raise InputError(
+                Mistake("holds no rows (rows/*.parquet); wanted results that `springbench run` left", path)
+            )
+        found = rows.read(files).to_pylist()
+    runs: dict[Key, list[Row]] = defaultdict(list)
+    for row in found:
+        runs[tuple(row[name] for name in ASKED)].append(row)
+    return {key: _run(of) for key, of in runs.items()}
+
+
+@contextmanager
+def _folder(path: Path) -> Iterator[Path]:
+    """The folder itself, or one with what an archive holds."""
+    if path.is_dir():
+        yield path
+        return
+    with TemporaryDirectory() as scratch:
+        try:
+            if zipfile.is_zipfile(path):
+                with zipfile.ZipFile(path) as packed:
+                    packed.extractall(scratch)  # names that lead out of the folder are made to stay in it
+            elif path.is_file() and tarfile.is_tarfile(path):
+                with tarfile.open(path) as packed:
+                    packed.extractall(scratch, filter="data")
+            else:
+                wanted = "wanted a folder of results, an archive of one (.zip, .tar.*), or pytest-benchmark's (.json)"
+                raise InputError(Mistake(wanted if path.exists() else f"is not there; {wanted}", path))
+        except (OSError, zipfile.BadZipFile, tarfile.TarError) as error:
+            raise InputError(Mistake(f"cannot be unpacked: {error}", path)) from error
+        yield Path(scratch)
+
+
+def _run(found: Sequence[Row]) -> Run:
+    steps = [row for row in found if row["phase"] == "step" and row["frame"] is not None]
+    seconds: dict[int, float] = {}
+    for row in steps:
+        seconds[row["frame"]] = min(row["seconds"], seconds.get(row["frame"], np.inf))
+    once = {row["frame"]: row for row in steps}
+    last: Row = once[max(once)] if once else {}
+    counted = [row["iterations"] for row in once.values() if row["iterations"] is not None]
+    return Run(
+        found[0],
+        next((row["status"] for row in found if row["status"] != "ok"), "ok"),
+        seconds,
+        sum(counted) if counted else None,
+        *(last.get(name) for name in ("residual", "stationarity", "digest")),
+    )
+
+
+def _incomparable(old: Run, new: Run, yardstick: str | None) -> str:
+    """Why two times do not compare, empty where they do."""
+    if old.status != "ok":
+        return f"there is no old time: {old.status}"
+    if old.row["machine"] != new.row["machine"] and yardstick is None:
+        where = [f"{run.row['cpu']}, {run.row['cores']} cores" for run in (old, new)]
+        return f"other machines ({where[0]}; {where[1]}); --yardstick SOLVER compares ratios to one that both ran"
+    return ""
+
+
+def _unit(runs: Mapping[Key, Run], key: Key, yardstick: str) -> float | None:
+    """One over the seconds of the yardstick's step in the same scene, size and steps; None where it was not run."""
+    at = {name: key[ASKED.index(name)] for name in ("scene", "size", "time_step", "integrator", "threads")}
+    found = [run for run in runs.values() if run.row["solver"] == yardstick and run.status == "ok" and run.seconds]
+    found = [run for run in found if all(run.row[name] == value for name, value in at.items())]
+    return 1 / float(np.median(list(found[0].seconds.values()))) if found else None
+
+
+def _judged(old: Run, new: Run, units: Sequence[float | None]) -> tuple[tuple[str, str, str], str]:
+    """Old and new times, their change with its interval, and a verdict: slower, faster, unchanged or fails now."""
+    if new.status != "ok":
+        return ("", "", ""), "fails now"
+    frames = sorted(set(old.seconds) & set(new.seconds))
+    was, now = (np.array([run.seconds[f] for f in frames]) * unit for run, unit in zip((old, new), units, strict=True))
+    ratio, low, high = _interval(np.log(now / was))
+    slower, faster = low > 1 + MARGIN, high * (1 + MARGIN) < 1
+    told = [f"{float(np.median(x)):.4g}" for x in (was, now)]
+    change = f"{100 * (ratio - 1):+.1f} % [{100 * (low - 1):+.1f}, {100 * (high - 1):+.1f}]"
+    return (told[0], told[1], change), "slower" if slower else "faster" if faster else "unchanged"
+
+
+def _interval(logs: Array) -> tuple[float, float, float]:
+    """The median ratio and its 95 % interval; of one frame, or of ratios that are all alike, that ratio alone."""
+    middle = float(np.exp(np.median(logs)))
+    if len(logs) < 2 or np.ptp(logs) == 0:
+        return middle, middle, middle
+    found = bootstrap((logs,), np.median, method="percentile", n_resamples=2000, rng=np.random.default_rng(0))
+    return middle, float(np.exp(found.confidence_interval.low)), float(np.exp(found.confidence_interval.high))
+
+
+def _beside(old: Run, new: Run) -> tuple[str, str, str, str]:
+    """What changed beside the time: iterations, residual, error, and whether the last positions are the same."""
+    told = []
+    for name in ("iterations", "residual", "error"):
+        was, now = getattr(old, name), getattr(new, name)
+        same = was == now or was is None or now is None
+        told.append(("" if now is None else f"{now:.4g}") if same else f"{was:.4g} -> {now:.4g}")
+    known = old.digest is not None and new.digest is not None
+    return told[0], told[1], told[2], ("the same" if old.digest == new.digest else "others") if known else ""

@@ -1,0 +1,215 @@
+"""`springbench gate --against REVISION`, in small repositories whose gates do arithmetic instead of physics."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from harness.cli import app
+from harness.experiments.gates.against import Request, exit_code, started
+from harness.experiments.gates.pair import Side, changes, workers
+from harness.experiments.gates.sequential import Answer
+
+GATES = """
+from types import SimpleNamespace
+
+def work(rounds, answer):
+    def run():
+        total = 0
+        for k in range(rounds):
+            total += k
+        print("what the work prints is no answer")
+        return [[0.0, 1.0], [answer, 2.0]]
+    return run
+
+ALL = (
+    SimpleNamespace(name="adding", clock="cpu", candidate=lambda: work({rounds}, {answer})),
+    SimpleNamespace(name="{other}", clock="cpu", candidate=lambda: work(10, 0.0)),
+)
+"""
+
+
+def git(folder: Path, *arguments: str) -> str:
+    who = ["-c", "user.name=somebody", "-c", "user.email=somebody@example.org"]
+    told = subprocess.run(["git", *who, *arguments], cwd=folder, capture_output=True, text=True, check=True)
+    return told.stdout.strip()
+
+
+def state(folder: Path, rounds: int = 100_000, answer: float = 0.0, other: str = "old") -> None:
+    bench = folder / "tests" / "bench"
+    bench.mkdir(parents=True, exist_ok=True)
+    for package in (bench.parent, bench):
+        (package / "__init__.py").touch()
+    text = GATES.replace("{rounds}", str(rounds)).replace("{answer}", str(answer)).replace("{other}", other)
+    (bench / "test_gates.py").write_text(text)
+
+
+def commit(folder: Path) -> None:
+    git(folder, "add", "--all")
+    git(folder, "commit", "--quiet", "--message", "a state")
+
+
+@pytest.fixture
+def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkout with one commit, and the current directory."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    git(folder, "init", "--quiet")
+    state(folder)
+    commit(folder)
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def gate(*arguments: str) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["gate", *arguments])
+    return done.exit_code, " ".join(done.output.split())
+
+
+def test_a_program_that_takes_twice_as_long_fails_and_an_equal_one_holds(repository: Path):
+    # Nothing depends on the machine's speed: the limits lie far from the ratios 2 and 1, and there is time enough.
+    state(repository, rounds=200_000)
+    code, said = gate("--against", "HEAD", "-k", "adding", "--limit", "1.2", "--budget", "500")
+    assert code == 1, said
+    assert "adding: ratio" in said
+    assert "fails (limit 1.2)" in said
+    state(repository)
+    code, said = gate("--against", "HEAD", "-k", "adding", "--limit", "5", "--budget", "500")
+    assert code == 0, said
+    assert "holds (limit 5)" in said
+
+
+def test_what_cannot_be_told_in_time_has_an_exit_code_of_its_own(repository: Path):
+    code, said = gate("--against", "HEAD", "-k", "adding", "--budget", "0.001")
+    assert code == 3, said
+    assert "adding: cannot tell within" in said
+    assert "turns are too few" in said
+
+
+def test_answers_that_differ_fail_before_anything_is_timed(repository: Path):
+    state(repository, answer=0.5)
+    code, said = gate("--against", "HEAD", "-k", "adding")
+    assert code == 2
+    # The old answer's size is 1, which 0.5 is half of.
+    assert "answer differently: they lie 5.0e-01 of the answer's size apart, wanted 1e-09; nothing was timed" in said
+
+
+def test_a_revision_that_does_not_run_says_why_in_its_own_words(repository: Path):
+    (repository / "tests" / "bench" / "test_gates.py").write_text("ALL = (\n")
+    commit(repository)
+    state(repository)
+    code, said = gate("--against", "HEAD", "-k", "adding")
+    assert code == 2
+    assert "revision HEAD" in said
+    assert "does not run: SyntaxError: '(' was never closed" in said
+
+
+def test_a_revision_whose_libraries_cannot_be_had_does_not_build(repository: Path):
+    project = '[project]\nname = "mine"\nversion = "{}"\ndependencies = [{}]\n'
+    (repository / "pyproject.toml").write_text(project.format("0", '"no such thing !"'))
+    commit(repository)
+    (repository / "pyproject.toml").write_text(project.format("1", ""))
+    code, said = gate("--against", "HEAD", "-k", "adding")
+    assert code == 2
+    assert "does not build:" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--against", "nowhere", "-k", "adding"), "--against: unknown revision 'nowhere'; wanted a commit"),
+        (("--against", "--help", "-k", "adding"), "--against: unknown revision '--help'; wanted a commit"),
+        (("--against", "HEAD", "-k", "subtracting"), "-k subtracting: neither has such a gate; they have adding, new"),
+        (("--against", "HEAD", "-k", "new"), "-k new: revision HEAD"),
+        (("--against", "HEAD", "-k", "old"), "-k old: this checkout has no gate old"),
+        (("--against", "HEAD", "scene.yaml", "-k", "old"), "wanted one scene, one sweep, or -k NAME"),
+        (("--against", "HEAD", "nowhere.yaml"), "cannot be read: No such file"),
+        (("--against", "HEAD", "--clock", "sun"), "--clock: came sun; wanted cpu or wall"),
+        (("--against", "HEAD", "--budget", "-1"), "--budget: came -1.0; wanted seconds"),
+        (("--against", "HEAD", "--limit", "-1"), "--limit: came -1.0; wanted a ratio of times"),
+        (("-k", "old"), "-k: chooses gates to compare with another revision; wanted --against REVISION"),
+        (("a.json", "b.json", "--budget", "3"), "--budget: nothing is timed between stored results"),
+        (("a.json",), "gate: came 1 file; wanted --against REVISION, a table of gates, or two stored"),
+        ((), "gate: came 0 files; wanted --against REVISION, a table of gates, or two stored"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
+)
+def test_a_mistake_is_one_message(repository: Path, arguments: tuple[str, ...], said: str):
+    state(repository, other="new")
+    code, told = gate(*arguments)
+    assert code == 2, told
+    assert said in told
+
+
+def test_a_folder_outside_git_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    code, said = gate("--against", "HEAD", "-k", "adding")
+    assert code == 2
+    assert "is in no git checkout" in said
+
+
+SCENE = """
+mesh: {kind: grid}
+mass: 0.3
+time_step: 1/30
+frames: 2
+default_size: 4
+effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
+"""
+
+
+def test_a_run_of_a_scene_is_held_with_its_exact_facts_and_each_revision_has_its_own_file(repository: Path):
+    (repository / "cloth.yaml").write_text(SCENE)
+    other = repository / "elsewhere"
+    other.mkdir()
+    (other / "cloth.yaml").write_text(SCENE.replace("300", "600"))
+    sides = Side("this", repository), Side("that", other, checkout=repository, extra=0.1)
+    asked = {"solvers": ["sparse"], "sizes": [], "iterations": 20}
+    with workers(*sides) as alive:
+        held = []
+        for worker in alive:
+            config = str(worker.side.own(repository / "cloth.yaml"))
+            (title,) = worker.ask("runs", config=config, asked=asked)["runs"]
+            assert title == "cloth, size 4, sparse, 20 iterations, implicit-euler, dt 0.03333"
+            given = {"config": config, "asked": asked, "index": 0, "frames": 9, "extra": worker.side.extra}
+            held.append(worker.hold("run", **given))
+            assert worker.seconds(2, "cpu") > 0
+    assert [(h.frames, h.clock, h.answer.shape) for h in held] == [(2, "cpu", (16, 3))] * 2
+    assert held[0].facts == held[1].facts  # what is planted is beside the run's own work
+    assert held[0].facts["iterations"] == 40
+    assert held[0].facts["nnz_factor"] > 16
+    assert abs(held[0].answer - held[1].answer).max() > 1e-6
+
+
+def test_a_worker_that_dies_is_told_with_its_last_words(tmp_path: Path):
+    (tmp_path / "json.py").write_text("raise SystemExit('there is no more json')")
+    request = Request("a gate", "gate", {"name": "a gate"})
+    from harness.base.errors import InputError
+    from harness.experiments.gates.against import Options
+
+    with (
+        pytest.raises(InputError, match="that: does not run: there is no more json"),
+        started((Side("that", tmp_path), Side("this", tmp_path)), request, Options(1.0), print),
+    ):
+        pass
+
+
+def test_changes_of_exact_facts_are_told():
+    old = {"iterations": 200, "nnz_factor": 1000, "instructions": 1_000_000, "gone": 1}
+    new = {"iterations": 210, "nnz_factor": 1000, "instructions": 1_000_900, "come": 2}
+    assert changes(new, old) == ["iterations 200 -> 210 (+5.0%)"]
+    assert changes(new | {"instructions": 990_000}, old)[1] == "instructions 1,000,000 -> 990,000 (-1.0%)"
+
+
+@pytest.mark.parametrize(
+    ("answers", "code"),
+    [
+        ([Answer.HOLDS], 0),
+        ([Answer.HOLDS, Answer.UNDECIDED], 3),
+        ([Answer.UNDECIDED, Answer.FAILS, Answer.HOLDS], 1),
+    ],
+)
+def test_one_failure_outweighs_what_is_undecided_and_that_what_holds(answers: list[Answer], code: int):
+    assert exit_code(answers) == code

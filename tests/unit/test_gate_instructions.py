@@ -1,0 +1,32 @@
+"""The counter of instructions, on events that every Linux machine counts."""
+
+from harness.experiments.gates import instructions
+from harness.experiments.gates.instructions import PAGE_FAULTS
+
+PAGES = 1000
+
+
+def test_an_event_of_the_kernels_own_is_counted_as_often_as_it_happens():
+    if instructions.reason(PAGE_FAULTS):
+        assert "cannot be counted" in instructions.reason(PAGE_FAULTS)  # a kernel without perf says so
+        return
+    # Every page of fresh memory faults once when it is touched; pages have 4 to 64 KiB, or 2 MiB where the kernel
+    # hands out huge ones.
+    found = instructions.count(lambda: bytearray(64 * 1024 * PAGES), PAGE_FAULTS)
+    assert found is not None
+    assert 20 <= found <= 17 * PAGES
+    nothing = instructions.count(lambda: None, PAGE_FAULTS)
+    assert nothing is not None
+    assert nothing < 20
+
+
+def test_an_event_that_nobody_knows_is_refused_with_the_systems_reason():
+    unknown = (99, 99)
+    assert instructions.count(lambda: None, unknown) is None
+    assert "cannot be counted" in instructions.reason(unknown)
+
+
+def test_work_is_done_only_where_it_can_be_counted():
+    done = []
+    found = instructions.count(lambda: done.append(1))
+    assert (found is None) == (not done)

@@ -1,0 +1,107 @@
+"""The study of gates: what is recorded, and that a replay asks the gates' own rule."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from harness.base import rows
+from harness.cli import app
+from harness.experiments.gates.sequential import Rule
+from harness.experiments.gates.study import OTHERS, SCHEMA, Start, read, replay, replay_other
+
+SCENE = """
+mesh: {kind: grid}
+mass: 0.3
+time_step: 1/30
+frames: 2
+default_size: 4
+effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
+"""
+
+
+def starts(biases: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 0.02, turns: int = 500) -> list[Start]:
+    """Recorded starts of the same code, whose second process is so many times as slow, on a machine with bursts."""
+    found = []
+    for seed, bias in enumerate(biases):
+        rng = np.random.default_rng(seed)
+        a, b = np.exp(noise * rng.standard_normal((2, turns, 2)))
+        burst = np.repeat(rng.random(turns // 10) < 0.2, 10)
+        a[burst] *= rng.uniform(1, 2, (burst.sum(), 2))
+        b[burst] *= rng.uniform(1, 2, (burst.sum(), 2))
+        found.append(Start(np.log(bias * a.sum(axis=1) / b.sum(axis=1)), bias * a, b, wall=0.1, load=1.0))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("slower", "limit", "fails", "holds"),
+    [
+        (1.0, 1.03, (0.0, 0.001), (0.99, 1.0)),
+        (1.05, 1.03, (0.95, 1.0), (0.0, 0.001)),
+        (1.1, 1.03, (0.99, 1.0), (0.0, 0.0)),
+    ],
+)
+def test_a_replay_finds_slowdowns_and_raises_no_alarm(
+    slower: float, limit: float, fails: tuple[float, float], holds: tuple[float, float]
+):
+    found = replay(starts(), slower, Rule(limit), budget=120.0, replays=1000)
+    assert fails[0] <= found.fails <= fails[1]
+    assert holds[0] <= found.holds <= holds[1]
+    assert found.fails + found.holds + found.undecided == pytest.approx(1.0)
+    assert 1.6 <= found.seconds <= 120  # 16 turns of .1 s, the fewest that decide
+
+
+def test_a_start_that_lies_badly_alone_hardly_makes_an_alarm():
+    # One of ten pairs of processes is 5 % apart: a tenth of first races fails, a tenth of those a second time.
+    found = replay(starts((1.05, *([1.0] * 9))), 1.0, Rule(1.03), budget=120.0, replays=2000)
+    assert 0.0 < found.fails < 0.02
+    assert found.undecided > 0.05
+
+
+def test_others_compare_one_session_with_the_next():
+    same = starts()
+    for rule in OTHERS.values():
+        assert replay_other(rule, same, 1.5, seconds=20.0, replays=100) > 0.9
+        assert replay_other(rule, same, 0.7, seconds=20.0, replays=100) == 0.0
+
+
+def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "cloth.yaml").write_text(SCENE)
+    (tmp_path / ".git").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("harness.experiments.gates.revisions.root", lambda folder: folder)
+    samples = tmp_path / "samples.parquet"
+    given = ["record", str(samples), "cloth.yaml", "--solver", "sparse", "--seconds", "1", "--starts", "2"]
+    done = CliRunner().invoke(app, ["gate-study", *given, "--planted", "0.1"])
+    assert done.exit_code == 0, done.output
+    recorded = rows.read([samples], SCHEMA).to_pylist()
+    assert {row["start"] for row in recorded} == {0, 1}
+    assert {row["planted"] for row in recorded} == {0.1}
+    ((key, found),) = read([samples]).items()
+    assert key == ("cloth, size 4, sparse, 50 iterations, implicit-euler, dt 0.03333", "nothing")
+    assert sum(len(start.log_ratios) for start in found) == len(recorded)
+    done = CliRunner().invoke(app, ["gate-study", "replay", str(samples), "--replays", "20"])
+    assert done.exit_code == 0, done.output
+    assert "asv continuous" in done.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            ("record", "new.parquet", "cloth.yaml", "--condition", "windy"),
+            "--condition: came windy; wanted one of nothing",
+        ),
+        (("replay", "nowhere.parquet"), "nowhere.parquet: no such file; `springbench gate-study record` makes one"),
+    ],
+)
+def test_a_mistake_is_one_message(
+    arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "cloth.yaml").write_text(SCENE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("harness.experiments.gates.revisions.root", lambda folder: folder)
+    done = CliRunner().invoke(app, ["gate-study", *arguments])
+    assert done.exit_code == 2, done.output
+    assert said in " ".join(done.output.split())

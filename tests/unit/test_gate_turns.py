@@ -1,0 +1,92 @@
+"""Turns of two programs: fair orders, a budget, and a slowdown that is believed only when it is found twice."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from random import Random
+
+import pytest
+
+from harness.experiments.gates.sequential import Answer, Interval, Rule
+from harness.experiments.gates.turns import ORDERS, Result, Turn, confirmed, orders, race
+
+RULE = Rule(1.03)
+
+
+def clock(seconds: float) -> Callable[[], float]:
+    return lambda: seconds
+
+
+@pytest.mark.parametrize(
+    ("ratio", "answer"),
+    [(1.0, Answer.HOLDS), (1.05, Answer.FAILS), (1.03, Answer.UNDECIDED)],
+)
+def test_a_race_ends_when_it_knows(ratio: float, answer: Answer):
+    # The third ratio is the limit itself: neither above nor below, so that only the budget ends it.
+    found = race(clock(ratio), clock(1.0), RULE, budget=60.0 if answer is not Answer.UNDECIDED else 0.05)
+    assert found.answer is answer
+    if answer is not Answer.UNDECIDED:
+        assert len(found.turns) == 16  # the fewest that can decide at an error of 0.1 %
+        assert (found.interval.low, found.interval.high) == pytest.approx((ratio, ratio))
+
+
+def test_both_orders_come_equally_often():
+    drawn = list(islice(orders(Random(1)), 1000))
+    assert set(drawn) == set(ORDERS)
+    assert abs(drawn.count("ABBA") - 500) < 50  # three standard deviations
+
+
+def test_a_steady_drift_cancels_in_each_turn():
+    for order in ORDERS:
+        assert Turn(order, (1.0, 1.1, 1.2, 1.3)).log_ratio == pytest.approx(0.0, abs=1e-15)
+
+
+def pairs(*ratios: float) -> tuple[Callable[..., object], list[float]]:
+    """Starts of programs whose ratios of times are these, one start after the other; what has been started."""
+    left, started = iter(ratios), []
+
+    @contextmanager
+    def start() -> Iterator[tuple[Callable[[], float], Callable[[], float]]]:
+        started.append(next(left))
+        yield clock(started[-1]), clock(1.0)
+
+    return start, started
+
+
+@pytest.mark.parametrize(
+    ("ratios", "answer"),
+    [
+        ((1.0,), Answer.HOLDS),
+        ((1.06, 1.05), Answer.FAILS),
+        ((1.06, 1.0), Answer.UNDECIDED),  # two processes of the same code may differ by where their memory lies
+    ],
+)
+def test_a_slowdown_is_believed_when_a_second_start_has_it_too(ratios: tuple[float, ...], answer: Answer):
+    start, started = pairs(*ratios)
+    found = confirmed(start, RULE, budget=60.0)  # type: ignore[arg-type]
+    assert found.answer is answer
+    assert (tuple(started), found.starts) == (ratios, len(ratios))
+    assert (found.interval.low, found.interval.high) == (pytest.approx(min(ratios)), pytest.approx(max(ratios)))
+
+
+@pytest.mark.parametrize(
+    ("answer", "limit", "interval", "said"),
+    [
+        (Answer.FAILS, 1.03, (1.061, 1.052, 1.07), "slower by 6.1 % [5.2, 7.0]: fails (limit 3.0 %)"),
+        (Answer.HOLDS, 1.03, (1.003, 0.99, 1.012), "no slower than 1.2 %: holds (limit 3.0 %)"),
+        (Answer.HOLDS, 1.03, (0.9, 0.89, 0.91), "ratio 0.9 [0.89, 0.91]: holds (limit 1.03)"),
+        (Answer.FAILS, 0.45, (0.5, 0.48, 0.52), "ratio 0.5 [0.48, 0.52]: fails (limit 0.45)"),
+        (Answer.FAILS, 1.03, (3.0, 2.9, 3.1), "ratio 3 [2.9, 3.1]: fails (limit 1.03)"),
+        (
+            *(Answer.UNDECIDED, 1.03, (1.01, 0.96, 1.07)),
+            "cannot tell within 120 s: 0.96 to 1.07 (limit 1.03), on a machine with load 7",
+        ),
+        (
+            *(Answer.UNDECIDED, 1.03, (1.01, 0.0, float("inf"))),
+            "cannot tell within 120 s: 1 turns are too few (limit 1.03), on a machine with load 7",
+        ),
+    ],
+)
+def test_a_result_says_what_was_found(answer: Answer, limit: float, interval: tuple[float, float, float], said: str):
+    turn = Turn("ABBA", (1.0, 1.0, 1.0, 1.0))
+    assert str(Result(answer, Rule(limit), Interval(*interval), (turn,), 120.0, 7.2)) == said
