@@ -42,6 +42,9 @@ ASKED = (
 )
 """The columns that pair two runs."""
 
+_ROWS, _MOST = ".parquet", 2**31
+"""What is unpacked of an archive, and how many bytes of it at most."""
+
 Row = Mapping[str, Any]
 Key = tuple[Any, ...]
 Array = NDArray[np.float64]
@@ -129,20 +132,31 @@ def _folder(path: Path) -> Iterator[Path]:
     if path.is_dir():
         yield path
         return
+    wanted = "wanted a folder of results, an archive of one (.zip, .tar.*), or pytest-benchmark's (.json)"
+    if not path.is_file():  # a device or a pipe would be read for ever
+        raise InputError(Mistake(f"is {'no file' if path.exists() else 'not there'}; {wanted}", path))
     with TemporaryDirectory() as scratch:
         try:
             if zipfile.is_zipfile(path):
                 with zipfile.ZipFile(path) as packed:
-                    packed.extractall(scratch)  # names that lead out of the folder are made to stay in it
-            elif path.is_file() and tarfile.is_tarfile(path):
+                    members = [info for info in packed.infolist() if info.filename.endswith(_ROWS)]
+                    _require_room(path, sum(info.file_size for info in members))
+                    packed.extractall(scratch, members)  # names that lead out of the folder are made to stay in it
+            elif tarfile.is_tarfile(path):
                 with tarfile.open(path) as packed:
-                    packed.extractall(scratch, filter="data")
+                    inside = [info for info in packed if info.name.endswith(_ROWS)]
+                    _require_room(path, sum(info.size for info in inside))
+                    packed.extractall(scratch, inside, filter="data")
             else:
-                wanted = "wanted a folder of results, an archive of one (.zip, .tar.*), or pytest-benchmark's (.json)"
-                raise InputError(Mistake(wanted if path.exists() else f"is not there; {wanted}", path))
+                raise InputError(Mistake(wanted, path))
         except (OSError, zipfile.BadZipFile, tarfile.TarError) as error:
             raise InputError(Mistake(f"cannot be unpacked: {error}", path)) from error
         yield Path(scratch)
+
+
+def _require_room(path: Path, unpacked: int) -> None:
+    if unpacked > _MOST:
+        raise InputError(Mistake(f"its rows take {unpacked:,} bytes unpacked; wanted {_MOST:,} at most", path))
 
 
 def _run(found: Sequence[Row]) -> Run:

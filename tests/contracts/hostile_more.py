@@ -144,7 +144,7 @@ COMMANDS: dict[str, tuple[list[str], int, str]] = {
     "a report on nothing": (["report", "results/none"], 2, "results/none"),
     "a report on a file": (["report", "good.yaml"], 2, "good.yaml"),
     "a gate on devices": (["gate", "/dev/zero", "/dev/zero"], 2, "/dev/zero"),
-    "a gate on folders": (["gate", ".", "."], 2, "no file"),
+    "a gate on folders": (["gate", ".", "."], 2, "no rows"),
     "a gate on a pipe": (["gate", "pipe", "pipe"], 2, "pipe"),
     "a query without rows": (["query", "SELECT 1"], 2, "no rows"),
     "a query in no time": (["query", "SELECT 1", "--seconds", "0"], 2, "--seconds"),

@@ -53,30 +53,6 @@ def test_the_public_call_for_layouts_leaves_threads_that_nothing_ends(tmp_path: 
     assert found > 0, "send_blueprint leaves no threads any more: call it instead"
 
 
-DEAD = """
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))
-stream = rr.RecordingStream("app", batcher_config=rr.ChunkBatcherConfig.NEVER(), send_properties=False)
-stream.save(sys.argv[1])
-try:
-    for _ in range(200):
-        stream.log("a", rr.Points3D([[0.0, 0.0, 0.0]] * 2000))
-        stream.flush(timeout_sec=30)
-except Exception:
-    pass
-stream.disconnect()
-"""
-PATIENCE = 8.0
-"""Seconds to wait for what waits for ever; a shorter wait, or a slower machine, only overlooks that it ends now."""
-
-
-def test_a_stream_whose_writer_has_died_is_waited_for_for_ever(tmp_path: Path):
-    # Way round: such a stream is never disconnected nor dropped (`PartialFile._failure`).
-    command = [sys.executable, "-c", STREAM + DEAD, tmp_path / "a.rrd"]
-    with pytest.raises(subprocess.TimeoutExpired):
-        subprocess.run(command, capture_output=True, timeout=PATIENCE)
-
-
 def test_a_file_that_was_cut_within_a_message_is_not_read_at_all(tmp_path: Path):
     # Way round: `whole_messages` finds where the last whole message ends.
     path = tmp_path / "a.rrd"

@@ -1,6 +1,7 @@
 """The fixture `race` and tables of gates, as somebody uses them in a folder of their own."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -39,7 +40,9 @@ def session(folder: Path, test: str, *options: str) -> tuple[int, str, list[dict
     # The plugin as a module, whether or not the package is installed with it.
     plugin = ["-p", "no:springbench", "-p", "harness.experiments.gates.plugin", "-p", "no:cacheprovider"]
     command = [sys.executable, "-m", "pytest", "-q", *plugin, f"--benchmark-json={stored}", *options]
-    told = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    # Beside other workers of one session pytest-benchmark times nothing; this session is one of its own.
+    alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
+    told = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=alone)
     found = json.loads(stored.read_text())["benchmarks"] if stored.exists() and stored.stat().st_size else []
     return told.returncode, told.stdout + told.stderr, found
 

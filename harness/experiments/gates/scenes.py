@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.base.errors import InputError
-from harness.config.load import load_any
+from harness.config.load import DEFAULT_SOLVER, load_any
 from harness.config.sweep import RunSpec
 from harness.experiments.gates.turns import CALL, Clock, Timed
 from harness.scenes.bind import build
@@ -52,7 +52,9 @@ def pair(scene: Path, solver: Given, against: Given, *, size: int | None = None,
 
 
 def _steps(scene: Path, given: Given, size: int | None, options: dict[str, Any]) -> Steps:
-    asked: list[Any] = [dict(given) if isinstance(given, Mapping) else given if isinstance(given, str) else "sparse"]
+    asked: list[Any] = [
+        dict(given) if isinstance(given, Mapping) else given if isinstance(given, str) else DEFAULT_SOLVER
+    ]
     runs = load_any(scene, solvers=asked, sizes=[size] if size else [], **{"threads": 1, **options}).runs()
     if len(runs) != 1:
         raise InputError(f"{scene}: a gate is on one run; came {len(runs)}")
