@@ -138,17 +138,19 @@ class _Worker:
         """Ask a worker that takes too long where it is, and kill it."""
         with suppress(OSError):
             os.kill(self._process.pid or 0, DUMP)
-        wait([self._dump], _GRACE)
+        dump, more = b"", b""
+        while wait([self._dump], _LOOK if dump else _GRACE) and (more := _come(self._dump)):
+            dump += more
         self.kill()
         heard.listen()
-        return Lost("time-limit", f"did not end within {seconds:g} s; it was {_place(self._dump)}{heard}")
+        return Lost("time-limit", f"did not end within {seconds:g} s; it was {_at(dump)}{heard}")
 
     def _ended(self, heard: _Heard) -> Lost:
         """What became of a worker that gave no answer."""
         self._process.join(_GRACE)
         self.kill()
         heard.listen()
-        code, place = self._process.exitcode or 0, _place(self._dump)
+        code, at = self._process.exitcode or 0, _at(_come(self._dump))
         if code >= 0:
             return Lost("failed", f"ended its process with exit code {code}, {heard}")
         name = signal.Signals(-code).name
@@ -156,7 +158,7 @@ class _Worker:
             return Lost("killed", f"was killed by SIGKILL, as the system does where memory runs out, {heard}")
         if -code == signal.SIGTERM:
             return Lost("killed", f"was ended by SIGTERM, {heard}")
-        return Lost("failed", f"crashed by {name} {place}{heard}")
+        return Lost("failed", f"crashed by {name} {at}{heard}")
 
     def kill(self) -> None:
         """End it at once."""
@@ -208,9 +210,9 @@ def _come(pipe: Connection) -> bytes:
     return found
 
 
-def _place(dump: Connection) -> str:
+def _at(dump: bytes) -> str:
     """Where a worker was, as it has written down: `at file:line in function, `."""
-    found = place(_come(dump).decode(errors="replace"))
+    found = place(dump.decode(errors="replace"))
     return found and f"at {found}, "
 
 
