@@ -88,13 +88,13 @@ def test_a_run_that_took_too_long_is_done_again_with_another_limit(tmp_path: Pat
     flag.touch()
     assert "2 of 2 runs are there already" in re.sub(r"\s+", " ", ran(made).output)
     made.sweep.write_text(made.sweep.read_text().replace("time_limit: 8", "time_limit: 800"))
-    assert ran(made).exit_code == 0
+    assert (told := ran(made)).exit_code == 0, told.output
     assert {row["status"] for row in first_rows(made).values()} == {"ok"}
 
 
 def test_a_debugger_can_have_the_runs_in_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     made = own(tmp_path, monkeypatch, solving="import os; globals()['seen'] = os.getpid()")
-    assert ran(made).exit_code == 0
+    assert (told := ran(made)).exit_code == 0, told.output
     module = made.solver.stem
     assert not hasattr(sys.modules.get(module), "seen")
     assert ran(made, "--again", "--here").exit_code == 0
@@ -141,7 +141,7 @@ def test_all_runs_of_a_sweep_are_done_in_one_process(tmp_path: Path, monkeypatch
     note = tmp_path / "note"
     does = f"import os; open({str(note)!r}, 'a').write(str(os.getpid()) + ' ')"
     made = own(tmp_path, monkeypatch, solving=does, options=OPTIONS + ", tolerance: [1e-2, 1e-3, 1e-4]")
-    assert ran(made).exit_code == 0
+    assert (told := ran(made)).exit_code == 0, told.output
     workers = set(note.read_text().split())
     assert len(workers) == 1
     assert str(os.getpid()) not in workers
