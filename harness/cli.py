@@ -61,6 +61,9 @@ def run(
     changed: Annotated[
         bool, typer.Option("--changed", help="Do also the runs that are there by other code than today's.")
     ] = False,
+    here: Annotated[
+        bool, typer.Option("--here", help="Do runs in this process, without limits, as a debugger wants them.")
+    ] = False,
 ) -> None:
     """Do what is missing of a sweep, or of the one scene in a file."""
     from harness.base.claim import claimed
@@ -83,7 +86,8 @@ def run(
     _check_positions(positions)
     folder = claimed(results / sweep.name, config)
     runs = sweep.runs()
-    table = run_sweep(sweep.name, runs, folder, display(err), _say, again=again, changed=changed, positions=positions)
+    how = {"again": again, "changed": changed, "positions": positions, "isolated": not here}
+    table = run_sweep(sweep.name, runs, folder, display(err), _say, **how)
     out.print(summary_table(table, of_other_code(runs, table)))
     _say(f"rows, recordings and pictures are in {folder}")
     failed = failures(table)

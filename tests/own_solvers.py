@@ -39,6 +39,9 @@ class Prepared:
     def iterates(self, problem):
         return self.sound.iterates(problem)
 
+    def residual_at(self, problem, p):
+        return self.sound.residual_at(problem, p)
+
     def phases(self, problem):
         return {}
 

@@ -153,8 +153,8 @@ def serve() -> None:
 
 def _answer(function: Callable[..., Any], arguments: tuple[Any, ...], limits: Limits) -> tuple[str, Any]:
     used = resource.getrusage(resource.RUSAGE_SELF)
-    _limit(resource.RLIMIT_CPU, used.ru_utime + used.ru_stime + limits.seconds)
-    _limit(resource.RLIMIT_DATA, _data() + limits.bytes)
+    limit(resource.RLIMIT_CPU, used.ru_utime + used.ru_stime + limits.seconds)
+    limit(resource.RLIMIT_DATA, data() + limits.bytes)
     try:
         return "answer", function(*arguments)
     except InputError as error:
@@ -166,17 +166,17 @@ def _answer(function: Callable[..., Any], arguments: tuple[Any, ...], limits: Li
         return "error", said or type(error).__name__
     finally:
         for what in (resource.RLIMIT_CPU, resource.RLIMIT_DATA):
-            _limit(what, resource.RLIM_INFINITY)
+            limit(what, resource.RLIM_INFINITY)
 
 
-def _limit(what: int, value: float) -> None:
+def limit(what: int, value: float) -> None:
     """Set a soft limit; the hard one stays, so that the next call may have another."""
     hard = resource.getrlimit(what)[1]
     soft = int(value) if value != resource.RLIM_INFINITY else hard
     resource.setrlimit(what, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
 
 
-def _data() -> int:
+def data() -> int:
     """Bytes of memory that this process has of its own, as the limit counts them; 0 where the system does not say."""
     with suppress(OSError), open("/proc/self/status") as file:
         return next((1024 * int(line.split()[1]) for line in file if line.startswith("VmData:")), 0)

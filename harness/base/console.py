@@ -32,6 +32,13 @@ def show_log() -> None:
         log.setLevel(logging.INFO)
 
 
+def log_plainly() -> None:
+    """In a copy of this process: show the log on its own standard error, whatever is drawn on this one's."""
+    for handler in logging.getLogger("springbench").handlers:
+        if isinstance(handler, RichHandler):
+            handler.console = Console(stderr=True, width=err.width)
+
+
 class _Once(logging.Filter):
     """Lets a message pass once: a command builds a scene several times."""
 

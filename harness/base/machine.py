@@ -143,6 +143,14 @@ def _idle() -> Threads:
     return Threads(number, f"threads: {number} of {usable}, for {idle:.1f} cores were idle (load average {load:.1f})")
 
 
+def require_threads(number: int) -> None:
+    """Raise InputError where this process may not use so many threads."""
+    usable = _usable()
+    if not 1 <= number <= usable:
+        wanted = f"should be from 1 to {usable}, the cores that this process may use, not {number}"
+        raise InputError(Mistake(wanted, key="threads"))
+
+
 @contextmanager
 def pinned_threads(threads: int) -> Iterator[None]:
     """Let BLAS and Numba's parallel kernels use `threads` threads each, and restore their numbers afterwards.
@@ -154,10 +162,7 @@ def pinned_threads(threads: int) -> Iterator[None]:
     import numba
     import scipy.linalg  # noqa: F401
 
-    usable = _usable()
-    if not 1 <= threads <= usable:
-        wanted = f"should be from 1 to {usable}, the cores that this process may use, not {threads}"
-        raise InputError(Mistake(wanted, key="threads"))
+    require_threads(threads)
     before = numba.get_num_threads()
     with threadpool_limits(threads, user_api="blas"):
         numba.set_num_threads(threads)

@@ -168,8 +168,16 @@ COLUMNS = (
     Column("flops", _REAL, "", "additions and multiplications of the phase, by count"),
     Column("working_set", _REAL, "", "bytes that the phase goes through again and again"),
     Column("load", _REAL, "", "load average over a minute when the phase was timed"),
-    Column("status", _TEXT, "", "ok, unsupported, diverged, disputed (by the second opinion), failed or skipped"),
+    Column(
+        "status",
+        _TEXT,
+        "",
+        "ok, unsupported, diverged, disputed (by the second opinion), failed (an error, or a crash), "
+        "time-limit, killed (from outside) or skipped",
+    ),
     Column("reason", _TEXT, "", "why the status is not ok"),
+    Column("time_limit", _REAL, "s", "wall time that the run might take; null: any"),
+    Column("memory_limit", _REAL, "GiB", "memory that the run might take; null: any"),
     Column("machine", _TEXT, "", "id of the machine: hash of its processor, cores and memory"),
     Column("cpu", _TEXT, "", "name of the processor"),
     Column("cores", _INT, "", "cores this process may use"),
@@ -257,6 +265,7 @@ def of_other_code(paths: Iterable[Path], code: str) -> str:
 def alone(folder: Path) -> Iterator[None]:
     """Hold a folder of results for one process; whatever a killed one left half written is removed."""
     lock = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+    _LOCKS.add(lock)
     try:
         if not stat.S_ISREG(os.fstat(lock).st_mode):
             raise InputError(Mistake("is no plain file; take it away", folder / ".lock"))
@@ -268,4 +277,17 @@ def alone(folder: Path) -> Iterator[None]:
             partial.unlink()
         yield
     finally:
+        _LOCKS.discard(lock)
         os.close(lock)
+
+
+_LOCKS: set[int] = set()
+
+
+def _let_go() -> None:
+    """A copy of this process holds no folder, and so holds up nobody who comes after this one."""
+    while _LOCKS:
+        os.close(_LOCKS.pop())
+
+
+os.register_at_fork(after_in_child=_let_go)

@@ -71,6 +71,10 @@ class Options(Varied):
     """Whether pictures are drawn from the recordings."""
     judge: bool = False
     """Whether an oracle judges each step's answer in the rows: for `springbench report`, on small meshes."""
+    time_limit: float | None = Field(default=3600.0, gt=0, le=1e7)
+    """Wall time [s] that a run may take, all of it; null is any. One that takes longer is ended, and is a row."""
+    memory_limit: float | None = Field(default=None, gt=0, le=1e6)
+    """Memory [GiB] that a run may take beyond what a process has anyway; null is any."""
 
 
 def _without_defaults(schema: dict[str, Any]) -> None:
@@ -137,7 +141,8 @@ class RunSpec:
     """One run. size: 0 where the mesh comes from a file.
 
     frames, time_step (which is the scene's own here) and first_guess are resolved; tolerance: None does all iterations;
-    convergence_frames: None is the first, the middle and the last; strain_range: strain at the colour scale's ends.
+    convergence_frames: None is the first, the middle and the last; strain_range: strain at the colour scale's ends;
+    time_limit, memory_limit: what the run may take [s] [GiB], None is any.
     """
 
     sweep: str
@@ -158,11 +163,13 @@ class RunSpec:
     record: bool
     pictures: bool
     judge: bool
+    time_limit: float | None
+    memory_limit: float | None
 
     def identity(self) -> str:
         """All that determines the run's result and timing on one machine, as canonical JSON; pictures come later, from
-        the recording."""
-        left_out = ("sweep", "scene_name", "pictures")
+        the recording, and limits only say when to give up."""
+        left_out = ("sweep", "scene_name", "pictures", "time_limit", "memory_limit")
         settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
         settings |= {"scene": self.scene.digest, "solver": [self.solver.name, dict(self.solver.parameters)]}
         return json.dumps(settings, sort_keys=True, separators=(",", ":"))

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base import machine, rows
+from harness.base.blame import where
 from harness.base.errors import InputError, RunFailed
 from harness.base.files import CannotWrite, replacing
 from harness.base.stated import stated
@@ -33,7 +34,6 @@ from harness.reference.grade import Graded
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
 from harness.simulation import times
-from harness.simulation.contract import where
 from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, digest, measure
 from harness.simulation.observe import observe, require_numbers
 from harness.simulation.step import prepare
@@ -115,7 +115,7 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
     settings = _settings(run)
     told = times.rows(measured := measure(scene, _solver(run), settings, tick))
     by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
-    require_numbers(by_frame, minimises=_solver(run).minimises, yardstick=run.tolerance is not None)
+    require_numbers(by_frame, minimises=minimises(_solver(run)), yardstick=run.tolerance is not None)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
     facts |= {"choice": measured.prepared.choice} | standing(run)
     return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
@@ -249,6 +249,17 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
     )
 
 
+def abandoned(run: RunSpec, files: Files, status: str, reason: str) -> list[dict[str, Any]]:
+    """The rows of a run whose process gave no answer, written; what it left half written is removed."""
+    for earlier in (files.recording, files.picture):
+        earlier.unlink(missing_ok=True)
+        for partial in earlier.parent.glob(".*partial*"):
+            partial.unlink()
+    found = [common(run) | {"code": code(parts(run))} | {"phase": "run", "status": status, "reason": reason}]
+    rows.write(files.rows, found)
+    return found
+
+
 def save_positions(path: Path, positions: np.ndarray) -> None:
     """Store positions (frames, n, 3) [m] under a partial name and rename. Raises CannotWrite."""
     with replacing(path) as partial:
@@ -270,6 +281,8 @@ def asked(run: RunSpec) -> dict[str, Any]:
         **stated(run.solver.name),
         **{option.column: getattr(run, name) for name, option in OPTIONS.items() if option.column},
         "threads": machine.threads(run.threads).number,
+        "time_limit": run.time_limit,
+        "memory_limit": run.memory_limit,
     }
 
 

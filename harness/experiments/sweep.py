@@ -16,15 +16,20 @@ import pyarrow as pa
 from harness.base import machine, rows
 from harness.base.errors import InputError
 from harness.base.progress import Display
+from harness.base.workers import Limits, Lost, Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts
-from harness.experiments.run import Files, execute
+from harness.experiments.core import do_all, require_threads
+from harness.experiments.run import Files, abandoned, execute
 from harness.record.sound import whole_messages
 from harness.report.sweep import Pictured, draw_sweep
 
 DONE, MISSING = "done", "missing"
 NEEDED = ("run_id", "scene", "size", "solver", "status", "code")
 """Columns without which a row tells nothing of a run."""
+
+_LIMITED = ("failed", "time-limit", "killed")
+"""How a run may end for its limits."""
 
 _NAMED = 8
 """So many runs are named where more are meant."""
@@ -47,8 +52,48 @@ class Planned:
     @property
     def title(self) -> str:
         """The run in words."""
-        size = f" {self.run.size}" if self.run.size else ""
-        return f"{self.run.scene_name}{size} {self.run.solver.name}"
+        return _title(self.run)
+
+
+def _title(run: RunSpec) -> str:
+    return f"{run.scene_name}{f' {run.size}' if run.size else ''} {run.solver.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class RunUnit:
+    """A run as a unit of a sweep (`harness.experiments.core.Unit`). positions: where to store those of its steps."""
+
+    run: RunSpec
+    files: Files
+    positions: Path | None = None
+
+    @property
+    def title(self) -> str:
+        """The run in words."""
+        return _title(self.run)
+
+    @property
+    def ticks(self) -> int:
+        """The steps of the pass that warms up, of the timed ones and of the second pass."""
+        return self.run.frames * (self.run.rounds + 2)
+
+    @property
+    def work(self) -> float:
+        """A rough measure of the run's effort, for the time left."""
+        return (self.run.size or 32) ** 2 * self.ticks * self.run.iterations
+
+    @property
+    def limits(self) -> Limits:
+        """What the sweep says."""
+        return Limits(self.run.time_limit, self.run.memory_limit)
+
+    def do(self, tick: Tick) -> str:
+        """See Unit."""
+        return _outcome(execute(self.run, self.files, tick, positions=self.positions))
+
+    def lost(self, lost: Lost) -> str:
+        """See Unit."""
+        return _outcome(abandoned(self.run, self.files, lost.status, str(lost)))
 
 
 def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
@@ -64,6 +109,9 @@ def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
                 damage = f"{files.rows} {there}"
             else:
                 state = DONE if there["status"] == "ok" else there["status"]
+                limits = there["time_limit"], there["memory_limit"]
+                if state in _LIMITED and limits != (run.time_limit, run.memory_limit):
+                    state = MISSING  # who failed within other limits has said nothing of these
                 if (made_of := parts(run)) not in codes:
                     codes[made_of] = code(made_of)
                 older = there["code"] != codes[made_of]
@@ -92,17 +140,17 @@ def run_sweep(
     again: bool = False,
     changed: bool = False,
     positions: Path | None = None,
+    isolated: bool = True,
 ) -> pa.Table:
     """Do what is missing of a sweep, all of it with `again` or `positions`, with `changed` also what was done by other
     code than today's, and return all its rows.
 
-    say: prints a remark; positions: where to store the positions of the sweep's only run. Raises InputError.
+    say: prints a remark; positions: where to store the positions of the sweep's only run; isolated: whether runs are
+    done in a process that may die, within their limits, or in this one. Raises InputError.
     """
     if positions and len(runs) != 1:
         raise InputError(f"--positions stores the positions of one run; this is {len(runs)} runs")
-    for threads in {machine.threads(run.threads).number for run in runs}:
-        with machine.pinned_threads(threads):  # refuses what this machine cannot do before anything starts
-            pass
+    require_threads({machine.threads(run.threads).number for run in runs})
     for part in ("rows", "recordings", "pictures"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     with rows.alone(folder):
@@ -114,14 +162,7 @@ def run_sweep(
         for p in todo:
             if p.damage:
                 say(f"{p.damage}; its run is done again")
-        display.begin(len(todo), sum(map(_work, todo)))
-        try:
-            for p in todo:
-                ticks = p.run.frames * (p.run.rounds + 2)
-                display.run(p.title, ticks, _work(p))
-                display.finished(_outcome(execute(p.run, p.files, display.tick, positions=positions)))
-        finally:
-            display.end()
+        do_all([RunUnit(p.run, p.files, positions) for p in todo], display, isolated=isolated)
         table = rows.read((p.files.rows for p in planned), needed=NEEDED)
         pictured = [Pictured(p.run, p.files.recording, p.files.picture) for p in planned]
         draw_sweep(name, pictured, folder, table, say)
@@ -140,11 +181,6 @@ def of_other_code(runs: Iterable[RunSpec], table: pa.Table) -> set[str]:
     """The ids of those runs whose rows in the table were made by other code than today's."""
     here, made = machine.describe().id, dict(zip(*(table[c].to_pylist() for c in ("run_id", "code")), strict=True))
     return {name for run in runs if made.get(name := run.run_id(here)) != code(parts(run))}
-
-
-def _work(p: Planned) -> float:
-    """A rough measure of a run's effort, for the time left."""
-    return (p.run.size or 32) ** 2 * p.run.frames * p.run.iterations * (p.run.rounds + 2)
 
 
 def _outcome(found: list[dict[str, Any]]) -> str:

@@ -57,14 +57,22 @@ SADDLE = Outcome("no minimum", "#b9a3d6", "stationary, but where the objective f
 SHORT = Outcome("not converged", "#f2c45f", "finite, and not yet stationary, or not close to the reference")
 WRONG = Outcome("silently wrong", "#e0683c", "said of a step that it had converged, which the oracle finds untrue")
 DIVERGED = Outcome("diverged", "#d1495b", "positions are not finite any more")
+LATE = Outcome("too slow", "#7b7f87", "did not end within its time limit")
 FAILED = Outcome("failed", "#23262b", "ended with an error")
 DISPUTED = Outcome("disputed", "#8a6d4b", "the second opinion finds the formulas of the steps themselves wrong")
 REFUSED = Outcome("refused", "#d9d9d6", "refused before it began, with a reason")
-OUTCOMES = (RIGHT, OTHER, VALLEY, SADDLE, SHORT, WRONG, DIVERGED, FAILED, DISPUTED, REFUSED)
+OUTCOMES = (RIGHT, OTHER, VALLEY, SADDLE, SHORT, WRONG, DIVERGED, LATE, FAILED, DISPUTED, REFUSED)
 
 _CLAIMS = ("tolerance", "floor")
 """How a solve ends that takes itself for converged."""
-_ENDED = {"unsupported": REFUSED, "diverged": DIVERGED, "failed": FAILED, "disputed": DISPUTED}
+_ENDED = {
+    "time-limit": LATE,
+    "unsupported": REFUSED,
+    "diverged": DIVERGED,
+    "failed": FAILED,
+    "killed": FAILED,
+    "disputed": DISPUTED,
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,6 @@ Errors blame the solver's own line, which whoever wrote it can mend, and not the
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.base.blame import where
 from harness.base.errors import RunFailed
 from solvers import sources
 from solvers.core.driver import Iterative
@@ -98,16 +98,6 @@ class Checked:
         except Exception:  # a compiled solver may not take such arrays at all
             return ""
         return ""
-
-
-def where(error: BaseException, own: Collection[str]) -> str:
-    """`file:line` of an error: the last line in the files `own`, else in those of other people, else of all; with the
-    line that raised it behind that, where it is another."""
-    frames = [(frame.filename, frame.lineno or 0) for frame in traceback.extract_tb(error.__traceback__)]
-    theirs = [frame for frame in frames if not sources.known(frame[0])]
-    blamed = [frame for frame in frames if frame[0] in own] or theirs or frames
-    told = [f"{Path(file).name}:{line}" for file, line in dict.fromkeys((blamed[-1], frames[-1]))]
-    return ", raised in ".join(told)
 
 
 def _line(of: type, method: str) -> str:

@@ -1,0 +1,228 @@
+"""Strangers' code may crash, hang, swell or leave; it is run in a worker process, which may die, and this one goes on.
+
+One worker does all pieces of work, one after the other, so it stays warm: modules are imported, kernels compiled. It
+is replaced where it was lost, or where a piece left threads behind. It is a fork of this process, which costs nothing
+of that again, as long as no thread of Numba runs here: OpenMP's do not survive a fork, and then it is started anew.
+
+Files are read in a process of their own likewise (`harness.base.child`), which has nothing of this one's.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from pickle import UnpicklingError
+from time import monotonic
+from typing import Any, Protocol
+
+from harness.base.blame import place
+from harness.base.worker import DUMP, Answer, Limits, Piece, Tick, serve
+
+_LOOK = 0.1
+"""Seconds between two looks at a worker that is at work."""
+_GRACE = 5.0
+"""Seconds that a worker has to say where it is, or to end, before it is killed."""
+_KEPT = 2**14
+"""So many of the last bytes that a worker said are kept."""
+
+
+class Lost(Exception):
+    """A piece gave no answer.
+
+    status: `time-limit` where it took too long, `killed` where others ended its worker, `failed` where it did so
+    itself, or raised what no program should catch; reason: all that is known of it.
+    """
+
+    def __init__(self, status: str, reason: str) -> None:
+        super().__init__(reason)
+        self.status, self.reason = status, reason
+
+
+class Executor(Protocol):
+    """Does pieces of work, one after the other."""
+
+    def do(self, piece: Piece, tick: Tick, limits: Limits) -> Any:
+        """What the piece returns. Raises the SpringbenchError that it raises, and Lost where it gives no answer."""
+        ...
+
+    def end(self) -> None:
+        """Let go of everything."""
+        ...
+
+
+class Here:
+    """Does pieces in this process, without limits: for debuggers, and for work that is trusted. It loses none."""
+
+    def do(self, piece: Piece, tick: Tick, limits: Limits) -> Any:
+        """See Executor; whatever the piece raises is raised."""
+        return piece(tick)
+
+    def end(self) -> None:
+        """See Executor."""
+
+
+class Workers:
+    """Does pieces in a worker. ready: called in each before anything else."""
+
+    def __init__(self, ready: Callable[[], object] = int) -> None:
+        self._ready = ready
+        self._worker: _Worker | None = None
+
+    def do(self, piece: Piece, tick: Tick, limits: Limits) -> Any:
+        """See Executor."""
+        if self._worker is None or not self._worker.alive:
+            self.end()
+            self._worker = _Worker(self._ready)
+        try:
+            answer = self._worker.ask(piece, tick, limits)
+        except BaseException:  # it was lost, or somebody wants to leave
+            self._worker.kill()
+            self.end()
+            raise
+        if not answer.clean:
+            self.end()
+        if isinstance(answer.error, str) and answer.error:
+            raise Lost("failed", answer.error)
+        if answer.error:
+            raise answer.error
+        return answer.value
+
+    def end(self) -> None:
+        """See Executor."""
+        if self._worker:
+            self._worker.end()
+            self._worker = None
+
+
+class _Worker:
+    """One worker process, seen from its parent."""
+
+    def __init__(self, ready: Callable[[], object]) -> None:
+        context: Any = get_context("fork" if sys.platform == "linux" and not _threads_run() else "spawn")
+        self._calls, calls = context.Pipe()
+        (self._ticks, ticks), (self._said, said), (self._dump, dump) = (context.Pipe(duplex=False) for _ in range(3))
+        theirs = calls, ticks, said, dump
+        self._process = context.Process(target=serve, args=(*theirs, ready, os.getpid()))
+        self._process.start()
+        for end in theirs:
+            end.close()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it can be asked."""
+        return self._process.is_alive()
+
+    def ask(self, piece: Piece, tick: Tick, limits: Limits) -> Answer:
+        """The answer to a piece. Raises Lost."""
+        heard, began = _Heard(self._ticks, self._said, tick), monotonic()
+        try:
+            self._calls.send((piece, limits))
+            while not wait([self._calls], _LOOK):
+                heard.listen()
+                if limits.seconds is not None and monotonic() - began > limits.seconds:
+                    raise self._late(limits.seconds, heard)
+                if not self.alive and not self._calls.poll():  # processes of its own may hold the pipe open
+                    raise EOFError
+            answer = self._calls.recv()
+        except (EOFError, OSError, UnpicklingError):
+            raise self._ended(heard) from None
+        heard.listen()
+        return answer
+
+    def _late(self, seconds: float, heard: _Heard) -> Lost:
+        """Ask a worker that takes too long where it is, and kill it."""
+        with suppress(OSError):
+            os.kill(self._process.pid or 0, DUMP)
+        dump, more = b"", b""
+        while wait([self._dump], _LOOK if dump else _GRACE) and (more := _come(self._dump)):
+            dump += more
+        self.kill()
+        heard.listen()
+        return Lost("time-limit", f"did not end within {seconds:g} s; it was {_at(dump)}{heard}")
+
+    def _ended(self, heard: _Heard) -> Lost:
+        """What became of a worker that gave no answer."""
+        self._process.join(_GRACE)
+        self.kill()
+        heard.listen()
+        code, at = self._process.exitcode or 0, _at(_come(self._dump))
+        if code >= 0:
+            return Lost("failed", f"ended its process with exit code {code}, {heard}")
+        name = signal.Signals(-code).name
+        if -code == signal.SIGKILL:
+            return Lost("killed", f"was killed by SIGKILL, as the system does where memory runs out, {heard}")
+        if -code == signal.SIGTERM:
+            return Lost("killed", f"was ended by SIGTERM, {heard}")
+        return Lost("failed", f"crashed by {name} {at}{heard}")
+
+    def kill(self) -> None:
+        """End it at once."""
+        if self._process.is_alive():
+            self._process.kill()
+        self._process.join()
+
+    def end(self) -> None:
+        """Let it end, and end it where it does not."""
+        with suppress(OSError):
+            self._calls.send(None)
+        self._process.join(_GRACE)
+        self.kill()
+        for pipe in (self._calls, self._ticks, self._said, self._dump):
+            pipe.close()
+        self._process.close()
+
+
+class _Heard:
+    """What is heard of a piece while it is done: the phases of its steps, and what it writes to standard error."""
+
+    def __init__(self, ticks: Connection, said: Connection, tick: Tick) -> None:
+        self._ticks, self._said, self._tick = ticks, said, tick
+        self._phase, self._steps, self._kept = "", 0, b""
+
+    def listen(self) -> None:
+        """Pass on what came meanwhile."""
+        with suppress(EOFError):
+            while self._ticks.poll():
+                phase = self._ticks.recv_bytes().decode()
+                self._phase, self._steps = phase, 1 + (self._steps if phase == self._phase else 0)
+                self._tick(phase)
+        if said := _come(self._said):
+            sys.stderr.write(said.decode(errors="replace"))
+            self._kept = (self._kept + said)[-_KEPT:]
+
+    def __str__(self) -> str:
+        steps = f"after {self._steps} steps of the {self._phase}" if self._steps else "before its first step"
+        lines = [line for line in self._kept.decode(errors="replace").splitlines() if line.strip()]
+        return f"{steps}; it said: {lines[-1].strip()[:300]}" if lines else steps
+
+
+def _come(pipe: Connection) -> bytes:
+    """The bytes that are in a pipe now."""
+    found = b""
+    with suppress(BrokenPipeError):
+        while pipe.poll() and (more := os.read(pipe.fileno(), 2**16)):
+            found += more
+    return found
+
+
+def _at(dump: bytes) -> str:
+    """Where a worker was, as it has written down: `at file:line in function, `."""
+    found = place(dump.decode(errors="replace"))
+    return found and f"at {found}, "
+
+
+def _threads_run() -> bool:
+    """Whether Numba's threads were started in this process."""
+    numba: Any = sys.modules.get("numba")
+    if numba is None:
+        return False
+    try:
+        numba.threading_layer()
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,147 @@
+"""A solver that crashes, hangs, swells or leaves is a row with its reason; the sweep goes on, and resumes."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from time import sleep
+from typing import Any, NamedTuple
+
+import psutil
+import pytest
+from typer.testing import CliRunner, Result
+
+from harness.base import rows
+from harness.cli import app
+from harness.config.load import load_any
+from harness.experiments.run import Files
+from tests.own_solvers import OPTIONS, Own, own
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+class Case(NamedTuple):
+    """What a solver does while it solves, the status of its run, what is said of it, and options of the sweep."""
+
+    does: str
+    status: str
+    said: str
+    options: str = ""
+
+
+CASES = {
+    "a crash": Case("import ctypes; ctypes.string_at(0)", "failed", "crashed by SIGSEGV at {line} in solve"),
+    "an abort": Case(
+        "import os; print('out of luck', file=__import__('sys').stderr); os.abort()",
+        "failed",
+        "crashed by SIGABRT at {line} in solve, before its first step; it said: out of luck",
+    ),
+    "an exit by the system": Case("import os; os._exit(3)", "failed", "ended its process with exit code 3"),
+    "an exit by Python": Case("raise SystemExit(0)", "failed", "raised SystemExit: 0 ({line})"),
+    "the end of a generator": Case("raise GeneratorExit", "failed", "raised GeneratorExit ({line})"),
+    "a kill": Case("import os; os.kill(os.getpid(), 9)", "killed", "was killed by SIGKILL"),
+    "a loop": Case("while True: hang = 1", "time-limit", "did not end within 8 s", ", time_limit: 8"),
+    "too much memory": Case(
+        "swollen = [bytes(2**20) for _ in range(2**12)]", "failed", "MemoryError:  ({line})", ", memory_limit: 0.5"
+    ),
+}
+
+
+def ran(made: Own, *more: str) -> Result:
+    return CliRunner().invoke(app, ["run", str(made.sweep), "--results", str(made.sweep.parent / "r"), *more])
+
+
+def first_rows(made: Own) -> dict[str, dict[str, Any]]:
+    """By solver, the first row of its run."""
+    folder = made.sweep.parent / "r" / "sweep"
+    found = (rows.first(Files.of(run, folder).rows) for run in load_any(made.sweep).runs())
+    return {row["solver"]: row for row in found if isinstance(row, dict)}
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_a_sweep_survives_its_solvers(case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made = own(tmp_path, monkeypatch, solving=case.does, options=OPTIONS + case.options)
+    told = ran(made)
+    assert told.exit_code == 1, told.output
+    assert "Traceback" not in told.output
+    found = first_rows(made)
+    assert found["sparse"]["status"] == "ok", found["sparse"]["reason"]
+    mine = found["mine"]
+    assert mine["status"] == case.status, mine["reason"]
+    assert case.said.format(line=made.line(case.does)) in mine["reason"]
+    assert mine["solver"] == "mine"
+    again = ran(made)
+    assert again.exit_code == 1
+    assert "2 of 2 runs are there already" in re.sub(r"\s+", " ", again.output)
+    assert first_rows(made) == found
+
+
+def test_a_run_that_took_too_long_is_done_again_with_another_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    flag = tmp_path / "quick"
+    hangs = f"import pathlib\n        while not pathlib.Path({str(flag)!r}).exists(): hang = 1"
+    made = own(tmp_path, monkeypatch, solving=hangs, options=OPTIONS + ", time_limit: 8")
+    assert ran(made).exit_code == 1
+    flag.touch()
+    assert "2 of 2 runs are there already" in re.sub(r"\s+", " ", ran(made).output)
+    made.sweep.write_text(made.sweep.read_text().replace("time_limit: 8", "time_limit: 800"))
+    assert (told := ran(made)).exit_code == 0, told.output
+    assert {row["status"] for row in first_rows(made).values()} == {"ok"}
+
+
+def test_a_debugger_can_have_the_runs_in_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made = own(tmp_path, monkeypatch, solving="import os; globals()['seen'] = os.getpid()")
+    assert (told := ran(made)).exit_code == 0, told.output
+    module = made.solver.stem
+    assert not hasattr(sys.modules.get(module), "seen")
+    assert ran(made, "--again", "--here").exit_code == 0
+    assert sys.modules[module].seen == os.getpid()
+
+
+LONG = "scenes: [scene.yaml]\nsolvers: [sparse]\noptions: {frames: 100000, rounds: 1, iterations: 50, record: false}\n"
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_no_worker_stays_behind(how: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made = own(tmp_path, monkeypatch)
+    made.sweep.write_text(LONG)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "harness.cli", "run", str(made.sweep), "--results", str(tmp_path / "r")],
+        cwd=ROOT,
+        stderr=subprocess.DEVNULL,
+        # A shell that started these tests in the background has made its children deaf to Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    parent, workers = psutil.Process(process.pid), []
+    while not workers and process.poll() is None:
+        sleep(0.01)
+        workers = [child for child in parent.children() if child.name() == parent.name() and busy(child)]
+    assert workers, "it ended before it had a worker"
+    process.send_signal(how)
+    process.wait()
+    assert process.returncode == (130 if how == signal.SIGINT else -how)
+    gone, alive = psutil.wait_procs(workers, timeout=60.0)
+    assert gone
+    assert not alive
+
+
+def busy(process: psutil.Process) -> bool:
+    """Whether it has taken its run: it has computed for a while."""
+    try:
+        return process.cpu_times().user > 0.3
+    except psutil.NoSuchProcess:
+        return False
+
+
+def test_all_runs_of_a_sweep_are_done_in_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """One worker does all runs of a sweep: its process is the same in all."""
+    note = tmp_path / "note"
+    does = f"import os; open({str(note)!r}, 'a').write(str(os.getpid()) + ' ')"
+    made = own(tmp_path, monkeypatch, solving=does, options=OPTIONS + ", tolerance: [1e-2, 1e-3, 1e-4]")
+    assert (told := ran(made)).exit_code == 0, told.output
+    workers = set(note.read_text().split())
+    assert len(workers) == 1
+    assert str(os.getpid()) not in workers

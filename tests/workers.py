@@ -1,0 +1,87 @@
+"""What strangers' code does to the process that it runs in."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+from time import sleep
+
+from harness.base.worker import Tick
+
+
+def double(number: int, tick: Tick) -> int:
+    tick("doubling")
+    return 2 * number
+
+
+def name(tick: Tick) -> int:
+    """Of the worker's process."""
+    return os.getpid()
+
+
+def crash(tick: Tick) -> None:
+    tick("crashing")
+    tick("crashing")
+    ctypes.string_at(0)
+
+
+def abort(tick: Tick) -> None:
+    print("I cannot go on", file=sys.stderr)
+    os.abort()
+
+
+def leave(tick: Tick) -> None:
+    os._exit(7)
+
+
+def leave_well(tick: Tick) -> None:
+    os._exit(0)
+
+
+def leave_by_python(tick: Tick) -> None:
+    sys.exit("I am off")
+
+
+def leave_as_a_generator(tick: Tick) -> None:
+    raise GeneratorExit
+
+
+def interrupt(tick: Tick) -> None:
+    raise KeyboardInterrupt
+
+
+def be_killed(tick: Tick) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def loop(tick: Tick) -> None:
+    while True:
+        pass
+
+
+def swell(tick: Tick) -> int:
+    return len([bytes(2**20) for _ in range(2**11)])
+
+
+def leave_a_thread(tick: Tick) -> int:
+    threading.Thread(target=sleep, args=(60.0,), daemon=True).start()
+    return os.getpid()
+
+
+def chat(tick: Tick) -> str:
+    """More than any pipe holds."""
+    for _ in range(5000):
+        print("x" * 99, file=sys.stderr)
+        tick("chatting")
+    return "said"
+
+
+def copy(tick: Tick) -> int:
+    """Make a copy of the process that goes on as if it were the worker."""
+    child = os.fork()
+    if child:
+        os.waitpid(child, 0)
+    return os.getpid()
