@@ -73,7 +73,7 @@ def load_any(
     if "scenes" in document.data:
         if solvers or sizes or asked:
             raise InputError(Mistake("is a sweep, which says itself what to run; change the file instead", path))
-        return _sweep(document)
+        return sweep_of(document)
     if not _is_assignment(path) and "mesh" not in document.data:
         raise InputError(Mistake("is neither a scene (it has no `mesh`) nor a sweep (it has no `scenes`)", path))
     scene = scene_from_assignment(path) if _is_assignment(path) else scene_of(document)
@@ -84,7 +84,7 @@ def load_any(
 
 def load_sweep(path: Path) -> Sweep:
     """The sweep in a YAML file, its scenes checked and its grid expanded. Raises InputError."""
-    return _sweep(read_yaml(path))
+    return sweep_of(read_yaml(path))
 
 
 def load_scene(path: Path, *, opens: bool = True) -> SceneSpec:
@@ -186,8 +186,8 @@ def _with_paths(document: Document, model: type[Model], data: dict[str, Any], at
     return data
 
 
-def _sweep(document: Document) -> Sweep:
-    """The sweep in a document, its scenes read from the files that it names."""
+def sweep_of(document: Document) -> Sweep:
+    """The sweep in a document, its scenes read from the files that it names. Raises InputError."""
     return _expanded(document, scenes_of(document))
 
 
