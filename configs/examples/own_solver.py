@@ -14,6 +14,8 @@ from solvers.linear.factors import SparseLU
 
 @dataclass(frozen=True)
 class HeavyBall:
+    """The method and its parameter b."""
+
     momentum: float = 0.3
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = False
@@ -25,6 +27,8 @@ class HeavyBall:
 
 
 class Ready(Iterative):
+    """Ready for a system: Q is factorised."""
+
     residual_of, choice, facts = "previous", "", {}
 
     def __init__(self, base, momentum):
@@ -35,6 +39,8 @@ class Ready(Iterative):
 
 
 class Rolling(Iterating):
+    """One solve."""
+
     def __init__(self, ready, problem, guess):
         self.ready, self.problem, self.positions = ready, problem, ready.base.placed(guess, problem)
         self.before, self.step = self.positions, np.full_like(guess, np.nan)

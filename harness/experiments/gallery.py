@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from harness.base.console import say
@@ -32,6 +31,8 @@ def gallery(
 def _tile(path: Path) -> Any:
     """A scene's tile."""
     from harness.base.machine import pinned_threads
+    import numpy as np
+
     from harness.config.load import load_any
     from harness.record.base import Replay
     from harness.record.obstacles import declared, listed
