@@ -30,9 +30,9 @@ def gallery(
 
 def _tile(path: Path) -> Any:
     """A scene's tile."""
-    from harness.base.machine import pinned_threads
     import numpy as np
 
+    from harness.base.machine import pinned_threads
     from harness.config.load import load_any
     from harness.record.base import Replay
     from harness.record.obstacles import declared, listed
