@@ -1,4 +1,4 @@
-"""Figures of one's own: iterations a step, as a report that a sweep names, `reports: ["./own_report.py:iterations"]`."""
+"""A figure of one's own: iterations a step, as a report, `reports: ["./own_report.py:iterations"]`."""
 
 from pathlib import Path
 
