@@ -70,6 +70,7 @@ def run(
     from harness.base.progress import display
     from harness.config.load import load_any
     from harness.experiments.sweep import failures, of_other_code, run_sweep
+    from harness.report.named import draw_reports
     from harness.report.timing_table import summary_table
 
     options = {
@@ -90,6 +91,8 @@ def run(
     table = run_sweep(sweep.name, runs, folder, display(err), _say, **how)
     out.print(summary_table(table, of_other_code(runs, table)))
     _say(f"rows, recordings and pictures are in {folder}")
+    for path in draw_reports(sweep.reports, table, folder):
+        _say(f"reported in {path}")
     failed = failures(table)
     for line in failed:
         _say(line)
@@ -207,7 +210,7 @@ def list_runs(config: Config, results: Results = Path("results")) -> None:
     from harness.config.load import load_any
     from harness.experiments.sweep import plan
 
-    sweep = load_any(config)
+    sweep = load_any(config, opens=False)
     table = Table("run", "scene", "size", "solver", "iterations", "frames", "threads", "state")
     for p in plan(sweep.runs(), results / sweep.name):
         r = p.run

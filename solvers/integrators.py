@@ -22,6 +22,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from solvers.plugins import Table, load
 from solvers.problem import Positions, Solution, Start
 
 
@@ -75,4 +76,12 @@ INTEGRATORS = {
     "bdf2": Integrator(2.25, 1.0, 1.0, True, _bdf2),
     "midpoint": Integrator(4.0, 0.5, 0.5, False, _midpoint),
 }
-"""The integrators by name."""
+"""The shipped integrators by name."""
+
+EVERY = Table("springbench.integrators", INTEGRATORS)
+"""All that a config can name."""
+
+
+def find(name: str) -> Integrator:
+    """The integrator of a name, which may be somebody's own."""
+    return INTEGRATORS[name] if name in INTEGRATORS else load(EVERY[name])

@@ -1,12 +1,13 @@
-"""The solvers by name. A new one is one file and one line here."""
+"""The solvers by name. One of ours is a file and a line here; other people's need no line, see `solvers.plugins`."""
 
 from __future__ import annotations
 
-from collections import ChainMap
-from importlib import import_module
 from typing import Any
 
 from solvers.about import About
+from solvers.plugins import Table, load
+
+__all__ = ["EVERY", "OPTIONAL", "SOLVERS", "about", "load", "minimises"]
 
 SOLVERS = {
     "dense": "solvers.methods.local_global:DenseLocalGlobal",
@@ -27,14 +28,8 @@ SOLVERS = {
 OPTIONAL = {"eigen": "solvers.methods.eigen:EigenLocalGlobal"}
 """Those that need what is not everywhere, and refuse with the reason where it is missing."""
 
-EVERY = ChainMap(SOLVERS, OPTIONAL)
+EVERY = Table("springbench.solvers", SOLVERS, OPTIONAL)
 """All that a config can name."""
-
-
-def load(target: str) -> Any:
-    """The object that "module:name" names; its module is imported now and no sooner."""
-    module, _, name = target.partition(":")
-    return getattr(import_module(module), name)
 
 
 def minimises(solver: Any) -> bool:

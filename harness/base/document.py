@@ -34,12 +34,16 @@ M = TypeVar("M", bound=BaseModel)
 
 @dataclass(slots=True)
 class Document:
-    """A config as plain data, the line of each key, and the mistakes found in it so far."""
+    """A config as plain data, the line of each key, and the mistakes found in it so far.
+
+    opens: whether code that the config names is imported; else it is told by its files alone.
+    """
 
     path: Path
     data: dict[str, Any]
     lines: dict[Key, int] = field(default_factory=dict)
     mistakes: list[Mistake] = field(default_factory=list)
+    opens: bool = True
 
     def report(self, problem: str, at: Key = ()) -> None:
         """Note a mistake at a key; a key that is not in the file gets the line of the mapping around it."""
@@ -52,7 +56,7 @@ class Document:
         It is validated as strict JSON: a list may stand for a tuple, but no boolean or text for a number.
         """
         try:
-            return model.model_validate_json(json.dumps(data), strict=True)
+            return model.model_validate_json(json.dumps(data), strict=True, context={"folder": self.path.parent})
         except ValidationError as error:
             problems: dict[Key, list[str]] = {}
             for detail in error.errors()[: MAX_MISTAKES + 1]:

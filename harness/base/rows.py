@@ -186,6 +186,7 @@ COLUMNS = (
     Column("versions", _TEXT, "", "versions of Python and the libraries, as JSON"),
     Column("commit", _TEXT, "", "commit of the code, with -dirty where files differed from it"),
     Column("code", _TEXT, "", "hash of all sources that the run depends on: rows made by other code differ"),
+    Column("own", _TEXT, "", "somebody's own code in the run: names, modules, versions, as JSON; null without"),
     Column("started", _TEXT, "", "when the run started, UTC, ISO 8601"),
 )
 

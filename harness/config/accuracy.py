@@ -10,8 +10,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from harness.base.model import Many, Model
-from harness.config.sweep import Iterations, Rounds, SolverSpec, Threads, Tolerance
+from harness.config.sweep import Iterations, Rounds, SolverSpec, Threads, Tolerance, in_file_name
 from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, Size, TimeStep
+from solvers.plugins import identity
 
 Moment = Literal["early", "middle", "violent"] | Frames
 """A moment of the scene that is found from its own run, or the number of a frame."""
@@ -92,7 +93,7 @@ class Case:
 
     def identity(self) -> list[Any]:
         """All that determines the motion, as plain data."""
-        return [self.scene.digest, self.size, self.integrator]
+        return [self.scene.digest, self.size, identity(self.integrator)]
 
     @property
     def title(self) -> str:
@@ -123,7 +124,7 @@ class CurveUnit:
 
     def point(self) -> list[Any]:
         """What is measured, however it is; plain data."""
-        return ["curve", *self.case.identity(), self.moment, self.solver.name, dict(self.solver.parameters)]
+        return ["curve", *self.case.identity(), self.moment, identity(self.solver.name), dict(self.solver.parameters)]
 
     def unit_id(self, machine: str) -> str:
         """12 hex digits of all that determines result and timing."""
@@ -132,7 +133,8 @@ class CurveUnit:
 
     def label(self) -> str:
         """The name of its file; measured otherwise, it takes the place of what was there."""
-        return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{self.solver.name}-{_hash(self.point())}"
+        solver = in_file_name(self.solver.name)
+        return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{solver}-{_hash(self.point())}"
 
     def problem_label(self) -> str:
         """The name of the file of the step itself."""
@@ -155,7 +157,7 @@ class WorkUnit:
     def point(self) -> list[Any]:
         """What is measured, however it is; plain data."""
         stop = [self.first_guess, self.iterations, self.tolerance, self.how.threads]
-        solver = [self.solver.name, dict(self.solver.parameters)]
+        solver = [identity(self.solver.name), dict(self.solver.parameters)]
         return ["work", *self.case.identity(), self.horizon, *solver, *stop]
 
     def unit_id(self, machine: str) -> str:
@@ -164,7 +166,7 @@ class WorkUnit:
 
     def label(self) -> str:
         """The name of its file; measured otherwise, it takes the place of what was there."""
-        return f"{self.case.scene_name}-{self.case.size}-work-{self.solver.name}-{_hash(self.point())}"
+        return f"{self.case.scene_name}-{self.case.size}-work-{in_file_name(self.solver.name)}-{_hash(self.point())}"
 
 
 Unit = CurveUnit | WorkUnit

@@ -15,15 +15,17 @@ from harness.base.document import Document, Key, key_text, quote, read_yaml
 from harness.base.errors import InputError, Mistake
 from harness.base.model import Model
 from harness.config.expand import Expansion
+from harness.config.own import UnopenedEffect, UnopenedMesh, chosen, given, opened
 from harness.config.sweep import AUTO, Options, RunSpec, SolverSpec, SweepFields
 from harness.scenes.assignment import FORCE, PIN_WEIGHT, TIME_STEP, read_assignment
 from harness.scenes.bind import build
-from harness.scenes.effects.table import EFFECTS
+from harness.scenes.effects import table as effect_table
+from harness.scenes.mesh import table as mesh_table
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.generator import Generator
-from harness.scenes.mesh.table import MESHES
 from harness.scenes.spec import NAME, SceneFile, SceneSpec
-from solvers.registry import EVERY, load
+from solvers.plugins import Plugin, found, load
+from solvers.registry import EVERY
 
 ASSIGNMENT_FRAMES = 30
 DEFAULT_SOLVER = "numba"
@@ -42,47 +44,52 @@ class AssignmentMesh(Model):
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """A checked sweep: its name, its options and the runs that it asks for."""
+    """A checked sweep: its name, its options, the runs and the reports that it asks for."""
 
     name: str
     options: Options
     expanded: tuple[RunSpec, ...]
+    reports: tuple[str, ...] = ()
 
     def runs(self) -> list[RunSpec]:
         """The runs, without duplicates: scene by scene, size by size, solver by solver."""
         return list(self.expanded)
 
 
-def load_any(path: Path, *, solvers: Sequence[str] = (), sizes: Sequence[int] = (), **options: Any) -> Sweep:
+def load_any(
+    path: Path, *, solvers: Sequence[str] = (), sizes: Sequence[int] = (), opens: bool = True, **options: Any
+) -> Sweep:
     """The sweep in a file, or a sweep of the one scene in it.
 
     For a scene, `solvers`, `sizes` and `options` (those of `harness.config.sweep.Options`, None for the default) say
-    what to run; a sweep says so itself. Raises InputError.
+    what to run; a sweep says so itself. opens: whether code that it names is run; else its parameters are not checked.
+    Raises InputError.
     """
-    given = {key: value for key, value in options.items() if value is not None}
+    asked = {key: value for key, value in options.items() if value is not None}
     document = Document(path, {}) if _is_assignment(path) else read_yaml(path)
+    document.opens = opens
     if {"curves", "work"} & set(document.data):
         raise InputError(Mistake("is an accuracy config; run it with `springbench accuracy`", path))
     if "scenes" in document.data:
-        if solvers or sizes or given:
+        if solvers or sizes or asked:
             raise InputError(Mistake("is a sweep, which says itself what to run; change the file instead", path))
-        return _sweep(document)
+        return sweep_of(document)
     if not _is_assignment(path) and "mesh" not in document.data:
         raise InputError(Mistake("is neither a scene (it has no `mesh`) nor a sweep (it has no `scenes`)", path))
-    scene = scene_from_assignment(path) if _is_assignment(path) else _scene(document)
+    scene = scene_from_assignment(path) if _is_assignment(path) else scene_of(document)
     keys = {"scenes": [path.name], "sizes": list(sizes), "solvers": list(solvers) or [DEFAULT_SOLVER]}
-    asked = Document(path, {**keys, "options": {"threads": AUTO, **given}})
-    return _expanded(asked, {path.stem: scene})
+    alone = Document(path, {**keys, "options": {"threads": AUTO, **asked}}, opens=opens)
+    return _expanded(alone, {path.stem: scene})
 
 
 def load_sweep(path: Path) -> Sweep:
     """The sweep in a YAML file, its scenes checked and its grid expanded. Raises InputError."""
-    return _sweep(read_yaml(path))
+    return sweep_of(read_yaml(path))
 
 
-def load_scene(path: Path) -> SceneSpec:
-    """The scene in a YAML file, or in an assignment's JSON file. Raises InputError."""
-    return scene_from_assignment(path) if _is_assignment(path) else _scene(read_yaml(path))
+def load_scene(path: Path, *, opens: bool = True) -> SceneSpec:
+    """The scene in a YAML file, or in an assignment's JSON file; opens: see `load_any`. Raises InputError."""
+    return scene_from_assignment(path) if _is_assignment(path) else scene_of(replace(read_yaml(path), opens=opens))
 
 
 def scene_from_assignment(path: Path) -> SceneSpec:
@@ -103,29 +110,32 @@ def scene_from_assignment(path: Path) -> SceneSpec:
         mesh_digest=_digest(mesh),
         time_step=TIME_STEP,
         frames=ASSIGNMENT_FRAMES,
-        effects=tuple(load(EFFECTS[effect["kind"]])(**effect) for effect in effects),
+        effects=tuple(load(effect_table.EFFECTS[effect["kind"]])(**effect) for effect in effects),
         first_guess="assignment",
         path=path,
     )
 
 
-def _scene(document: Document) -> SceneSpec:
+def scene_of(document: Document) -> SceneSpec:
+    """The scene in a document. Raises InputError."""
     data = document.data
     if "scenes" in data and "mesh" not in data:
         raise InputError(Mistake("is a sweep; a scene is wanted here", document.path))
     check_name(document)
-    own = document.check(SceneFile, data)
-    mesh = _chosen(document, MESHES, data["mesh"], ("mesh",)) if "mesh" in data else None
+    fields = document.check(SceneFile, data)
+    own: dict[str, tuple[Plugin, dict[str, Any]]] = {}
+    mesh = _part(document, "mesh", data["mesh"], ("mesh",), own) if "mesh" in data else None
     listed = data.get("effects", [])
     if not isinstance(listed, list):
         document.report("should be a list of mappings, each with a `kind`", ("effects",))
         listed = []
-    effects = tuple(_chosen(document, EFFECTS, effect, ("effects", i)) for i, effect in enumerate(listed))
-    if own is None or document.mistakes:
+    effects = tuple(_part(document, "effect", effect, ("effects", i), own) for i, effect in enumerate(listed))
+    if fields is None or document.mistakes:
         raise document.error()
     return SceneSpec(
-        **vars(own) | {"mesh": mesh, "mesh_digest": _digest(mesh), "effects": effects},
+        **vars(fields) | {"mesh": mesh, "mesh_digest": _digest(mesh), "effects": effects},
         path=document.path,
+        own=own,
         lines={key_text(key): line for key, line in document.lines.items()},
     )
 
@@ -143,13 +153,27 @@ def _digest(source: Any) -> str:
     return digest.hexdigest()
 
 
-def _chosen(document: Document, table: dict[str, str], data: Any, at: Key) -> Any:
-    """A mesh or an effect, checked by the class that its `kind` names; only that class is imported."""
-    chosen = document.choose(data, table, "kind", at)
-    if chosen is None:
+_PARTS = {"mesh": (mesh_table.EVERY, UnopenedMesh), "effect": (effect_table.EVERY, UnopenedEffect)}
+
+
+def _part(document: Document, what: str, data: Any, at: Key, own: dict[str, tuple[Plugin, dict[str, Any]]]) -> Any:
+    """A mesh or an effect, checked by the class that its `kind` names; only that class is imported.
+
+    own: told of what is somebody's own code.
+    """
+    table, unopened = _PARTS[what]
+    named = chosen(document, table, data, "kind", at)
+    if named is None:
         return None
-    model = load(table[chosen[0]])
-    return document.check(model, _with_paths(document, model, data, at), at)
+    name, parameters = named
+    if not isinstance(name, Plugin):
+        model = load(table[name])
+        return document.check(model, _with_paths(document, model, data, at), at)
+    own[key_text(at)] = name, given(document, parameters)
+    if not document.opens:
+        return unopened(kind=str(name))
+    model = opened(document, name, what, (*at, "kind"))
+    return model and document.check(model, _with_paths(document, model, parameters, at), at)
 
 
 def _with_paths(document: Document, model: type[Model], data: dict[str, Any], at: Key) -> dict[str, Any]:
@@ -162,8 +186,8 @@ def _with_paths(document: Document, model: type[Model], data: dict[str, Any], at
     return data
 
 
-def _sweep(document: Document) -> Sweep:
-    """The sweep in a document, its scenes read from the files that it names."""
+def sweep_of(document: Document) -> Sweep:
+    """The sweep in a document, its scenes read from the files that it names. Raises InputError."""
     return _expanded(document, scenes_of(document))
 
 
@@ -181,7 +205,7 @@ def scenes_of(document: Document) -> dict[str, SceneSpec]:
             document.report(f"two scenes are named {path.stem}; rename one of the files", at)
         else:
             try:
-                scenes[path.stem] = load_scene(path)
+                scenes[path.stem] = load_scene(path, opens=document.opens)
             except InputError as error:
                 document.mistakes.extend(error.mistakes)
     return scenes
@@ -205,11 +229,17 @@ def _expanded(document: Document, scenes: dict[str, SceneSpec]) -> Sweep:
     if sweep is None or document.mistakes:
         raise document.error()
     runs = Expansion(document, document.path.stem, sweep, scenes, solvers).runs()
+    if document.opens:
+        for integrator in found({run.integrator: None for run in runs}):
+            opened(document, integrator, "integrator", ("options", "integrator"))
+        for report in found(sweep.reports):
+            opened(document, report, "report", ("reports",))
     for name, scene in scenes.items():
-        document.mistakes.extend(misfits(scene, [run.size for run in runs if run.scene_name == name]))
+        sizes = [run.size for run in runs if run.scene_name == name]
+        document.mistakes.extend(misfits(scene, sizes) if document.opens or not scene.own else [])
     if document.mistakes:
         raise document.error()
-    return Sweep(document.path.stem, sweep.options, runs)
+    return Sweep(document.path.stem, sweep.options, runs, sweep.reports)
 
 
 def misfits(scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:
@@ -225,19 +255,22 @@ def misfits(scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:
 def _solver(document: Document, entry: str | dict[str, Any], at: Key) -> SolverSpec | None:
     """A solver with all of its parameters; they are the fields of its dataclass."""
     data = {"name": entry} if isinstance(entry, str) else entry
-    chosen = document.choose(data, EVERY, "name", at)
-    if chosen is None:
+    named = chosen(document, EVERY, data, "name", at)
+    if named is None:
         return None
-    name, given = chosen
-    solver = load(EVERY[name])
-    parameters = document.check(parameters_model(name, solver), given, at)
+    name, asked = named
+    own = isinstance(name, Plugin)
+    if own and not document.opens:
+        return SolverSpec(name, asked)
+    solver = opened(document, name, "solver", at) if own else load(EVERY[name])
+    parameters = solver and document.check(parameters_model(name, solver), asked, at)
     if parameters is None:
         return None
     try:
         solver(**vars(parameters))
     except ValueError as error:
         document.report(str(error), at)
-    return SolverSpec(name, parameters.model_dump(mode="json"))
+    return SolverSpec(name, asked if own else parameters.model_dump(mode="json"))  # own code's are those of `list` too
 
 
 def parameters_model(name: str, solver: type) -> type[Model]:

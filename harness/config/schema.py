@@ -7,7 +7,7 @@ from functools import reduce
 from operator import or_
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, create_model
+from pydantic import ConfigDict, Field, create_model
 from pydantic.json_schema import models_json_schema
 
 from harness.base.model import Model
@@ -17,15 +17,17 @@ from harness.config.sweep import SweepFields
 from harness.scenes.effects.table import EFFECTS
 from harness.scenes.mesh.table import MESHES
 from harness.scenes.spec import SceneFile
-from solvers.registry import EVERY, load
+from solvers.plugins import PATTERN
+from solvers.registry import OPTIONAL, SOLVERS, load
 
 
 def schema() -> dict[str, Any]:
     """The schema of a config: a scene, a sweep or an accuracy config; it names every mesh, effect and solver."""
     mesh = _one_of({kind: load(target) for kind, target in MESHES.items()}, "kind")
     effect = _one_of({kind: load(target) for kind, target in EFFECTS.items()}, "kind")
-    solver = _one_of({name: parameters_model(name, load(target)) for name, target in EVERY.items()}, "name")
-    names: Any = Literal[tuple(EVERY)]
+    shipped = {**SOLVERS, **OPTIONAL}
+    solver = _one_of({name: parameters_model(name, load(target)) for name, target in shipped.items()}, "name")
+    names: Any = Literal[tuple(shipped)] | Annotated[str, Field(pattern=PATTERN)]
     scene = create_model(
         "Scene",
         __base__=SceneFile,
@@ -56,4 +58,10 @@ def _one_of(models: dict[str, type[Model]], tag: str) -> Any:
         create_model(name, __base__=model, __doc__=model.__doc__, **{tag: (Literal[name], ...)})  # pyright: ignore[reportCallIssue, reportArgumentType]
         for name, model in models.items()
     ]
-    return Annotated[reduce(or_, tagged), Field(discriminator=tag)]
+    own = create_model(  # its keys are known to its code alone, which nobody runs for a schema
+        f"Own {tag}",
+        __config__=ConfigDict(extra="allow"),
+        __doc__="Your own: `module:Name`, or `./file.py:Name` beside the config.",
+        **{tag: (Annotated[str, Field(pattern=PATTERN)], ...)},  # pyright: ignore[reportCallIssue, reportArgumentType]
+    )
+    return Annotated[reduce(or_, tagged), Field(discriminator=tag)] | own

@@ -4,14 +4,27 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import ConfigDict, Field
 
 from harness.base.model import Many, Model
-from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, Size, TimeStep
+from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, Size, TimeStep, named_in
+from solvers.plugins import Plugin, Table, found, identity
+
+REPORTS: dict[str, str] = {"medians": "harness.report.medians:medians", "timing": "harness.report.timing_plot:timing"}
+"""The shipped reports by name; each is a function `report(rows, folder)` that answers the files it wrote."""
+
+EVERY_REPORT = Table("springbench.reports", REPORTS)
+"""All that a sweep can name."""
+
+if TYPE_CHECKING:
+    ReportName = str
+else:
+    ReportName = named_in(EVERY_REPORT)
 
 Iterations = Annotated[int, Field(ge=1, le=100_000)]
 Tolerance = Annotated[float, Field(gt=0, lt=1)] | None
@@ -126,6 +139,8 @@ class SweepFields(Model):
     """Grid points to leave out."""
     include: tuple[Include, ...] = ()
     """Runs beside the grid."""
+    reports: tuple[ReportName, ...] = ()
+    """What is told of the rows when all runs are done, beside the pictures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +186,8 @@ class RunSpec:
         the recording, and limits only say when to give up."""
         left_out = ("sweep", "scene_name", "pictures", "time_limit", "memory_limit")
         settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
-        settings |= {"scene": self.scene.digest, "solver": [self.solver.name, dict(self.solver.parameters)]}
+        settings |= {"scene": self.scene.digest, "solver": [identity(self.solver.name), dict(self.solver.parameters)]}
+        settings["integrator"] = identity(self.integrator)
         return json.dumps(settings, sort_keys=True, separators=(",", ":"))
 
     def run_id(self, machine: str) -> str:
@@ -180,4 +196,13 @@ class RunSpec:
 
     def label(self, machine: str) -> str:
         """The run's name in the names of its files."""
-        return f"{self.scene_name}-{self.size}-{self.solver.name}-{self.run_id(machine)}"
+        return f"{self.scene_name}-{self.size}-{in_file_name(self.solver.name)}-{self.run_id(machine)}"
+
+    def own(self) -> list[Plugin]:
+        """Somebody's own code in the run: the solver, the integrator, the mesh, effects."""
+        return found([self.solver.name, self.integrator, *(plugin for plugin, _ in self.scene.own.values())])
+
+
+def in_file_name(name: str) -> str:
+    """A name as part of the names of files: that of own code has no colon and no slash there."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).lstrip("._")

@@ -7,6 +7,7 @@ from typing import Any
 
 from harness.config.sweep import RunSpec
 from solvers import sources
+from solvers.plugins import Plugin
 from solvers.registry import EVERY, SOLVERS, load
 
 _RUN = Path(__file__).with_name("run.py")
@@ -18,12 +19,22 @@ def solver_class(run: RunSpec) -> Any:
     return load(EVERY[run.solver.name])
 
 
-def parts(run: RunSpec) -> frozenset[type]:
-    """The classes that a run is put together from by name: the solver, the mesh, the effects, a judge's reference."""
+def parts(run: RunSpec) -> frozenset[type | Plugin]:
+    """What a run is put together from by name: the classes of the solver, the mesh, the effects, a judge's reference.
+    Somebody's own code is named and not imported."""
+    named = {"mesh": run.scene.mesh, **{f"effects[{i}]": effect for i, effect in enumerate(run.scene.effects)}}
+    shipped = [type(part) for place, part in named.items() if place not in run.scene.own]
+    solver = [] if isinstance(run.solver.name, Plugin) else [solver_class(run)]
     judge = (load(SOLVERS["newton"]),) if run.judge else ()
-    return frozenset([solver_class(run), type(run.scene.mesh), *map(type, run.scene.effects), *judge])
+    return frozenset([*solver, *shipped, *run.own(), *judge])
 
 
-def code(parts: frozenset[type]) -> str:
+def code(parts: frozenset[type | Plugin]) -> str:
     """12 hexadecimal digits of SHA-256 over all sources that a run of these parts depends on."""
-    return sources.digest([_RUN, *(file for part in parts for file in sources.of_class(part))])[:12]
+    return sources.digest([_RUN, *(file for part in parts for file in _files(part))])[:12]
+
+
+def _files(part: type | Plugin) -> set[Path]:
+    if isinstance(part, Plugin):
+        return {Path(part.source)} if part.source.endswith(".py") else set()
+    return sources.of_class(part)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from harness.base.console import say
@@ -31,6 +30,8 @@ def gallery(
 
 def _tile(path: Path) -> Any:
     """A scene's tile."""
+    import numpy as np
+
     from harness.base.machine import pinned_threads
     from harness.config.load import load_any
     from harness.record.base import Replay

@@ -278,6 +278,7 @@ def asked(run: RunSpec) -> dict[str, Any]:
         "size": run.size,
         "solver": run.solver.name,
         "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
+        "own": json.dumps([plugin.identity() for plugin in run.own()]) if run.own() else None,
         **stated(run.solver.name),
         **{option.column: getattr(run, name) for name, option in OPTIONS.items() if option.column},
         "threads": machine.threads(run.threads).number,

@@ -25,6 +25,13 @@ _LETTERS = 34  # of a direct label
 _DASHES = (DASHED, DOTTED, DASH_DOTTED)  # the further variants of one solver
 
 
+def timing(rows: pa.Table, folder: Path) -> list[Path]:
+    """The times of a sweep as a report that a sweep can name."""
+    path = folder / "timing.png"
+    draw_timing(rows, path, folder.name)
+    return [path]
+
+
 def draw_timing(table: pa.Table, path: Path, title: str) -> None:
     """Draw the times of a sweep's runs to `path`, WIDTH x HEIGHT pixels, PNG.
 

@@ -16,7 +16,7 @@ from harness.scenes.motion import Motion
 from harness.scenes.spec import SceneSpec
 from harness.scenes.start import Rest
 from solvers.energies.springs import Springs
-from solvers.integrators import IMPLICIT_EULER, INTEGRATORS, Integrator
+from solvers.integrators import IMPLICIT_EULER, Integrator, find
 from solvers.matrices import assemble
 from solvers.problem import NotPositiveDefinite, Pins, Positions, ProjectiveEnergy, System
 
@@ -92,7 +92,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
         if isinstance(force, Steady):
             load += force.force
     load.flags.writeable = False
-    system = System(mass, spec.time_step, energies, pins, INTEGRATORS[integrator].factor)
+    system = System(mass, spec.time_step, energies, pins, find(integrator).factor)
     _require_determined(system)
     start = spec.start or AT_REST
     _check(parts, start.positions(mesh.rest))
@@ -106,7 +106,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
         filters=tuple(one for part in parts for one in part.filters),
         pin_targets=targets,
         velocity=spec.velocity,
-        integrator=INTEGRATORS[integrator],
+        integrator=find(integrator),
         moving=moving,
         start=start,
         alternate=None if other in (None, spec.time_step) else build(spec.stepped(other), size, integrator),

@@ -9,22 +9,44 @@ from collections.abc import Mapping
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
-from pydantic import BeforeValidator, ConfigDict, Field, SkipValidation, WithJsonSchema
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, SkipValidation, ValidationInfo, WithJsonSchema
 
-from harness.base.errors import InputError, Mistake
+from harness.base.errors import InputError, Mistake, did_you_mean
 from harness.base.model import Model
 from harness.scenes.effects.base import Effect
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.generator import MAX_VERTICES
 from harness.scenes.start import AnyStart
+from solvers import integrators, plugins
+from solvers.plugins import Plugin, Table
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 """Names of scenes and sweeps; they become names of files in the results."""
 
 FirstGuess = Literal["assignment", "current", "inertial"]
-IntegratorName = Literal["implicit-euler", "bdf2", "midpoint"]
+
+
+def named_in(table: Table) -> Any:
+    """The type of a name in a table, or of somebody's own code as `solvers.plugins` tells; the folder of the config
+    comes with the context of the validation."""
+
+    def checked(value: str, info: ValidationInfo) -> str:
+        name = table.named(value, Path((info.context or {}).get("folder", ".")))
+        if name not in table:
+            raise ValueError(f"came {json.dumps(value)[:60]}; should be {did_you_mean(value, table)}")
+        return name
+
+    shipped = [name for one in table.shipped for name in one]
+    schema = {"anyOf": [{"enum": shipped, "type": "string"}, {"pattern": plugins.PATTERN, "type": "string"}]}
+    return Annotated[str, AfterValidator(checked), WithJsonSchema(schema)]
+
+
+if TYPE_CHECKING:
+    IntegratorName = str
+else:
+    IntegratorName = named_in(integrators.EVERY)
 
 
 def _seconds(value: Any) -> Any:
@@ -119,6 +141,8 @@ class SceneSpec(SceneFields):
     """Where a step's iteration starts if a sweep does not say."""
     path: Path
     """The file that the scene was read from, for messages."""
+    own: SkipValidation[Mapping[str, tuple[Plugin, Mapping[str, Any]]]] = Field(default_factory=dict)
+    """Which of `mesh`, `effects[0]`, ... is somebody's own code, and the parameters that its file gives."""
     lines: SkipValidation[Mapping[str, int]] = Field(default_factory=dict)
     """The lines of the keys in that file, for messages."""
 
@@ -140,6 +164,12 @@ class SceneSpec(SceneFields):
         """SHA-256 of all that determines a run of the scene; mesh files count by content, not by name."""
         content = self.model_dump(mode="json", include={"mass", "time_step", "velocity", "camera", "mesh", "effects"})
         content["mesh"] = self.mesh_digest or content["mesh"]
+        for place, (plugin, given) in self.own.items():  # which need not be imported to be told apart
+            told = [plugin.identity(), dict(given)]
+            if place == "mesh":
+                content["mesh"] = told
+            else:
+                content["effects"][int(place[len("effects[") : -1])] = told
         if self.start:
             content["start"] = self.start.model_dump(mode="json")
         if self.alternate_time_step is not None:

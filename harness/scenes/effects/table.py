@@ -1,4 +1,6 @@
-"""The effects by name. A new one is one file and one line here; a scene imports only those that it names."""
+"""The effects by name. One of ours is a file and a line here, others need no line; a scene imports what it names."""
+
+from solvers.plugins import Table
 
 EFFECTS = {
     "air-drag": "harness.scenes.effects.air_drag:AirDrag",
@@ -16,3 +18,6 @@ EFFECTS = {
     "strain-limits": "harness.scenes.effects.strain_limits:StrainLimits",
     "wind": "harness.scenes.effects.wind:Wind",
 }
+
+EVERY = Table("springbench.effects", EFFECTS)
+"""All that a scene can name."""

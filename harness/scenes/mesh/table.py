@@ -1,5 +1,7 @@
 """The kinds of mesh that a scene may name, as `module:Class`, so that a run imports the one it uses."""
 
+from solvers.plugins import Table
+
 MESHES: dict[str, str] = {
     "chain": "harness.scenes.mesh.chain:Chain",
     "grid": "harness.scenes.mesh.grid:Grid",
@@ -12,3 +14,6 @@ MESHES: dict[str, str] = {
     "network": "harness.scenes.mesh.network:Network",
     "file": "harness.scenes.mesh.files:File",
 }
+
+EVERY = Table("springbench.meshes", MESHES)
+"""All that a scene can name."""

@@ -1,0 +1,52 @@
+"""A mesh of one's own, a wheel: a hub, a rim, and spokes. In a scene:
+
+mesh: {kind: "./own_mesh.py:Wheel", radius: 0.5}
+"""
+
+from typing import ClassVar, Literal
+
+import numpy as np
+
+import harness
+from harness.scenes.mesh.base import SHEAR, STRETCH, Mesh
+from harness.scenes.mesh.generator import Generator, Metres
+from harness.scenes.mesh.topology import assemble, by_length
+
+
+class Wheel(Generator):
+    """The hub, vertex 0, and `size` vertices around it; the rim is of stretch springs, the spokes of shear springs."""
+
+    kind: Literal["wheel"] = "wheel"
+    radius: Metres = 1.0
+    SMALLEST: ClassVar[int] = 3
+    COUNTS: ClassVar[str] = "vertices of the rim"
+    SPRINGS: ClassVar[int] = 2
+
+    def count(self, size: int) -> int:
+        return size + 1
+
+    def generate(self, size: int) -> Mesh:
+        angle, i = 2.0 * np.pi * np.arange(size) / size, np.arange(1, size + 1)
+        rest = np.zeros((size + 1, 3))
+        rest[1:, :2] = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        springs = {STRETCH: np.stack([i, np.roll(i, -1)], axis=1), SHEAR: np.stack([0 * i, i], axis=1)}
+        weights, spacing = by_length(rest, np.concatenate(list(springs.values()))), self.radius * 2.0 * np.pi / size
+        return assemble(
+            rest=rest,
+            springs=springs,
+            weights=weights,
+            dimension=1,
+            spacing=spacing,
+            resolution=size,
+            parts={"hub": [0]},
+        )
+
+
+if __name__ == "__main__":
+    effects = [
+        {"kind": "springs", "stretch": 500.0, "shear": 500.0},
+        {"kind": "gravity"},
+        {"kind": "pins", "indices": [0]},
+    ]
+    scene = harness.make_scene(mesh=Wheel(radius=0.5), effects=effects, mass=1.0, time_step=0.02, frames=20)
+    print(f"the rim sinks to {harness.Simulation(scene, size=12).steps(20)[:, :, 1].min():.3f} m")

@@ -1,0 +1,228 @@
+"""What scripts and notebooks use, as `harness.run` and so on: scenes, steps, sweeps, rows, pictures, recordings.
+
+scene = harness.make_scene(mesh={"kind": "grid"}, mass=1.0, time_step=1/30, frames=60, default_size=16,
+                           effects=[{"kind": "springs", "stretch": 300.0}, {"kind": "gravity"}])
+simulation = harness.Simulation(scene, "hybrid")
+positions = simulation.step()                        # (n, 3) [m], after 1/30 s
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.base.document import Document
+from harness.base.errors import InputError
+from harness.config import load
+from harness.record.base import Replay
+from harness.scenes.bind import build
+from harness.scenes.effects.base import Effect
+from harness.scenes.mesh.base import Mesh
+from harness.scenes.spec import FirstGuess, MeshSource, SceneSpec
+from harness.simulation.step import Step, prepare, simulate, start
+from solvers.problem import Positions, Solver, StopRule
+
+
+def load_scene(path: str | Path) -> SceneSpec:
+    """The scene in a YAML file, or in an assignment's JSON file. Raises InputError."""
+    return load.load_scene(Path(path))
+
+
+def make_scene(
+    *,
+    mesh: Mapping[str, Any] | MeshSource,
+    effects: Sequence[Mapping[str, Any] | Effect] = (),
+    folder: str | Path = ".",
+    name: str = "scene",
+    **fields: Any,
+) -> SceneSpec:
+    """A scene written in Python, with the keys that its file would have.
+
+    mesh, effects: mappings as in a file, or objects, such as an effect of your own; folder: where files that it names
+    are; name: for messages. Raises InputError.
+    """
+    listed = [dict(effect) if isinstance(effect, Mapping) else {"kind": "gravity"} for effect in effects]
+    given = dict(mesh) if isinstance(mesh, Mapping) else {"kind": "grid"}
+    data = {**fields, "mesh": given, "effects": listed}
+    checked = load.scene_of(Document(Path(folder) / f"{name}.yaml", json.loads(json.dumps(data))))
+    own = tuple(
+        made if isinstance(effect, Mapping) else effect for effect, made in zip(effects, checked.effects, strict=True)
+    )
+    changed: dict[str, Any] = {"effects": own}
+    if not isinstance(mesh, Mapping):
+        changed["mesh"] = mesh
+    return checked.model_copy(update=changed)
+
+
+class Simulation:
+    """A scene in motion, one step each time it is asked.
+
+    mesh: at rest; time [s]; positions (n, 3) [m]; velocity (n, 3) [m/s]; last: the last step, with its problem and its
+    solution, None at the start.
+    """
+
+    def __init__(
+        self,
+        scene: SceneSpec,
+        solver: str | Solver = "hybrid",
+        *,
+        size: int | None = None,
+        integrator: str = "implicit-euler",
+        iterations: int = 500,
+        tolerance: float | None = 1e-4,
+        first_guess: FirstGuess | None = None,
+        parameters: Mapping[str, Any] | None = None,
+    ) -> None:
+        """solver: a name as in a sweep, its parameters beside it, or an object; size: of the mesh, the scene's own if
+        left out; tolerance: relative, None does all iterations. Raises InputError, and what `prepare` raises."""
+        size = size if size is not None else scene.default_size
+        self._scene = build(scene, size or 0, integrator)
+        if isinstance(solver, str):
+            solver = _solver(solver, parameters or {}, scene.path)
+        self._prepared = prepare(self._scene, solver)
+        self._stop, self._guess = StopRule(iterations, tolerance), first_guess or scene.first_guess
+        self._state = start(self._scene)
+        self.mesh: Mesh = self._scene.mesh
+        self.last: Step | None = None
+
+    @property
+    def time(self) -> float:
+        """The simulated time [s]."""
+        return self._scene.time(self._state.index)
+
+    @property
+    def positions(self) -> Positions:
+        """Where the vertices are, (n, 3) [m]; a copy."""
+        return self._state.now.positions.copy()
+
+    @property
+    def velocity(self) -> Positions:
+        """Of the vertices, (n, 3) [m/s]; a copy."""
+        return self._state.now.velocity.copy()
+
+    def step(self) -> Positions:
+        """Do one step, and tell where the vertices are after it, (n, 3) [m]."""
+        frames = self._state.index + 1
+        (self.last,) = simulate(
+            self._scene, self._prepared, self._stop, first_guess=self._guess, frames=frames, state=self._state
+        )
+        self._state = self.last.state
+        return self.positions
+
+    def steps(self, count: int) -> NDArray[np.float64]:
+        """Do some steps: the positions after each, (count, n, 3) [m]."""
+        return np.array([self.step() for _ in range(count)])
+
+
+def _solver(name: str, parameters: Mapping[str, Any], path: Path) -> Solver:
+    document = Document(path, {"solvers": [{"name": name, **parameters}]})
+    found = load.solvers_of(document)
+    if document.mistakes:
+        raise document.error()
+    return load.load(load.EVERY[found[0].name])(**found[0].parameters)
+
+
+def run(
+    config: str | Path | Mapping[str, Any],
+    *,
+    name: str = "",
+    folder: str | Path = ".",
+    results: str | Path = "results",
+    again: bool = False,
+) -> Any:
+    """Do what is missing of a sweep, as `springbench run`, and return its rows as `rows` does.
+
+    config: the file of a sweep or a scene; or a sweep as a mapping, with its name, and the folder that holds the scenes
+    and the code that it names. Raises InputError.
+    """
+    from harness.base.claim import claimed
+    from harness.base.console import err
+    from harness.base.progress import Lines
+    from harness.experiments.sweep import run_sweep
+    from harness.report.named import draw_reports
+
+    if isinstance(config, Mapping):
+        if not name:
+            raise InputError("a sweep that is a mapping needs a name: run({...}, name='mine')")
+        path = Path(folder) / f"{name}.yaml"
+        sweep = load.sweep_of(Document(path, json.loads(json.dumps(dict(config)))))
+    else:
+        path = Path(config)
+        sweep = load.load_any(path)
+    place = claimed(Path(results) / sweep.name, path)
+    table = run_sweep(sweep.name, sweep.runs(), place, Lines(err), lambda line: None, again=again)
+    draw_reports(sweep.reports, table, place)
+    return _frame(table)
+
+
+def rows(folder: str | Path) -> Any:
+    """The rows of a sweep's results, such as "results/quickstart": a DataFrame of polars where it is installed, else of
+    pandas, else a table of pyarrow. Raises InputError."""
+    from harness.base.rows import read
+
+    return _frame(read(sorted((Path(folder) / "rows").glob("*.parquet"))))
+
+
+def _frame(table: Any) -> Any:
+    try:
+        import polars  # pyright: ignore[reportMissingImports]
+
+        return polars.from_arrow(table)
+    except ImportError:
+        pass
+    try:
+        import pandas  # noqa: F401  # pyright: ignore[reportMissingImports]
+
+        return table.to_pandas()
+    except ImportError:
+        return table
+
+
+def open_recording(path: str | Path) -> Replay:
+    """What a recording shows: times (k,) [s], positions (k, n, 3) [m], springs, strain, scalars. Raises InputError."""
+    from harness.record.reader import read_replay
+
+    return read_replay(Path(path))
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture that a notebook shows; png: its content."""
+
+    png: bytes
+
+    def _repr_png_(self) -> bytes:
+        return self.png
+
+    def save(self, path: str | Path) -> Path:
+        """Write it to a file (.png)."""
+        Path(path).write_bytes(self.png)
+        return Path(path)
+
+
+def draw(what: str | Path | Replay | Mapping[str, str | Path | Replay]) -> Picture:
+    """The picture of a run, from its recording; or, of several recordings by name, one that compares them.
+
+    Raises InputError, and RunFailed where the system cannot draw.
+    """
+    from harness.report.comparison import draw_comparison
+    from harness.report.run_picture import draw_run
+
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "picture.png"
+        if isinstance(what, Mapping):
+            draw_comparison({name: _replay(one) for name, one in what.items()}, path)
+        else:
+            draw_run(_replay(what), path)
+        return Picture(path.read_bytes())
+
+
+def _replay(one: str | Path | Replay) -> Replay:
+    return one if isinstance(one, Replay) else open_recording(one)

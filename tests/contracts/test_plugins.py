@@ -1,0 +1,255 @@
+"""Somebody's own solver, effect, mesh, integrator and report: installed, or in a file beside the config."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from harness.base.errors import InputError
+from harness.config.load import load_any
+from harness.experiments.code import code, parts
+from solvers.plugins import Refused
+from solvers.registry import EVERY
+
+ROOT = Path(__file__).resolve().parents[2]
+
+CODE = '''"""One of each, by somebody else."""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from harness.base.model import Model
+from harness.scenes.effects.base import Contribution, steady
+from harness.scenes.mesh.chain import Chain
+from solvers.integrators import IMPLICIT_EULER
+from solvers.methods.local_global import SparseLocalGlobal
+
+open(__file__ + ".was-run", "w").close()
+
+
+@dataclass(frozen=True)
+class Mine(SparseLocalGlobal):
+    patience: int = 3
+
+
+class Hum(Model):
+    kind: Literal["hum"] = "hum"
+    force: float
+
+    def bind(self, mesh, mass, time_step):
+        return Contribution(forces=steady(np.full_like(mesh.rest, self.force)))
+
+
+class Rope(Chain):
+    kind: Literal["rope"] = "rope"
+
+
+EULER = IMPLICIT_EULER
+
+
+def tell(rows, folder):
+    path = folder / "told.txt"
+    path.write_text(f"{rows.num_rows} rows")
+    return [path]
+'''
+ENTRIES = """
+[springbench.solvers]
+mine = somebodys:Mine
+[springbench.effects]
+hum = somebodys:Hum
+[springbench.meshes]
+rope = somebodys:Rope
+[springbench.integrators]
+euler = somebodys:EULER
+[springbench.reports]
+tell = somebodys:tell
+"""
+ABOUT = "somebodys-4.2.dist-info"
+WHEEL = {
+    "somebodys/__init__.py": CODE,
+    f"{ABOUT}/METADATA": "Metadata-Version: 2.1\nName: somebodys\nVersion: 4.2\n",
+    f"{ABOUT}/WHEEL": "Wheel-Version: 1.0\nGenerator: by hand\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+    f"{ABOUT}/entry_points.txt": ENTRIES,
+}
+"""What a wheel holds: pip installs it without a build backend, and without a network."""
+NAMES = {"mesh": "Rope", "effect": "Hum", "solver": "Mine", "integrator": "EULER", "report": "tell"}
+INSTALLED = {"mesh": "rope", "effect": "hum", "solver": "mine", "integrator": "euler", "report": "tell"}
+WAYS = {
+    "beside": {part: f"./mine.py:{name}" for part, name in NAMES.items()},
+    "below": {part: f"./own/mine.py:{name}" for part, name in NAMES.items()},
+    "module": {part: f"somebodys:{name}" for part, name in NAMES.items()},
+    "entry-point": INSTALLED,
+}
+
+
+def configs(folder: Path, names: dict[str, str]) -> Path:
+    """A sweep in a folder that names own code, in a scene and in itself."""
+    (folder / "scene.yaml").write_text(
+        f"mesh: {{kind: '{names['mesh']}', length: 2.0}}\nmass: 1.0\ntime_step: 1/30\nframes: 2\ndefault_size: 4\n"
+        f"effects: [{{kind: springs, stretch: 200}}, {{kind: '{names['effect']}', force: 0.5}}, "
+        "{kind: pins, at: [ends]}]\n"
+    )
+    (folder / "sweep.yaml").write_text(
+        f"scenes: [scene.yaml]\nsolvers: [{{name: '{names['solver']}', patience: 5}}]\nreports: ['{names['report']}']\n"
+        f"options: {{integrator: '{names['integrator']}', rounds: 1, iterations: 3, pictures: false}}\n"
+    )
+    return folder / "sweep.yaml"
+
+
+def springbench(folder: Path, *arguments: str, code: int = 0) -> str:
+    """What a command says in a process of its own, to which the folder's `installed` are packages."""
+    command = [sys.executable, "-m", "harness.cli", *arguments]
+    path = os.pathsep.join([str(ROOT), str(folder / "installed")])
+    told = subprocess.run(command, cwd=folder, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True)
+    assert told.returncode == code, told.stdout + told.stderr
+    return told.stdout + told.stderr
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of packages in which the package `somebodys` was installed."""
+    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("installed")
+    wheel = source / "somebodys-4.2-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w") as packed:
+        for name, content in WHEEL.items():
+            packed.writestr(name, content)
+        packed.writestr(f"{ABOUT}/RECORD", "".join(f"{name},,\n" for name in [*WHEEL, f"{ABOUT}/RECORD"]))
+    options = ["--quiet", "--no-deps", "--no-index", "--no-compile", "--target", str(target)]
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, str(wheel)], check=True)
+    return target
+
+
+@pytest.fixture
+def beside(tmp_path: Path) -> Path:
+    """A folder with own code in a file, and nothing installed."""
+    (tmp_path / "own").mkdir()
+    for path in (tmp_path / "mine.py", tmp_path / "own" / "mine.py"):
+        path.write_text(CODE)
+    return tmp_path
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_sweep_runs_own_code_and_says_whose_it_is(way: str, beside: Path, installed: Path):
+    (beside / "installed").symlink_to(installed)
+    for mark in [*beside.rglob("*.was-run"), *installed.rglob("*.was-run")]:
+        mark.unlink()
+    configs(beside, WAYS[way])
+
+    def ran() -> bool:
+        return any(next(folder.rglob("*.was-run"), None) for folder in (beside, installed))
+
+    assert "missing" in springbench(beside, "list", "sweep.yaml")
+    springbench(beside, "schema")
+    assert not ran(), "to list a config runs nothing that it names"
+    springbench(beside, "run", "sweep.yaml")
+    assert ran()
+    (rows,) = (beside / "results" / "sweep" / "rows").glob("*.parquet")
+    row = pq.read_table(rows).to_pylist()[0]
+    assert row["status"] == "ok", row["reason"]
+    assert (row["solver"], row["integrator"]) == (WAYS[way]["solver"], WAYS[way]["integrator"])
+    own = {name: (module, version) for name, module, version in json.loads(row["own"])}
+    assert set(own) == {name for part, name in WAYS[way].items() if part != "report"}
+    for module, version in own.values():
+        if way in ("beside", "below"):
+            assert module == WAYS[way]["solver"].partition(":")[0]
+            assert len(version) == 12
+        else:
+            assert module == "somebodys"
+            assert version.startswith("4.2+")
+    assert (beside / "results" / "sweep" / "told.txt").read_text().endswith("rows")
+    for mark in [*beside.rglob("*.was-run"), *installed.rglob("*.was-run")]:
+        mark.unlink()
+    assert "done" in springbench(beside, "list", "sweep.yaml"), "the run has the same name, opened or not"
+    springbench(beside, "query", "select own from rows")
+    springbench(beside, "report", "results/sweep", code=2)  # it reads the rows, which nobody judged
+    assert not ran(), "rows are read without the code that they are of"
+
+
+def test_a_changed_file_is_another_run(beside: Path):
+    sweep = configs(beside, WAYS["beside"])
+    springbench(beside, "run", "sweep.yaml")
+    (beside / "mine.py").write_text(CODE.replace("patience: int = 3", "patience: int = 4"))
+    assert "missing" in springbench(beside, "list", sweep.name)
+
+
+def test_opened_or_not_a_run_has_one_name_and_one_code(beside: Path):
+    sweep = configs(beside, WAYS["beside"])
+    closed, opened = (load_any(sweep, opens=opens).runs()[0] for opens in (False, True))
+    assert closed.identity() == opened.identity()
+    assert code(parts(closed)) == code(parts(opened))
+    shipped = load_any(ROOT / "configs" / "quickstart.yaml", opens=False).runs()[0]
+    assert not shipped.own()
+
+
+def test_a_file_beside_the_config_travels_between_processes(beside: Path):
+    import pickle
+
+    run = load_any(configs(beside, WAYS["beside"])).runs()[0]
+    (beside / "run.pickle").write_bytes(pickle.dumps(run))
+    program = "import pickle; run = pickle.load(open('run.pickle', 'rb')); print(run.scene.effects[1], run.identity())"
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    told = subprocess.run([sys.executable, "-c", program], cwd=beside, env=env, capture_output=True, text=True)
+    assert told.stdout.split(" ", 2)[:2] == ["kind='hum'", "force=0.5"], told.stderr
+    assert told.stdout.rstrip().endswith(run.identity())
+
+
+REFUSED = {
+    "../mine.py:Mine": "wanted",
+    "/mine.py:Mine": "wanted",
+    "mine.py:Mine": "named from the config's folder on: ./file.py:Mine",
+    "./../mine.py:Mine": "leaves the config's folder",
+    "./own/../../mine.py:Mine": "leaves the config's folder",
+    "./link.py:Mine": "leaves the config's folder",
+    "./linked/mine.py:Mine": "leaves the config's folder",
+    "./nothing.py:Mine": "there is no file",
+    "./mine.py:": "wanted",
+    "nobodys:Mine": "which Python does not find",
+    "solvers.nothing:Mine": "which Python does not find",
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_code_elsewhere_is_refused(name: str, beside: Path):
+    inside = beside / "inside"
+    (inside / "own").mkdir(parents=True)
+    (inside / "mine.py").write_text(CODE)
+    (inside / "link.py").symlink_to(beside / "mine.py")
+    (inside / "linked").symlink_to(beside / "own")
+    with pytest.raises(Refused, match=r".") as caught:
+        EVERY.named(name, inside)
+    assert REFUSED[name] in str(caught.value) or "from the config's folder on" in str(caught.value)
+
+
+WRONG = {
+    ("solver", "./mine.py:Nothing"): "./mine.py:Nothing cannot be loaded: AttributeError",
+    ("solver", "./mine.py:tell"): "./mine.py:tell is no solver; wanted a frozen dataclass",
+    ("effect", "./mine.py:Mine"): "./mine.py:Mine is no effect; wanted a subclass",
+    ("mesh", "./mine.py:Hum"): "./mine.py:Hum is no mesh; wanted a subclass",
+    ("integrator", "./mine.py:Mine"): "./mine.py:Mine is no integrator; wanted an object",
+    ("report", "./mine.py:EULER"): "./mine.py:EULER is no report; wanted a function",
+}
+
+
+@pytest.mark.parametrize(("part", "name"), WRONG)
+def test_what_a_name_leads_to_is_checked_when_it_is_run(part: str, name: str, beside: Path):
+    sweep = configs(beside, WAYS["beside"] | {part: name})
+    assert load_any(sweep, opens=False).runs()
+    with pytest.raises(InputError) as caught:
+        load_any(sweep)
+    assert WRONG[part, name] in str(caught.value)
+
+
+def test_wrong_parameters_of_own_code_are_told_with_their_line(beside: Path):
+    sweep = configs(beside, WAYS["beside"])
+    sweep.write_text(sweep.read_text().replace("patience: 5", "patience: soon"))
+    with pytest.raises(InputError, match=r"sweep\.yaml:2: solvers\[0\]\.patience: came \"soon\"; should be"):
+        load_any(sweep)
