@@ -42,7 +42,7 @@ from solvers.round_off import EPS
 
 _LOST = 1e-3
 """Of the median rest length, what positions may lose by the bound, which is some 20 times what they do lose. Sheets of
-256 vertices a side and 1e6 N/m stay below it; scenes whose stiffnesses lie 1e12 apart do not."""
+256 vertices a side and 1e5 N/m keep a hundredfold distance from it; scenes whose stiffnesses lie 1e12 apart do not."""
 
 _NEAR = 100.0
 """Metres from the origin within which most scenes stay."""
