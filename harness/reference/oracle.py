@@ -54,9 +54,9 @@ class Oracle:
 
     def residual(self, problem: StepProblem, p: Positions) -> float:
         """|Q^-1 grad g(p)|_Q [J^(1/2)] over the unpinned vertices."""
-        return self._length(problem.gradient(p))
+        return self.length(problem.gradient(p))
 
-    def _length(self, gradient: Positions) -> float:
+    def length(self, gradient: Positions) -> float:
         """|Q^-1 g|_Q [J^(1/2)] of a gradient (n, 3) [N], over the unpinned vertices; infinite where it overflows."""
         free, e = self._system.free, np.zeros_like(gradient)
         if len(free):
@@ -83,9 +83,9 @@ class Oracle:
     def stationarity(self, problem: StepProblem, p: Positions) -> Reading:
         """How stationary p (n, 3) [m] is."""
         yardstick, gradient = self.yardstick(problem), problem.gradient(p)
-        reached = self._length(gradient) / yardstick
+        reached = self.length(gradient) / yardstick
         doubtless = gradient - within(gradient, FACTOR * gradient_round_off(problem, p))
-        beyond = min(reached, self._length(doubtless) / yardstick)
+        beyond = min(reached, self.length(doubtless) / yardstick)
         return Reading(reached, self.floor(problem, p) / yardstick, beyond)
 
 

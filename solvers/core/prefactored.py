@@ -42,7 +42,8 @@ class PreparedLocalGlobal(Iterative):
     columns (f, x); norm: |e|_Q [J^(1/2)] of a displacement that vanishes at the pins; trace: of the unpinned
     part of Q [N/m]; facts: exact counts of what was built; choice: the linear solver in words; lagged: the local step
     of one problem, where it differs from problem to problem; rounded: Q's free rows and columns where the factor is
-    less precise: then corrections are solved for, p + Q^-1 (b - Q p), and the fixed point stays accurate to float64.
+    less precise: then corrections are solved for, p + Q^-1 (b - Q p), and the fixed point stays accurate to float64;
+    spread: max_i Q_ii / (Q 1)_i over its free rows and columns, half of what bounds its condition.
     """
 
     residual_of: ClassVar[ResidualOf] = "previous"
@@ -57,6 +58,7 @@ class PreparedLocalGlobal(Iterative):
     choice: str
     lagged: Callable[[StepProblem], Project] | None = None
     rounded: csr_array | None = None
+    spread: float = 1.0
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """See Iterative."""
@@ -198,7 +200,16 @@ def prepared(
         choice,
         (lambda problem: _projection(problem.energies)) if lagged else None,
         inner if rounded else None,
+        _spread(inner),
     )
+
+
+def _spread(Q: csr_array) -> float:
+    """max_i Q_ii / (Q 1)_i; infinite where a row's sum is nothing, or round-off."""
+    sums, diagonal = Q.sum(axis=1), Q.diagonal()
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        found = np.where(sums > 0.0, diagonal / np.maximum(sums, 0.0), np.inf)
+    return float(found.max(initial=1.0))
 
 
 def _projection(energies: Iterable[Energy]) -> Project:

@@ -24,6 +24,7 @@ from solvers.linear.inverse import Inverse
 from solvers.linear.ordering import nested_dissection
 from solvers.linear.supernodal import Supernodal, stored
 from solvers.linear.symbolic import Symbolic, analyse
+from solvers.matrices import energy_norm
 from solvers.memory import in_words, of_machine
 from solvers.problem import Unsupported
 
@@ -43,6 +44,10 @@ _BYTES_PER_FLOP = 0.4
 
 _ITERATIONS = 10
 """Of conjugate gradients to their tolerance: 9 to 11 on sheets and solids of 1e4 to 1e6 vertices."""
+
+_LEFT, _POWERS = 0.9, 4
+"""What a correction by a rounded factor may leave of an error, which is 1 where it ceases to descend; and how many
+corrections look for it."""
 
 _ROUNDING: dict[Precision, float] = {"float64": 0.0, "float32": 0.5, "float16": 1.25}
 """What rounding a factor needs beside its float64 panels, in their size; the fronts are gone by then."""
@@ -81,11 +86,36 @@ def factorise(
     """A solver of Q out = b and, in words, which one it is and why.
 
     With a precision below float64 a solve is only that accurate, and is meant for corrections p - Q^-1 grad; cg is
-    accurate to float64 always. memory [bytes]: what the solver may take beside Q, by `solvers.memory` if left out.
+    accurate to float64 always. A factor whose rounding would lead such corrections uphill, because stiffnesses lie too
+    far apart, is made in float64. memory [bytes]: what the solver may take beside Q, by `solvers.memory` if left out.
     Raises Unsupported where nothing fits, NotPositiveDefinite.
     """
     name, why, symbolic = choose(Q, linear, precision, memory=memory)
-    return _MAKERS[name](Q, precision, symbolic), f"{name}: {why}"
+    found = _MAKERS[name](Q, precision, symbolic)
+    if precision == "float64" or name == "cg" or _left(Q, found) <= _LEFT:
+        return found, f"{name}: {why}"
+    found, whole = factorise(Q, linear, memory=memory)
+    return found, f"{whole}; in float64, for stiffnesses lie too far apart for {precision}"
+
+
+def _left(Q: csr_array, factor: Factor) -> float:
+    """What a correction by a rounded factor R leaves of an error e at most, |e - R^-1 Q e|_Q / |e|_Q.
+
+    Below 1 each descends. A few powers of a random vector find what is more: then what is soft hides what is stiff in
+    the rounded numbers, or the rounding of what is stiff spills over into what is soft.
+    """
+    e = np.random.default_rng(0).standard_normal((len(Q.indptr) - 1, 3))
+    most, corrected, before = 0.0, np.empty_like(e), energy_norm(Q, e)
+    for _ in range(_POWERS):
+        factor.solve(Q @ e, corrected)
+        e -= corrected
+        after = energy_norm(Q, e)
+        if not np.isfinite(after):
+            return np.inf
+        if not before > 0.0:
+            break
+        most, before = max(most, after / before), after
+    return most
 
 
 def choose(

@@ -3,6 +3,10 @@
 Factors of float64 solve for positions, Q p = A'K d + y. Less precise ones solve for corrections,
 p <- p - Q^-1 grad g(p), with the gradient in float64: the iterations end where those of float64 do, to all of its
 digits, and only the way there differs.
+
+The factors are kept as inverses of blocks, whose products round to eps cond(Q) |p| (Higham 2002, section 14.1), where
+cond(Q) <= 2 max_i Q_ii / (Q 1)_i, scaled by Q 1. Where that is more than a small part of a spring's length, because
+stiffnesses lie far apart or vertices far away, corrections are solved for in float64 too.
 """
 
 from __future__ import annotations
@@ -34,6 +38,14 @@ from solvers.linear.supernodal import Supernodal
 from solvers.linear.team import Team
 from solvers.memory import aligned
 from solvers.problem import Positions, Prepared, ResidualOf, StepProblem, System
+from solvers.round_off import EPS
+
+_LOST = 1e-3
+"""Of the median rest length, what positions may lose by the bound, which is some 20 times what they do lose. Sheets of
+256 vertices a side and 1e5 N/m keep a hundredfold distance from it; scenes whose stiffnesses lie 1e12 apart do not."""
+
+_NEAR = 100.0
+"""Metres from the origin within which most scenes stay."""
 
 FAR = 1e100
 """Where the springs end that fill up bundles: at no vertex, whatever the unit of length."""
@@ -84,7 +96,7 @@ def compiled(base: PreparedLocalGlobal, *, corrects: bool = False) -> PreparedCo
 
     corrects: whether corrections are wanted whatever the factor's precision.
     """
-    order = next((order for kind, order in ORDERS.items() if isinstance(base.factor, kind)), None)
+    order = _order(base)
     if order is None:
         return "iterations through Python: this linear solver is called from there"
     parts = split(base.system)
@@ -92,9 +104,18 @@ def compiled(base: PreparedLocalGlobal, *, corrects: bool = False) -> PreparedCo
         return f"iterations through Python: the kernels do not know {', '.join(parts.unknown)}"
     if parts.cancel:
         return "iterations through Python: the stiffnesses between some vertices cancel"
-    return PreparedCompiled.of(
-        replace(base, choice=f"{base.choice}; iterations compiled"), parts, order(base.factor), corrects
-    )
+    return PreparedCompiled.of(replace(base, choice=f"{base.choice}; iterations compiled"), parts, order, corrects)
+
+
+def _order(base: PreparedLocalGlobal) -> Order | None:
+    """A factor's rows in the kernels' order; None of one that they do not know."""
+    return next((order(base.factor) for kind, order in ORDERS.items() if isinstance(base.factor, kind)), None)
+
+
+def _reach(base: PreparedLocalGlobal, springs: Springs) -> float:
+    """The largest coordinate [m] of which a solve for positions loses at most _LOST of the median rest length."""
+    lengths = springs.rest_length[springs.rest_length > 0.0]
+    return _LOST * float(np.median(lengths)) / (2.0 * EPS * base.spread) if len(lengths) else np.inf
 
 
 class Work(NamedTuple):
@@ -111,7 +132,8 @@ class PreparedCompiled(Iterative):
 
     base: the same, step by step; parts: of the energies; plan: of an iteration; bundles: of the springs
     in its local step; edges: beside them; form: of
-    |e|_Q^2; rows: of the vertices; far: the last row.
+    |e|_Q^2; rows: of the vertices; far: the last row; corrects: whether it solves for corrections; reach: the
+    largest coordinate [m] up to which it may solve for positions.
     """
 
     residual_of: ClassVar[ResidualOf] = "previous"
@@ -124,6 +146,8 @@ class PreparedCompiled(Iterative):
     form: kernels.Bundles
     rows: step_ends.Rows
     far: int
+    corrects: bool
+    reach: float
 
     @classmethod
     def of(cls, base: PreparedLocalGlobal, parts: Parts, order: Order, corrects: bool) -> PreparedCompiled:
@@ -183,7 +207,16 @@ class PreparedCompiled(Iterative):
                 np.flatnonzero(pins.exact)[coupling.coords[1]],
             ),
             nobody + 1,
+            corrects,
+            np.inf if corrects else _reach(base, parts.springs),
         )
+
+    @cached_property
+    def corrected(self) -> PreparedCompiled:
+        """The same for corrections."""
+        order = _order(self.base)
+        assert order is not None  # `of` was given one
+        return self.of(self.base, self.parts, order, True)
 
     @property
     def facts(self) -> dict[str, float]:
@@ -192,16 +225,18 @@ class PreparedCompiled(Iterative):
 
     @property
     def choice(self) -> str:
-        """The linear solver in words, and how many of the allowed threads a step uses where that is not all."""
+        """The linear solver in words, from which distance on it solves for corrections where scenes may reach that far,
+        and how many of the allowed threads a step uses where that is not all."""
+        beyond = f"; corrections beyond {self.reach:.1g} m of the origin" if self.reach < _NEAR else ""
         allowed, used = numba.get_num_threads(), self.threads() or 1
         if used == allowed:
-            return self.base.choice
+            return f"{self.base.choice}{beyond}"
         why = "the system is too small for a second thread to pay" if used == 1 else f"its factor comes in {used} parts"
-        return f"{self.base.choice}; {used} of {allowed} threads: {why}"
+        return f"{self.base.choice}{beyond}; {used} of {allowed} threads: {why}"
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """See Iterative."""
-        return _Iterating(self, problem, guess)
+        return _Iterating(self if largest(problem) <= self.reach else self.corrected, problem, guess)
 
     def scale(self, problem: StepProblem) -> float:
         """See Iterative."""
@@ -246,7 +281,7 @@ class PreparedCompiled(Iterative):
         """Memory for one solve."""
         rows, dtype = len(self.plan.held), self.plan.squares.dtype
         arrays = vectors(dtype, rows)
-        p = None if dtype == np.float64 else aligned(4 * rows)
+        p = aligned(4 * rows) if self.corrects else None
         for x in arrays[:3] if p is None else [p]:
             x[4 * self.far] = FAR
         return Work(arrays, self.bundles.right(self.plan.held), p)

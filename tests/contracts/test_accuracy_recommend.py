@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.base import rows
+from harness.base.claim import claimed
 from harness.base.errors import InputError, RunFailed
 from harness.cli import main
 from harness.experiments.accuracy import recommend as module
@@ -90,6 +91,16 @@ def test_what_was_measured_of_another_scene_or_on_another_machine_is_no_answer(s
         pq.write_table(table, path)
     assert asked(scene, 0.1)[1] == COUNT
     assert asked(scene, 0.1, horizon=0.4)[1] == COUNT
+
+
+def test_the_results_of_another_scene_of_this_name_are_left_alone(scene: Path) -> None:
+    (scene.parent / "other").mkdir()
+    other = scene.parent / "other" / scene.name
+    other.write_text(SCENE)
+    claimed(scene.parent / "results" / f"recommend-{scene.stem}", other)
+    with pytest.raises(InputError, match="holds the results of another file of this name"):
+        asked(scene, 0.1)
+    assert not measured(scene)
 
 
 def test_an_error_that_nothing_keeps_to_is_told_with_the_nearest(scene: Path) -> None:

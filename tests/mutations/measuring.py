@@ -53,7 +53,7 @@ MEASURING = (
     ),
     Mutation(
         "global-does-nothing",
-        "solvers/methods/local_global.py",
+        "solvers/core/prefactored.py",
         '"global": whole}',
         '"global": lambda: None}',
         (_PHASES,),

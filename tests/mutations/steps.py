@@ -64,7 +64,7 @@ _TABLE = (
     ),
     (
         "force-in-right",
-        f"{_M}/local_global.py",
+        "solvers/core/prefactored.py",
         "y = s.inertia[:, None] * problem.target + problem.force",
         "y = s.inertia[:, None] * problem.target - problem.force",
         f"{_U}/test_local_global.py",
@@ -78,9 +78,9 @@ _TABLE = (
     ),
     (
         "stop-early",
-        f"{_M}/local_global.py",
-        "residual <= max(limit, floor):",
-        "residual <= 10.0 * max(limit, floor):",
+        f"{_K}/loop.py",
+        "if residual <= limits.limit:",
+        "if residual <= 10.0 * limits.limit:",
         f"{_U}/test_stop_rule.py",
     ),
     (

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from harness.base.claim import claimed
 from harness.base.rows import COLUMNS as RUN_COLUMNS
 from harness.base.rows import Column
 from harness.cli import app
@@ -288,3 +289,15 @@ def test_a_sweep_is_refused(tmp_path: Path):
     told = CliRunner().invoke(app, ["ablate", str(sweep), "--results", str(tmp_path)])
     assert told.exit_code == 2
     assert "is a sweep" in told.stderr
+
+
+def test_the_command_leaves_the_results_of_another_scene_of_this_name_alone(tmp_path: Path):
+    for folder in ("one", "other"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "cloth.yaml").write_text(CLOTH)
+    claimed(tmp_path / "results" / "cloth", tmp_path / "one" / "cloth.yaml")
+    asked = ["ablate", str(tmp_path / "other" / "cloth.yaml"), "--results", str(tmp_path / "results"), "--frames", "2"]
+    told = CliRunner().invoke(app, asked)
+    assert told.exit_code == 2
+    assert "holds the results of another file of this name" in " ".join(told.stderr.split())
+    assert not list(tmp_path.glob("results/cloth/ablation/*"))

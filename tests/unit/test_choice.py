@@ -181,3 +181,13 @@ def test_an_inverse_of_every_small_size_is_right(n):
     # a condition of 9 at most
     np.testing.assert_allclose(Q @ out, b, rtol=0, atol=1e-14)
     assert factor.nonzeros == n * (n + 1) // 2
+
+
+def test_stiffnesses_too_far_apart_for_a_precision_are_solved_in_float64():
+    ends = np.array([[0, 1], [1, 2], [2, 3]])
+    Q = network(ends, np.array([1e14, 100.0, 1e14]), np.full(4, 0.1))
+    factor, why = factorise(Q, "supernodal", "float32", memory=PLENTY)
+    assert "in float64, for stiffnesses lie too far apart for float32" in why
+    assert isinstance(factor, Supernodal)
+    assert factor.squares.dtype == np.float64
+    assert "too far apart" not in factorise(grid(10, 10), precision="float16", memory=PLENTY)[1]

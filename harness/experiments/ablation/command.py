@@ -25,6 +25,7 @@ def ablate(
     pairs: Annotated[bool, typer.Option("--pairs", help="Leave out each pair of effects too.")] = False,
 ) -> None:
     """Leave out each effect of a scene: what it costs, what it changes, and which effects the motion calls for."""
+    from harness.base.claim import claimed
     from harness.config.load import load_any
     from harness.experiments.ablation.run import ablate as run_ablation
     from harness.report.ablation import ablation_table, read, sentences
@@ -34,7 +35,7 @@ def ablate(
         solver, tolerance = SOLVER, tolerance or TOLERANCE
     options = {"frames": frames, "iterations": iterations, "tolerance": tolerance, "rounds": rounds, "threads": 1}
     sweep = load_any(scene, solvers=[solver], sizes=[size] if size else [], **options)
-    folder = results / sweep.name
+    folder = claimed(results / sweep.name, scene)
     path = run_ablation(sweep, folder, pairs=pairs, tick=lambda phase: None)
     rows, picture = read(path), folder / "pictures" / f"ablation-{path.stem}.png"
     out.print(ablation_table(rows))

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.base import machine, rows
+from harness.base.claim import claimed
 from harness.base.document import Document
 from harness.base.errors import InputError, Mistake, RunFailed
 from harness.base.progress import Display
@@ -100,7 +101,7 @@ def recommend(
     ways, reasons = _known(path.stem, scene, size, horizon, results)
     if not any(way.error <= error for way in ways):
         say(f"nothing measured of {path.stem} {size or ''} keeps to an error of {error:g}: measuring")
-        run_accuracy(asked, results / asked.name, display, say)
+        run_accuracy(asked, claimed(results / asked.name, path), display, say)
         ways, reasons = _known(path.stem, scene, size, horizon, results)
     within = [way for way in ways if way.error <= error]
     if not within:
