@@ -188,9 +188,8 @@ def test_a_judged_sweep_becomes_a_map_with_links(tmp_path: Path):
 
 def test_results_that_were_not_judged_are_refused(tmp_path: Path):
     (tmp_path / "rows").mkdir()
-    rows.write(
-        tmp_path / "rows" / "x.parquet", [{"run_id": "x", "scene": "net", "phase": "step", "round": 0, "status": "ok"}]
-    )
+    row = {"run_id": "x", "scene": "net", "size": 4, "solver": "sparse", "started": "2026", "phase": "step"}
+    rows.write(tmp_path / "rows" / "x.parquet", [row | {"round": 0, "status": "ok"}])
     with pytest.raises(InputError, match="judge: true"):
         read_cells(tmp_path)
 
