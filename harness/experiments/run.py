@@ -249,17 +249,6 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
     )
 
 
-def abandoned(run: RunSpec, files: Files, status: str, reason: str) -> list[dict[str, Any]]:
-    """The rows of a run whose process gave no answer, written; what it left half written is removed."""
-    for earlier in (files.recording, files.picture):
-        earlier.unlink(missing_ok=True)
-        for partial in earlier.parent.glob(".*partial*"):
-            partial.unlink()
-    found = [common(run) | {"code": code(parts(run))} | {"phase": "run", "status": status, "reason": reason}]
-    rows.write(files.rows, found)
-    return found
-
-
 def save_positions(path: Path, positions: np.ndarray) -> None:
     """Store positions (frames, n, 3) [m] under a partial name and rename. Raises CannotWrite."""
     with replacing(path) as partial:

@@ -20,7 +20,7 @@ from harness.base.workers import Limits, Lost, Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts
 from harness.experiments.core import do_all, require_threads
-from harness.experiments.run import Files, abandoned, execute
+from harness.experiments.run import Files, common, execute
 from harness.record.sound import whole_messages
 from harness.report.sweep import Pictured, draw_sweep
 
@@ -93,7 +93,7 @@ class RunUnit:
 
     def lost(self, lost: Lost) -> str:
         """See Unit."""
-        return _outcome(abandoned(self.run, self.files, lost.status, str(lost)))
+        return _outcome(_abandoned(self.run, self.files, lost.status, str(lost)))
 
 
 def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
@@ -120,6 +120,17 @@ def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
                 state = MISSING if damage or not files.recording.exists() else DONE
         planned.append(Planned(run, files, state, older, damage))
     return planned
+
+
+def _abandoned(run: RunSpec, files: Files, status: str, reason: str) -> list[dict[str, Any]]:
+    """The rows of a run whose process gave no answer, written; what it left half written is removed."""
+    for earlier in (files.recording, files.picture):
+        earlier.unlink(missing_ok=True)
+        for partial in earlier.parent.glob(".*partial*"):
+            partial.unlink()
+    found = [common(run) | {"code": code(parts(run))} | {"phase": "run", "status": status, "reason": reason}]
+    rows.write(files.rows, found)
+    return found
 
 
 def _unfit(recording: Path) -> str:
