@@ -17,9 +17,8 @@ import numpy as np
 from solvers.about import About, Reference
 from solvers.contact.touching import without_contact
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
-from solvers.core.objective import Objective, StepObjective
+from solvers.core.objective import Hessian, Objective, StepObjective
 from solvers.kernels import conjugate
-from solvers.kernels.hessian import linearise
 from solvers.linear.inverse import Inverse
 from solvers.linear.supernodal import Supernodal
 from solvers.problem import Positions, System, Unsupported
@@ -98,9 +97,9 @@ class Method:
 
     def _direction(self, step: StepObjective, at: Point, descent: Positions, eta: float) -> Positions:
         """What conjugate gradients make of -H^-1 g; descent: Q^-1 g."""
-        if self.compiled and not step.others:
-            return self.compiled.direction(step, at, descent, eta)
         hessian = step.hessian(at.positions)
+        if self.compiled and not step.own:
+            return self.compiled.direction(hessian, at, descent, eta)
         d, r, s = np.zeros_like(descent), at.gradient.copy(), -descent
         norm = dot(at.gradient, descent)
         limit = eta**2 * norm
@@ -129,19 +128,17 @@ def _known(metric: Metric) -> Supernodal | None:
 
 
 class _Compiled:
-    """The same conjugate gradients in one kernel, for springs alone."""
+    """The same conjugate gradients in one kernel, for springs, forms and elements."""
 
     def __init__(self, objective: Objective, factor: Supernodal) -> None:
         system = objective.system
         self._threads, self._held = factor.threads, system.pins.vertices[system.pins.exact]
         self._factor = conjugate.Factor.of(factor, system.free)
-        self._linear = np.empty((len(objective.springs.stiffness), 4))
         self._scratch = np.zeros((4, system.vertices, 3))
 
-    def direction(self, step: StepObjective, at: Point, descent: Positions, eta: float) -> Positions:
+    def direction(self, hessian: Hessian, at: Point, descent: Positions, eta: float) -> Positions:
         """See `Method._direction`."""
-        d, terms = np.empty_like(descent), step.whole.terms
-        linearise(terms, at.positions, self._linear)
-        fixed = terms, self._linear, self._factor, self._threads(), self._held
+        d = np.empty_like(descent)
+        fixed = *hessian.compiled, self._factor, self._threads(), self._held
         conjugate.direction(*fixed, at.gradient, descent, eta, _MOST, self._scratch, d)
         return d
