@@ -33,7 +33,8 @@ _NEAR = 1e-10
 class Objective:
     """The objective of a system's steps: what does not change from step to step.
 
-    stated: which of the system's energies state the law of their elements; own: which state nothing.
+    stated: which of the system's energies state the law of their elements; own: which state nothing; moving: which
+    forms have another force in each step, or any at all; projective: which energies other than springs are.
     """
 
     def __init__(self, system: System) -> None:
@@ -44,6 +45,7 @@ class Objective:
         self.moving: list[int] = []
         self.stated: list[int] = []
         self.own: list[int] = []
+        self.projective: set[int] = set()
         others = {k: e for k, e in enumerate(system.energies) if not isinstance(e, Springs)}
         if others:
             self._sort(others)
@@ -62,6 +64,7 @@ class Objective:
         rest = {k: e for k, e in others.items() if k not in quadratic}
         self.stated = [k for k, e in rest.items() if hasattr(e, "law")]
         self.own = [k for k in rest if k not in self.stated]
+        self.projective = {k for k, e in others.items() if isinstance(e, ProjectiveEnergy)}
 
     @cached_property
     def matrix(self) -> Matrix:
@@ -104,9 +107,11 @@ def pairs(vertices: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class Stated(NamedTuple):
-    """What a step knows of an energy that states a law: which of the system's it is, its law, and its elements."""
+    """What a step knows of an energy that states a law: which of the system's it is, whether it is projective, its law,
+    and its elements."""
 
     number: int
+    projective: bool
     law: Law
     elements: Elements
 
@@ -126,12 +131,17 @@ class StepObjective:
             begun: Any = problem.energies
             for k in whole.moving:
                 begun[k].add_projection(problem.target, self.given.force)
-            found = (Stated(k, begun[k].law, begun[k].elements) for k in whole.stated)
+            found = (Stated(k, k in whole.projective, begun[k].law, begun[k].elements) for k in whole.stated)
             self.stated = [one for one in found if len(one.elements.vertices)]
             self.own = [begun[k] for k in whole.own]
         self._constant: tuple[Matrix, NDArray[np.float64]] | None = None
         pins = problem.system.pins
         self._exact, self._held = pins.vertices[pins.exact], problem.pin_targets[pins.exact]
+
+    @property
+    def touched(self) -> bool:
+        """Whether elements act that are in no Q: those of contact, where something may be touched in this step."""
+        return any(not one.projective for one in self.stated)
 
     def placed(self, p: Positions) -> Positions:
         """A copy of p with the exactly pinned vertices on their targets."""
@@ -310,6 +320,20 @@ class Hessian:
         step = self._step
         curvature = np.concatenate(self._curvature) if self._curvature else None
         return self._terms, self._linear, step.whole.form, step.joined, curvature
+
+    def beyond(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """What elements that are in no Q add to the blocks of vertices: which (c,), and the blocks (c, 3, 3) [N/m]."""
+        n = len(self._p)
+        blocks, acted = np.zeros((n, 3, 3)), np.zeros(n, np.bool_)
+        for one, curvature in zip(self._step.stated, self._curvature, strict=True):
+            if not one.projective:
+                k = one.elements.vertices.shape[1]
+                places = np.full((len(curvature), k * k), -1)
+                places[:, :: k + 1] = one.elements.vertices
+                add_blocks(one.elements, places, curvature, blocks)
+                acted[one.elements.vertices] = True
+        acted &= blocks.any(axis=(1, 2))
+        return np.flatnonzero(acted), blocks[acted]
 
     def multiply(self, x: Positions) -> Positions:
         """The exact Hessian times x (n, 3), which is zero at vertices that are not free; so is the product."""

@@ -20,7 +20,7 @@ SOLVED: dict[str, Solver] = {
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 TAKE_ALL = {"newton", "newton-cg", "hybrid", "lbfgs"}
 PROJECTIVE = {"sparse", "numba", "anderson", "chebyshev"}
-CONTACT = {*PROJECTIVE, "lbfgs", "vbd", "hybrid", "newton"}
+CONTACT = {*PROJECTIVE, *TAKE_ALL, "vbd"}
 BY_BLOCKS = {"bending", "air drag", "attachments", "contact"}
 """Who takes what: blocks are those of `vbd`; those not named take springs only."""
 STOP = StopRule(5000, 1e-11)
