@@ -27,7 +27,7 @@ from scipy.sparse import bsr_array, csr_array
 from solvers.contact import planes as contact_planes
 from solvers.contact.law import LAW
 from solvers.contact.touching import Rows
-from solvers.kernels.elements import Elements, Law
+from solvers.energies.elements import Elements, Law
 from solvers.problem import Positions, Start
 from solvers.round_off import EPS
 

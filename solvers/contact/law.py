@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from solvers.compiling import inner
-from solvers.kernels.elements import Law, line
+from solvers.energies.elements import Law, line
 
 
 @inner

@@ -1,9 +1,9 @@
 """The objective of a step, its gradient and its Hessian, evaluated fast; `StepProblem` stays the oracle.
 
 All springs are one compiled pass, all constant quadratic forms another, and so is each energy that states the law of
-its elements (`solvers.kernels.elements`); what states none brings its own value, gradient and Hessian. The unknowns are
-the free vertices: exactly pinned ones stay on their targets. The Hessian's blocks lie in a matrix that is analysed once
-(`solvers.core.pattern`); what does not change in a run or in a step is added up once.
+its elements (`solvers.energies.elements`); what states none brings its own value, gradient and Hessian. The unknowns
+are the free vertices: exactly pinned ones stay on their targets. The Hessian's blocks lie in a matrix that is analysed
+once (`solvers.core.pattern`); what does not change in a run or in a step is added up once.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from scipy.sparse import csr_array
 
 from solvers import matrices
 from solvers.core.pattern import Matrix
+from solvers.energies.elements import Elements, Joined, Law, add_blocks
 from solvers.energies.springs import Springs
 from solvers.kernels import forms, hessian, objective
-from solvers.kernels.elements import Elements, Joined, Law, add_blocks
 from solvers.kernels.forms import Form
 from solvers.problem import Energy, LaggedEnergy, Positions, ProjectiveEnergy, StepProblem, System
 

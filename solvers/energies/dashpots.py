@@ -22,7 +22,7 @@ from scipy.sparse import csr_array
 
 from solvers.compiling import inner
 from solvers.energies.edges import Edges, directions, rest_directions
-from solvers.kernels.elements import Elements, Law, line
+from solvers.energies.elements import Elements, Law, line
 from solvers.problem import Positions, Start
 
 

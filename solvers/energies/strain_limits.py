@@ -18,7 +18,7 @@ from scipy.sparse import csr_array
 
 from solvers.compiling import inner
 from solvers.energies.edges import TINY, Edges, directions
-from solvers.kernels.elements import Elements, Law, line
+from solvers.energies.elements import Elements, Law, line
 from solvers.problem import Positions
 from solvers.round_off import EPS
 

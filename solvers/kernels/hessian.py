@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers.compiling import inner, kernel
-from solvers.kernels.elements import add_products
+from solvers.energies.elements import add_products
 from solvers.kernels.forms import add_product
 from solvers.kernels.objective import along
 from solvers.problem import System

@@ -8,7 +8,7 @@ from scipy.sparse import csr_array
 
 from harness.scenes.effects.contact import Contact
 from solvers.core.objective import Objective, StepObjective
-from solvers.kernels.elements import Joined, add_blocks
+from solvers.energies.elements import Joined, add_blocks
 from tests.effects import DASHPOTS, FLOOR, LIMITS, RAYLEIGH, cloth, stepped
 
 ENERGIES = {
