@@ -123,6 +123,7 @@ class StepObjective:
     """
 
     def __init__(self, whole: Objective, problem: StepProblem) -> None:
+        """problem: of a system that has the whole's energies, in their order."""
         self.whole, self.problem = whole, problem
         self.given = objective.Given.of(problem)
         self.stated: list[Stated] = []

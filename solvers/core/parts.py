@@ -62,11 +62,9 @@ class Parts:
         below = self.whole.stiffness < 0.0
         return _pairs(self.whole.edges[below], -self.whole.stiffness[below]).stiffness_matrix(len(self.held))
 
-    def edges(self, row: NDArray[np.int64], rows: int, unknowns: int) -> Edges | None:
-        """The limits and dashpots as they are before a step, between vertices in rows `row` (n,); None without any.
-
-        rows: how many there are; unknowns: how many come before those that do not move.
-        """
+    def edges(self, row: NDArray[np.int64], rows: int) -> Edges | None:
+        """The limits and dashpots as they are before a step, between vertices in rows `row` (n,), of so many; None
+        without any."""
         if not (self.limits or self.dashpots):
             return None
         from solvers.kernels.edges import Edges
@@ -75,7 +73,7 @@ class Parts:
         ends, k = np.concatenate([e.edges for e in both]), np.concatenate([e.stiffness for e in both])
         none = np.empty(0)
         low, high = (np.concatenate([none, *(getattr(e, at) for e in self.limits)]) for at in ("low", "high"))
-        edges = Edges.of(ends, k, low, high, row, rows, unknowns)
+        edges = Edges.of(ends, k, low, high, row, rows)
         edges.axis[: len(low)] = np.concatenate([none.reshape(0, 3), *(e.rest_direction for e in self.limits)])
         return edges
 
@@ -83,7 +81,9 @@ class Parts:
         """The edges in a step."""
         if edges is None or not self.dashpots:
             return edges
-        steps, first = [e.begin_step(problem.start) for e in self.dashpots], len(edges.low)
+        from solvers.energies.dashpots import Dashpots
+
+        steps, first = [e for e in problem.energies if isinstance(e, Dashpots)], len(edges.low)
         axis, offset = edges.axis.copy(), edges.offset.copy()
         axis[first:] = np.concatenate([e.direction for e in steps])
         offset[first:] = np.concatenate([e.offset for e in steps])
