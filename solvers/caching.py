@@ -58,7 +58,7 @@ class KernelCache(_CACHE):
         """function: of Python; options: of its compilation."""
         self._source = function.__code__.co_filename
         self._module, self._name = function.__module__, function.__qualname__
-        cells = tuple(cell.cell_contents for cell in function.__closure__ or ())
+        cells = tuple(_told(cell.cell_contents) for cell in function.__closure__ or ())
         chosen = sorted((key, sorted(v) if isinstance(v, (set, frozenset)) else v) for key, v in options.items())
         self._fixed = (
             repr(chosen),
@@ -111,6 +111,14 @@ class KernelCache(_CACHE):
     def _path(self, key: Any) -> Path:
         name = self._name.replace("<", "").replace(">", "")
         return Path(self.cache_path) / f"{name}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
+
+
+def _told(value: Any) -> Any:
+    """What a kernel closes over: other kernels by their names and all that they depend on."""
+    function = getattr(value, "py_func", None)
+    if function is None:
+        return value
+    return function.__module__, function.__qualname__, sources.digest([function.__code__.co_filename])
 
 
 def _folder(home: Path, module: str, digest: str) -> Path:

@@ -18,14 +18,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 
 from solvers.contact import planes as contact_planes
+from solvers.contact.law import LAW
 from solvers.contact.touching import Rows
+from solvers.energies.elements import Elements, Law
 from solvers.problem import Positions, Start
 from solvers.round_off import EPS
 
@@ -84,6 +86,15 @@ class Contact:
     margin: float
     time_step: float
     planes: Planes = field(default=_NONE)
+
+    law: ClassVar[Law] = LAW
+
+    @cached_property
+    def elements(self) -> Elements:
+        """The half-spaces of a step that has begun; none before."""
+        p, count = self.planes, len(self.planes.vertices)
+        numbers = p.normal, p.offset, p.anchor, p.stiffness, p.grip, np.full(count, self.slip)
+        return Elements(p.vertices[:, None], np.ones((count, 1)), np.column_stack(numbers))
 
     def idle(self) -> bool:
         """Whether nothing can be touched in this step."""

@@ -15,7 +15,7 @@ from solvers.core.acceleration import Accelerating, Engine, Interpreted, Scheme
 from solvers.core.objective import Objective, StepObjective
 from solvers.core.prefactored import PreparedLocalGlobal
 from solvers.kernels import accelerate
-from solvers.problem import Positions, StepProblem
+from solvers.problem import Positions, StepProblem, System
 
 _ALIKE = 2.0
 """Weights that differ by no more than this factor may stand for each other."""
@@ -24,9 +24,9 @@ _ALIKE = 2.0
 class Touching:
     """See Engine. idle: the engine while nothing is touched."""
 
-    def __init__(self, scheme: Scheme, base: PreparedLocalGlobal, idle: Engine) -> None:
+    def __init__(self, scheme: Scheme, system: System, base: PreparedLocalGlobal, idle: Engine) -> None:
         self._scheme, self._base, self._idle = scheme, base, idle
-        self._objective, self._corrections = Objective(base.system), Corrections(base)
+        self._objective, self._corrections = Objective(system), Corrections(base)
 
     def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
         """See Engine."""

@@ -1,24 +1,27 @@
 """The objective of a step, its gradient and its Hessian, evaluated fast; `StepProblem` stays the oracle.
 
-All springs are one compiled pass, other energies bring their own value, gradient and Hessian. The unknowns are the free
-vertices: exactly pinned ones stay on their targets. The Hessian's blocks lie where springs and projective energies
-have theirs, in a matrix analysed once; where another energy needs more (contact), the pattern of the day is analysed
-and kept for as long as it lasts, so that a result depends on the positions alone and not on what came before.
+All springs are one compiled pass, all constant quadratic forms another, and so is each energy that states the law of
+its elements (`solvers.energies.elements`); what states none brings its own value, gradient and Hessian. The unknowns
+are the free vertices: exactly pinned ones stay on their targets. The Hessian's blocks lie in a matrix that is analysed
+once (`solvers.core.pattern`); what does not change in a run or in a step is added up once.
 """
 
 from __future__ import annotations
 
 from functools import cached_property, reduce
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 
 from solvers import matrices
+from solvers.core.pattern import Matrix
+from solvers.energies.elements import Elements, Joined, Law, add_blocks
 from solvers.energies.springs import Springs
-from solvers.kernels import hessian, objective
-from solvers.linear.block import BlockCholesky
-from solvers.problem import Energy, Positions, ProjectiveEnergy, StepProblem, System
+from solvers.kernels import forms, hessian, objective
+from solvers.kernels.forms import Form
+from solvers.problem import Energy, LaggedEnergy, Positions, ProjectiveEnergy, StepProblem, System
 
 _ROUND_OFF = 4.0 * np.finfo(np.float64).eps
 """Of an energy's value, beside its size."""
@@ -28,22 +31,53 @@ _NEAR = 1e-10
 
 
 class Objective:
-    """The objective of a system's steps: what does not change from step to step."""
+    """The objective of a system's steps: what does not change from step to step.
+
+    stated: which of the system's energies state the law of their elements; own: which state nothing; moving: which
+    forms have another force in each step, or any at all; projective: which energies other than springs are.
+    """
 
     def __init__(self, system: System) -> None:
         self.system = system
         self.springs = Springs.joined([e for e in system.energies if isinstance(e, Springs)])
         self.terms = objective.Terms.of(system, self.springs)
+        self.form: Form | None = None
+        self.moving: list[int] = []
+        self.stated: list[int] = []
+        self.own: list[int] = []
+        self.projective: set[int] = set()
+        others = {k: e for k, e in enumerate(system.energies) if not isinstance(e, Springs)}
+        if others:
+            self._sort(others)
         self._grown: Matrix | None = None
+
+    def _sort(self, others: dict[int, Energy]) -> None:
+        """The energies that are not springs, by what is known of them."""
+        from solvers.energies.quadratic import Quadratic  # for those who need it
+
+        quadratic = {k: e for k, e in others.items() if isinstance(e, Quadratic)}
+        if quadratic:
+            n = self.system.vertices
+            shares = matrices.shares(self.system, quadratic.values())
+            self.form = Form.of(reduce(lambda total, share: total + share, shares, csr_array((n, n))))
+        self.moving = [k for k, e in quadratic.items() if isinstance(e, LaggedEnergy) or e.d.any()]
+        rest = {k: e for k, e in others.items() if k not in quadratic}
+        self.stated = [k for k, e in rest.items() if hasattr(e, "law")]
+        self.own = [k for k in rest if k not in self.stated]
+        self.projective = {k for k, e in others.items() if isinstance(e, ProjectiveEnergy)}
 
     @cached_property
     def matrix(self) -> Matrix:
-        """The Hessian's matrix for the pattern of springs and projective energies."""
+        """The Hessian's matrix for the pattern of springs, projective energies and elements."""
         n, s = self.system.vertices, self.system
         shares = (e.stiffness_matrix(n) for e in s.energies if isinstance(e, ProjectiveEnergy))
         pattern = reduce(lambda total, share: total + abs(share), shares, matrices.diagonal(np.ones(n)))
         free = csr_array(csr_array(pattern[s.free])[:, s.free])
-        i, j = self.springs.edges.T  # springs of no stiffness, or that cancel, keep their places
+        known: list[Any] = [s.energies[k].elements for k in self.stated]  # pyright: ignore[reportAttributeAccessIssue]
+        ends = [self.springs.edges, *(pairs(elements.vertices) for elements in known)]
+        if self.form is not None:
+            ends.append(self.form.pairs)
+        i, j = np.concatenate(ends).T  # what has no stiffness, or cancels, keeps its places
         return self._matrix(free, self.number[i], self.number[j])
 
     @cached_property
@@ -54,11 +88,7 @@ class Objective:
         return number
 
     def _matrix(self, graph: csr_array, i: NDArray[np.int64], j: NDArray[np.int64]) -> Matrix:
-        """A matrix with the blocks of a graph and those between vertices i and j, both ways, where both are free."""
-        i, j = i[(i >= 0) & (j >= 0)], j[(i >= 0) & (j >= 0)]
-        ones = np.ones(2 * len(i))
-        more = csr_array(coo_array((ones, (np.append(i, j), np.append(j, i))), shape=graph.shape))
-        return Matrix(self.system, self.springs.edges, matrices.without_zeros(abs(graph) + more))
+        return Matrix.of(self.system, self.terms, self.form, self.number, graph, i, j)
 
     def matrix_for(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Matrix:
         """A matrix with places for entries (rows, columns) of free coordinates too."""
@@ -70,43 +100,49 @@ class Objective:
         return self._grown
 
 
-class Matrix:
-    """A matrix of 3 x 3 blocks between free vertices: where its entries are, and its factorisation."""
+def pairs(vertices: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Every two vertices of each element (m, k), as rows (m k^2, 2)."""
+    k = vertices.shape[1]
+    return np.column_stack([np.repeat(vertices, k, axis=1).ravel(), np.tile(vertices, k).ravel()])
 
-    def __init__(self, system: System, edges: NDArray[np.int64], graph: csr_array) -> None:
-        """graph: its pattern of blocks (f, f), sorted, with a diagonal."""
-        self.graph, self._size = graph, len(system.free)
-        self.values = np.empty((graph.nnz, 3, 3))
-        self.factor = BlockCholesky(graph)
-        self.places = hessian.Places.of(system, edges, graph)
-        rows = np.repeat(np.arange(len(graph.indptr) - 1), np.diff(graph.indptr))
-        self._keys = rows * self._size + graph.indices
-        self.diagonal = self.entries(*np.tile(np.arange(3 * len(system.free)), (2, 1)))
 
-    def has(self, i: NDArray[np.int64], j: NDArray[np.int64]) -> bool:
-        """Whether it has the blocks (i, j)."""
-        return bool(np.isin(i * self._size + j, self._keys).all())
+class Stated(NamedTuple):
+    """What a step knows of an energy that states a law: which of the system's it is, whether it is projective, its law,
+    and its elements."""
 
-    def needs(self, i: NDArray[np.int64], j: NDArray[np.int64], base: Matrix) -> bool:
-        """Whether it has no blocks but those of another, and (i, j) or (j, i)."""
-        size = self._size
-        return len(np.unique(np.concatenate([base._keys, i * size + j, j * size + i]))) == len(self._keys)
-
-    def entries(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Where the entries (rows, columns) lie among its values."""
-        block = np.searchsorted(self._keys, rows // 3 * self._size + columns // 3)
-        return 9 * block + 3 * (rows % 3) + columns % 3
+    number: int
+    projective: bool
+    law: Law
+    elements: Elements
 
 
 class StepObjective:
-    """The objective g of one step: all positions are (n, 3) [m], exactly pinned vertices on their targets."""
+    """The objective g of one step: all positions are (n, 3) [m], exactly pinned vertices on their targets.
+
+    stated: energies by their elements, less those that have none in this step; own: those that state nothing.
+    """
 
     def __init__(self, whole: Objective, problem: StepProblem) -> None:
+        """problem: of a system that has the whole's energies, in their order."""
         self.whole, self.problem = whole, problem
-        self._given = objective.Given.of(problem)
-        self.others: list[Energy] = [e for e in problem.energies if not isinstance(e, Springs)]
+        self.given = objective.Given.of(problem)
+        self.stated: list[Stated] = []
+        self.own: list[Energy] = []
+        if whole.form is not None or whole.stated or whole.own:
+            begun: Any = problem.energies
+            for k in whole.moving:
+                begun[k].add_projection(problem.target, self.given.force)
+            found = (Stated(k, k in whole.projective, begun[k].law, begun[k].elements) for k in whole.stated)
+            self.stated = [one for one in found if len(one.elements.vertices)]
+            self.own = [begun[k] for k in whole.own]
+        self._constant: tuple[Matrix, NDArray[np.float64]] | None = None
         pins = problem.system.pins
         self._exact, self._held = pins.vertices[pins.exact], problem.pin_targets[pins.exact]
+
+    @property
+    def touched(self) -> bool:
+        """Whether elements act that are in no Q: those of contact, where something may be touched in this step."""
+        return any(not one.projective for one in self.stated)
 
     def placed(self, p: Positions) -> Positions:
         """A copy of p with the exactly pinned vertices on their targets."""
@@ -124,19 +160,27 @@ class StepObjective:
     def gradient(self, p: Positions) -> Positions:
         """The gradient [N], (n, 3), zero at exactly pinned vertices."""
         out = np.empty_like(p)
-        objective.gradient(self.whole.terms, self._given, p, out)
-        for energy in self.others:
+        objective.gradient(self.whole.terms, self.given, p, out)
+        if self.whole.form is not None:
+            forms.add_gradient(self.whole.form, p, out)
+        for one in self.stated:
+            one.law.add_gradient(one.elements, p, out)
+        for energy in self.own:
             energy.add_gradient(p, out)
         out[self._exact] = 0.0
         return out
 
     def rise(self, p: Positions, q: Positions) -> tuple[float, float]:
-        """g(q) - g(p) [J], and what of it may be round-off of the energies that are not springs.
+        """g(q) - g(p) [J], and what of it may be round-off of the energies that state nothing.
 
         Theirs is the difference of their values, or the mean slope where that difference has lost its digits.
         """
-        change, noise = objective.rise(self.whole.terms, self._given, p, q), 0.0
-        for energy in self.others:
+        change, noise = objective.rise(self.whole.terms, self.given, p, q), 0.0
+        if self.whole.form is not None:
+            change += forms.rise(self.whole.form, p, q)
+        for one in self.stated:
+            change += one.law.rise(one.elements, p, q)
+        for energy in self.own:
             before, after = energy.value(p), energy.value(q)
             slope = np.zeros_like(q)
             energy.add_gradient(q, slope)
@@ -159,6 +203,34 @@ class StepObjective:
         """The Hessian at p, to be factorised."""
         return Hessian(self, p)
 
+    def curvature(self, p: Positions) -> list[NDArray[np.float64]]:
+        """The second derivatives of the elements at p, of each energy (m, 6) [N/m]."""
+        return [self._curve(one, p) for one in self.stated]
+
+    @staticmethod
+    def _curve(one: Stated, p: Positions) -> NDArray[np.float64]:
+        out = np.empty((len(one.elements.vertices), 6))
+        one.law.curve(one.elements, p, out)
+        return out
+
+    def constant(self, matrix: Matrix, p: Positions) -> NDArray[np.float64] | None:
+        """The blocks of a matrix that are the same at all points p of this step; None for springs alone."""
+        steady = [one for one in self.stated if one.law.constant]
+        if not steady:
+            return matrix.constant if self.whole.form is not None else None
+        if self._constant is None or self._constant[0] is not matrix:
+            blocks = matrix.constant.copy()
+            for one in steady:
+                places = matrix.of_elements(one.number, one.elements.vertices)
+                add_blocks(one.elements, places, self._curve(one, p), blocks)
+            self._constant = matrix, blocks
+        return self._constant[1]
+
+    @cached_property
+    def joined(self) -> Joined | None:
+        """The elements of all energies, None for none."""
+        return Joined.of([one.elements for one in self.stated]) if self.stated else None
+
 
 class Hessian:
     """The Hessian [N/m] at a point, over the coordinates of free vertices."""
@@ -166,12 +238,13 @@ class Hessian:
     def __init__(self, step: StepObjective, p: Positions) -> None:
         self._step, self._p = step, p
         self._terms, self._free = step.whole.terms, step.whole.system.free
-        parts = [csr_array(energy.hessian(p)) for energy in step.others]
+        parts = [csr_array(energy.hessian(p)) for energy in step.own]
         self._others = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
+        self._curvature = step.curvature(p)
 
     @cached_property
     def _placed(self) -> tuple[Matrix, NDArray[np.int64], NDArray[np.float64]]:
-        """The matrix, and where in it which entries of the energies that are not springs go."""
+        """The matrix, and where in it which entries of the energies that state nothing go."""
         whole = self._step.whole
         if self._others is None:
             return whole.matrix, np.empty(0, np.int64), np.empty(0)
@@ -214,8 +287,13 @@ class Hessian:
         self, keep: float, shift: NDArray[np.float64] | float, tension: NDArray[np.float64] | None
     ) -> Matrix:
         matrix, places, entries = self._placed
-        tension = self._tension if tension is None else tension
-        hessian.assemble(self._terms, matrix.places, self._p, tension, keep, matrix.values)
+        step, tension = self._step, self._tension if tension is None else tension
+        constant = step.constant(matrix, self._p)
+        hessian.assemble(self._terms, matrix.places, constant, self._p, tension, keep, matrix.values)
+        for one, curvature in zip(step.stated, self._curvature, strict=True):
+            if not one.law.constant:
+                at = matrix.of_elements(one.number, one.elements.vertices)
+                add_blocks(one.elements, at, curvature, matrix.values)
         values = matrix.values.reshape(-1)
         values[places] += entries
         values[matrix.diagonal] += shift
@@ -237,10 +315,31 @@ class Hessian:
         hessian.linearise(self._terms, self._p, linear)
         return linear
 
+    @cached_property
+    def compiled(self) -> tuple[Any, ...]:
+        """What `solvers.kernels.hessian.multiply` needs of it: all but the energies that state nothing."""
+        step = self._step
+        curvature = np.concatenate(self._curvature) if self._curvature else None
+        return self._terms, self._linear, step.whole.form, step.joined, curvature
+
+    def beyond(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """What elements that are in no Q add to the blocks of vertices: which (c,), and the blocks (c, 3, 3) [N/m]."""
+        n = len(self._p)
+        blocks, acted = np.zeros((n, 3, 3)), np.zeros(n, np.bool_)
+        for one, curvature in zip(self._step.stated, self._curvature, strict=True):
+            if not one.projective:
+                k = one.elements.vertices.shape[1]
+                places = np.full((len(curvature), k * k), -1)
+                places[:, :: k + 1] = one.elements.vertices
+                add_blocks(one.elements, places, curvature, blocks)
+                acted[one.elements.vertices] = True
+        acted &= blocks.any(axis=(1, 2))
+        return np.flatnonzero(acted), blocks[acted]
+
     def multiply(self, x: Positions) -> Positions:
         """The exact Hessian times x (n, 3), which is zero at vertices that are not free; so is the product."""
         product, out = np.empty_like(x), np.zeros_like(x)
-        hessian.multiply(self._terms, self._linear, x, product)
+        hessian.multiply(*self.compiled, x, product)
         if self._others is not None:
             product += (self._others @ x.ravel()).reshape(-1, 3)
         out[self._free] = product[self._free]

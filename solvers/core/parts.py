@@ -1,14 +1,9 @@
 """What the compiled methods make of a system's energies: springs, and what may be computed as springs.
 
 A constant quadratic form (bending, attachments, linear drag) is springs without length between the vertices that it
-couples, and what holds each vertex by itself:
-
-    x'Lx/2 = sum over i < j of w_ij/2 |x_i - x_j|^2 + sum over i of h_i/2 |x_i|^2,     w_ij = -L_ij,  h = L 1
-
-So the kernels of springs add up its forces and its value, from differences of positions, which keep their digits. Where
-it couples more than neighbours, as bending does, some w are negative. Its force at the origin, A'W d, is constant in a
-step: one more external force. Strain limits and dashpots are edges of a kernel of their own (see
-`solvers.kernels.edges`); in Q they too are springs without length.
+couples, and what holds each vertex by itself (see `solvers.kernels.forms`). So the kernels of springs add up its forces
+and its value. Its force at the origin, A'W d, is constant in a step: one more external force. Strain limits and
+dashpots are edges of a kernel of their own (see `solvers.kernels.edges`); in Q they too are springs without length.
 """
 
 from __future__ import annotations
@@ -20,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array, triu
+from scipy.sparse import csr_array
 
 from solvers import matrices
 from solvers.energies.springs import Springs
@@ -30,9 +25,6 @@ if TYPE_CHECKING:
     from solvers.energies.dashpots import Dashpots
     from solvers.energies.strain_limits import StrainLimits
     from solvers.kernels.edges import Edges
-
-_ROUND_OFF = 1e-13
-"""Of the sum of a row's absolute values, what its sum may be and still count as zero: a dozen terms' round-off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +62,9 @@ class Parts:
         below = self.whole.stiffness < 0.0
         return _pairs(self.whole.edges[below], -self.whole.stiffness[below]).stiffness_matrix(len(self.held))
 
-    def edges(self, row: NDArray[np.int64], rows: int, unknowns: int) -> Edges | None:
-        """The limits and dashpots as they are before a step, between vertices in rows `row` (n,); None without any.
-
-        rows: how many there are; unknowns: how many come before those that do not move.
-        """
+    def edges(self, row: NDArray[np.int64], rows: int) -> Edges | None:
+        """The limits and dashpots as they are before a step, between vertices in rows `row` (n,), of so many; None
+        without any."""
         if not (self.limits or self.dashpots):
             return None
         from solvers.kernels.edges import Edges
@@ -83,7 +73,7 @@ class Parts:
         ends, k = np.concatenate([e.edges for e in both]), np.concatenate([e.stiffness for e in both])
         none = np.empty(0)
         low, high = (np.concatenate([none, *(getattr(e, at) for e in self.limits)]) for at in ("low", "high"))
-        edges = Edges.of(ends, k, low, high, row, rows, unknowns)
+        edges = Edges.of(ends, k, low, high, row, rows)
         edges.axis[: len(low)] = np.concatenate([none.reshape(0, 3), *(e.rest_direction for e in self.limits)])
         return edges
 
@@ -91,7 +81,9 @@ class Parts:
         """The edges in a step."""
         if edges is None or not self.dashpots:
             return edges
-        steps, first = [e.begin_step(problem.start) for e in self.dashpots], len(edges.low)
+        from solvers.energies.dashpots import Dashpots
+
+        steps, first = [e for e in problem.energies if isinstance(e, Dashpots)], len(edges.low)
         axis, offset = edges.axis.copy(), edges.offset.copy()
         axis[first:] = np.concatenate([e.direction for e in steps])
         offset[first:] = np.concatenate([e.offset for e in steps])
@@ -112,6 +104,7 @@ def split(system: System) -> Parts:
     from solvers.energies.dashpots import Dashpots  # for those who need one of them
     from solvers.energies.quadratic import Quadratic
     from solvers.energies.strain_limits import StrainLimits
+    from solvers.kernels.forms import Form
 
     forms = [energy for energy in others if isinstance(energy, Quadratic)]
     limits = tuple(energy for energy in others if isinstance(energy, StrainLimits))
@@ -121,19 +114,16 @@ def split(system: System) -> Parts:
     known = Quadratic, StrainLimits, Dashpots
     unknown = tuple(sorted({type(energy).__name__ for energy in others if not isinstance(energy, known)}))
     L: csr_array = reduce(lambda total, share: total + share, matrices.shares(system, forms), csr_array((n, n)))
-    above = coo_array(triu(L, 1))
-    whole = Springs.joined(
-        [springs, _pairs(np.column_stack(above.coords).astype(np.int64), -np.asarray(above.data, np.float64))]
-    )
+    form = Form.of(L)
+    whole = Springs.joined([springs, _pairs(form.pairs, form.weight)])
     edges = [_pairs(energy.edges, energy.stiffness) for energy in (*limits, *dashpots)]
     pairs = Springs.joined([whole, *edges])
-    held, size = L.sum(axis=1), abs(L).sum(axis=1)
     K = Springs.joined([springs, *edges]).stiffness_matrix(n)
     return Parts(
         springs,
         whole,
         pairs,
-        np.where(abs(held) <= _ROUND_OFF * size, 0.0, held),
+        form.held,
         tuple(form.begin_step if isinstance(form, LaggedEnergy) else _steady(form) for form in forms),
         limits,
         dashpots,

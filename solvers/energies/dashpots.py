@@ -13,13 +13,44 @@ opposite forces along the edge as it was conserve linear and, by implicit Euler,
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from solvers.compiling import inner
 from solvers.energies.edges import Edges, directions, rest_directions
+from solvers.energies.elements import Elements, Law, line
 from solvers.problem import Positions, Start
+
+
+@inner
+def _closing(numbers, e, z0, z1, z2):
+    return numbers[e, 1] * z0 + numbers[e, 2] * z1 + numbers[e, 3] * z2 - numbers[e, 4]
+
+
+@inner
+def _value(numbers, e, z0, z1, z2):
+    return 0.5 * numbers[e, 0] * _closing(numbers, e, z0, z1, z2) ** 2
+
+
+@inner
+def _gradient(numbers, e, z0, z1, z2):
+    force = numbers[e, 0] * _closing(numbers, e, z0, z1, z2)
+    return force * numbers[e, 1], force * numbers[e, 2], force * numbers[e, 3]
+
+
+@inner
+def _curvature(numbers, e, z0, z1, z2):
+    return line(numbers[e, 0], 0.0, numbers[e, 1], numbers[e, 2], numbers[e, 3])
+
+
+@inner
+def _rise(numbers, e, z0, z1, z2, s0, s1, s2):
+    closer = numbers[e, 1] * s0 + numbers[e, 2] * s1 + numbers[e, 3] * s2
+    return numbers[e, 0] * closer * (_closing(numbers, e, z0, z1, z2) + 0.5 * closer)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +63,13 @@ class Dashpots(Edges):
 
     direction: Positions
     offset: NDArray[np.float64]
+
+    law: ClassVar[Law] = Law.of(_value, _gradient, _curvature, _rise, constant=True)
+
+    @cached_property
+    def elements(self) -> Elements:
+        """The edges, with their damping, directions and offsets."""
+        return Elements.along(self.edges, self.stiffness, self.direction, self.offset)
 
     @classmethod
     def along(cls, rest: Positions, edges: NDArray[np.int64], damping: NDArray[np.float64]) -> Dashpots:

@@ -9,14 +9,67 @@ limit is reached.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from solvers.compiling import inner
 from solvers.energies.edges import TINY, Edges, directions
+from solvers.energies.elements import Elements, Law, line
 from solvers.problem import Positions
 from solvers.round_off import EPS
+
+
+@inner
+def _beyond(numbers, e, length):
+    """By how much a length is beyond the limits."""
+    return length - min(max(length, numbers[e, 1]), numbers[e, 2])
+
+
+@inner
+def _direction(numbers, e, length, z0, z1, z2):
+    if length <= TINY:
+        return numbers[e, 3], numbers[e, 4], numbers[e, 5]
+    return z0 / length, z1 / length, z2 / length
+
+
+@inner
+def _value(numbers, e, z0, z1, z2):
+    return 0.5 * numbers[e, 0] * _beyond(numbers, e, np.sqrt(z0 * z0 + z1 * z1 + z2 * z2)) ** 2
+
+
+@inner
+def _gradient(numbers, e, z0, z1, z2):
+    length = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2)
+    force = numbers[e, 0] * _beyond(numbers, e, length)
+    if force == 0.0:
+        return 0.0, 0.0, 0.0
+    n0, n1, n2 = _direction(numbers, e, length, z0, z1, z2)
+    return force * n0, force * n1, force * n2
+
+
+@inner
+def _curvature(numbers, e, z0, z1, z2):
+    length, k = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2), numbers[e, 0]
+    beyond = _beyond(numbers, e, length)
+    if beyond == 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    n0, n1, n2 = _direction(numbers, e, length, z0, z1, z2)
+    return line(k, k * beyond / length if length > TINY else 0.0, n0, n1, n2)
+
+
+@inner
+def _rise(numbers, e, z0, z1, z2, s0, s1, s2):
+    t0, t1, t2 = z0 + s0, z1 + s1, z2 + s2
+    before, after = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2), np.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+    one, other = _beyond(numbers, e, before), _beyond(numbers, e, after)
+    longer = other - one
+    if one * other > 0.0:  # the same limit: the difference of the lengths, which keeps its digits
+        longer = (s0 * (z0 + t0) + s1 * (z1 + t1) + s2 * (z2 + t2)) / (before + after)
+    return 0.5 * numbers[e, 0] * longer * (one + other)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +83,13 @@ class StrainLimits(Edges):
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     rest_direction: NDArray[np.float64]
+
+    law: ClassVar[Law] = Law.of(_value, _gradient, _curvature, _rise)
+
+    @cached_property
+    def elements(self) -> Elements:
+        """The edges, with their stiffness, limits and directions."""
+        return Elements.along(self.edges, self.stiffness, self.low, self.high, self.rest_direction)
 
     def _beyond(self, p: Positions) -> tuple[Positions, NDArray[np.float64], NDArray[np.float64], Positions]:
         """v (m, 3), the length |v| and by how much it is beyond the limits (m,), the directions (m, 3)."""

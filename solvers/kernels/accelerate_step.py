@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from solvers.compiling import inner, kernel
 from solvers.kernels.accelerate import AGAIN, STALLED, Window, accept, begin, judge, propose
 from solvers.kernels.accelerate_springs import Shares, descend
-from solvers.kernels.edges import add_edges, energy
+from solvers.kernels.edges import descend_edges
 from solvers.kernels.loop import compiled_over
 from solvers.kernels.springs import Bundles, squared_norm
 from solvers.kernels.step import Plan
@@ -84,8 +84,7 @@ def _advance(state):
 def _evaluate(step, edges, window):
     rows = len(window.direction) // 4
     total = descend(step.bundles, step.shares, window.trial, step.right, window.descent_there)
-    add_edges(edges, 0, rows, window.trial, window.descent_there, 0, True)
-    return total + energy(edges, rows, window.trial)
+    return total + descend_edges(edges, rows, window.trial, window.descent_there)
 
 
 @inner

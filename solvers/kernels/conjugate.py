@@ -1,4 +1,4 @@
-"""Conjugate gradients on the exact Hessian of springs, preconditioned by a factor of Q, without Python.
+"""Conjugate gradients on the exact Hessian, preconditioned by a factor of Q, without Python.
 
 H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r           see `solvers.methods.newton_cg`
 """
@@ -42,12 +42,14 @@ class Factor(NamedTuple):
 
 
 @kernel
-def direction(terms, linear, factor, threads, held, gradient, descent, eta, most, scratch, d):
+def direction(
+    terms, linear, form, joined, curvature, factor, threads, held, gradient, descent, eta, most, scratch, d
+):  # fmt: skip
     """Write d (n, 3) [m].
 
-    linear: see `hessian.linearise`; threads: of a solve, None for one; held: vertices that do not move; gradient,
-    descent (n, 3): g [N] and Q^-1 g [m]; eta: what is left of |g|; most: products with H; scratch (4, n, 3), which
-    is zero at the held vertices.
+    linear, form, joined, curvature: see `hessian.multiply`; threads: of a solve, None for one; held: vertices that do
+    not move; gradient, descent (n, 3): g [N] and Q^-1 g [m]; eta: what is left of |g|; most: products with H; scratch
+    (4, n, 3), which is zero at the held vertices.
     """
     r, s, z, product = scratch[0], scratch[1], scratch[2], scratch[3]
     for i in range(len(d)):
@@ -56,18 +58,18 @@ def direction(terms, linear, factor, threads, held, gradient, descent, eta, most
     norm = _dot(gradient, descent)
     limit = eta * eta * norm
     for k in range(most):
-        multiply(terms, linear, s, product)
+        multiply(terms, linear, form, joined, curvature, s, product)
         for v in held:
             for c in range(3):
                 product[v, c] = 0.0
-        curvature = _dot(s, product)
-        if curvature <= 0.0:
+        along = _dot(s, product)
+        if along <= 0.0:
             if k == 0:
                 for i in range(len(d)):
                     for c in range(3):
                         d[i, c] = s[i, c]
             return
-        length, before = norm / curvature, norm
+        length, before = norm / along, norm
         for i in range(len(d)):
             for c in range(3):
                 d[i, c] += length * s[i, c]

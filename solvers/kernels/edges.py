@@ -3,8 +3,8 @@
     E = sum_e k_e/2 |b_e|^2      b = (|v| - t) v/|v| of a limit, with t the nearest length allowed
                                  b = (n.v - o) n of a dashpot
 
-Both are projective: the gradient is A'K b, the projection d = v - b. Each edge is computed at both of its ends, as
-springs are, so that nobody adds to another's sum.
+Both are projective: the gradient is A'K b, the projection d = v - b. Where rows are done block by block, each edge is
+computed at both of its ends, as springs are, so that nobody adds to another's sum; where one pass does them all, once.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from solvers.problem import Positions
 class Edges(NamedTuple):
     """Edges by the rows of their ends, limits first.
 
-    first (rows + 1,): the first entry of each row; of each entry the row of the other end (other), the edge, ~edge at
-    its second end, and its share of the energy: 1/2, or 1 where the other end does not move; stiffness: k (m,) [N/m];
+    ends (m, 2): the rows of each edge; first (rows + 1,): the first entry of each row; of each entry the row of the
+    other end (other) and the edge, ~edge at its second end; stiffness: k (m,) [N/m];
     low, high: the lengths allowed [m] of the limits; axis (m, 3): n of a dashpot, and what a limit without length
     takes; offset: o (m,) [m].
     """
 
+    ends: NDArray[np.int64]
     first: NDArray[np.int64]
     other: NDArray[np.int64]
     edge: NDArray[np.int64]
-    share: NDArray[np.float64]
     stiffness: NDArray[np.float64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
@@ -47,17 +47,16 @@ class Edges(NamedTuple):
         high: NDArray[np.float64],
         row: NDArray[np.int64],
         rows: int,
-        unknowns: int,
     ) -> Edges:
-        """Edges between vertices (m, 2) in rows `row` (n,), of which the first ones are unknowns."""
+        """Edges between vertices (m, 2) in rows `row` (n,)."""
         kept = np.flatnonzero(ends[:, 0] != ends[:, 1])
         here, there = row[ends[kept]].T.ravel(), row[ends[kept, ::-1]].T.ravel()
         order = np.argsort(here, kind="stable")
         return cls(
+            row[ends].astype(np.int64),
             np.concatenate([[0], np.cumsum(np.bincount(here, minlength=rows))]),
             there[order],
             np.concatenate([kept, ~kept])[order],
-            np.where(there < unknowns, 0.5, 1.0)[order],
             stiffness,
             low,
             high,
@@ -103,13 +102,34 @@ def add_edges(edges, begin, end, x, out, shift, correct):
 
 
 @inner
-def energy(edges, end, x):
-    """The energy [J] of the edges of the rows before `end`."""
+def descend_edges(edges, rows, x, out):
+    """Add minus the gradient of all edges to the first `rows` rows of `out`, those that move; returns the energy [J].
+
+    Each edge is computed once, and added at both of its ends.
+    """
     if edges is None:
         return 0.0
-    total = 0.0
-    for row in range(end):
-        for entry in range(edges.first[row], edges.first[row + 1]):
-            _, b, k = _at(edges, row, entry, x)
-            total += 0.5 * edges.share[entry] * k * (b[0] * b[0] + b[1] * b[1] + b[2] * b[2])
+    total, limits = 0.0, len(edges.low)
+    for e in range(len(edges.stiffness)):
+        i, j, k = edges.ends[e, 0], edges.ends[e, 1], edges.stiffness[e]
+        if i == j or (i >= rows and j >= rows):
+            continue
+        v0, v1, v2 = x[4 * i] - x[4 * j], x[4 * i + 1] - x[4 * j + 1], x[4 * i + 2] - x[4 * j + 2]
+        n0, n1, n2 = edges.axis[e, 0], edges.axis[e, 1], edges.axis[e, 2]
+        if e >= limits:
+            scale = n0 * v0 + n1 * v1 + n2 * v2 - edges.offset[e]
+        else:
+            squared = v0 * v0 + v1 * v1 + v2 * v2
+            if edges.low[e] * edges.low[e] <= squared <= edges.high[e] * edges.high[e]:
+                continue
+            length = np.sqrt(squared)
+            scale = length - min(max(length, edges.low[e]), edges.high[e])
+            if length > TINY:
+                n0, n1, n2 = v0 / length, v1 / length, v2 / length
+        total += 0.5 * k * scale * scale
+        f0, f1, f2 = k * scale * n0, k * scale * n1, k * scale * n2
+        if i < rows:
+            out[4 * i], out[4 * i + 1], out[4 * i + 2] = out[4 * i] - f0, out[4 * i + 1] - f1, out[4 * i + 2] - f2
+        if j < rows:
+            out[4 * j], out[4 * j + 1], out[4 * j + 2] = out[4 * j] + f0, out[4 * j + 1] + f1, out[4 * j + 2] + f2
     return total

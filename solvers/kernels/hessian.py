@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers.compiling import inner, kernel
+from solvers.energies.elements import add_products
+from solvers.kernels.forms import add_product
 from solvers.kernels.objective import along
 from solvers.problem import System
 
@@ -84,11 +86,13 @@ def _add(values, block, sign, xx, xy, xz, yy, yz, zz):
 
 
 @kernel
-def assemble(terms, places, p, tension, keep, values):
-    """Write the Hessian [N/m] of springs, inertia and penalty pins at p (n, 3) to the blocks `values`, (b, 3, 3).
+def hold(terms, places, values):
+    """Write what inertia and penalty pins hold vertices with [N/m] to the blocks `values`, (b, 3, 3)."""
+    _hold(terms, places, values)
 
-    tension (m,): of each spring [N].
-    """
+
+@inner
+def _hold(terms, places, values):
     values[:] = 0.0
     for v in places.free:
         h = terms.inertia[v]
@@ -96,6 +100,22 @@ def assemble(terms, places, p, tension, keep, values):
     for q in range(len(terms.pinned)):
         v, w = terms.pinned[q], terms.weight[q]
         _add(values, places.diagonal[v], 1.0, w, 0.0, 0.0, w, 0.0, w)
+
+
+@kernel
+def assemble(terms, places, constant, p, tension, keep, values):
+    """Write the Hessian [N/m] of springs, inertia and penalty pins at p (n, 3) to the blocks `values`, (b, 3, 3).
+
+    constant: blocks of inertia, pins and what else does not depend on p, None where there is nothing else; tension
+    (m,): of each spring [N].
+    """
+    if constant is None:
+        _hold(terms, places, values)
+    else:
+        for block in range(len(values)):
+            for row in range(3):
+                for column in range(3):
+                    values[block, row, column] = constant[block, row, column]
     for e in range(len(terms.stiffness)):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
         if i == j:
@@ -126,8 +146,18 @@ def linearise(terms, p, out):
 
 
 @kernel
-def multiply(terms, linear, x, out):
-    """Write to `out` the product [N] of the exact Hessian of springs, inertia and penalty pins with x [m], (n, 3)."""
+def multiply(terms, linear, form, joined, curvature, x, out):
+    """Write to `out` the product [N] of the exact Hessian with x [m], (n, 3).
+
+    linear: see `linearise`; form, joined and curvature: of the energies that are not springs, None for none.
+    """
+    _multiply(terms, linear, x, out)
+    add_product(form, x, out)
+    add_products(joined, curvature, x, out)
+
+
+@inner
+def _multiply(terms, linear, x, out):
     for v in range(len(x)):
         for c in range(3):
             out[v, c] = terms.inertia[v] * x[v, c]

@@ -14,6 +14,9 @@ L-BFGS comes first, over a factor of Q in float32: it is the memory that its ite
 need no more digits. Once it gets slow, whichever brought the greater descent for its cost the last time goes on. The
 exact method takes over when the Hessian is positive definite as it is and the slope falls as it does where Newton's
 method converges quadratically. The start is the lower one of first guess and free fall.
+
+Where something is touched, the exact method does it all: contact is in no Q, so that L-BFGS begins anew whenever
+another vertex is touched, and its stiffness is beyond what tensions predict.
 """
 
 from __future__ import annotations
@@ -98,7 +101,7 @@ class HybridMethod:
         """The points after `start`; where a saddle was left, all begins anew."""
         point = _lower(step, start)
         while not point.stalled:
-            for following in self._approach(step, point):
+            for following in () if step.touched else self._approach(step, point):
                 point = following
                 yield point
             for following in self._newton.points(step, point):

@@ -194,7 +194,7 @@ class PreparedCompiled(Iterative):
                 order.shift,
             ),
             bundles,
-            parts.edges(row, len(held), order.rows),
+            parts.edges(row, len(held)),
             form,
             step_ends.Rows(
                 row,

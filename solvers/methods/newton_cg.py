@@ -4,6 +4,9 @@
 
 For springs Q majorises H, so that the eigenvalues of Q^-1 H are at most 1. Conjugate gradients end where they meet
 negative curvature, with what they have: from the first direction of all that is -Q^-1 g, a local-global iteration.
+
+Contact is far stiffer than Q, on a few vertices. There P = S Q S takes the place of Q, with S_i = (I + W_i/Q_ii)^(1/2)
+of the blocks W_i that it adds to H: on these vertices P is Q + W but for what couples them, and it is Q on all others.
 """
 
 from __future__ import annotations
@@ -13,19 +16,22 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from solvers.about import About, Reference
-from solvers.contact.touching import without_contact
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
-from solvers.core.objective import Objective, StepObjective
+from solvers.core.objective import Hessian, Objective, StepObjective
 from solvers.kernels import conjugate
-from solvers.kernels.hessian import linearise
 from solvers.linear.inverse import Inverse
 from solvers.linear.supernodal import Supernodal
-from solvers.problem import Positions, System, Unsupported
+from solvers.problem import Positions, System
 
 _LOOSE, _TIGHT = 0.5, 1e-10
 """The bounds of eta."""
+
+_TOUCHED = 1e-4
+"""The upper one where something is touched: what sticks does so within a hundred-millionth of a metre, and a direction
+that misses that by little leads where another quadratic model holds."""
 
 _MOST = 1000
 """Iterations of conjugate gradients: as many as the stiffest springs need for a few digits."""
@@ -48,13 +54,38 @@ class NewtonCG:
     )
 
     def prepare(self, system: System) -> PreparedDescent:
-        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported for contact, and where Q fits
-        nowhere."""
-        if without_contact(system) is not system:
-            raise Unsupported("newton-cg: Q preconditions no Contact, which is far stiffer; take newton or lbfgs")
+        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
         metric = Metric(system)
         objective = Objective(system)
         return PreparedDescent(objective, metric, Method(metric, objective), metric.choice, metric.facts)
+
+
+Preconditioner = Callable[[Positions], Positions]
+"""Gradients [N] to displacements [m], both (n, 3)."""
+
+
+class Scaled:
+    """(S Q S)^-1 with S_i = (I + W_i/Q_ii)^(1/2) for some vertices, I for all others."""
+
+    def __init__(self, metric: Metric, vertices: NDArray[np.int64], blocks: NDArray[np.float64]) -> None:
+        """blocks: W (c, 3, 3) [N/m] of vertices (c,), positive semidefinite."""
+        self._metric, system = metric, metric.system
+        resists = np.full(system.vertices, np.inf)
+        resists[system.free] = metric.diagonal
+        size, axes = np.linalg.eigh(blocks)
+        shrunk = (1.0 + np.maximum(0.0, size) / resists[vertices, None]) ** -0.5
+        self._vertices, self._root = vertices, (axes * shrunk[:, None, :]) @ axes.transpose(0, 2, 1)
+
+    def __call__(self, b: Positions) -> Positions:
+        """(S Q S)^-1 b, (n, 3)."""
+        scaled = b.copy()
+        self._shrink(scaled)
+        x = self._metric.solve(scaled)
+        self._shrink(x)
+        return x
+
+    def _shrink(self, x: Positions) -> None:
+        x[self._vertices] = np.einsum("vij,vj->vi", self._root, x[self._vertices])
 
 
 class Method:
@@ -66,22 +97,30 @@ class Method:
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
         """The points after `start`."""
-        point, eta = start, _LOOSE
-        descent = self._metric.solve(point.gradient)
+        loose = _TOUCHED if step.touched else _LOOSE
+        point, eta = start, loose
+        hessian, solve = self._at(step, point)
+        descent = solve(point.gradient)
         while not point.stalled:
             found = None
             if dot(point.gradient, descent) > self._metric.round_off(point.positions):
-                direction = self._direction(step, point, descent, eta)
+                direction = self._direction(step, hessian, solve, point, descent, eta)
                 found = search(step, point, direction) or search(step, point, -descent)
             if found is None:
                 yield point._replace(stalled=True)
                 return
-            before, descent = dot(point.gradient, descent), self._metric.solve(found.gradient)
+            hessian, solve = self._at(step, found)
+            before, descent = dot(point.gradient, descent), solve(found.gradient)
             # The safeguard of Eisenstat and Walker: eta falls no faster than its own square.
             following = 0.9 * dot(found.gradient, descent) / before
-            eta = min(_LOOSE, max(_TIGHT, following, 0.9 * eta**2 if 0.9 * eta**2 > 0.1 else 0.0))
+            eta = min(loose, max(_TIGHT, following, 0.9 * eta**2 if 0.9 * eta**2 > 0.1 else 0.0))
             point = found
             yield point
+
+    def _at(self, step: StepObjective, at: Point) -> tuple[Hessian, Preconditioner]:
+        """The Hessian at a point, and what preconditions it there."""
+        hessian = step.hessian(at.positions)
+        return hessian, Scaled(self._metric, *hessian.beyond()) if step.touched else self._metric.solve
 
     def certifies(self, step: StepObjective, at: Point) -> bool:
         """It has no factor to tell by."""
@@ -96,11 +135,18 @@ class Method:
             "solve": lambda: self._metric.solve(at.gradient),
         }
 
-    def _direction(self, step: StepObjective, at: Point, descent: Positions, eta: float) -> Positions:
-        """What conjugate gradients make of -H^-1 g; descent: Q^-1 g."""
-        if self.compiled and not step.others:
-            return self.compiled.direction(step, at, descent, eta)
-        hessian = step.hessian(at.positions)
+    def _direction(
+        self,
+        step: StepObjective,
+        hessian: Hessian,
+        solve: Preconditioner,
+        at: Point,
+        descent: Positions,
+        eta: float,
+    ) -> Positions:
+        """What conjugate gradients make of -H^-1 g; descent: what `solve`, the preconditioner, makes of g."""
+        if self.compiled and not step.own and not step.touched:
+            return self.compiled.direction(hessian, at, descent, eta)
         d, r, s = np.zeros_like(descent), at.gradient.copy(), -descent
         norm = dot(at.gradient, descent)
         limit = eta**2 * norm
@@ -112,7 +158,7 @@ class Method:
             length = norm / curvature
             d += length * s
             r += length * product
-            z = self._metric.solve(r)
+            z = solve(r)
             norm, before = dot(r, z), norm
             if norm <= limit:
                 break
@@ -129,19 +175,17 @@ def _known(metric: Metric) -> Supernodal | None:
 
 
 class _Compiled:
-    """The same conjugate gradients in one kernel, for springs alone."""
+    """The same conjugate gradients in one kernel, for springs, forms and elements."""
 
     def __init__(self, objective: Objective, factor: Supernodal) -> None:
         system = objective.system
         self._threads, self._held = factor.threads, system.pins.vertices[system.pins.exact]
         self._factor = conjugate.Factor.of(factor, system.free)
-        self._linear = np.empty((len(objective.springs.stiffness), 4))
         self._scratch = np.zeros((4, system.vertices, 3))
 
-    def direction(self, step: StepObjective, at: Point, descent: Positions, eta: float) -> Positions:
+    def direction(self, hessian: Hessian, at: Point, descent: Positions, eta: float) -> Positions:
         """See `Method._direction`."""
-        d, terms = np.empty_like(descent), step.whole.terms
-        linearise(terms, at.positions, self._linear)
-        fixed = terms, self._linear, self._factor, self._threads(), self._held
+        d = np.empty_like(descent)
+        fixed = *hessian.compiled, self._factor, self._threads(), self._held
         conjugate.direction(*fixed, at.gradient, descent, eta, _MOST, self._scratch, d)
         return d

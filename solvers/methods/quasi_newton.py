@@ -45,11 +45,11 @@ def prepare(system: System, scheme: Scheme, linear: Linear, precision: Precision
     found = compiled(base, corrects=True)
     known = isinstance(found, PreparedCompiled)
     base = found.base if known else replace(base, choice=f"{base.choice}; {found}")
-    engine: Engine = _Compiled(scheme, found) if known else _Any(scheme, base)
+    engine: Engine = _Compiled(scheme, found) if known else _Any(scheme, system, base)
     if bare is not system:
         from solvers.contact.quasi_newton import Touching  # for those who need it
 
-        engine = Touching(scheme, base, engine)
+        engine = Touching(scheme, system, base, engine)
     return PreparedAccelerated(base, engine)
 
 
@@ -164,8 +164,8 @@ class _CompiledAccelerating(Accelerating):
 class _Any:
     """Any energies, and any factor."""
 
-    def __init__(self, scheme: Scheme, base: PreparedLocalGlobal) -> None:
-        self._scheme, self._base, self._objective = scheme, base, Objective(base.system)
+    def __init__(self, scheme: Scheme, system: System, base: PreparedLocalGlobal) -> None:
+        self._scheme, self._base, self._objective = scheme, base, Objective(system)
 
     def begin(self, problem: StepProblem, guess: Positions) -> Accelerating:
         """See Engine."""

@@ -19,7 +19,7 @@ from tests.contacts import OBSTACLES, contact, sheet, steps
 
 SOLVED: dict[str, Solver] = {name: load(target)() for name, target in SOLVERS.items()}
 PREFACTORED = ("sparse", "numba", "anderson", "chebyshev", "lbfgs")
-TAKE = (*PREFACTORED, "vbd", "hybrid", "newton")
+TAKE = (*PREFACTORED, "vbd", "hybrid", "newton", "newton-cg")
 FLOOR = contact(OBSTACLES["plane"], friction=0.4)
 FALL = (0.5, -6.0, 0.0)
 

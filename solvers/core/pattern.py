@@ -1,0 +1,101 @@
+"""The matrix of a Hessian: 3 x 3 blocks between free vertices, where each energy's go, and its factorisation.
+
+The blocks lie where springs, projective energies and elements have theirs, known before the first step; where another
+energy needs more, the pattern of the day is analysed and kept for as long as it lasts, so that a result depends on the
+positions alone and not on what came before.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+
+from solvers import matrices
+from solvers.kernels import forms, hessian
+from solvers.kernels.forms import Form
+from solvers.kernels.objective import Terms
+from solvers.linear.block import BlockCholesky
+from solvers.problem import System
+
+Indices = NDArray[np.int64]
+
+
+class Matrix:
+    """A matrix of 3 x 3 blocks between free vertices."""
+
+    def __init__(self, system: System, terms: Terms, form: Form | None, number: Indices, graph: csr_array) -> None:
+        """form: of the system, None for none; number (n,): of each vertex among the free ones, or -1; graph: the
+        pattern of blocks (f, f), sorted, with a diagonal."""
+        self.graph, self._number, self._size = graph, number, len(system.free)
+        self._terms, self._form = terms, form
+        self.values = np.empty((graph.nnz, 3, 3))
+        self.factor = BlockCholesky(graph)
+        self.places = hessian.Places.of(system, terms.edges, graph)
+        rows = np.repeat(np.arange(len(graph.indptr) - 1), np.diff(graph.indptr))
+        self._keys = rows * self._size + graph.indices
+        self.diagonal = self.entries(*np.tile(np.arange(3 * len(system.free)), (2, 1)))
+        self._elements: dict[int, tuple[Indices, Indices]] = {}
+
+    @classmethod
+    def of(
+        cls,
+        system: System,
+        terms: Terms,
+        form: Form | None,
+        number: Indices,
+        graph: csr_array,
+        i: Indices,
+        j: Indices,
+    ) -> Matrix:
+        """A matrix with the blocks of a graph and those between vertices i and j, both ways, where both are free."""
+        i, j = i[(i >= 0) & (j >= 0)], j[(i >= 0) & (j >= 0)]
+        ones = np.ones(2 * len(i))
+        more = csr_array(coo_array((ones, (np.append(i, j), np.append(j, i))), shape=graph.shape))
+        return cls(system, terms, form, number, matrices.without_zeros(abs(graph) + more))
+
+    def has(self, i: Indices, j: Indices) -> bool:
+        """Whether it has the blocks (i, j)."""
+        return bool(np.isin(i * self._size + j, self._keys).all())
+
+    def needs(self, i: Indices, j: Indices, base: Matrix) -> bool:
+        """Whether it has no blocks but those of another, and (i, j) or (j, i)."""
+        size = self._size
+        return len(np.unique(np.concatenate([base._keys, i * size + j, j * size + i]))) == len(self._keys)
+
+    def entries(self, rows: Indices, columns: Indices) -> Indices:
+        """Where the entries (rows, columns) lie among its values."""
+        block = np.searchsorted(self._keys, rows // 3 * self._size + columns // 3)
+        return 9 * block + 3 * (rows % 3) + columns % 3
+
+    def of_elements(self, energy: int, vertices: Indices) -> Indices:
+        """Where the blocks of an energy's elements lie, every vertex of (m, k) with every one, (m, k^2); -1 where one
+        is not free. They are found once for the same array of vertices."""
+        known = self._elements.get(energy)
+        if known is None or known[0] is not vertices:
+            known = self._elements[energy] = vertices, self._found(vertices)
+        return known[1]
+
+    def _found(self, vertices: Indices) -> Indices:
+        m, k = vertices.shape
+        if k == 1:
+            return self.places.diagonal[vertices]
+        return self._between(np.repeat(vertices, k, axis=1), np.tile(vertices, k)).reshape(m, k * k)
+
+    def _between(self, i: Indices, j: Indices) -> Indices:
+        """The blocks between vertices i and j, of one shape; -1 where one is not free."""
+        i, j = self._number[i], self._number[j]
+        return np.where((i >= 0) & (j >= 0), np.searchsorted(self._keys, i * self._size + j), -1)
+
+    @cached_property
+    def constant(self) -> NDArray[np.float64]:
+        """The blocks of inertia, penalty pins and the form, (b, 3, 3) [N/m]."""
+        out = np.empty_like(self.values)
+        hessian.hold(self._terms, self.places, out)
+        if self._form is not None:
+            i, j = self._form.pairs.T
+            across = np.column_stack([self._between(i, j), self._between(j, i)])
+            forms.add_blocks(self._form, self.places.diagonal, across, out)
+        return out

@@ -1,0 +1,111 @@
+"""Constant quadratic forms, all of a system as one: pairs of vertices, and what holds each vertex by itself.
+
+    x'Lx/2 = sum over i < j of w_ij/2 |x_i - x_j|^2 + sum over i of h_i/2 |x_i|^2,     w_ij = -L_ij,  h = L 1
+
+Differences of positions keep their digits where products with L would lose them. Where a form couples more than
+neighbours, as bending does, some w are negative. Its force at the origin is constant in a step and part of what the
+step gives.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, triu
+
+from solvers.compiling import inner, kernel
+
+_ROUND_OFF = 1e-13
+"""Of the sum of a row's absolute values, what its sum may be and still count as zero: a dozen terms' round-off."""
+
+
+class Form(NamedTuple):
+    """pairs (k, 2): vertices; weight: w (k,) [N/m]; held: h (n,) [N/m]."""
+
+    pairs: NDArray[np.int64]
+    weight: NDArray[np.float64]
+    held: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, L: csr_array) -> Form:
+        """The form of a symmetric matrix [N/m], (n, n)."""
+        above = coo_array(triu(L, 1))
+        held, size = L.sum(axis=1), abs(L).sum(axis=1)
+        return cls(
+            np.column_stack(above.coords).astype(np.int64),
+            -np.asarray(above.data, np.float64),
+            np.where(abs(held) <= _ROUND_OFF * size, 0.0, held),
+        )
+
+
+@kernel
+def add_gradient(form, p, out):
+    """Add L p [N] to `out`, both (n, 3)."""
+    _add(form, p, out)
+
+
+@inner
+def add_product(form, x, out):
+    """Add L x [N] to `out`, both (n, 3); nothing without a form."""
+    if form is None:
+        return
+    _add(form, x, out)
+
+
+@inner
+def _add(form, x, out):
+    for i in range(len(form.held)):
+        h = form.held[i]
+        out[i, 0] += h * x[i, 0]
+        out[i, 1] += h * x[i, 1]
+        out[i, 2] += h * x[i, 2]
+    for k in range(len(form.weight)):
+        i, j, w = form.pairs[k, 0], form.pairs[k, 1], form.weight[k]
+        f0, f1, f2 = w * (x[i, 0] - x[j, 0]), w * (x[i, 1] - x[j, 1]), w * (x[i, 2] - x[j, 2])
+        out[i, 0] += f0
+        out[i, 1] += f1
+        out[i, 2] += f2
+        out[j, 0] -= f0
+        out[j, 1] -= f1
+        out[j, 2] -= f2
+
+
+@kernel
+def rise(form, p, q):
+    """q'Lq/2 - p'Lp/2 [J], p and q (n, 3)."""
+    total = 0.0
+    for i in range(len(form.held)):
+        h = 0.5 * form.held[i]
+        for c in range(3):
+            total += h * (q[i, c] - p[i, c]) * (q[i, c] + p[i, c])
+    for k in range(len(form.weight)):
+        i, j, change = form.pairs[k, 0], form.pairs[k, 1], 0.0
+        for c in range(3):
+            s = (q[i, c] - p[i, c]) - (q[j, c] - p[j, c])
+            change += s * (2.0 * (p[i, c] - p[j, c]) + s)
+        total += 0.5 * form.weight[k] * change
+    return total
+
+
+@kernel
+def add_blocks(form, diagonal, across, values):
+    """Add L [N/m] to the blocks `values` (b, 3, 3): to those on the diagonal (n,) and to those of pairs, both ways,
+    (k, 2); -1 stands for none."""
+    for i in range(len(form.held)):
+        _hold(values, diagonal[i], form.held[i])
+    for k in range(len(form.weight)):
+        w = form.weight[k]
+        _hold(values, diagonal[form.pairs[k, 0]], w)
+        _hold(values, diagonal[form.pairs[k, 1]], w)
+        _hold(values, across[k, 0], -w)
+        _hold(values, across[k, 1], -w)
+
+
+@inner
+def _hold(values, block, w):
+    if block >= 0:
+        values[block, 0, 0] += w
+        values[block, 1, 1] += w
+        values[block, 2, 2] += w
