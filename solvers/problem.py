@@ -188,11 +188,10 @@ class StepProblem:
         return tuple(e.begin_step(self.start) if isinstance(e, LaggedEnergy) else e for e in self.system.energies)
 
     def terms(self, p: Positions) -> dict[str, float]:
-        """The terms [J] of the objective at p: inertia, force, pins, and energies by their class's name, which is
-        `energy pins` and so on where a class has the name of one of those three."""
+        """The terms [J] of the objective at p by name: inertia, force, pins, and energies by their class."""
         s, values, away = self.system, dict[str, float](), p - self.target
         for energy in self.energies:
-            name = type(energy).__name__.lower()
+            name = type(energy).__name__.lower()  # which may be that of one of the three
             name = f"energy {name}" if name in ("inertia", "force", "pins") else name
             values[name] = values.get(name, 0.0) + energy.value(p)
         values["inertia"] = 0.5 * float(s.inertia @ np.einsum("ij,ij->i", away, away))
@@ -224,18 +223,16 @@ class StepProblem:
 
 @dataclass(frozen=True, slots=True)
 class StopRule:
-    """When a solve ends: after `iterations`, or before that once the residual is small enough.
+    """When a solve ends: after `iterations`, or with a `tolerance` before that, once the residual is at most so much of
+    its value at the current positions, or once the gradient is round-off, so that a scene at rest stops at once.
 
     The residual at p is |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q [J^(1/2)] over the unpinned vertices, the same for every
-    method. With a `tolerance` the solve ends when it is at most `tolerance` times its value at the current positions;
-    without one it does all iterations. `floor` is absolute: a residual that a mean displacement of `floor` times
-    the largest coordinate would cause ends the solve too (only where a tolerance is set), so that a
-    scene at rest stops at once.
+    method. Round-off is at each of them at most `floor` times its bound (see `solvers.round_off`); 0 looks for none.
     """
 
     iterations: int = 50
     tolerance: float | None = None
-    floor: float = 1e-12
+    floor: float = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -259,10 +256,7 @@ class Solution:
 
 
 class Prepared(Protocol):
-    """A solver that has factorised, coloured and compiled what one system needs.
-
-    `choice` is a fifth member because whoever reads a row must learn what a solver chose by itself.
-    """
+    """A solver that has factorised, coloured and compiled what one system needs."""
 
     @property
     def choice(self) -> str:
@@ -302,8 +296,5 @@ class Solver(Protocol):
     descends: ClassVar[bool]
 
     def prepare(self, system: System) -> Prepared:
-        """Factorise, colour, compile.
-
-        Raises Unsupported, before any work, for what the method cannot do, and NotPositiveDefinite.
-        """
+        """Raises Unsupported, before any work, for what the method cannot do, and NotPositiveDefinite."""
         ...

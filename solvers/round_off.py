@@ -21,13 +21,14 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.problem import Energy, Positions, StepProblem
+from solvers.problem import Energy, Positions, StepProblem, StopRule
 
 EPS = float(np.finfo(np.float64).eps)
 
-FACTOR = 8.0
-"""Of the bound, up to which a gradient is round-off. Where solvers are left to go on for ever, it ends at .1 to .9 of
-the bound at the worst vertex of most hard scenes, at 2 in the worst; what has not converged is at a hundred or more."""
+FACTOR = StopRule().floor
+"""Of the bound, up to which a gradient is round-off: 8. Where solvers are left to go on for ever, it ends at .1 to .9
+of the bound at the worst vertex of most hard scenes, at 2 in the worst; what has not converged is at a hundred or
+more."""
 
 Terms = NDArray[np.float64]
 
@@ -56,6 +57,13 @@ def gradient_round_off(problem: StepProblem, p: Positions) -> Terms:
     out[np.isnan(out)] = np.inf
     out[s.pins.vertices[s.pins.exact]] = 0.0
     return out
+
+
+def at_rest(problem: StepProblem, p: Positions, factor: float = FACTOR) -> bool:
+    """Whether the gradient at p (n, 3) [m] is round-off at every vertex that no pin holds: at most `factor` times the
+    bound, where that is finite. A sum over vertices would let one part's round-off hide another's gradient."""
+    bound, size = gradient_round_off(problem, p), lengths(problem.gradient(p))
+    return bool(((size <= factor * bound) & np.isfinite(bound))[problem.system.unpinned].all())
 
 
 def within(gradient: Positions, bound: Terms) -> Positions:

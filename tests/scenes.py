@@ -21,6 +21,7 @@ from harness.scenes.mesh.surfaces import Skirt
 from harness.scenes.spec import MeshSource, SceneSpec
 from harness.simulation.step import problem, simulate, start
 from solvers.energies.springs import Springs
+from solvers.energies.strain_limits import StrainLimits
 from solvers.methods.local_global import DenseLocalGlobal, SparseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Pins, Positions, Solver, Start, StepProblem, StopRule, System
@@ -140,3 +141,29 @@ def far(problem: StepProblem) -> float:
     """|e|_Q [J^(1/2)] of a displacement e by the largest coordinate at every unpinned vertex: the scale of rounding."""
     trace = float(stiffness(problem.system).diagonal()[problem.system.unpinned].sum())
     return float(np.abs(problem.first_guess).max(initial=0.0)) * trace**0.5
+
+
+def beside(problem: StepProblem, other: StepProblem) -> StepProblem:
+    """Two problems as one, whose components do not touch."""
+    n, systems = problem.system.vertices, (problem.system, other.system)
+    moved = [replace(e, edges=e.edges + n) for e in other.system.energies if isinstance(e, Springs | StrainLimits)]
+    pins = [s.pins for s in systems]
+    system = System(
+        np.concatenate([s.mass for s in systems]),
+        problem.system.time_step,
+        (*problem.system.energies, *moved),
+        Pins(np.append(pins[0].vertices, pins[1].vertices + n), np.append(pins[0].weight, pins[1].weight)),
+    )
+    names = ("target", "force", "pin_targets", "current", "first_guess")
+    arrays = {name: np.concatenate([getattr(problem, name), getattr(other, name)]) for name in names}
+    return StepProblem(system, **arrays, start=begun(system, arrays["current"], arrays["current"]))
+
+
+def moved(problem: StepProblem, by: float, stiffer: float = 1.0) -> StepProblem:
+    """The problem elsewhere, and of stiffer springs."""
+    names = ("target", "pin_targets", "current", "first_guess")
+    energies = tuple(
+        replace(e, stiffness=stiffer * e.stiffness) for e in problem.system.energies if isinstance(e, Springs)
+    )
+    arrays = {name: getattr(problem, name) + by for name in names}
+    return replace(problem, system=replace(problem.system, energies=energies), **arrays)

@@ -18,6 +18,7 @@ import numpy as np
 from solvers.kernels import loop
 from solvers.kernels.loop import Limits, at_most
 from solvers.problem import Positions, ResidualOf, Solution, StepProblem, StopRule
+from solvers.round_off import at_rest
 
 _STOPPED = {
     loop.ITERATIONS: "iterations",
@@ -25,6 +26,10 @@ _STOPPED = {
     loop.FLOOR: "floor",
     loop.STALLED: "stalled",
 }
+
+_NEAR = 1e-12
+"""Of `Iterative.scale`: what no round-off exceeds, by far. It is thousands of the last digits of all that is added up,
+whatever has most of them."""
 
 _CLOSE = 1e-5
 """A tolerance from which on the last point should be a minimum; a greater one asks for less than that."""
@@ -88,15 +93,35 @@ class Iterative(ABC):
         limits, yardstick, close = at_most(stop.iterations), float("nan"), False
         if stop.tolerance is not None and self.residual_of != "none":
             yardstick = self.residual_at(problem, problem.current)
-            limits = Limits(stop.iterations, stop.tolerance * yardstick, stop.floor * self.scale(problem), loop.EACH)
+            near = _NEAR * self.scale(problem) if stop.floor > 0.0 else 0.0
+            limits = Limits(stop.iterations, stop.tolerance * yardstick, near, loop.EACH)
             close = stop.tolerance <= _CLOSE
-        count, residual, ended = run.iterate(limits)
+        count, residual, ended = self._iterated(run, problem, limits, stop.floor)
         while close and ended in (loop.TOLERANCE, loop.FLOOR) and not run.certifies():
-            more, residual, ended = run.iterate(limits._replace(iterations=stop.iterations - count))
+            left = limits._replace(iterations=stop.iterations - count)
+            more, residual, ended = self._iterated(run, problem, left, stop.floor)
             count += more
             if not more and ended != loop.ITERATIONS:
                 ended = loop.STALLED
         return Solution(run.positions, count, residual, yardstick, _STOPPED[ended], run.velocity, self.residual_of)
+
+    @staticmethod
+    def _iterated(run: Iterating, problem: StepProblem, limits: Limits, floor: float) -> tuple[int, float, int]:
+        """As `run.iterate`, but FLOOR only where the gradient is round-off, vertex by vertex.
+
+        That is looked at where the residual is near to it, and then again after one more iteration, and whenever half
+        as many have been done since as at the last look.
+        """
+        count, residual, ended = run.iterate(limits)
+        since = 0
+        while ended == loop.FLOOR and not at_rest(problem, run.positions, floor):
+            some = min(1 + since // 2, limits.iterations - count)
+            if some == 0:
+                return count, residual, loop.ITERATIONS
+            more, residual, ended = run.iterate(limits._replace(iterations=some, floor=0.0))
+            count, since = count + more, since + more
+            ended = loop.FLOOR if ended == loop.ITERATIONS else ended
+        return count, residual, ended
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """The residual [J^(1/2)] at positions p (n, 3) [m]: an iteration's work for one of the previous iterate."""
@@ -105,7 +130,8 @@ class Iterative(ABC):
         return self.begin(problem, p).iterate(at_most(int(self.residual_of == "previous")))[1]
 
     def scale(self, problem: StepProblem) -> float:
-        """The residual [J^(1/2)] that a mean displacement of the first guess's largest coordinate would cause."""
+        """The residual [J^(1/2)] that a mean displacement of the first guess's largest coordinate would cause: a small
+        part of it is where round-off begins to be looked for, and 0 where it never is."""
         return 0.0
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:

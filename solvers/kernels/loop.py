@@ -23,8 +23,8 @@ NEVER, LAST, EACH = range(3)
 
 
 class Limits(NamedTuple):
-    """iterations: at most; limit, floor: residuals [J^(1/2)] that end the loop where each is asked for; wanted: which
-    residuals are."""
+    """iterations: at most; limit, floor: residuals [J^(1/2)] that end the loop where each is asked for, the latter to
+    look for round-off; wanted: which residuals are."""
 
     iterations: int
     limit: float

@@ -3,52 +3,24 @@
 Factors of float64 solve for positions, Q p = A'K d + y. Less precise ones solve for corrections,
 p <- p - Q^-1 grad g(p), with the gradient in float64: the iterations end where those of float64 do, to all of its
 digits, and only the way there differs.
-
-The factors are kept as inverses of blocks, whose products round to eps cond(Q) |p| (Higham 2002, section 14.1), where
-cond(Q) <= 2 max_i Q_ii / (Q 1)_i, scaled by Q 1. Where that is more than a small part of a spring's length, because
-stiffnesses lie far apart or vertices far away, corrections are solved for in float64 too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from solvers.about import LIU_2013, LOCAL_GLOBAL, About
 from solvers.contact.touching import without_contact
-from solvers.core.driver import Iterating, Iterative, largest
-from solvers.core.parts import Parts, split
-from solvers.core.prefactored import PreparedLocalGlobal, Project, prepared, projective
+from solvers.core.compiled import FAR, PreparedCompiled, compiled
+from solvers.core.prefactored import Project, prepared, projective
 from solvers.energies.springs import Springs
 from solvers.kernels import springs as kernels
-from solvers.kernels import step, step_ends
-from solvers.kernels.edges import Edges
-from solvers.kernels.loop import ONE, Limits
-from solvers.kernels.plan import Order, of_inverse, of_supernodal, vectors
 from solvers.linear.choice import Linear, Precision, factorise
-from solvers.linear.inverse import Inverse
-from solvers.linear.supernodal import Supernodal
-from solvers.linear.team import Team
 from solvers.memory import aligned
-from solvers.problem import Positions, Prepared, ResidualOf, StepProblem, System
-from solvers.round_off import EPS
-
-_LOST = 1e-3
-"""Of the median rest length, what positions may lose by the bound, which is some 20 times what they do lose. Sheets of
-256 vertices a side and 1e5 N/m keep a hundredfold distance from it; scenes whose stiffnesses lie 1e12 apart do not."""
-
-_NEAR = 100.0
-"""Metres from the origin within which most scenes stay."""
-
-FAR = 1e100
-"""Where the springs end that fill up bundles: at no vertex, whatever the unit of length."""
+from solvers.problem import Positions, Prepared, System
 
 
 @dataclass(frozen=True)
@@ -85,252 +57,6 @@ class CompiledLocalGlobal:
             return found
         local = {"project": _projection(alone[0], system.vertices)} if alone else {}
         return replace(base, choice=f"{base.choice}; {found}", **local)
-
-
-ORDERS: dict[type, Callable[[Any], Order]] = {Supernodal: of_supernodal, Inverse: of_inverse}
-"""The linear solvers whose panels the kernels go through; the others are called in between."""
-
-
-def compiled(base: PreparedLocalGlobal, *, corrects: bool = False) -> PreparedCompiled | str:
-    """The iterations over the factor's own rows; where there are none, in words that they go through Python, and why.
-
-    corrects: whether corrections are wanted whatever the factor's precision.
-    """
-    order = _order(base)
-    if order is None:
-        return "iterations through Python: this linear solver is called from there"
-    parts = split(base.system)
-    if parts.unknown:
-        return f"iterations through Python: the kernels do not know {', '.join(parts.unknown)}"
-    if parts.cancel:
-        return "iterations through Python: the stiffnesses between some vertices cancel"
-    return PreparedCompiled.of(replace(base, choice=f"{base.choice}; iterations compiled"), parts, order, corrects)
-
-
-def _order(base: PreparedLocalGlobal) -> Order | None:
-    """A factor's rows in the kernels' order; None of one that they do not know."""
-    return next((order(base.factor) for kind, order in ORDERS.items() if isinstance(base.factor, kind)), None)
-
-
-def _reach(base: PreparedLocalGlobal, springs: Springs) -> float:
-    """The largest coordinate [m] of which a solve for positions loses at most _LOST of the median rest length."""
-    lengths = springs.rest_length[springs.rest_length > 0.0]
-    return _LOST * float(np.median(lengths)) / (2.0 * EPS * base.spread) if len(lengths) else np.inf
-
-
-class Work(NamedTuple):
-    """What the kernels write to: three vectors and scratch, the right-hand side, positions to be corrected or None."""
-
-    vectors: tuple[NDArray[Any], ...]
-    right: NDArray[np.float64]
-    p: NDArray[np.float64] | None
-
-
-@dataclass(frozen=True, eq=False)
-class PreparedCompiled(Iterative):
-    """The iterations over a factor's own rows (see `solvers.kernels.step`).
-
-    base: the same, step by step; parts: of the energies; plan: of an iteration; bundles: of the springs
-    in its local step; edges: beside them; form: of
-    |e|_Q^2; rows: of the vertices; far: the last row; corrects: whether it solves for corrections; reach: the
-    largest coordinate [m] up to which it may solve for positions.
-    """
-
-    residual_of: ClassVar[ResidualOf] = "previous"
-
-    base: PreparedLocalGlobal
-    parts: Parts
-    plan: step.Plan
-    bundles: kernels.Bundles
-    edges: Edges | None
-    form: kernels.Bundles
-    rows: step_ends.Rows
-    far: int
-    corrects: bool
-    reach: float
-
-    @classmethod
-    def of(cls, base: PreparedLocalGlobal, parts: Parts, order: Order, corrects: bool) -> PreparedCompiled:
-        """The iterations over a factor that is cut into blocks; corrects: for corrections in any case."""
-        s, pins = base.system, base.system.pins
-        exact = pins.vertices[pins.exact]
-        nobody = order.rows + len(exact)
-        row = np.empty(s.vertices, np.int64)
-        slot = order.slot[: len(s.free)]  # those behind are padding
-        row[s.free] = slot
-        row[exact] = order.rows + np.arange(len(exact))
-        part = np.full(s.vertices, -1)
-        part[s.free] = np.searchsorted(order.spans[:, 0], slot, side="right") - 1
-        corrects |= order.squares.dtype != np.float64
-        where = row, part, len(order.spans), nobody, nobody + 1
-        form, first = kernels.Bundles.of(parts.pairs, *where)
-        # Positions are solved for with the forms in Q; corrections need their gradient too.
-        local = parts.whole if corrects else parts.springs
-        bundles = form if local is parts.pairs else kernels.Bundles.of(local, *where)[0]
-        inertia = s.inertia
-        held, measure, loose = np.zeros((3, nobody + 2 + order.shift))
-        held[row] = measure[row] = inertia + parts.held
-        _, soft, weight = s.penalty
-        held[row[soft]] += weight
-        measure[row[s.free]] -= 0.5 * base.coupling.sum(axis=1)
-        loose[row[s.unpinned]] = 1.0
-        coupling = csr_array((0, 0)).tocoo() if corrects else base.coupling.tocoo()
-        return cls(
-            base,
-            parts,
-            step.Plan(
-                order.squares,
-                order.panels,
-                order.places,
-                order.chunks,
-                order.top,
-                np.ascontiguousarray(np.column_stack([order.spans[:, :2], first[:-1], first[1:], order.spans[:, 2:]])),
-                order.of_group,
-                order.visits,
-                order.visits_of,
-                held,
-                form.in_lanes(measure),
-                loose,
-                order.shift,
-            ),
-            bundles,
-            parts.edges(row, len(held)),
-            form,
-            step_ends.Rows(
-                row,
-                bundles.in_right(len(held))[row],
-                inertia,
-                np.array(pins.weight),
-                np.array(pins.vertices),
-                np.array(coupling.data, np.float64),
-                s.free[coupling.coords[0]],
-                np.flatnonzero(pins.exact)[coupling.coords[1]],
-            ),
-            nobody + 1,
-            corrects,
-            np.inf if corrects else _reach(base, parts.springs),
-        )
-
-    @cached_property
-    def corrected(self) -> PreparedCompiled:
-        """The same for corrections."""
-        order = _order(self.base)
-        assert order is not None  # `of` was given one
-        return self.of(self.base, self.parts, order, True)
-
-    @property
-    def facts(self) -> dict[str, float]:
-        """Exact counts of what was built."""
-        return self.base.facts
-
-    @property
-    def choice(self) -> str:
-        """The linear solver in words, from which distance on it solves for corrections where scenes may reach that far,
-        and how many of the allowed threads a step uses where that is not all."""
-        beyond = f"; corrections beyond {self.reach:.1g} m of the origin" if self.reach < _NEAR else ""
-        allowed, used = numba.get_num_threads(), self.threads() or 1
-        if used == allowed:
-            return f"{self.base.choice}{beyond}"
-        why = "the system is too small for a second thread to pay" if used == 1 else f"its factor comes in {used} parts"
-        return f"{self.base.choice}{beyond}; {used} of {allowed} threads: {why}"
-
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative."""
-        return _Iterating(self if largest(problem) <= self.reach else self.corrected, problem, guess)
-
-    def scale(self, problem: StepProblem) -> float:
-        """See Iterative."""
-        return largest(problem) * self.base.trace**0.5
-
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The local step over all springs at the first guess, and a solve with the factor as it is, once.
-
-        Within a step neither is done alone: blocks take turns at both.
-        """
-        (a, b, _, _), right, p = work = self.memory()
-        target, force, pins, guess = self.arrays(problem, problem.first_guess)
-        step_ends.state(self.rows, target, force, pins, right)
-        step_ends.start(self.rows, work.vectors, p, guess, pins)
-
-        edges = self.parts.begun(self.edges, problem)
-
-        def local() -> NDArray[Any]:
-            step.local(self.plan, self.bundles, edges, a, right, p, b)
-            return b
-
-        y, out = self.base.system.inertia[:, None] * target + force, np.zeros_like(target)
-        return {"local": local, "global": lambda: self.base.correction(y, out)}
-
-    def arrays(self, problem: StepProblem, guess: Positions) -> list[Positions]:
-        """The problem's target, force and pin targets, and the guess. The kernels are compiled for arrays that may be
-        written to: what may not is copied."""
-        given = (problem.target, self.parts.force(problem), problem.pin_targets, guess)
-        return [x if x.flags.carray else np.array(x, np.float64, order="C") for x in given]
-
-    @cached_property
-    def team(self) -> Team:
-        """The threads of whole solves."""
-        return Team.of(int(self.plan.top[2]))
-
-    @cached_property
-    def work(self) -> Work:
-        """The memory of whole solves, one after the other."""
-        return self.memory()
-
-    def memory(self) -> Work:
-        """Memory for one solve."""
-        rows, dtype = len(self.plan.held), self.plan.squares.dtype
-        arrays = vectors(dtype, rows)
-        p = aligned(4 * rows) if self.corrects else None
-        for x in arrays[:3] if p is None else [p]:
-            x[4 * self.far] = FAR
-        return Work(arrays, self.bundles.right(self.plan.held), p)
-
-    def threads(self) -> int | None:
-        """As many as are allowed and as there are groups of subtrees; None for one."""
-        threads = min(numba.get_num_threads(), int(self.plan.top[2]))
-        return threads if threads > 1 else None
-
-
-class _Iterating(Iterating):
-    """A solve is one call, in memory that all solves share; who advances by hand instead has memory of his own."""
-
-    def __init__(self, prepared: PreparedCompiled, problem: StepProblem, guess: Positions) -> None:
-        self._prepared, self._problem, self._guess = prepared, problem, guess
-        self._arrays, self._edges = prepared.arrays(problem, guess), prepared.parts.begun(prepared.edges, problem)
-        self.positions = np.empty_like(problem.target)
-
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating; from the first guess on."""
-        made = self._prepared
-        fixed = made.plan, made.bundles, self._edges, made.form, made.rows, *made.work, *self._arrays
-        return step_ends.solve(*fixed, limits, made.threads(), made.team, self.positions)
-
-    def advance(self) -> bool:
-        """See Iterating."""
-        made = self._prepared
-        (a, b, c, e), right, p = self._own
-        fixed = made.plan, made.bundles, self._edges, made.form, (a, b, c, e), right, p
-        step.iterate(*fixed, ONE, made.threads(), self._team)
-        self._own = Work((b, a, c, e), right, p)
-        step_ends.fetch(made.rows, b if p is None else p, self.positions)
-        return True
-
-    def residual(self) -> float:
-        """|p - LG(p)|_Q of the previous positions p."""
-        (a, b, _, e), _, p = self._own
-        return step.length(self._prepared.plan, self._prepared.form, a, b, p, e)
-
-    @cached_property
-    def _own(self) -> Work:
-        work, (target, force, pins, guess) = self._prepared.memory(), self._arrays
-        step_ends.state(self._prepared.rows, target, force, pins, work.right)
-        step_ends.start(self._prepared.rows, work.vectors, work.p, guess, pins)
-        return work
-
-    @cached_property
-    def _team(self) -> Team:
-        return Team.of(int(self._prepared.plan.top[2]))
 
 
 def _projection(springs: Springs, n: int) -> Project:

@@ -18,6 +18,7 @@ import numpy as np
 
 from solvers.contact.touching import without_contact
 from solvers.core.acceleration import Accelerating, Engine, Interpreted, Scheme, window_for
+from solvers.core.compiled import FAR, PreparedCompiled, compiled
 from solvers.core.driver import Iterative, largest
 from solvers.core.objective import Objective, StepObjective
 from solvers.core.parts import Parts
@@ -29,7 +30,6 @@ from solvers.kernels.edges import Edges
 from solvers.kernels.loop import ONE, Limits, at_most
 from solvers.linear.choice import Linear, Precision, factorise
 from solvers.memory import aligned
-from solvers.methods.local_global_compiled import FAR, PreparedCompiled, compiled
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
 
 

@@ -61,7 +61,7 @@ MEASURING = (
     ),
     Mutation(
         "global-leaves-what-is-there",
-        "solvers/methods/local_global_compiled.py",
+        "solvers/core/compiled.py",
         '"global": lambda: self.base.correction(y, out)}',
         '"global": lambda: out}',
         (_PHASES,),

@@ -28,7 +28,7 @@ STOP = StopRule(50, 1e-6)
 
 
 def hangs(made: Scene, now: Motion) -> None:
-    # Drag-free implicit Euler has damped every swing to the floor of the stop rule, 1e-12 of the positions a step.
+    # Drag-free implicit Euler has damped every swing to what the tolerance leaves of a step.
     assert np.abs(now.velocity).max() <= 1e-8 * made.mesh.size / made.system.time_step
 
 

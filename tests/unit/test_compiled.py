@@ -15,13 +15,14 @@ from numba import types
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
+from solvers.core.compiled import PreparedCompiled
 from solvers.energies.springs import Springs
 from solvers.kernels import plan
 from solvers.kernels.springs import Bundles, aligned, project
 from solvers.linear.choice import Linear, Precision
 from solvers.matrices import assemble, energy_norm
 from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.local_global_compiled import CompiledLocalGlobal, PreparedCompiled
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, StepProblem, StopRule
 from solvers.vectors.springs import WIDE, Vectors
 from tests.scenes import cloth, first_problem, random_network, random_problem

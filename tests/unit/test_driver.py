@@ -8,6 +8,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from solvers.core import driver
 from solvers.core.driver import Iterating, Iterative
 from solvers.core.prefactored import only_springs
 from solvers.kernels.loop import EACH, FLOOR, ITERATIONS, LAST, NEVER, STALLED, TOLERANCE, Limits, over
@@ -150,3 +151,29 @@ class PreparedStepping(Iterative):
 def test_a_close_tolerance_ends_a_solve_at_a_minimum_only(prepared, stop, wanted):
     solution = prepared.solve(first_problem(cloth(3)), stop)
     assert (solution.iterations, solution.stopped) == wanted
+
+
+@dataclass(frozen=True)
+class PreparedNear(PreparedStepping):
+    """Near to round-off by its residual from the fortieth iteration on."""
+
+    def scale(self, problem: StepProblem) -> float:
+        return 1e12 * 0.5**40
+
+
+@pytest.mark.parametrize(
+    ("rests", "most", "wanted", "looks"),
+    [
+        (0, 90, (40, "floor"), [40]),
+        (41, 90, (41, "floor"), [40, 41]),
+        (45, 90, (47, "floor"), [40, 41, 42, 44, 47]),  # not after every one: a look costs as much as some of them
+        (99, 43, (43, "iterations"), [40, 41, 42, 43]),
+    ],
+)
+def test_a_small_residual_is_the_floor_where_the_gradient_is_round_off(monkeypatch, rests, most, wanted, looks):
+    run, looked = Stepping(0, 1000), []
+    monkeypatch.setattr(PreparedNear, "begin", lambda *_: run)
+    monkeypatch.setattr(driver, "at_rest", lambda *_: looked.append(run.count) or run.count >= rests)
+    monkeypatch.setattr(PreparedNear, "residual_at", lambda *_: 1.0)
+    solution = PreparedNear(0).solve(first_problem(cloth(3)), StopRule(most, 1e-300))
+    assert ((solution.iterations, solution.stopped), looked) == (wanted, looks)

@@ -67,10 +67,8 @@ class Stays:
 
 
 def snap_through(weight: float = 0.005, height: float = 0.2) -> StepProblem:
-    """A mass on four struts that are too long for their pins: it is stable above the pins and below them.
-
-    Its weight [N] makes the lower place the better one, for inertia is weak. It starts at a height [m] over the pins.
-    """
+    """A mass on four struts that are too long for their pins, stable above these and below them; its weight [N] makes
+    the lower place the better one, for inertia is weak. It starts at a height [m] over the pins."""
     rest = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, 0.2, 0.0]])
     springs = Springs.at_rest(rest, np.array([[0, 4], [1, 4], [2, 4], [3, 4]]), np.full(4, 100.0))
     system = System(np.full(5, 1e-4), 0.1, (springs,), Pins(np.arange(4), np.full(4, np.inf)))
@@ -265,8 +263,7 @@ def test_a_start_that_is_shaken_is_certified_by_no_eigenvalue_of_another_point(t
 
 def test_a_classification_lets_no_valley_in(tmp_path):
     store, one = standing(tmp_path)
-    found = store.classify(one, one.problem.current)
-    assert not found.certified
+    assert not store.classify(one, one.problem.current).certified
     assert store.reference(one).minima == ()
     assert not list(tmp_path.glob("minima-*"))
 

@@ -14,12 +14,13 @@ from harness.scenes.bind import Scene
 from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs as SpringsEffect
 from harness.scenes.mesh.chain import Chain
+from solvers.core.compiled import PreparedCompiled
 from solvers.core.parts import split
 from solvers.energies.quadratic import Quadratic
 from solvers.energies.springs import Springs
 from solvers.methods.lbfgs import Lbfgs
 from solvers.methods.local_global import SparseLocalGlobal
-from solvers.methods.local_global_compiled import CompiledLocalGlobal, PreparedCompiled
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, Solver, StepProblem, StopRule
 from tests.effects import ATTACHED, BEND, DASHPOTS, DRAG, LIMITS, RAYLEIGH, cloth, stepped
 from tests.scenes import scene

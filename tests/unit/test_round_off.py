@@ -11,10 +11,10 @@ from scipy.sparse import csr_array
 from solvers.energies.springs import Springs
 from solvers.energies.strain_limits import StrainLimits
 from solvers.kernels import objective
-from solvers.problem import Energy, Pins, Positions, StepProblem, System
+from solvers.problem import Energy, Positions
 from solvers.round_off import EPS, Rounded, gradient_round_off, lengths, within
 from tests.effects import SCENES, stepped
-from tests.scenes import begun, random_problem
+from tests.scenes import beside, moved, random_problem
 
 NUDGES = 20
 """Of the last bit: as many ways to round the positions."""
@@ -46,32 +46,6 @@ def test_the_bound_is_not_slack(case: str):
     free = problem.system.free
     changes = [lengths(problem.gradient(nudged(p, seed)) - problem.gradient(p))[free] for seed in range(NUDGES)]
     assert (np.max(changes, axis=0) / bound[free]).max() > 1 / 300
-
-
-def beside(problem: StepProblem, other: StepProblem) -> StepProblem:
-    """Two problems as one, whose components do not touch."""
-    n, systems = problem.system.vertices, (problem.system, other.system)
-    moved = [replace(e, edges=e.edges + n) for e in other.system.energies if isinstance(e, Springs | StrainLimits)]
-    pins = [s.pins for s in systems]
-    system = System(
-        np.concatenate([s.mass for s in systems]),
-        problem.system.time_step,
-        (*problem.system.energies, *moved),
-        Pins(np.append(pins[0].vertices, pins[1].vertices + n), np.append(pins[0].weight, pins[1].weight)),
-    )
-    names = ("target", "force", "pin_targets", "current", "first_guess")
-    arrays = {name: np.concatenate([getattr(problem, name), getattr(other, name)]) for name in names}
-    return StepProblem(system, **arrays, start=begun(system, arrays["current"], arrays["current"]))
-
-
-def moved(problem: StepProblem, by: float, stiffer: float = 1.0) -> StepProblem:
-    """The problem elsewhere, and of stiffer springs."""
-    names = ("target", "pin_targets", "current", "first_guess")
-    energies = tuple(
-        replace(e, stiffness=stiffer * e.stiffness) for e in problem.system.energies if isinstance(e, Springs)
-    )
-    arrays = {name: getattr(problem, name) + by for name in names}
-    return replace(problem, system=replace(problem.system, energies=energies), **arrays)
 
 
 @pytest.mark.parametrize(("by", "stiffer"), [(1e6, 1.0), (1e9, 1e8), (0.0, 1e12)])

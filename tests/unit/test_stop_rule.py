@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from harness.config.load import load_scene
+from harness.scenes.bind import build
 from harness.simulation.trace import EnergyNorm, trace
 from solvers.core.prefactored import only_springs
+from solvers.methods.lbfgs import Lbfgs
+from solvers.methods.local_global import SparseLocalGlobal
+from solvers.methods.newton import Newton
 from solvers.problem import StepProblem, StopRule
-from tests.scenes import BACKENDS, cloth, first_problem, random_problem
+from solvers.round_off import FACTOR, at_rest, gradient_round_off, lengths
+from tests.scenes import BACKENDS, beside, cloth, first_problem, moved, random_problem
+
+HARD = Path(__file__).resolve().parents[2] / "configs" / "hard"
 
 HALF_THE_DIGITS = 1e-7
 """A residual is the root of a sum that cancels, added up in another order by each backend."""
@@ -19,7 +28,7 @@ HALF_THE_DIGITS = 1e-7
 backends = pytest.mark.parametrize("backend", BACKENDS, ids=lambda b: type(b).__name__)
 
 
-def at_rest(problem: StepProblem) -> StepProblem:
+def without_motion(problem: StepProblem) -> StepProblem:
     """The same system with nothing that moves it."""
     p = problem.current
     return replace(problem, target=p, force=np.zeros_like(p), first_guess=p)
@@ -27,7 +36,7 @@ def at_rest(problem: StepProblem) -> StepProblem:
 
 @backends
 def test_without_a_tolerance_all_iterations_are_done(backend):
-    problem = at_rest(first_problem(cloth(6)))
+    problem = without_motion(first_problem(cloth(6)))
     solution = backend.prepare(problem.system).solve(problem, StopRule(17))
     assert (solution.iterations, solution.stopped) == (17, "iterations")
     assert np.isnan(solution.yardstick)
@@ -59,7 +68,7 @@ def test_the_limit_ends_a_solve_that_the_tolerance_does_not(backend):
 @pytest.mark.parametrize("offset", [0.0, 1e3], ids="{:g} m from the origin".format)
 def test_a_scene_at_rest_stops_after_one_iteration(backend, offset):
     """Its residual is round-off, of which no fraction would ever be reached; the floor knows its size."""
-    problem = at_rest(first_problem(cloth(12)))
+    problem = without_motion(first_problem(cloth(12)))
     away = {name: getattr(problem, name) + offset for name in ("target", "pin_targets", "current", "first_guess")}
     solution = backend.prepare(problem.system).solve(replace(problem, **away), StopRule(50, 1e-6))
     assert solution.iterations == 1
@@ -77,7 +86,7 @@ def test_the_floor_does_not_stop_a_scene_that_moves(backend):
 
 @backends
 def test_the_floor_can_be_taken_away(backend):
-    problem = at_rest(first_problem(cloth(12)))
+    problem = without_motion(first_problem(cloth(12)))
     solution = backend.prepare(problem.system).solve(problem, StopRule(3, 1e-9, floor=0.0))
     assert solution.stopped != "floor"
 
@@ -121,3 +130,53 @@ def test_a_solve_that_diverged_says_so_and_does_not_pass_for_converged(backend):
     solution = backend.prepare(problem.system).solve(replace(problem, first_guess=lost), StopRule(4, 1e-3))
     assert (solution.iterations, solution.stopped) == (4, "iterations")
     assert np.isnan(solution.residual)
+
+
+def hard(name: str) -> StepProblem:
+    """The first step of a hard scene."""
+    spec = load_scene(HARD / f"{name}.yaml")
+    return first_problem(build(spec, spec.default_size or 0))
+
+
+methods = pytest.mark.parametrize(
+    "method", [SparseLocalGlobal(), Lbfgs(), Newton()], ids=lambda method: type(method).__name__
+)
+
+
+@methods
+@pytest.mark.parametrize(
+    "case", ["effects-strain-limits-1e13", "effects-strain-limits-1e18", "scales-cubes-1e6-m-apart", "scales-far-chain"]
+)
+def test_a_stiff_or_far_part_does_not_pass_for_round_off_of_the_others(method, case: str):
+    """Q weighs limits that no spring reaches, and the far part's coordinates are large; neither is the gradient's."""
+    problem = hard(case)
+    assert not at_rest(problem, problem.current)
+    solution = method.prepare(problem.system).solve(problem, StopRule(300, 1e-14))
+    assert solution.stopped != "floor" or at_rest(problem, solution.positions)
+    assert solution.iterations > 1
+
+
+@pytest.mark.parametrize("case", ["effects-strain-limits-1e13", "effects-strain-limits-1e18"])
+def test_a_chain_falls_whatever_the_limits_that_it_does_not_reach(case: str):
+    """As far as it would without them."""
+    problem = hard(case)
+    solution = Newton().prepare(problem.system).solve(problem, StopRule(300, 1e-14))
+    free = replace(problem, system=replace(problem.system, energies=problem.system.energies[:1]))
+    wanted = Newton().prepare(free.system).solve(free, StopRule(300, 1e-14)).positions
+    fall = problem.value(solution.positions) - problem.value(problem.current)
+    assert fall == pytest.approx(problem.value(wanted) - problem.value(problem.current), rel=1e-9)
+
+
+@pytest.mark.parametrize("method", [SparseLocalGlobal(), Lbfgs()], ids=lambda method: type(method).__name__)
+@pytest.mark.parametrize("away", [0.0, 1e6], ids="{:g} m away".format)
+def test_another_component_does_not_change_where_the_first_one_stops(method, away: float):
+    problem = random_problem(1)
+    both, n = beside(problem, moved(random_problem(2), away)), problem.system.vertices
+    ends = []
+    for given in (problem, both):
+        solution = method.prepare(given.system).solve(given, StopRule(20_000, 1e-300))
+        assert solution.stopped in ("floor", "stalled")
+        ends.append(solution.positions[:n])
+    bound = FACTOR * gradient_round_off(problem, ends[0])
+    for p in ends:
+        assert (lengths(problem.gradient(p)) <= bound)[problem.system.unpinned].all()
