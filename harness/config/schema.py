@@ -27,7 +27,8 @@ def schema() -> dict[str, Any]:
     effect = _one_of({kind: load(target) for kind, target in EFFECTS.items()}, "kind")
     shipped = {**SOLVERS, **OPTIONAL}
     solver = _one_of({name: parameters_model(name, load(target)) for name, target in shipped.items()}, "name")
-    names: Any = Literal[tuple(shipped)] | Annotated[str, Field(pattern=PATTERN)]
+    known: Any = Literal[tuple(shipped)]
+    names: Any = known | Annotated[str, Field(pattern=PATTERN)]
     scene = create_model(
         "Scene",
         __base__=SceneFile,

@@ -23,6 +23,7 @@ from harness.experiments.core import do_all, require_threads
 from harness.experiments.run import Files, common, execute
 from harness.record.sound import whole_messages
 from harness.report.sweep import Pictured, draw_sweep
+from solvers.plugins import Plugin
 
 DONE, MISSING = "done", "missing"
 NEEDED = ("run_id", "scene", "size", "solver", "status", "code")
@@ -98,7 +99,7 @@ class RunUnit:
 
 def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
     """Each run with its files and what is there already."""
-    codes: dict[frozenset[type], str] = {}
+    codes: dict[frozenset[type | Plugin], str] = {}
     planned = []
     for run in runs:
         files = Files.of(run, folder)

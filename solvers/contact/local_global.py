@@ -22,7 +22,8 @@ from scipy.sparse import coo_array, csr_array
 
 from solvers.contact.touching import ContactEnergy, Rows, touching, without_contact
 from solvers.core.driver import Iterating, Iterative, largest
-from solvers.core.objective import Objective, StepObjective
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
 from solvers.core.prefactored import PreparedLocalGlobal
 from solvers.problem import Positions, Prepared, ResidualOf, Solver, StepProblem, System
 

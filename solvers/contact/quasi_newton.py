@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from solvers.contact.local_global import Corrections
 from solvers.contact.touching import ContactEnergy, Rows, touching
 from solvers.core.acceleration import Accelerating, Engine, Interpreted, Scheme
-from solvers.core.objective import Objective, StepObjective
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
 from solvers.core.prefactored import PreparedLocalGlobal
 from solvers.kernels import accelerate
 from solvers.problem import Positions, StepProblem, System

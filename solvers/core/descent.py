@@ -18,7 +18,8 @@ from scipy.sparse import csr_array
 
 from solvers import matrices
 from solvers.core.driver import Iterating, Iterative, largest
-from solvers.core.objective import Objective, StepObjective
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
 from solvers.linear.choice import factorise
 from solvers.linear.factors import DenseCholesky
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System

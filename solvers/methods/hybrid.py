@@ -30,7 +30,8 @@ import numpy as np
 from solvers.about import About, Reference
 from solvers.core.acceleration import Accelerating
 from solvers.core.descent import DECREASE, Metric, Point, PreparedDescent, dot, search
-from solvers.core.objective import Hessian, Objective, StepObjective
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import Hessian, StepObjective
 from solvers.kernels.loop import NEVER, STALLED, Limits, at_most
 from solvers.methods.lbfgs import Lbfgs
 from solvers.methods.newton import NewtonMethod

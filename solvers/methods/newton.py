@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from solvers.about import About, Reference
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
-from solvers.core.objective import Objective, StepObjective
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
 from solvers.core.saddles import certified, leave
 from solvers.problem import System
 

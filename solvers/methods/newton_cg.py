@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from solvers.about import About, Reference
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
-from solvers.core.objective import Hessian, Objective, StepObjective
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import Hessian, StepObjective
 from solvers.kernels import conjugate
 from solvers.linear.inverse import Inverse
 from solvers.linear.supernodal import Supernodal

@@ -20,7 +20,8 @@ from solvers.contact.touching import without_contact
 from solvers.core.acceleration import Accelerating, Engine, Interpreted, Scheme, window_for
 from solvers.core.compiled import FAR, PreparedCompiled, compiled
 from solvers.core.driver import Iterative, largest
-from solvers.core.objective import Objective, StepObjective
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
 from solvers.core.parts import Parts
 from solvers.core.prefactored import PreparedLocalGlobal, prepared, projective
 from solvers.kernels import accelerate_step, step_ends

@@ -27,7 +27,8 @@ from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.springs import Springs
 from harness.scenes.spec import IntegratorName, SceneSpec
 from harness.simulation.step import prepare, simulate
-from solvers.core.objective import Objective, StepObjective
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
 from solvers.methods.newton import certified
 from solvers.problem import Positions, StepProblem, StopRule
 from solvers.registry import SOLVERS, load

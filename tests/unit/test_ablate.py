@@ -261,11 +261,11 @@ def test_a_driven_motion_is_not_asked_to_rest():
 
 
 def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: Path):
-    log = logging.getLogger("springbench")
-    for handler in list(log.handlers):  # of another test's command, which wrote elsewhere
+    for handler in list(
+        (log := logging.getLogger("springbench")).handlers
+    ):  # of another test's command, which wrote elsewhere
         log.removeHandler(handler)
-    scene = tmp_path / "cloth.yaml"
-    scene.write_text(CLOTH)
+    (scene := tmp_path / "cloth.yaml").write_text(CLOTH)
     asked = ["ablate", str(scene), "--results", str(tmp_path), "--frames", "4", "--rounds", "2", "--iterations", "5"]
     told = CliRunner().invoke(app, asked)
     assert told.exit_code == 0, told.output
@@ -285,8 +285,7 @@ def test_every_column_of_its_own_is_documented(column: Column):
 
 
 def test_a_sweep_is_refused(tmp_path: Path):
-    sweep = ROOT / "configs" / "quickstart.yaml"
-    told = CliRunner().invoke(app, ["ablate", str(sweep), "--results", str(tmp_path)])
+    told = CliRunner().invoke(app, ["ablate", str(ROOT / "configs" / "quickstart.yaml"), "--results", str(tmp_path)])
     assert told.exit_code == 2
     assert "is a sweep" in told.stderr
 

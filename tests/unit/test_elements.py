@@ -7,7 +7,8 @@ import pytest
 from scipy.sparse import csr_array
 
 from harness.scenes.effects.contact import Contact
-from solvers.core.objective import Objective, StepObjective
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
 from solvers.energies.elements import Joined, add_blocks
 from tests.effects import DASHPOTS, FLOOR, LIMITS, RAYLEIGH, cloth, stepped
 

@@ -16,7 +16,8 @@ from harness.scenes.mesh.chain import Chain
 from harness.scenes.mesh.grid import Grid
 from harness.simulation.step import problem
 from solvers.core.descent import PreparedDescent
-from solvers.core.objective import Objective, StepObjective
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
 from solvers.core.saddles import certified
 from solvers.methods.hybrid import Hybrid
 from solvers.methods.newton import Newton

@@ -14,7 +14,8 @@ from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.surfaces import Balloon
 from solvers.core.descent import PreparedDescent
-from solvers.core.objective import Objective, StepObjective
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
 from solvers.core.saddles import certified
 from solvers.methods.hybrid import Hybrid
 from solvers.methods.newton import Newton

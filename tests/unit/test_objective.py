@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, diags_array
 
-from solvers.core.objective import Objective, StepObjective
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
 from solvers.energies.springs import Springs
 from solvers.problem import Positions, StepProblem
 from tests.scenes import cloth, first_problem, random_problem

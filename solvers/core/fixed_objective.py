@@ -1,0 +1,97 @@
+"""What of the objective stays the same from step to step: springs, constant quadratic forms, the Hessian's pattern.
+
+The unknowns are the free vertices. The Hessian's blocks lie in a matrix that is analysed once (`solvers.core.pattern`);
+what does not change in a run is added up once.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property, reduce
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from solvers import matrices
+from solvers.core.pattern import Matrix
+from solvers.energies.springs import Springs
+from solvers.kernels import objective
+from solvers.kernels.forms import Form
+from solvers.problem import Energy, LaggedEnergy, ProjectiveEnergy, System
+
+
+class Objective:
+    """The objective of a system's steps: what does not change from step to step.
+
+    stated: which of the system's energies state the law of their elements; own: which state nothing; moving: which
+    forms have another force in each step, or any at all; projective: which energies other than springs are.
+    """
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        self.springs = Springs.joined([e for e in system.energies if isinstance(e, Springs)])
+        self.terms = objective.Terms.of(system, self.springs)
+        self.form: Form | None = None
+        self.moving: list[int] = []
+        self.stated: list[int] = []
+        self.own: list[int] = []
+        self.projective: set[int] = set()
+        others = {k: e for k, e in enumerate(system.energies) if not isinstance(e, Springs)}
+        if others:
+            self._sort(others)
+        self._grown: Matrix | None = None
+
+    def _sort(self, others: dict[int, Energy]) -> None:
+        """The energies that are not springs, by what is known of them."""
+        from solvers.energies.quadratic import Quadratic  # for those who need it
+
+        quadratic = {k: e for k, e in others.items() if isinstance(e, Quadratic)}
+        if quadratic:
+            n = self.system.vertices
+            shares = matrices.shares(self.system, quadratic.values())
+            self.form = Form.of(reduce(lambda total, share: total + share, shares, csr_array((n, n))))
+        self.moving = [k for k, e in quadratic.items() if isinstance(e, LaggedEnergy) or e.d.any()]
+        rest = {k: e for k, e in others.items() if k not in quadratic}
+        self.stated = [k for k, e in rest.items() if hasattr(e, "law")]
+        self.own = [k for k in rest if k not in self.stated]
+        self.projective = {k for k, e in others.items() if isinstance(e, ProjectiveEnergy)}
+
+    @cached_property
+    def matrix(self) -> Matrix:
+        """The Hessian's matrix for the pattern of springs, projective energies and elements."""
+        n, s = self.system.vertices, self.system
+        shares = (e.stiffness_matrix(n) for e in s.energies if isinstance(e, ProjectiveEnergy))
+        pattern = reduce(lambda total, share: total + abs(share), shares, matrices.diagonal(np.ones(n)))
+        free = csr_array(csr_array(pattern[s.free])[:, s.free])
+        known: list[Any] = [s.energies[k].elements for k in self.stated]  # pyright: ignore[reportAttributeAccessIssue]
+        ends = [self.springs.edges, *(pairs(elements.vertices) for elements in known)]
+        if self.form is not None:
+            ends.append(self.form.pairs)
+        i, j = np.concatenate(ends).T  # what has no stiffness, or cancels, keeps its places
+        return self._matrix(free, self.number[i], self.number[j])
+
+    @cached_property
+    def number(self) -> NDArray[np.int64]:
+        """The number of each vertex among the free ones, -1 for the others, (n,)."""
+        number = np.full(self.system.vertices, -1)
+        number[self.system.free] = np.arange(len(self.system.free))
+        return number
+
+    def _matrix(self, graph: csr_array, i: NDArray[np.int64], j: NDArray[np.int64]) -> Matrix:
+        return Matrix.of(self.system, self.terms, self.form, self.number, graph, i, j)
+
+    def matrix_for(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Matrix:
+        """A matrix with places for entries (rows, columns) of free coordinates too."""
+        i, j = rows // 3, columns // 3
+        for known in (self.matrix, self._grown):
+            if known is not None and known.has(i, j) and (known is self.matrix or known.needs(i, j, self.matrix)):
+                return known
+        self._grown = self._matrix(self.matrix.graph, i, j)
+        return self._grown
+
+
+def pairs(vertices: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Every two vertices of each element (m, k), as rows (m k^2, 2)."""
+    k = vertices.shape[1]
+    return np.column_stack([np.repeat(vertices, k, axis=1).ravel(), np.tile(vertices, k).ravel()])
