@@ -261,9 +261,7 @@ def test_a_driven_motion_is_not_asked_to_rest():
 
 
 def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: Path):
-    for handler in list(
-        (log := logging.getLogger("springbench")).handlers
-    ):  # of another test's command, which wrote elsewhere
+    for handler in list((log := logging.getLogger("springbench")).handlers):  # of another test, written elsewhere
         log.removeHandler(handler)
     (scene := tmp_path / "cloth.yaml").write_text(CLOTH)
     asked = ["ablate", str(scene), "--results", str(tmp_path), "--frames", "4", "--rounds", "2", "--iterations", "5"]
