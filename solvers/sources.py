@@ -24,6 +24,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("solvers", "harness")
 
 _INSTALLED = {str(Path(sysconfig.get_path(name)).resolve()) for name in ("stdlib", "purelib", "platlib")}
+_TYPES_ALONE = re.compile(r"^if TYPE_CHECKING:\n(?:[ \t]+\S.*\n|\n)+", re.M)
+"""What is imported for the types and never run."""
+
 _IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+(?P<base>\.*[\w.]*)[ \t]+import[ \t]+(?P<names>\([^)]*\)|.*)|import[ \t]+(?P<whole>.+))", re.M
 )
@@ -126,7 +129,8 @@ def _imported(source: str) -> set[str]:
         text = Path(source).read_text(encoding="utf-8", errors="replace")
     except OSError:  # it was removed, which `digest` notes
         return set()
-    return {path for base, name in _names(text) for path in _found(source, base, name)}
+    run = _TYPES_ALONE.sub("", text)
+    return {path for base, name in _names(run) for path in _found(source, base, name)}
 
 
 def _names(text: str) -> Iterator[tuple[str, str]]:

@@ -257,7 +257,8 @@ def save_positions(path: Path, positions: np.ndarray) -> None:
 
 def common(run: RunSpec) -> dict[str, Any]:
     """The columns that are the same in all rows of a run."""
-    return {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep} | asked(run) | provenance()
+    limits = {"time_limit": run.time_limit, "memory_limit": run.memory_limit}
+    return {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep} | asked(run) | limits | provenance()
 
 
 def asked(run: RunSpec) -> dict[str, Any]:
@@ -271,8 +272,6 @@ def asked(run: RunSpec) -> dict[str, Any]:
         **stated(run.solver.name),
         **{option.column: getattr(run, name) for name, option in OPTIONS.items() if option.column},
         "threads": machine.threads(run.threads).number,
-        "time_limit": run.time_limit,
-        "memory_limit": run.memory_limit,
     }
 
 

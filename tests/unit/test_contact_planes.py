@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -107,8 +109,7 @@ def test_gradient_and_hessian_are_differences_of_the_value(name):
     rng = np.random.default_rng(2)
     step = begun(energy, p, rng.normal(size=p.shape))
     grip = np.where(np.arange(len(step.planes.vertices)) % 2, 3.0, 0.0)
-    step = type(step)(**{f: getattr(step, f) for f in step.__dataclass_fields__} | {
-        "planes": step.planes._replace(grip=grip), "slip": 0.3})  # fmt: skip
+    step = replace(step, planes=step.planes._replace(grip=grip), slip=0.3)
     x, u, h = p + 0.5 * rng.normal(size=p.shape), rng.normal(size=p.shape), 1e-7
     step.add_gradient(x, gradient := np.zeros_like(x))
     found = (step.value(x + h * u) - step.value(x - h * u)) / (2 * h)
@@ -129,8 +130,7 @@ def test_cautious_rows_majorise_the_energy(name):
     p, _ = ways(obstacle, 200)
     rng = np.random.default_rng(3)
     step = begun(energy, p, rng.normal(size=p.shape))
-    step = type(step)(**{f: getattr(step, f) for f in step.__dataclass_fields__} | {
-        "planes": step.planes._replace(grip=np.full(len(step.planes.vertices), 3.0)), "slip": 0.3})  # fmt: skip
+    step = replace(step, planes=step.planes._replace(grip=np.full(len(step.planes.vertices), 3.0)), slip=0.3)
     for size in (0.01, 0.1, 1.0):
         x, d = p + 0.5 * rng.normal(size=p.shape), size * rng.normal(size=p.shape)
         rows = step.rows(x, x + d, cautious=True)

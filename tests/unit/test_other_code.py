@@ -33,7 +33,9 @@ def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Own:
 
 def ran(made: Own, *options: str) -> str:
     """What the command says, in lines without breaks."""
-    told = CliRunner().invoke(app, ["run", str(made.sweep), "--results", str(made.sweep.parent / "r"), *options])
+    told = CliRunner().invoke(
+        app, ["run", str(made.sweep), "--here", "--results", str(made.sweep.parent / "r"), *options]
+    )
     assert told.exit_code == 0, told.output
     return re.sub(r"\s+", " ", told.output)
 

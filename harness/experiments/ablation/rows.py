@@ -26,7 +26,7 @@ def _as_in_runs(*names: str) -> tuple[Column, ...]:
 COLUMNS = (
     Column("kind", _TEXT, "", "whole, without, error or suggestion"),
     Column("name", _TEXT, "", "the effects left out, joined by +; of an error `solver` or `time-step`"),
-    *_as_in_runs("scene", "size", "vertices", "springs", "solver", "parameters", "time_step", "integrator"),
+    *_as_in_runs("scene", "size", "vertices", "springs", "solver", "parameters", "own", "time_step", "integrator"),
     *_as_in_runs("family", "reference", "minimises", "own_steps"),
     *_as_in_runs("first_guess", "max_iterations", "tolerance", "threads"),
     Column("frames", _INT, "", "steps simulated"),
