@@ -136,10 +136,14 @@ def test_a_source_that_is_removed_while_a_process_runs_stops_nothing(checkout: P
     assert asked(checkout, removing + ASK) == "6.0 0"
 
 
+TYPES = "TYPE_CHECKING"
+
+
 def imported(path: Path) -> set[str]:
-    """The project's modules that a source imports, by Python's own grammar."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    """The project's modules that a source imports when it runs, by Python's own grammar."""
+    found, tree = set(), ast.parse(path.read_text())
+    tree.body = [node for node in tree.body if not (isinstance(node, ast.If) and ast.unparse(node.test) == TYPES)]
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
