@@ -7,7 +7,7 @@ It is done in the second pass, where no clock runs. Whoever does nothing and rep
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection
 from itertools import islice
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from harness.base.errors import RunFailed
 from harness.reference.oracle import Oracle
+from harness.simulation.passing import Passing
 from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule
 from solvers.registry import minimises
 
@@ -28,38 +29,17 @@ _SAME = 1e-9
 """Of the largest coordinate, what two sums of the same terms may differ by after many iterations."""
 
 
-class Graded:
+class Graded(Passing):
     """A prepared solver whose answers in some frames are graded, as it gives them in turn."""
 
     def __init__(self, prepared: Prepared, solver: Solver, frames: Collection[int]) -> None:
         """frames: counted from 1."""
-        self._prepared, self._frames, self._done = prepared, frames if minimises(solver) else (), 0
+        super().__init__(prepared)
+        self._frames, self._done = frames if minimises(solver) else (), 0
         self._name = type(solver).__name__
         self._oracles: dict[float, Oracle] = {}
         self.found: dict[int, dict[str, Any]] = {}
         """By frame, the column `graded` of its row."""
-
-    @property
-    def choice(self) -> str:
-        """The solver's."""
-        return self._prepared.choice
-
-    @property
-    def facts(self) -> dict[str, float]:
-        """The solver's."""
-        return self._prepared.facts
-
-    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The solver's."""
-        return self._prepared.iterates(problem)
-
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The solver's."""
-        return self._prepared.phases(problem)
-
-    def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """The solver's."""
-        return self._prepared.residual_at(problem, p)
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """The solver's answer; raises RunFailed where it claims what is not so."""

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from harness.base.blame import where
 from harness.base.errors import RunFailed
+from harness.simulation.passing import Passing
 from solvers import sources
 from solvers.core.driver import Iterative
-from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule, System
+from solvers.problem import Prepared, Solution, Solver, StepProblem, StopRule, System
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -41,33 +42,12 @@ class Contract:
             raise RunFailed(f"{line}: wrote to {', '.join(written)}, which it was given; copy what is to be changed")
 
 
-class Checked:
+class Checked(Passing):
     """A prepared solver whose every solve is checked."""
 
     def __init__(self, prepared: Prepared, contract: Contract, own: Collection[str]) -> None:
-        self._prepared, self._contract, self._own = prepared, contract, own
-
-    @property
-    def choice(self) -> str:
-        """The solver's."""
-        return self._prepared.choice
-
-    @property
-    def facts(self) -> dict[str, float]:
-        """The solver's."""
-        return self._prepared.facts
-
-    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """The solver's."""
-        return self._prepared.iterates(problem)
-
-    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The solver's."""
-        return self._prepared.phases(problem)
-
-    def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """The solver's."""
-        return self._prepared.residual_at(problem, p)
+        super().__init__(prepared)
+        self._contract, self._own = contract, own
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """The solver's answer; raises RunFailed where it is none, or something was written to."""
