@@ -69,7 +69,8 @@ def run(
     from harness.base.claim import claimed
     from harness.base.progress import display
     from harness.config.load import load_any
-    from harness.experiments.sweep import failures, of_other_code, run_sweep
+    from harness.experiments.plan import of_other_code
+    from harness.experiments.sweep import failures, run_sweep
     from harness.report.named import draw_reports
     from harness.report.timing_table import summary_table
 
@@ -208,7 +209,7 @@ app.add_typer(study, name="gate-study")
 def list_runs(config: Config, results: Results = Path("results")) -> None:
     """Check a config, and show what would run and what is there already."""
     from harness.config.load import load_any
-    from harness.experiments.sweep import plan
+    from harness.experiments.plan import plan
 
     sweep = load_any(config, opens=False)
     table = Table("run", "scene", "size", "solver", "iterations", "frames", "threads", "state")

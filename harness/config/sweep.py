@@ -181,6 +181,11 @@ class RunSpec:
     time_limit: float | None
     memory_limit: float | None
 
+    @property
+    def title(self) -> str:
+        """The run in words."""
+        return f"{self.scene_name}{f' {self.size}' if self.size else ''} {self.solver.name}"
+
     def identity(self) -> str:
         """All that determines the run's result and timing on one machine, as canonical JSON; pictures come later, from
         the recording, and limits only say when to give up."""

@@ -6,11 +6,9 @@ final positions must equal the timed ones to the last bit. The rows are written 
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,12 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base import machine, rows
-from harness.base.blame import where
 from harness.base.errors import InputError, RunFailed
-from harness.base.files import CannotWrite, replacing
-from harness.base.stated import stated
-from harness.config.sweep import OPTIONS, RunSpec
+from harness.base.files import replacing
+from harness.base.worker import Tick
+from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts, solver_class
+from harness.experiments.columns import asked, common
+from harness.experiments.failure import failure
+from harness.experiments.plan import Files
 from harness.experiments.standing import standing
 from harness.record.base import RecordingInfo
 from harness.record.obstacles import listed
@@ -34,33 +34,12 @@ from harness.reference.grade import Graded
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
 from harness.simulation import times
-from harness.simulation.measure import Diverged, Measured, Settings, StepFailed, digest, measure
+from harness.simulation.measure import Measured, Settings, digest, measure
 from harness.simulation.observe import observe, require_numbers
 from harness.simulation.step import prepare
 from solvers import sources
-from solvers.problem import NotPositiveDefinite, Solver, StopRule, Unsupported
+from solvers.problem import Solver, StopRule
 from solvers.registry import SOLVERS, load, minimises
-
-Tick = Callable[[str], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Files:
-    """Where a run leaves its files."""
-
-    rows: Path
-    recording: Path
-    picture: Path
-
-    @classmethod
-    def of(cls, run: RunSpec, folder: Path) -> Files:
-        """The files of a run in the folder of its sweep."""
-        label = run.label(machine.describe().id)
-        return cls(
-            folder / "rows" / f"{label}.parquet",
-            folder / "recordings" / f"{label}.rrd",
-            folder / "pictures" / f"{label}.png",
-        )
 
 
 def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = None) -> list[dict[str, Any]]:
@@ -87,26 +66,6 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
     result = [shared | row for row in found]
     rows.write(files.rows, result)
     return result
-
-
-_STATUS: dict[type[BaseException], str] = {Unsupported: "unsupported", Diverged: "diverged"}
-
-
-def failure(error: BaseException, own: Collection[Path] = ()) -> dict[str, Any]:
-    """The row of a run that ended with an error, less what all its rows share; with the frame, where a step failed;
-    own: the solver's files, whose lines are blamed first. Raises CannotWrite if that is the error."""
-    if isinstance(error, CannotWrite):  # that is no outcome: a row of it would keep the run from being done again
-        raise error
-    if isinstance(error, StepFailed) and error.__cause__:
-        return failure(error.__cause__, own) | {"frame": error.frame}
-    return {"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error, own)}
-
-
-def _reason(error: BaseException, own: Collection[Path]) -> str:
-    """An error of ours speaks for itself; of any other the row also says what it was and where it came from."""
-    if isinstance(error, (Unsupported, NotPositiveDefinite, Diverged, RunFailed)):
-        return str(error)
-    return f"{type(error).__name__}: {error} ({where(error, set(map(str, own)))})"
 
 
 def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
@@ -253,39 +212,3 @@ def save_positions(path: Path, positions: np.ndarray) -> None:
     """Store positions (frames, n, 3) [m] under a partial name and rename. Raises CannotWrite."""
     with replacing(path) as partial:
         np.savez_compressed(partial, positions=positions)
-
-
-def common(run: RunSpec) -> dict[str, Any]:
-    """The columns that are the same in all rows of a run."""
-    limits = {"time_limit": run.time_limit, "memory_limit": run.memory_limit}
-    return {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep} | asked(run) | limits | provenance()
-
-
-def asked(run: RunSpec) -> dict[str, Any]:
-    """The columns that tell what a run was asked to do."""
-    return {
-        "scene": run.scene_name,
-        "size": run.size,
-        "solver": run.solver.name,
-        "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
-        "own": json.dumps([plugin.identity() for plugin in run.own()]) if run.own() else None,
-        **stated(run.solver.name),
-        **{option.column: getattr(run, name) for name, option in OPTIONS.items() if option.column},
-        "threads": machine.threads(run.threads).number,
-    }
-
-
-def provenance() -> dict[str, Any]:
-    """The columns that tell where, when and by which code something was measured."""
-    here = machine.describe()
-    return {
-        "machine": here.id,
-        "cpu": here.cpu,
-        "cores": here.cores,
-        "memory_gib": here.memory_gib,
-        "system": here.system,
-        "versions": json.dumps(machine.versions(), sort_keys=True),
-        "commit": machine.commit(),
-        "code": machine.code_hash(),
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-    }

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from harness.config.load import load_any
-from harness.experiments.run import Files, execute
+from harness.experiments.plan import Files
+from harness.experiments.run import execute
 from harness.record.base import Frame
 from harness.record.rerun import RerunRecorder
 from harness.record.shading import Shading

@@ -18,7 +18,8 @@ from harness.config.load import load_any
 from harness.config.schema import schema
 from harness.experiments.ablation.suggest import seen, suggestions
 from harness.experiments.accuracy.run import run_accuracy
-from harness.experiments.run import Files, execute
+from harness.experiments.plan import Files
+from harness.experiments.run import execute
 from harness.report.accuracy import draw
 from harness.report.robustness import RIGHT, read_cells
 from harness.report.style import marks

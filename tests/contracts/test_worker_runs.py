@@ -18,7 +18,7 @@ from typer.testing import CliRunner, Result
 from harness.base import rows
 from harness.cli import app
 from harness.config.load import load_any
-from harness.experiments.run import Files
+from harness.experiments.plan import Files
 from tests.own_solvers import OPTIONS, Own, own
 
 ROOT = Path(__file__).resolve().parents[2]

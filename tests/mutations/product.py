@@ -10,7 +10,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from harness.config.load import load_any
-from harness.experiments.run import Files, execute
+from harness.experiments.plan import Files
+from harness.experiments.run import execute
 
 SCENE = """
 mesh: {kind: grid}

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.config.load import load_any, load_scene
-from harness.experiments.run import Files, execute
+from harness.experiments.plan import Files
+from harness.experiments.run import execute
 from harness.record.reader import read_replay, summary
 from harness.reference.judge import Judge
 from harness.scenes.bind import Scene, build

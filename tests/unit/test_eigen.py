@@ -77,7 +77,8 @@ class _Other:
 
 
 def test_without_a_compiler_the_row_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from harness.experiments.run import Files, execute
+    from harness.experiments.plan import Files
+    from harness.experiments.run import execute
 
     monkeypatch.setattr(eigen.shutil, "which", lambda _: None)
     (tmp_path / "chain.yaml").write_text(SCENE)

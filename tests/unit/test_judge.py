@@ -11,7 +11,8 @@ import pytest
 from harness.base import rows
 from harness.base.errors import InputError
 from harness.config.load import load_any
-from harness.experiments.run import Files, execute
+from harness.experiments.plan import Files
+from harness.experiments.run import execute
 from harness.record.reader import read_replay
 from harness.reference.judge import Judge, is_minimum, reference
 from harness.reference.oracle import Oracle

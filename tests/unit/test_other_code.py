@@ -15,7 +15,7 @@ from harness.cli import app
 from harness.config.load import load_any
 from harness.experiments import run as run_module
 from harness.experiments.code import code, parts
-from harness.experiments.run import Files
+from harness.experiments.plan import Files
 from solvers import sources
 from solvers.registry import SOLVERS, load
 from tests.own_solvers import OPTIONS, Own, own

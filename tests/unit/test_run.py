@@ -8,7 +8,8 @@ import pytest
 from harness.base import machine
 from harness.config.load import load_any
 from harness.experiments import run
-from harness.experiments.run import Files, execute
+from harness.experiments.plan import Files
+from harness.experiments.run import execute
 from harness.simulation.measure import StepFailed
 from harness.simulation.observe import require_numbers
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from harness.experiments import run as runs
-from harness.experiments.run import Files, execute
+from harness.experiments.plan import Files
+from harness.experiments.run import execute
 from tests.own_solvers import OPTIONS, Own, own
 
 

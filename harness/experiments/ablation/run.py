@@ -15,7 +15,8 @@ from harness.experiments.ablation.difference import Motion, difference, rest_len
 from harness.experiments.ablation.rows import SCHEMA
 from harness.experiments.ablation.suggest import seen, suggestions
 from harness.experiments.ablation.turns import Turn, cost, motion, seconds, turns
-from harness.experiments.run import asked, failure, provenance
+from harness.experiments.columns import asked, provenance
+from harness.experiments.failure import failure
 from harness.scenes.bind import Scene, build
 from harness.simulation.measure import Settings
 from solvers.problem import Solver, StopRule

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from harness.experiments.run import failure
+from harness.experiments.failure import failure
 from harness.reference.minimiser import Uncertified
 from harness.reference.motion import Unintegrable
 from harness.reference.trajectory import Unpredictable

@@ -23,7 +23,7 @@ from harness.experiments.accuracy.failures import lost
 from harness.experiments.accuracy.rows import SCHEMA
 from harness.experiments.accuracy.solves import Graded, curve_rows
 from harness.experiments.accuracy.work import work_rows
-from harness.experiments.run import provenance
+from harness.experiments.columns import provenance
 from harness.reference.store import Store
 from harness.reference.trajectory import Trajectory
 

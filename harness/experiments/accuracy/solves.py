@@ -16,7 +16,7 @@ from harness.experiments.accuracy.curves import Curve, measure
 from harness.experiments.accuracy.failures import lost
 from harness.experiments.accuracy.recording import record
 from harness.experiments.accuracy.scales import distances, stiffness_ratio
-from harness.experiments.run import provenance
+from harness.experiments.columns import provenance
 from harness.reference.frozen import Frozen, bind
 from harness.reference.minimiser import Minimum, Reference
 from harness.reference.oracle import Oracle

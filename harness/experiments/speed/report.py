@@ -17,7 +17,7 @@ import pyarrow as pa
 from harness.base import machine, rows
 from harness.config.load import Sweep
 from harness.config.sweep import RunSpec, SolverSpec
-from harness.experiments.run import Files
+from harness.experiments.plan import Files
 from harness.experiments.speed import yardstick
 from harness.experiments.speed.candidates import Candidate, MachineCandidate, SolverCandidate, YardstickCandidate
 from harness.experiments.speed.rest import precision, rest_of

@@ -18,7 +18,8 @@ import numpy as np
 from harness.base import machine
 from harness.base.errors import RunFailed
 from harness.config.sweep import RunSpec
-from harness.experiments.run import common, failure
+from harness.experiments.columns import common
+from harness.experiments.failure import failure
 from harness.experiments.speed.candidates import Candidate, Reading
 from harness.simulation.measure import digest
 from solvers.problem import Positions

@@ -1,0 +1,47 @@
+"""Columns that rows of all experiments share: what was asked, and where, when and by which code it was measured."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from typing import Any
+
+from harness.base import machine
+from harness.base.stated import stated
+from harness.config.sweep import OPTIONS, RunSpec
+
+
+def common(run: RunSpec) -> dict[str, Any]:
+    """The columns that are the same in all rows of a run."""
+    limits = {"time_limit": run.time_limit, "memory_limit": run.memory_limit}
+    return {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep} | asked(run) | limits | provenance()
+
+
+def asked(run: RunSpec) -> dict[str, Any]:
+    """The columns that tell what a run was asked to do."""
+    return {
+        "scene": run.scene_name,
+        "size": run.size,
+        "solver": run.solver.name,
+        "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
+        "own": json.dumps([plugin.identity() for plugin in run.own()]) if run.own() else None,
+        **stated(run.solver.name),
+        **{option.column: getattr(run, name) for name, option in OPTIONS.items() if option.column},
+        "threads": machine.threads(run.threads).number,
+    }
+
+
+def provenance() -> dict[str, Any]:
+    """The columns that tell where, when and by which code something was measured."""
+    here = machine.describe()
+    return {
+        "machine": here.id,
+        "cpu": here.cpu,
+        "cores": here.cores,
+        "memory_gib": here.memory_gib,
+        "system": here.system,
+        "versions": json.dumps(machine.versions(), sort_keys=True),
+        "commit": machine.commit(),
+        "code": machine.code_hash(),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+    }

@@ -1,0 +1,32 @@
+"""What ends a measurement early, as the status and the reason of its row."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from harness.base.blame import where
+from harness.base.errors import RunFailed
+from harness.base.files import CannotWrite
+from harness.simulation.measure import Diverged, StepFailed
+from solvers.problem import NotPositiveDefinite, Unsupported
+
+_STATUS: dict[type[BaseException], str] = {Unsupported: "unsupported", Diverged: "diverged"}
+
+
+def failure(error: BaseException, own: Collection[Path] = ()) -> dict[str, Any]:
+    """The row of a run that ended with an error, less what all its rows share; with the frame, where a step failed;
+    own: the solver's files, whose lines are blamed first. Raises CannotWrite if that is the error."""
+    if isinstance(error, CannotWrite):  # that is no outcome: a row of it would keep the run from being done again
+        raise error
+    if isinstance(error, StepFailed) and error.__cause__:
+        return failure(error.__cause__, own) | {"frame": error.frame}
+    return {"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error, own)}
+
+
+def _reason(error: BaseException, own: Collection[Path]) -> str:
+    """An error of ours speaks for itself; of any other the row also says what it was and where it came from."""
+    if isinstance(error, (Unsupported, NotPositiveDefinite, Diverged, RunFailed)):
+        return str(error)
+    return f"{type(error).__name__}: {error} ({where(error, set(map(str, own)))})"

@@ -1,0 +1,100 @@
+"""What is there of a sweep and what is missing, told from the files of its runs; it simulates and draws nothing.
+
+A run is complete when its rows, its recording and its picture are in place. Rows are written after the recording,
+and a picture is drawn from the recording alone, so what a kill leaves undone is told from the files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+
+from harness.base import machine, rows
+from harness.config.sweep import RunSpec
+from harness.experiments.code import code, parts
+from harness.record.sound import whole_messages
+from solvers.plugins import Plugin
+
+DONE, MISSING = "done", "missing"
+NEEDED = ("run_id", "scene", "size", "solver", "status", "code")
+"""Columns without which a row tells nothing of a run."""
+
+_LIMITED = ("failed", "time-limit", "killed")
+"""How a run may end for its limits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Files:
+    """Where a run leaves its files."""
+
+    rows: Path
+    recording: Path
+    picture: Path
+
+    @classmethod
+    def of(cls, run: RunSpec, folder: Path) -> Files:
+        """The files of a run in the folder of its sweep."""
+        label = run.label(machine.describe().id)
+        return cls(
+            folder / "rows" / f"{label}.parquet",
+            folder / "recordings" / f"{label}.rrd",
+            folder / "pictures" / f"{label}.png",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A run of a sweep, its files, and its state: done, missing, or the status of a run that failed.
+
+    older: whether its rows were made by other code than today's; damage: what is wrong with its rows or its recording,
+    for which it is missing.
+    """
+
+    run: RunSpec
+    files: Files
+    state: str
+    older: bool
+    damage: str = ""
+
+
+def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
+    """Each run with its files and what is there already."""
+    codes: dict[frozenset[type | Plugin], str] = {}
+    planned = []
+    for run in runs:
+        files = Files.of(run, folder)
+        state, older, damage = MISSING, False, ""
+        if files.rows.exists():
+            there = rows.first(files.rows, needed=NEEDED)
+            if isinstance(there, str):
+                damage = f"{files.rows} {there}"
+            else:
+                state = DONE if there["status"] == "ok" else there["status"]
+                limits = there["time_limit"], there["memory_limit"]
+                if state in _LIMITED and limits != (run.time_limit, run.memory_limit):
+                    state = MISSING  # who failed within other limits has said nothing of these
+                if (made_of := parts(run)) not in codes:
+                    codes[made_of] = code(made_of)
+                older = there["code"] != codes[made_of]
+            if state == DONE and run.record:
+                damage = _unfit(files.recording)
+                state = MISSING if damage or not files.recording.exists() else DONE
+        planned.append(Planned(run, files, state, older, damage))
+    return planned
+
+
+def _unfit(recording: Path) -> str:
+    """What keeps a recording from being one, without reading all of it; nothing does where there is none."""
+    if not recording.exists():
+        return ""
+    whole = recording.is_file() and whole_messages(recording)[0]
+    return "" if whole else f"{recording} is cut before its end"
+
+
+def of_other_code(runs: Iterable[RunSpec], table: pa.Table) -> set[str]:
+    """The ids of those runs whose rows in the table were made by other code than today's."""
+    here, made = machine.describe().id, dict(zip(*(table[c].to_pylist() for c in ("run_id", "code")), strict=True))
+    return {name for run in runs if made.get(name := run.run_id(here)) != code(parts(run))}
