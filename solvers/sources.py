@@ -1,7 +1,9 @@
 """Which sources code depends on, and their digest: what tells kernels, and measurements, of other code apart.
 
 A source depends on itself and on those that its imports lead to, wherever in it they stand: within this project, and
-within its own folder or package where it lies elsewhere. Installed libraries are told by their versions.
+within its own folder or package where it lies elsewhere. It depends as well on what lies beside it under its own name
+in a language that is compiled, as `eigen.cpp` and `eigen.hpp` do beside `eigen.py`. Installed libraries are told by
+their versions.
 
 A process keeps what it has imported, whatever becomes of the files. So each source counts as it was when this module
 was imported, or when it was first asked for: one that was changed since has a digest that no other process has.
@@ -22,6 +24,9 @@ ROOT = Path(__file__).resolve().parents[1]
 """The folder of the project's packages."""
 
 PACKAGES = ("solvers", "harness")
+
+COMPILED = (".c", ".cc", ".cpp", ".cu", ".cuh", ".f90", ".h", ".hpp")
+"""Names of sources that a Python source of the same name compiles end so."""
 
 _INSTALLED = {str(Path(sysconfig.get_path(name)).resolve()) for name in ("stdlib", "purelib", "platlib")}
 _TYPES_ALONE = re.compile(r"^if TYPE_CHECKING:\n(?:[ \t]+\S.*\n|\n)+", re.M)
@@ -45,7 +50,7 @@ def _stamps(folder: str) -> Iterator[tuple[str, Stamp]]:
         for entry in entries:
             if entry.is_dir():
                 yield from _stamps(entry.path)
-            elif entry.name.endswith(".py"):
+            elif entry.name.endswith((".py", *COMPILED)):
                 found = entry.stat()
                 yield entry.path, (found.st_mtime_ns, found.st_size)
 
@@ -124,13 +129,16 @@ def _held(path: str) -> bytes:
 
 @cache
 def _imported(source: str) -> set[str]:
-    """The paths of the sources that a source imports, and of the packages that they lie in."""
+    """The paths of the sources that a source imports or compiles, and of the packages that they lie in."""
+    if not source.endswith(".py"):
+        return set()
+    compiled = {path for path in (f"{source.removesuffix('.py')}{ending}" for ending in COMPILED) if _exists(path)}
     try:
         text = Path(source).read_text(encoding="utf-8", errors="replace")
     except OSError:  # it was removed, which `digest` notes
-        return set()
+        return compiled
     run = _TYPES_ALONE.sub("", text)
-    return {path for base, name in _names(run) for path in _found(source, base, name)}
+    return compiled | {path for base, name in _names(run) for path in _found(source, base, name)}
 
 
 def _names(text: str) -> Iterator[tuple[str, str]]:
@@ -158,8 +166,13 @@ def _found(source: str, base: str, name: str) -> Iterator[str]:
     for part in parts:
         place = os.path.join(place, part)
         for path in (f"{place}.py", os.path.join(place, "__init__.py")):
-            if path in _FIRST or (not _own(path) and os.path.isfile(path)):
+            if _exists(path):
                 yield path
+
+
+def _exists(path: str) -> bool:
+    """Whether there is a source, or was one of ours when this module was imported."""
+    return path in _FIRST or (not _own(path) and os.path.isfile(path))
 
 
 @cache

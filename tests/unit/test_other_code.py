@@ -17,7 +17,7 @@ from harness.experiments import run as run_module
 from harness.experiments.code import code, parts
 from harness.experiments.plan import Files
 from solvers import sources
-from solvers.registry import SOLVERS, load
+from solvers.registry import OPTIONAL, SOLVERS, load
 from tests.own_solvers import OPTIONS, Own, own
 
 
@@ -84,6 +84,20 @@ def test_a_run_depends_on_its_own_solver_and_effects_and_on_no_others(tmp_path: 
     others = {str(file) for name in ("xpbd", "vbd", "newton") for file in sources.of_class(load(SOLVERS[name]))}
     assert not reached & others
     assert not names & {"effects/wind.py", "effects/gas.py", "mesh/chain.py", "harness/cli.py", "report/page.py"}
+
+
+def test_the_code_of_a_run_covers_what_its_solver_compiles_in_another_language(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    made = own(tmp_path, monkeypatch)
+    for name in ("another", made.solver.stem):
+        before = code(parts(made.run()))
+        made.solver.with_name(f"{name}.hpp").write_text("import what;\n")
+        sources.reached.cache_clear()
+        sources._imported.cache_clear()
+        assert (code(parts(made.run())) != before) == (name == made.solver.stem)
+    (eigen,) = sources.of_class(load(OPTIONAL["eigen"]))
+    assert {str(eigen.with_suffix(ending)) for ending in (".cpp", ".hpp")} <= sources.reached(str(eigen))
 
 
 def test_pictures_are_drawn_later_without_a_run_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
