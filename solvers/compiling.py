@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from numba import njit
+from numba import njit  # noqa: TID251
 
 from solvers.caching import KernelCache
 

@@ -36,6 +36,8 @@ def test_the_code_keeps_the_rules_of_the_linter():
     [
         ("harness/record/new.py", '"""Doc."""\n\nimport rerun as rr\n\nrr.init("app")\n', "TID251"),
         ("harness/record/new.py", '"""Doc."""\n\nfrom rerun import log\n\nlog("a", 1)\n', "TID251"),
+        ("solvers/new.py", '"""Doc."""\n\nfrom numba import njit\n\nfast = njit(cache=True)(abs)\n', "TID251"),
+        ("solvers/new.py", '"""Doc."""\n\nimport numba\n\nfast = numba.njit(abs)\n', "TID251"),
         ("solvers/new.py", "x = 1\n", "D100"),
         ("solvers/new.py", '"""Doc."""\n\n\nclass Public:\n    x = 1\n', "D101"),
         ("harness/new.py", '"""Doc."""\n\n\ndef public() -> None:\n    return\n', "D103"),

@@ -109,7 +109,7 @@ def inverse_roots(estimates: bool):
         return types.void(s, out), generate
 
     root: Any = intrinsic(declare)
-    return numba.njit(lambda s, out: root(s, out))
+    return numba.njit(lambda s, out: root(s, out))  # noqa: TID251
 
 
 ESTIMATES = Vectors(cpu_target.target_context, None).estimates

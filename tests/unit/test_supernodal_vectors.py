@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numba import njit
+from numba import njit  # noqa: TID251
 
 from solvers.linear.supernodal_solve import backwards, forwards
 from solvers.memory import aligned
