@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 from solvers.kernels.hessian import multiply
+from solvers.linear.krylov import CURVED, compiled_over
 from solvers.linear.supernodal import Supernodal
 from solvers.linear.supernodal_solve import solve
 from solvers.linear.team import Team
@@ -41,49 +42,84 @@ class Factor(NamedTuple):
         return cls(factor.squares, factor.panels, at.places, at.chunks, at.spans, by_slot, by_vertex, work, team)
 
 
-@kernel
-def direction(
-    terms, linear, form, joined, curvature, factor, threads, held, gradient, descent, eta, most, scratch, d
-):  # fmt: skip
-    """Write d (n, 3) [m].
+class Newton(NamedTuple):
+    """A Newton equation H d = -g that is being solved.
 
-    linear, form, joined, curvature: see `hessian.multiply`; threads: of a solve, None for one; held: vertices that do
-    not move; gradient, descent (n, 3): g [N] and Q^-1 g [m]; eta: what is left of |g|; most: products with H; scratch
-    (4, n, 3), which is zero at the held vertices.
+    hessian: see `hessian.multiply`; factor, threads: of a solve with Q, None for one; held: vertices that do not move;
+    d, r, p, z, product (n, 3): the iterate, its residual, its direction, what the factor makes of the residual, and
+    the Hessian of the direction.
     """
-    r, s, z, product = scratch[0], scratch[1], scratch[2], scratch[3]
-    for i in range(len(d)):
+
+    hessian: tuple[Any, ...]
+    factor: Factor
+    threads: int | None
+    held: NDArray[np.int64]
+    d: NDArray[np.float64]
+    r: NDArray[np.float64]
+    p: NDArray[np.float64]
+    z: NDArray[np.float64]
+    product: NDArray[np.float64]
+
+
+@inner
+def _turn(state, product, before):
+    newton, _ = state
+    scale = product / before
+    for i in range(len(newton.p)):
         for c in range(3):
-            d[i, c], r[i, c], s[i, c] = 0.0, gradient[i, c], -descent[i, c]
-    norm = _dot(gradient, descent)
-    limit = eta * eta * norm
-    for k in range(most):
-        multiply(terms, linear, form, joined, curvature, s, product)
-        for v in held:
+            newton.p[i, c] = newton.z[i, c] + scale * newton.p[i, c]
+    multiply(*newton.hessian, newton.p, newton.product)
+    for v in newton.held:
+        for c in range(3):
+            newton.product[v, c] = 0.0
+    return _dot(newton.p, newton.product)
+
+
+@inner
+def _go(state, product, curvature):
+    newton, _ = state
+    length = product / curvature
+    for i in range(len(newton.d)):
+        for c in range(3):
+            newton.d[i, c] += length * newton.p[i, c]
+            newton.r[i, c] -= length * newton.product[i, c]
+    at = newton.factor
+    solve(at.squares, at.panels, at.places, at.chunks, at.spans, at.by_slot, at.by_vertex, at.work, newton.r, newton.z,
+          at.team, newton.threads)  # fmt: skip
+    return _dot(newton.r, newton.z)
+
+
+@inner
+def _convex(state, curvature):
+    return not curvature <= 0.0
+
+
+@inner
+def _near(state, product):
+    _, limit = state
+    return product <= limit
+
+
+_iterate = compiled_over(_turn, _go, _convex, _near)
+
+
+@kernel
+def direction(newton, gradient, descent, eta, most):
+    """Write newton.d (n, 3) [m]: -Q^-1 g, where the Hessian is not convex along that.
+
+    gradient, descent (n, 3): g [N] and Q^-1 g [m]; eta: what is left of |g|; most: products with H. Vectors of
+    `newton` are zero at the held vertices.
+    """
+    for i in range(len(newton.d)):
+        for c in range(3):
+            newton.d[i, c] = newton.p[i, c] = 0.0
+            newton.r[i, c], newton.z[i, c] = -gradient[i, c], -descent[i, c]
+    product = _dot(gradient, descent)
+    count, ended = _iterate((newton, eta * eta * product), product, most)
+    if ended == CURVED and count == 0:
+        for i in range(len(newton.d)):
             for c in range(3):
-                product[v, c] = 0.0
-        along = _dot(s, product)
-        if along <= 0.0:
-            if k == 0:
-                for i in range(len(d)):
-                    for c in range(3):
-                        d[i, c] = s[i, c]
-            return
-        length, before = norm / along, norm
-        for i in range(len(d)):
-            for c in range(3):
-                d[i, c] += length * s[i, c]
-                r[i, c] += length * product[i, c]
-        solve(
-            factor.squares, factor.panels, factor.places, factor.chunks, factor.spans, factor.by_slot,
-            factor.by_vertex, factor.work, r, z, factor.team, threads,
-        )  # fmt: skip
-        norm = _dot(r, z)
-        if norm <= limit:
-            return
-        for i in range(len(d)):
-            for c in range(3):
-                s[i, c] = norm / before * s[i, c] - z[i, c]
+                newton.d[i, c] = newton.p[i, c]
 
 
 @inner

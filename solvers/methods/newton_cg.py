@@ -24,6 +24,7 @@ from solvers.core.fixed_objective import Objective
 from solvers.core.objective import Hessian, StepObjective
 from solvers.kernels import conjugate
 from solvers.linear.inverse import Inverse
+from solvers.linear.krylov import CURVED, Iteration
 from solvers.linear.supernodal import Supernodal
 from solvers.problem import Positions, System
 
@@ -148,24 +149,43 @@ class Method:
         """What conjugate gradients make of -H^-1 g; descent: what `solve`, the preconditioner, makes of g."""
         if self.compiled and not step.own and not step.touched:
             return self.compiled.direction(hessian, at, descent, eta)
-        d, r, s = np.zeros_like(descent), at.gradient.copy(), -descent
-        norm = dot(at.gradient, descent)
-        limit = eta**2 * norm
-        for k in range(_MOST):
-            product = hessian.multiply(s)
-            curvature = dot(s, product)
-            if curvature <= 0.0:
-                return s if k == 0 else d
-            length = norm / curvature
-            d += length * s
-            r += length * product
-            z = solve(r)
-            norm, before = dot(r, z), norm
-            if norm <= limit:
-                break
-            s *= norm / before
-            s -= z
-        return d
+        product = dot(at.gradient, descent)
+        newton = _Newton(hessian, solve, at.gradient, descent, eta**2 * product)
+        count, ended = newton.iterate(product, _MOST)
+        return newton.p if ended == CURVED and count == 0 else newton.d
+
+
+class _Newton(Iteration):
+    """H d = -g to a limit of r'z [J]; descent: what `solve`, the preconditioner, makes of the gradient g."""
+
+    def __init__(
+        self, hessian: Hessian, solve: Preconditioner, gradient: Positions, descent: Positions, limit: float
+    ) -> None:
+        self._hessian, self._solve, self._limit = hessian, solve, limit
+        self.d, self.p, self._r, self._z = np.zeros_like(descent), np.zeros_like(descent), -gradient, -descent
+
+    def turn(self, product: float, before: float) -> float:
+        """See Iteration."""
+        self.p *= product / before
+        self.p += self._z
+        self._product = self._hessian.multiply(self.p)
+        return dot(self.p, self._product)
+
+    def go(self, product: float, curvature: float) -> float:
+        """See Iteration."""
+        length = product / curvature
+        self.d += length * self.p
+        self._r -= length * self._product
+        self._z = self._solve(self._r)
+        return dot(self._r, self._z)
+
+    def convex(self, curvature: float) -> bool:
+        """See Iteration."""
+        return not curvature <= 0.0
+
+    def near(self, product: float) -> bool:
+        """See Iteration."""
+        return product <= self._limit
 
 
 def _known(metric: Metric) -> Supernodal | None:
@@ -187,6 +207,7 @@ class _Compiled:
     def direction(self, hessian: Hessian, at: Point, descent: Positions, eta: float) -> Positions:
         """See `Method._direction`."""
         d = np.empty_like(descent)
-        fixed = *hessian.compiled, self._factor, self._threads(), self._held
-        conjugate.direction(*fixed, at.gradient, descent, eta, _MOST, self._scratch, d)
+        solving = self._factor, self._threads(), self._held
+        newton = conjugate.Newton(hessian.compiled, *solving, d, *self._scratch)
+        conjugate.direction(newton, at.gradient, descent, eta, _MOST)
         return d
