@@ -60,10 +60,11 @@ def gradient_round_off(problem: StepProblem, p: Positions) -> Terms:
 
 
 def at_rest(problem: StepProblem, p: Positions, factor: float = FACTOR) -> bool:
-    """Whether the gradient at p (n, 3) [m] is round-off at every vertex that no pin holds: at most `factor` times the
-    bound, where that is finite. A sum over vertices would let one part's round-off hide another's gradient."""
+    """Whether the gradient at p (n, 3) [m] is round-off at every free vertex: at most `factor` times the bound, where
+    that is finite. A sum over vertices would let one part's round-off hide another's gradient, and a vertex that a
+    penalty holds is one that others hang on."""
     bound, size = gradient_round_off(problem, p), lengths(problem.gradient(p))
-    return bool(((size <= factor * bound) & np.isfinite(bound))[problem.system.unpinned].all())
+    return bool(((size <= factor * bound) & np.isfinite(bound))[problem.system.free].all())
 
 
 def within(gradient: Positions, bound: Terms) -> Positions:
