@@ -35,6 +35,7 @@ from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
 
 from solvers import sources
+from solvers.linking import rebuilt
 
 _UNUSED = 3600.0
 """Seconds for which no process has looked into a folder of other sources before it goes; what a process that still runs
@@ -84,12 +85,14 @@ class KernelCache(_CACHE):
             return None
         with suppress(OSError):
             os.utime(path.parent)
-        return CompileResult._rebuild(target_context, *kept) if there == key else None
+        return rebuilt(target_context, kept) if there == key else None
 
     def save_overload(self, sig: Any, data: CompileResult) -> None:
         """Keep what was compiled for a signature, where it can be kept and there is room."""
         if data.library.has_dynamic_globals or not all(lifted.can_cache for lifted in data.lifted):
             return
+        for env in data._find_referenced_environments():  # of what it links in
+            data.library.codegen.set_env(env.env_name, env)
         key = (sig, data.target_context.codegen().magic_tuple(), self._fixed)
         path = self._path(key)
         with suppress(OSError):

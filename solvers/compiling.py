@@ -1,8 +1,8 @@
 """How kernels are compiled: kept on disk, and without counting references to arrays.
 
 Kernels neither make arrays nor keep them, so there is nothing to count; counting took half of a step of a hundred
-vertices. They let Python's other threads run meanwhile. Inner ones are called by kernels alone and need no wrappers
-for Python, which take longest to compile.
+vertices. They let Python's other threads run meanwhile. Inner ones are called by kernels alone: they need no wrappers
+for Python, and no machine code of their own (`solvers.linking`).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 from numba import njit  # noqa: TID251
 
 from solvers.caching import KernelCache
+from solvers.linking import LinkedCompiler
 
 
 def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -27,9 +28,12 @@ def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 _bare: Any = {"_nrt": False, "nogil": True}
-inner_options: Any = {**_bare, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_alone: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_linked: Any = {**_alone, "pipeline_class": LinkedCompiler}
+inner_options: Any = {**_bare, **_linked}
 
-kernel: Any = kept(**_bare)
+kernel: Any = kept(**_bare, no_cfunc_wrapper=True)
 inner: Any = kept(**inner_options)
+part: Any = kept(**_linked)  # an inner one that makes arrays
 inner_closure: Any = njit(**inner_options)  # has no name on disk; kept within what calls it
-inner_in_parallel: Any = kept(**inner_options, parallel=True)
+inner_in_parallel: Any = kept(**_bare, **_alone, parallel=True)

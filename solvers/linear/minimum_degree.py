@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from solvers.compiling import kept
+from solvers.compiling import kept, part
 
 
-@kept()
+@part
 def _bits(word):
     """The number of ones in a 64-bit word (Warren, Hacker's Delight, section 5-1)."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
@@ -20,8 +20,8 @@ def _bits(word):
     return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@kept()
-def minimum_degree(pointers, neighbours, piece, local):
+@part
+def of_piece(pointers, neighbours, piece, local):
     """Sort `piece` into minimum degree order. `local` (n,) is -1 on entry and on return."""
     size = len(piece)
     members = size
@@ -74,3 +74,9 @@ def minimum_degree(pointers, neighbours, piece, local):
                 for k in range(words):
                     rows[i, k] |= rows[best, k]
                     degree[i] += _bits(rows[i, k])
+
+
+@kept()
+def minimum_degree(pointers, neighbours, order):
+    """Sort `order`, all vertices of a graph, into minimum degree order."""
+    of_piece(pointers, neighbours, order, np.full(len(order), -1, np.int32))

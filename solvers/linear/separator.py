@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import kept
+from solvers.compiling import part
 
 LANDMARKS = 8
 _FEW = 4
@@ -47,7 +47,7 @@ _PATIENCE = 60
 """How many moves in a row may leave the separator no better before a pass of refinement ends."""
 
 
-@kept()
+@part
 def _breadth_first(pointers, neighbours, owner, number, root, dist, queue):
     """Graph distances from `root` within its piece into `dist`, which is -1 there; returns the count of vertices."""
     queue[0] = root
@@ -65,7 +65,7 @@ def _breadth_first(pointers, neighbours, owner, number, root, dist, queue):
     return tail
 
 
-@kept()
+@part
 def _distances(pointers, neighbours, owner, number, piece, begin, end, dist, queue):
     """Distances of the piece's vertices from landmarks `begin` to `end`, as far apart as may be, into `dist`."""
     far = piece[0]
@@ -87,7 +87,7 @@ def _distances(pointers, neighbours, owner, number, piece, begin, end, dist, que
         _breadth_first(pointers, neighbours, owner, number, far, dist[:, k], queue)
 
 
-@kept()
+@part
 def separate(pointers, neighbours, owner, number, piece, dist, field, queue):
     """The sides (len(piece),) of the best cut of any field, or an empty array where there is none.
 
@@ -149,7 +149,7 @@ def separate(pointers, neighbours, owner, number, piece, dist, field, queue):
     return side
 
 
-@kept()
+@part
 def _combine(dist, weights, piece, field, low, high):
     """Write weighted sums of distances to `field`, and their least and greatest values to `low` and `high`."""
     low[:] = 2**31 - 1
@@ -167,7 +167,7 @@ def _combine(dist, weights, piece, field, low, high):
             high[k] = max(high[k], total[k])
 
 
-@kept()
+@part
 def refine(pointers, neighbours, piece, side, local):
     """Shrink the separator in `side` by moving its vertices to a side, which pulls their neighbours there in.
 
@@ -257,7 +257,7 @@ def refine(pointers, neighbours, piece, side, local):
         local[piece[i]] = -1
 
 
-@kept()
+@part
 def _count_pull(pointers, neighbours, piece, side, local, i, pull):
     """Count i's neighbours on either side."""
     v = piece[i]

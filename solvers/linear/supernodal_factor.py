@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from solvers.compiling import kept
+from solvers.compiling import kept, part
 from solvers.linear.supernodes import WIDTH
 from solvers.vectors.supernodal import add_forward
 
@@ -130,25 +130,25 @@ def factorise(
     return -1
 
 
-@kept()
+@part
 def _padded(count):
     """The count, rounded up to whole strips."""
     return (count + 3) // 4 * 4
 
 
-@kept()
+@part
 def _at(size, row, col):
     """Where a front of a size has an entry."""
     return 4 * ((col >> 2) * size + row) + (col & 3)
 
 
-@kept()
+@part
 def _in_tile(row, col, width):
     """Where a panel of a width has an entry: by tiles of four rows, each column by column."""
     return (row >> 2) * 4 * width + 4 * col + (row & 3)
 
 
-@kept()
+@part
 def _extend_add(front, size, stack, begin, rows, start, end, place):
     """Add a child's update matrix to its parent's front."""
     count = end - start
@@ -161,7 +161,7 @@ def _extend_add(front, size, stack, begin, rows, start, end, place):
             front[target + 4 * place[rows[start + a]]] += stack[source + 4 * a]
 
 
-@kept()
+@part
 def _eliminate(
     front,
     size,

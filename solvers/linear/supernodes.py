@@ -11,7 +11,7 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import kept
+from solvers.compiling import kept, part
 
 WIDTH = 16
 """The most columns that a panel has."""
@@ -30,7 +30,7 @@ _WORTH_GROUPS = 3e4
 second one eats up most of what it gains: 1.1 times as fast at 16 x 16, 1.3 at 20 x 20, 1.6 at 32 x 32."""
 
 
-@kept()
+@part
 def _cost(width, rows):
     """What a supernode costs a solve, in the cost of an entry."""
     total = 0.0
