@@ -149,7 +149,7 @@ class Contact:
             self.friction * stiffness * when * depth,
         )
 
-    def _gap(self, p: Positions) -> Array:
+    def gap(self, p: Positions) -> Array:
         """n.x - d (k,) [m]."""
         return _dots(self.planes.normal, p[self.planes.vertices]) - self.planes.offset
 
@@ -166,14 +166,14 @@ class Contact:
             return 0.0
         grips, _, length = self._slipped(p)
         rounded = np.where(length <= self.slip, 0.5 * length**2 / self.slip, length - 0.5 * self.slip)
-        pressed = self.planes.stiffness @ np.minimum(0.0, self._gap(p)) ** 2
+        pressed = self.planes.stiffness @ np.minimum(0.0, self.gap(p)) ** 2
         return 0.5 * float(pressed) + float(self.planes.grip[grips] @ rounded)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N], shape (n, 3), to `out`."""
         if self.idle():
             return
-        planes, gap = self.planes, self._gap(p)
+        planes, gap = self.planes, self.gap(p)
         np.add.at(out, planes.vertices, (planes.stiffness * np.minimum(0.0, gap))[:, None] * planes.normal)
         grips, u, length = self._slipped(p)
         np.add.at(out, planes.vertices[grips], (planes.grip[grips] / np.maximum(self.slip, length))[:, None] * u)
@@ -185,7 +185,7 @@ class Contact:
             return
         planes, size = self.planes, np.sqrt(_dots(p, p))[self.planes.vertices]
         reach = size + np.abs(planes.offset)
-        presses = self._gap(p) <= EPS * reach
+        presses = self.gap(p) <= EPS * reach
         np.add.at(out, planes.vertices, np.where(presses, planes.stiffness * reach, 0.0))
         grips, _, length = self._slipped(p)
         anchor = planes.anchor[grips]
@@ -208,8 +208,8 @@ class Contact:
 
         Those of friction are exact, and majorise the energy where `cautious`.
         """
-        planes, gap = self.planes, self._gap(p)
-        pressed = np.flatnonzero((gap < 0.0) | (self._gap(trial) < 0.0))
+        planes, gap = self.planes, self.gap(p)
+        pressed = np.flatnonzero((gap < 0.0) | (self.gap(trial) < 0.0))
         grips, u, length = self._slipped(p)
         normal, weight = planes.normal[grips], planes.grip[grips] / np.maximum(self.slip, length)
         sticks = length <= self.slip

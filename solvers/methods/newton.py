@@ -6,23 +6,29 @@ The Hessian of compressed springs may be indefinite. It is left exact wherever i
 convergence quadratic; where it has none, more and more is taken from the springs' negative lateral parts, and in the
 end a multiple of the diagonal of Q is added. Clamping those parts everywhere (Teran et al. 2005) would converge
 linearly. A point where the gradient vanishes but the exact Hessian has no factor is left (`solvers.core.saddles`).
+
+Where something is touched, an iteration settles friction, and may be several steps (`solvers.contact.settling`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from solvers.about import About, Reference
+from solvers.contact.touching import is_contact
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
 from solvers.core.saddles import certified, leave
-from solvers.problem import System
+from solvers.problem import Positions, System
+
+if TYPE_CHECKING:
+    from solvers.contact.settling import Settling
 
 _LEVELS = ((1.0, 0.0), (0.9, 0.0), (0.5, 0.0), (0.0, 0.0), *((0.0, 10.0**k) for k in range(-4, 9, 2)))
 """What is kept of negative lateral parts, and what multiple of Q's diagonal is added: the first that factorises."""
@@ -58,10 +64,17 @@ class NewtonMethod:
     def __init__(self, metric: Metric) -> None:
         self._metric = metric
         self._diagonal: NDArray[np.float64] = np.repeat(metric.diagonal, 3)
+        self._settling: Settling | None = None
+        if any(is_contact(energy) for energy in metric.system.energies):
+            from solvers.contact.settling import Settling  # for those who need it
+
+            self._settling = Settling(metric)
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
         """The points after `start`."""
         point, steepest = start, 0.0
+        if self._settling and step.touched:
+            point = self._settling.start(step, point)
         while not point.stalled:
             point, steepest = self._next(step, point, steepest)
             yield point
@@ -91,7 +104,21 @@ class NewtonMethod:
         steepest = max(fall, steepest)
         known = fall > self._metric.round_off(at.positions)
         slight = fall <= _SLIGHT * steepest
-        found = search(step, at, direction) if known and not (slight and level > 0) else None
+        found = None
+        if known and not (slight and level > 0):
+            found = self._descent(step, at, direction, level == 0)
         if found is None and level > 0:
             found = leave(step, at, hessian, self._diagonal) or (search(step, at, direction) if known else None)
         return found or at._replace(stalled=True), steepest
+
+    def _descent(self, step: StepObjective, at: Point, direction: Positions, exact: bool) -> Point | None:
+        """A lower point by a direction, None for none; exact: whether nothing was added to the Hessian."""
+        if self._settling is None or not exact or not step.touched:
+            return search(step, at, direction)
+        return self._settling.search(step, at, direction, lambda point: self._exact(step, point))
+
+    @staticmethod
+    def _exact(step: StepObjective, at: Point) -> Positions | None:
+        """The direction from a point by the exact Hessian, None where it is not positive definite."""
+        hessian = step.hessian(at.positions)
+        return -hessian.solve(at.gradient) if hessian.factorise() else None

@@ -84,8 +84,8 @@ _TABLE = (
     (
         "contact-side",
         "solvers/contact/energy.py",
-        "@ np.minimum(0.0, self._gap(p)) ** 2",
-        "@ np.maximum(0.0, self._gap(p)) ** 2",
+        "@ np.minimum(0.0, self.gap(p)) ** 2",
+        "@ np.maximum(0.0, self.gap(p)) ** 2",
         f"{_U}/test_effect_contact.py",
     ),
     (
