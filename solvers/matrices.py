@@ -15,7 +15,7 @@ from functools import reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array, csr_array, dia_array
+from scipy.sparse import coo_array, csc_array, csr_array, dia_array
 from scipy.sparse.csgraph import connected_components
 
 from solvers.problem import Energy, LaggedEnergy, NotPositiveDefinite, ProjectiveEnergy, Start, System
@@ -136,10 +136,10 @@ def energy_norm(Q: Dense | csr_array, e: Dense) -> float:
 def diagonal(values: Dense) -> csr_array:
     """A diagonal matrix [any unit], shape (n, n), without entries for zeros."""
     n = len(values)
-    return without_zeros(csr_array(dia_array((values[None, :], [0]), shape=(n, n))))
+    return without_zeros(csr_array(dia_array((values[None, :], np.array([0])), shape=(n, n))))
 
 
-def without_zeros(matrix: csr_array) -> csr_array:
+def without_zeros(matrix: csr_array | csc_array) -> csr_array:
     """The matrix with duplicates summed, columns sorted and explicit zeros dropped."""
     matrix = csr_array(matrix)
     matrix.sum_duplicates()

@@ -1,27 +1,18 @@
-"""Config files: YAML to plain data that remembers its lines, and data to models with every mistake at once.
-
-Only the plain values of YAML 1.2 are read (mappings, lists, text, numbers, booleans, null): a tag or a
-directive is refused, and so is a file that exceeds the limits below once its aliases are expanded.
-"""
+"""Configs as plain data that remembers its lines, and data to models with every mistake at once."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeGuard, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
-from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
-from ruamel.yaml.reader import ReaderError
 
 from harness.base.errors import InputError, Mistake, did_you_mean
 
-MAX_BYTES, MAX_NODES, MAX_DEPTH = 2**18, 100_000, 32
 MAX_MISTAKES = 100
 
 Key = tuple[str | int, ...]
@@ -41,8 +32,8 @@ class Document:
 
     path: Path
     data: dict[str, Any]
-    lines: dict[Key, int] = field(default_factory=dict)
-    mistakes: list[Mistake] = field(default_factory=list)
+    lines: dict[Key, int] = field(default_factory=dict[Key, int])
+    mistakes: list[Mistake] = field(default_factory=list[Mistake])
     opens: bool = True
 
     def report(self, problem: str, at: Key = ()) -> None:
@@ -72,8 +63,8 @@ class Document:
 
     def choose(self, data: Any, table: Mapping[str, Any], tag: str, at: Key) -> tuple[str, dict[str, Any]] | None:
         """Split the mapping `data` into the name under its key `tag`, one of `table`, and its other keys."""
-        if not isinstance(data, dict) or not isinstance(data.get(tag), str):
-            place = (*at, tag) if isinstance(data, dict) and tag in data else at
+        if not is_mapping(data) or not isinstance(data.get(tag), str):
+            place = (*at, tag) if is_mapping(data) and tag in data else at
             self.report(f"should be a mapping with a `{tag}`, {did_you_mean('', table)}", place)
             return None
         if data[tag] not in table:
@@ -88,126 +79,20 @@ class Document:
         return InputError(found[:MAX_MISTAKES] + more)
 
 
-def read_bytes(path: Path) -> bytes:
-    """The content of a config; InputError when it is missing, no plain file, unreadable or too large."""
-    try:
-        if path.exists() and not path.is_file():
-            raise InputError(Mistake("is not a file; give a scene or a sweep (*.yaml, *.json)", path))
-        with path.open("rb") as file:
-            raw = file.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(Mistake(f"cannot be read: {reason}", path)) from error
-    if len(raw) > MAX_BYTES:
-        raise InputError(Mistake(f"is larger than {MAX_BYTES} bytes; a config is small", path))
-    return raw
-
-
-def read_yaml(path: Path) -> Document:
-    """Read a YAML file that holds one mapping; InputError with the line for everything else."""
-    try:
-        text = read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = error.object.count(b"\n", 0, error.start) + 1
-        raise InputError(Mistake("is not text in UTF-8", path, line)) from error
-    for number, line in enumerate(text.splitlines(), 1):
-        if line.startswith("%"):
-            raise InputError(Mistake("YAML directives (%) are not allowed; remove the line", path, number))
-    yaml = YAML(typ="safe", pure=True)
-    yaml.max_depth = MAX_DEPTH
-    try:
-        node = yaml.compose(text)
-    except ReaderError as error:
-        at = int(error.position)
-        problem = f"holds the character {chr(error.character)!r}, which is not allowed"
-        raise InputError(Mistake(problem, path, text.count("\n", 0, at) + 1)) from error
-    except (YAMLError, ValueError) as error:
-        line = error.problem_mark.line + 1 if isinstance(error, MarkedYAMLError) and error.problem_mark else None
-        parts = [getattr(error, name, None) for name in ("context", "problem")]
-        problem = ", ".join(filter(None, parts)) or "cannot be parsed"
-        raise InputError(Mistake(f"is not YAML: {problem}", path, line)) from error
-    document = Document(path, {})
-    if not isinstance(node, MappingNode):
-        document.lines = {(): node.start_mark.line + 1} if node else {}
-        document.report("should hold a mapping of keys to values; it is " + ("a value" if node else "empty"))
-    else:
-        document.data = _Converter(document).convert(node, (), 0)
-    if document.mistakes:
-        raise document.error()
-    return document
-
-
-_SCALARS: dict[str, Callable[[str], Any]] = {
-    "str": str,
-    "timestamp": str,
-    "null": lambda text: None,
-    "bool": lambda text: text.lower() == "true",
-    "int": lambda text: _integer(text.replace("_", "")),
-    "float": lambda text: _number(text.replace("_", "")),
-}
-_CORE = "tag:yaml.org,2002:"
-
-
-def _integer(text: str) -> int:
-    value = int(text, {"0x": 16, "0o": 8}.get(text.lstrip("+-")[:2], 10))
-    if abs(value) >= 2**63:
-        raise ValueError("too large")
-    return value
-
-
-def _number(text: str) -> float | int:
-    """A float; 1e5, a whole number without a point, may also stand where an integer is wanted."""
-    value = float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
-    return int(value) if "." not in text and abs(value) < 2**53 and value.is_integer() else value
-
-
-class _Converter:
-    """Turns composed nodes into plain data; the nodes are counted each time an alias repeats them."""
-
-    def __init__(self, document: Document) -> None:
-        self.document = document
-        self.nodes = 0
-
-    def convert(self, node: Node, at: Key, depth: int) -> Any:
-        document, line = self.document, node.start_mark.line + 1
-        self.nodes += 1
-        if self.nodes > MAX_NODES or depth > MAX_DEPTH:
-            problem = f"is too large: at most {MAX_NODES} values, nested {MAX_DEPTH} deep, aliases expanded"
-            raise InputError(Mistake(problem, document.path, line, key_text(at)))
-        document.lines.setdefault(at, line)
-        if isinstance(node, MappingNode) and node.tag == f"{_CORE}map":
-            return dict(self.items(node, at, depth))
-        if isinstance(node, SequenceNode) and node.tag == f"{_CORE}seq":
-            return [self.convert(item, (*at, i), depth + 1) for i, item in enumerate(node.value)]
-        scalar = _SCALARS.get(str(node.tag).removeprefix(_CORE))
-        if not isinstance(node, ScalarNode) or scalar is None:
-            document.report(f"the YAML tag {quote(str(node.tag))} is not allowed; write a plain value", at)
-            return None
-        try:
-            node.value.encode()  # escapes can spell lone surrogates, which no later writer could write
-            return scalar(node.value)
-        except ValueError:
-            document.report(f"cannot read the value {quote(node.value)}", at)
-            return None
-
-    def items(self, node: MappingNode, at: Key, depth: int) -> Iterator[tuple[str, Any]]:
-        first: dict[str, int] = {}
-        for name, value in node.value:
-            line, self.nodes = name.start_mark.line + 1, self.nodes + 1
-            if not isinstance(name, ScalarNode):
-                self.document.report("the keys of a mapping should be plain words", at)
-            elif name.value in first:
-                self.document.lines[*at, name.value] = line
-                self.document.report(f"duplicate key; it is first given in line {first[name.value]}", (*at, name.value))
-            else:
-                first[name.value] = self.document.lines[*at, name.value] = line
-                yield name.value, self.convert(value, (*at, name.value), depth + 1)
-
-
 def key_text(at: Key) -> str:
     """A key as users write it: `effects[2].weight`."""
     text = "".join(f"[{k}]" if isinstance(k, int) else f".{k if k.isprintable() else ascii(k)}" for k in at)
     return text.removeprefix(".")[:200]
+
+
+def is_mapping(data: object) -> TypeGuard[dict[str, Any]]:
+    """Whether data of a config is a mapping; its keys are text."""
+    return isinstance(data, dict)
+
+
+def is_list(data: object) -> TypeGuard[list[Any]]:
+    """Whether data of a config is a list."""
+    return isinstance(data, list)
 
 
 def quote(value: object) -> str:
@@ -220,9 +105,13 @@ def _place(detail: ErrorDetails, data: Any) -> Key:
     """The key in `data` that an error is about; names of union members in its location are passed over."""
     key: Key = ()
     for step in detail["loc"]:
-        if isinstance(data, (dict, list)) and step in (data if isinstance(data, dict) else range(len(data))):
-            key, data = (*key, step), data[step]  # pyright: ignore[reportArgumentType, reportCallIssue]
-    return (*key, detail["loc"][-1]) if detail["type"] == "missing" and isinstance(data, dict) else key
+        if _holds(data, step):
+            key, data = (*key, step), data[step]
+    return (*key, detail["loc"][-1]) if detail["type"] == "missing" and is_mapping(data) else key
+
+
+def _holds(data: Any, step: str | int) -> bool:
+    return step in data if is_mapping(data) else is_list(data) and step in range(len(data))
 
 
 def _problem(detail: ErrorDetails, model: type[BaseModel], key: Key) -> str:

@@ -7,15 +7,16 @@ import importlib.metadata
 import os
 import platform
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Literal
 
 import psutil
-from threadpoolctl import threadpool_limits
+from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
 from harness.base.errors import InputError, Mistake
 
@@ -152,7 +153,7 @@ def require_threads(number: int) -> None:
 
 
 @contextmanager
-def pinned_threads(threads: int) -> Iterator[None]:
+def pinned_threads(threads: int) -> Generator[None]:
     """Let BLAS and Numba's parallel kernels use `threads` threads each, and restore their numbers afterwards.
 
     Raises InputError where this process may not use as many.
@@ -160,8 +161,8 @@ def pinned_threads(threads: int) -> Iterator[None]:
     # Loaded here: BLAS can only be limited once it is loaded, NumPy and SciPy bring one each, and a process
     # that computes nothing should not wait for them.
     import numba
-    import scipy.linalg  # noqa: F401
 
+    import_module("scipy.linalg")
     require_threads(threads)
     before = numba.get_num_threads()
     with threadpool_limits(threads, user_api="blas"):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, TypeVar
+from collections.abc import Sequence
+from typing import Annotated, Any, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler
 from pydantic_core import core_schema
@@ -27,7 +28,7 @@ class _OneOrMany:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
         def many(value: Any) -> tuple[Any, ...]:
-            return tuple(value) if isinstance(value, (list, tuple)) else (value,)
+            return (*cast(Sequence[Any], value),) if isinstance(value, list | tuple) else (value,)
 
         return core_schema.no_info_before_validator_function(many, handler(source))
 

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# pyarrow's stubs say nothing of the kinds of files that Parquet is written to.
 """The rows that a run leaves: one flat Parquet file a run, under `results/<sweep>/rows/`.
 
 `COLUMNS` is the schema and its documentation at once; `results/README.md` shows the same table.
@@ -8,7 +10,7 @@ from __future__ import annotations
 import fcntl
 import os
 import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -263,7 +265,7 @@ def of_other_code(paths: Iterable[Path], code: str) -> str:
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
+def alone(folder: Path) -> Generator[None]:
     """Hold a folder of results for one process; whatever a killed one left half written is removed."""
     lock = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
     _LOCKS.add(lock)

@@ -8,8 +8,9 @@ from itertools import product
 from pathlib import Path
 from typing import TypeVar
 
-from harness.base.document import Document, Key, quote, read_yaml
+from harness.base.document import Document, Key, quote
 from harness.base.errors import InputError, Mistake, did_you_mean
+from harness.base.yaml import read_yaml
 from harness.config.accuracy import AccuracyFields, Case, CurveStudy, CurveUnit, How, Study, WorkStudy, WorkUnit
 from harness.config.expand import check_size
 from harness.config.load import check_name, misfits, scenes_of, solvers_of

@@ -11,9 +11,10 @@ from typing import Any, Literal, get_type_hints
 
 from pydantic import create_model
 
-from harness.base.document import Document, Key, key_text, quote, read_yaml
+from harness.base.document import Document, Key, key_text, quote
 from harness.base.errors import InputError, Mistake
 from harness.base.model import Model
+from harness.base.yaml import read_yaml
 from harness.config.expand import Expansion
 from harness.config.own import UnopenedEffect, UnopenedMesh, chosen, given, opened
 from harness.config.sweep import AUTO, Options, RunSpec, SolverSpec, SweepFields

@@ -97,7 +97,7 @@ def _copy(file: PartialFile, path: Path, name: str, k: int, look: Look) -> _Run:
 
 
 def _layout(runs: list[_Run]) -> rrb.Blueprint:
-    entities = set.union(*(run.entities for run in runs))
+    entities = set[str]().union(*(run.entities for run in runs))
     columns = min(len(runs), 4)
     scenes = [
         scene_view(run.root, run.name, run.box, springs_visible=not run.triangles, aspect=min(1.0, 3.2 / columns))

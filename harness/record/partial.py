@@ -71,9 +71,11 @@ class PartialFile:
         the stream and its storage hold each other.
         """
         name = self.stream.get_application_id() or ""
-        sketch = rr.RecordingStream._from_native(rerun_bindings.new_blueprint(name, False, False, True))
+        sketch = rr.RecordingStream._from_native(  # pyright: ignore[reportPrivateUsage]
+            rerun_bindings.new_blueprint(name, False, False, True)
+        )
         sketch.set_time("blueprint", sequence=0)
-        layout._log_to_stream(sketch)
+        layout._log_to_stream(sketch)  # pyright: ignore[reportPrivateUsage]
         storage = sketch.memory_recording().storage
         rerun_bindings.send_blueprint(storage, True, True, recording=self.stream.to_native())
         sketch.disconnect()

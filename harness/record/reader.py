@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyarrow's stubs do not know the columns of a schema.
 """Recordings read back, without a viewer: what pictures are drawn from and `springbench inspect` prints.
 
 A complete file is read through the index in its footer. A file without one (its run was killed) is scanned up to
@@ -10,7 +12,7 @@ import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -154,7 +156,7 @@ def _try(path: Path) -> None:
 
 
 @contextmanager
-def open_recording(path: Path) -> Iterator[Source]:
+def open_recording(path: Path) -> Generator[Source]:
     """The recording at `path`, for as long as the context lasts.
 
     Raises InputError when the file is not a Rerun recording, is damaged, or nothing of it can be read.
@@ -193,7 +195,7 @@ def network(source: Source) -> dict[str, NDArray[Any]]:
         names = [name for name in batch.schema.names if name != _ROW_ID]
         # Rerun writes no column for an empty array: a mesh without springs, or without pins.
         none = dict.fromkeys(("springs", "rest_lengths", "pinned"), np.empty(0))
-        return none | {name: _row(batch, name) for name in names}
+        return none | {name: cell(batch, name) for name in names}
     names = f"application {source.application!r}"
     problem = f"is a Rerun recording ({names}) but not of one run: it has no /network and /scene/mesh"
     raise InputError(Mistake(problem, file=source.path))
@@ -208,22 +210,24 @@ def positions(
         (name,) = set(_POSITIONS) & set(batch.schema.names)
         for k, index in enumerate(_times(batch, "frame")):
             if wanted is None or index in wanted:
-                yield int(index), float(_times(batch, "time")[k]), _row(batch, name, k).reshape(-1, 3)
+                yield int(index), float(_times(batch, "time")[k]), cell(batch, name, k).reshape(-1, 3)
 
 
 def triangles(source: Source) -> NDArray[np.int64]:
     """The mesh's triangles, shape (f, 3)."""
     for chunk in source.chunks(content="/scene/mesh", components=["Mesh3D:triangle_indices"]):
-        return _row(chunk.to_record_batch(), "Mesh3D:triangle_indices").reshape(-1, 3).astype(np.int64)
+        return cell(chunk.to_record_batch(), "Mesh3D:triangle_indices").reshape(-1, 3).astype(np.int64)
     return np.empty((0, 3), np.int64)
 
 
 def properties(source: Source) -> tuple[str, dict[str, Any]]:
     """The title and what was recorded about the run and its machine."""
-    title, facts = "", {}
+    title, facts = "", dict[str, Any]()
     for chunk in source.chunks(content="/__properties/**"):
         batch = chunk.to_record_batch()
-        values = {name: batch[name][0].as_py()[0] for name in batch.schema.names if name != _ROW_ID}
+        values: dict[str, Any] = {
+            name: _scalar(batch, name, 0).as_py()[0] for name in batch.schema.names if name != _ROW_ID
+        }
         if chunk.entity_path == "/__properties/run":
             facts = values
         title = values.get(_NAME, title)
@@ -235,23 +239,22 @@ def _scalars(source: Source) -> pa.Table:
     for chunk in source.chunks(content="/**", components=[_SCALAR]):
         batch = chunk.to_record_batch()
         known = {name: _times(batch, name) for name in chunk.timeline_names if name in SCALARS.names}
-        columns = {
+        columns: dict[str, Any] = {
             "entity": [chunk.entity_path] * batch.num_rows,
             "frame": known.get("frame"),
             "iteration": known.get("iteration"),
             "time": known.get("time"),
-            "value": batch[_SCALAR].flatten(),
+            "value": _column(batch, _SCALAR).flatten(),
         }
-        arrays = [
-            pa.nulls(batch.num_rows, field.type)
-            if columns[field.name] is None
-            else pa.array(columns[field.name], field.type)
-            for field in SCALARS
+        arrays: list[Any] = [
+            pa.nulls(batch.num_rows, SCALARS.field(name).type)
+            if columns[name] is None
+            else pa.array(columns[name], SCALARS.field(name).type)
+            for name in SCALARS.names
         ]
         tables.append(pa.Table.from_arrays(arrays, schema=SCALARS))
-    return pa.concat_tables(tables).sort_by(
-        [("entity", "ascending"), ("frame", "ascending"), ("iteration", "ascending")]
-    )
+    order: Any = [(name, "ascending") for name in ("entity", "frame", "iteration")]
+    return pa.concat_tables(tables).sort_by(order)
 
 
 def _by_frame(table: pa.Table) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
@@ -262,9 +265,9 @@ def _by_frame(table: pa.Table) -> dict[str, tuple[NDArray[np.int64], NDArray[np.
     return {str(entity): (frames[of], values[of]) for entity in np.unique(entities) for of in [entities == entity]}
 
 
-def _row(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:
+def cell(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:
     """All numbers of one row of a component, flat."""
-    values = batch[name][row].values
+    values = _scalar(batch, name, row).values
     while pa.types.is_nested(values.type):
         values = values.flatten()
     return values.to_numpy()
@@ -272,9 +275,18 @@ def _row(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:
 
 def _times(batch: pa.RecordBatch, timeline: str) -> NDArray[Any]:
     """The frames or iterations, or the times [s]."""
-    column = batch[timeline]
-    counts = column.cast(pa.int64()).to_numpy()
+    column = _column(batch, timeline)
+    counts: NDArray[np.int64] = column.cast(pa.int64()).to_numpy()
     return counts / 1e9 if pa.types.is_duration(column.type) else counts
+
+
+def _column(batch: pa.RecordBatch, name: str) -> Any:
+    """A column; pyarrow's stubs know no kind of array that is told by its schema alone."""
+    return batch[name]
+
+
+def _scalar(batch: pa.RecordBatch, name: str, row: int) -> Any:
+    return _column(batch, name)[row]
 
 
 def _chosen(path: Path, frame: int, known: NDArray[np.int64]) -> int:

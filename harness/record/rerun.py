@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyarrow's stubs do not know the arrays that the library makes.
 """A run as a Rerun recording: one file that opens with its own layout.
 
 Topology is written once, positions every FLUSH frames in one piece, scalars in bulk. The stream has no batching thread
@@ -35,7 +37,7 @@ FLUSH = 5
 SCALARS = 25
 """Frames between batches of scalars, which cost about 1.2 kB each per entity."""
 
-_STRIPS = rr.components.LineStrip3DBatch([]).as_arrow_array().type
+_STRIPS: Any = rr.components.LineStrip3DBatch([]).as_arrow_array().type
 
 
 class RerunRecorder:
@@ -230,10 +232,10 @@ class RerunRecorder:
                 self._stream.log(entity, rr.SeriesPoints(names=label, colors=colour, marker_sizes=3), static=True)
 
 
-def _segments(ends: NDArray[np.float32]) -> pa.Array:
+def _segments(ends: NDArray[np.float32]) -> Any:
     """Line strips of two points each from (m, 2, 3); the library's own way takes a Python loop over them."""
-    points = rr.components.Position3DBatch(ends.reshape(-1, 3)).as_arrow_array()
-    offsets = pa.array(np.arange(0, 2 * len(ends) + 1, 2, dtype=np.int32))
+    points: Any = rr.components.Position3DBatch(ends.reshape(-1, 3)).as_arrow_array()
+    offsets: Any = pa.array(np.arange(0, 2 * len(ends) + 1, 2, dtype=np.int32))
     return pa.ListArray.from_arrays(offsets, points, type=_STRIPS)
 
 

@@ -16,6 +16,8 @@ from harness.record.base import RecordingInfo
 from solvers.compiling import kept
 from solvers.problem import Positions
 
+Reals = NDArray[np.float64]
+
 STRAIN_COLOURS = ("#125490", "#64a2d6", "#d9d7d2", "#e5863b", "#943404")
 """Strain at -range, -range/2, 0, range/2, range: blue compressed, grey at rest, orange stretched; safe for the
 colour-blind, and grey enough in the middle that light and shadow still show."""
@@ -30,7 +32,8 @@ def palette() -> NDArray[np.uint8]:
     """The colours of the levels from most compressed to most stretched and, last, NEUTRAL: (LEVELS + 1, 4)."""
     stops = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)] + [255] for colour in STRAIN_COLOURS])
     at = np.linspace(0, len(stops) - 1, LEVELS)
-    colours = np.stack([np.interp(at, range(len(stops)), channel) for channel in stops.T], axis=1)
+    channels: list[NDArray[np.float64]] = [np.interp(at, range(len(stops)), channel) for channel in stops.T]
+    colours = np.stack(channels, axis=1)
     return np.vstack([np.rint(colours), NEUTRAL]).astype(np.uint8)
 
 
@@ -74,7 +77,13 @@ def strains(
 # Positions come as writable copies: a read-only array is another type to Numba, and another compilation. Without the
 # interpreter's lock, so that the solver beside need not wait.
 @kept(error_model="numpy", nogil=True)
-def _strains(p, springs, rest_lengths, of_spring, of_vertex):
+def _strains(
+    p: Positions,
+    springs: NDArray[np.int64],
+    rest_lengths: Reals,
+    of_spring: Reals,
+    of_vertex: Reals,
+) -> None:
     for e in range(len(springs)):
         i, j = springs[e, 0], springs[e, 1]
         x, y, z = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
@@ -87,7 +96,7 @@ def _strains(p, springs, rest_lengths, of_spring, of_vertex):
 
 
 @kept(error_model="numpy", nogil=True)
-def _normals(p, triangles, out):
+def _normals(p: NDArray[np.float32], triangles: NDArray[np.int64], out: NDArray[np.float32]) -> None:
     for t in range(len(triangles)):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
 from harness.record.base import RecordingInfo
-from harness.record.reader import open_recording
+from harness.record.reader import cell, open_recording
 from harness.record.shading import LEVELS, palette
 from solvers.problem import Positions
 
@@ -65,8 +65,8 @@ def _last(path: Path) -> _Last:
                 numbers, times = (batch[name].cast(pa.int64()).to_numpy() for name in ("frame", "time"))
                 k = int(np.argmax(numbers))
                 if numbers[k] > found.frame:
-                    p = batch[positions][k].values.flatten().to_numpy().reshape(-1, 3)
-                    found = _Last(int(numbers[k]), times[k] / 1e9, p, batch[colours][k].values.to_numpy())
+                    at, of = cell(batch, positions, k).reshape(-1, 3), cell(batch, colours, k)
+                    found = _Last(int(numbers[k]), times[k] / 1e9, at, of)
     return found
 
 

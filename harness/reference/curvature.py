@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,11 +106,11 @@ def free_hessian(problem: StepProblem, p: Positions) -> csr_array:
     system = problem.system
     _, vertices, weight = system.penalty
     held = system.inertia + np.bincount(vertices, weight, minlength=system.vertices)
-    H = diagonal(np.repeat(held, 3))
+    total = diagonal(np.repeat(held, 3))
     for energy in problem.energies:
-        H = H + energy.hessian(p)
+        total = csr_array(total + energy.hessian(p))
     free = (3 * system.free[:, None] + np.arange(3)).ravel()
-    return csr_array(csr_array(H)[free][:, free])
+    return csr_array(total[free][:, free])
 
 
 def _softest(H: csr_array) -> tuple[NDArray[np.float64], Solve]:
@@ -130,7 +130,8 @@ def _softest(H: csr_array) -> tuple[NDArray[np.float64], Solve]:
                 "v0": start,
                 "tol": 1e-8,
             }
-            return eigsh(H, **settings)[1][:, 0], solve
+            _, vectors = cast(tuple[Any, NDArray[np.float64]], eigsh(H, **settings))
+            return vectors[:, 0], solve
     raise ValueError("a Hessian that no multiple of the identity makes positive definite is not symmetric")
 
 

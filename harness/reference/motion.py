@@ -23,7 +23,8 @@ from solvers.contact.touching import without_contact
 from solvers.energies.springs import TINY, Springs
 from solvers.problem import LaggedEnergy, Positions, Start
 
-State = NDArray[np.float64]
+Reals = NDArray[np.float64]
+State = Reals
 """Positions [m] and velocities [m/s] of the free vertices, one after the other, shape (6 f,)."""
 
 TICK = 1e-5
@@ -94,7 +95,14 @@ class Field:
 
 
 @kernel
-def add_springs(p, edges, stiffness, rest_length, direction, out):
+def add_springs(
+    p: Positions,
+    edges: NDArray[np.int64],
+    stiffness: Reals,
+    rest_length: Reals,
+    direction: Reals,
+    out: Positions,
+) -> None:
     """Add the springs' gradient k (1 - r/l) (p_i - p_j) [N] at p (n, 3) [m] to `out` (n, 3)."""
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]

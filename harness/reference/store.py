@@ -117,7 +117,7 @@ class Store:
         return self.folder / f"problem-{asked.name}-{frame}.npz"
 
     def _keep(self, asked: _Asked, steps: dict[int, Step]) -> dict[int, Frozen]:
-        kept = {}
+        kept: dict[int, Frozen] = {}
         for frame, step in steps.items():
             kept[frame], arrays = freeze(step, asked.name)
             _write(self._problem(asked, frame), arrays)

@@ -7,7 +7,7 @@ is 1e-12 at the start grows past the error that is to be measured has no traject
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,9 +88,9 @@ def _apart(path: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.
     return np.linalg.norm((path - other)[:, : path.shape[1] // 2], axis=1)
 
 
-def _dop853(field: Callable[[float, State], State], y: State, times: Sequence[float], atol: float) -> NDArray:
+def _dop853(field: Field, y: State, times: Sequence[float], atol: float) -> State:
     """The states (k, 6 f); each time ends a step, for interpolation would not be as exact."""
-    path, begin = [], 0.0
+    path, begin = list[State](), 0.0
     for end in times:
         solved = solve_ivp(field, (begin, end), y, "DOP853", [end], rtol=RTOL, atol=atol)
         if not solved.success:
@@ -100,11 +100,11 @@ def _dop853(field: Callable[[float, State], State], y: State, times: Sequence[fl
     return np.array(path)
 
 
-def _adams(field: Callable[[float, State], State], y: State, times: Sequence[float], atol: float) -> NDArray:
+def _adams(field: Field, y: State, times: Sequence[float], atol: float) -> State:
     """The states (k, 6 f)."""
     solver = ode(field).set_integrator("vode", method="adams", rtol=RTOL, atol=atol, order=12, nsteps=10**8)
     solver.set_initial_value(y, 0.0)
-    path = []
+    path = list[State]()
     for end in times:
         path.append(np.array(solver.integrate(end)))
         if not solver.successful():

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# pyarrow's stubs say nothing of the kinds of files that Parquet is read from.
 """What an ablation found, in words: the verdict on each effect follows from the numbers of its rows.
 
 An effect is called for where leaving it out moves some vertex further than the scene's solver and its time step are

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """The picture of an ablation: what an effect costs to the right, what it changes upwards, one point an effect.
 
 What lies below the lines of the errors changes less than the scene is wrong by anyway.
@@ -7,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter
 
 from harness.report.ablation import Row, known_error, of_kind
-from harness.report.page import axes, header, new_page, quantity, save, text
+from harness.report.page import axes, header, new_page, quantity, save, text, ticks
 from harness.report.style import INK, MUTED, RC, RULE, WARNING, numbered
 
 _ERRORS = {"solver": "error of the solver", "time-step": "error of the time step"}
@@ -54,7 +56,7 @@ def _errors(ax: Axes, rows: Sequence[Row], points: Sequence[Row]) -> None:
     low, high = min(values, default=1e-3) / 4.0, max(values, default=1.0) * 4.0
     ax.set_yscale("log")
     ax.set_ylim(low, high)
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+    ax.yaxis.set_major_formatter(ticks("{:g}".format))
     ax.set_ylabel("largest displacement where it is left out [mean rest lengths]")
     ax.set_xlabel("cost [% of a step, with the 95 % interval]")
     ax.grid(axis="y", which="major")
@@ -64,7 +66,7 @@ def _errors(ax: Axes, rows: Sequence[Row], points: Sequence[Row]) -> None:
     for row in known:
         y = max(row["largest"], _NOTHING)
         ax.axhline(y, color=MUTED, linewidth=1.0, linestyle=(0, (5, 3)))
-        place = {"xycoords": ("axes fraction", "data"), "xytext": (-4, 3), "textcoords": "offset points"}
+        place: Any = {"xycoords": ("axes fraction", "data"), "xytext": (-4, 3), "textcoords": "offset points"}
         ax.annotate(_ERRORS[row["name"]], (1.0, y), ha="right", fontsize=9.5, color=MUTED, **place)
 
 

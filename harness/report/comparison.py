@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """Solvers side by side: for each scene and size the final frames, one camera, one scale, and what they cost."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords, and PyVista is known in part.
 """A sheet of scenes: each in a tile with its name, its effects and its time, all type of one size."""
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 from rich.box import SIMPLE_HEAD
@@ -84,8 +84,8 @@ class Stored(BaseModel):
     @property
     def machine(self) -> tuple[Any, ...]:
         """What decides about speed: the processor and how many of its cores may be used."""
-        cpu = self.machine_info.get("cpu")
-        cpu = cpu if isinstance(cpu, Mapping) else {}
+        told = self.machine_info.get("cpu")
+        cpu = cast(Mapping[str, Any], told) if isinstance(told, Mapping) else dict[str, Any]()
         return (cpu.get("brand_raw"), cpu.get("count"), self.machine_info.get("affinity"))
 
 
@@ -97,7 +97,7 @@ def compare(base: Path, new: Path, console: Console) -> int:
     old, now = _read(base), _read(new)
     same = old.machine == now.machine
     table = Table("benchmark", "old", "new", "change", "verdict", box=SIMPLE_HEAD)
-    verdicts = []
+    verdicts: list[str] = []
     for name in old.by_name | now.by_name:
         before, after = old.by_name.get(name), now.by_name.get(name)
         change, verdict = _judged(before, after, same)

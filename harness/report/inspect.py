@@ -1,17 +1,21 @@
+# pyright: reportUnknownMemberType=false
+# PyVista's filters and meshes are known in part.
 """What is in recordings, without a viewer: `springbench inspect`; and in the viewer: `springbench view`."""
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
-import rerun_cli
+import rerun_cli  # pyright: ignore[reportMissingTypeStubs]
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -111,7 +115,7 @@ def _print_difference(paths: list[Path], console: Console) -> None:
         raise InputError(f"{paths[0]} and {paths[1]} have {came} vertices: their positions cannot be compared")
     apart = np.linalg.norm(a.positions[0].astype(np.float64) - b.positions[0], axis=1)
     spacing = float(a.rest_lengths.mean()) if len(a.rest_lengths) else np.nan
-    figures = {"max": apart.max(), "rms": np.sqrt(np.mean(apart**2))}
+    figures = {"max": apart.max(), "rms": math.sqrt((apart**2).mean())}
     rows = [(name, f"{value:.6g}", f"{value / spacing:.6g}") for name, value in figures.items()]
     console.print(_table((f"positions in frame {last}", "metres", "mean rest lengths"), rows))
     times = [dict(_series(found.scalars)) for found in (first, second)]
@@ -158,7 +162,8 @@ def _export(replay: Replay, recording: Path, export: Path) -> None:
         mesh = pv.PolyData(points, lines=np.insert(replay.springs, 0, 2, axis=1).ravel())
         mesh.cell_data["strain"] = spring_strain(replay, 0)
     mesh.point_data["strain"] = vertex_strain(replay, 0)
-    _write(export, mesh.save)
+    save: Callable[[Path], Any] = mesh.save
+    _write(export, save)
 
 
 def _write(target: Path, write: Callable[[Path], object]) -> None:

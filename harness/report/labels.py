@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """Names at the ends of lines, moved apart where lines end side by side."""
 
 from __future__ import annotations
@@ -9,8 +11,11 @@ from matplotlib.axes import Axes
 LINE = 17
 """Pixels between the names."""
 
+End = tuple[float, float, str, str]
+"""Where a line ends, by the axes' scales; its name and colour."""
 
-def direct_labels(ax: Axes, ends: list) -> None:
+
+def direct_labels(ax: Axes, ends: Sequence[End]) -> None:
     """Names at the right of the lines' ends; where lines end at the same size, moved apart."""
     for column in sorted({x for x, *_ in ends}):
         here = sorted((end for end in ends if end[0] == column), key=lambda end: end[1])

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# pyarrow's stubs say nothing of some keywords.
 """Median step times as CSV, one line for each scene, size and solver: for tables of one's own."""
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """A page of WIDTH x HEIGHT pixels: its title, its scale of strain, type and pictures placed by the pixel."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from harness.base.files import replacing
@@ -32,6 +35,15 @@ def text(page: Figure, x: float, y: float, words: str, *, size: float, color: st
 def axes(page: Figure, left: float, top: float, width: float, height: float) -> Axes:
     """Axes in a rectangle given in pixels from the upper left corner."""
     return page.add_axes((left / WIDTH, 1 - (top + height) / HEIGHT, width / WIDTH, height / HEIGHT))
+
+
+def ticks(words: Callable[[float], str]) -> FuncFormatter:
+    """Ticks that are written as `words` has it."""
+
+    def written(value: float, _: int | None) -> str:
+        return words(value)
+
+    return FuncFormatter(written)
 
 
 def paste(page: Figure, pixels: NDArray[np.uint8], left: int, top: int) -> None:

@@ -84,10 +84,10 @@ def _answered(sql: str, files: dict[str, list[Path]], most: int) -> Answer:
                 connection.register(table, rows.read(files[table], schema))
         connection.execute("SET enable_external_access = false; SET lock_configuration = true")
         try:
-            found = connection.execute(sql)
+            found: Any = connection.execute(sql)
             if found is None or found.description is None:
                 raise InputError("query: came without a statement; wanted one, such as SELECT count(*) FROM rows")
-            values, characters = [], 0
+            values, characters = list[tuple[Any, ...]](), 0
             while len(values) <= most and characters < _CHARACTERS and (row := found.fetchone()):
                 values.append(_plain(row))
                 characters += sum(len(value) for value in values[-1] if isinstance(value, str))

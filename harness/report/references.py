@@ -27,7 +27,7 @@ def cited(reference: str | None) -> str:
 def bibtex(references: Iterable[str | None]) -> str:
     """An entry for each different reference, in the order of their keys; Unicode, for biber and recent BibTeX."""
     known = sorted({reference for reference in references if reference}, key=lambda r: (_key(json.loads(r)), r))
-    entries, keys = [], [_key(json.loads(reference)) for reference in known]
+    entries, keys = list[str](), [_key(json.loads(reference)) for reference in known]
     for k, reference in enumerate(known):
         found = json.loads(reference)
         letter = chr(ord("a") + keys[:k].count(keys[k])) if keys.count(keys[k]) > 1 else ""

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# PyVista's filters and meshes are known in part.
 """Shaded renderings of a recording's frames: surface or tubes coloured by strain, pins, a soft shadow.
 
 All frames of a run share one camera, so that what moves in the pictures is the scene and not the viewer.

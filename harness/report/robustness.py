@@ -118,7 +118,7 @@ def read_cells(folder: Path) -> list[Cell]:
     if any(row["stationarity"] is not None and row["beyond"] is None for row in table):
         raise InputError(f"{folder}: holds runs that another version judged; run the sweep again")
     firsts = [run[0] for run in runs.values()]
-    cells = {}
+    cells: dict[tuple[str, str], Cell] = {}
     for run in sorted(runs.values(), key=lambda run: run[0]["started"]):
         case, solver = _case(run[0], firsts), _solver(run[0], firsts)
         outcome, worst, graded, reason = judged(run)
@@ -190,7 +190,7 @@ class Score:
 
 def scores(cells: Sequence[Cell]) -> list[Score]:
     """A score for each solver, in the cells' order."""
-    found = []
+    found: list[Score] = []
     for solver in dict.fromkeys(cell.solver for cell in cells):
         own = [cell for cell in cells if cell.solver == solver]
         of = {outcome: sum(cell.outcome == outcome for cell in own) for outcome in OUTCOMES}

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """The robustness map: solvers x cases, coloured by outcome, the worst residual in each cell; a picture and a page."""
 
 from __future__ import annotations
@@ -64,7 +66,7 @@ def draw_map(cells: Sequence[Cell], path: Path, title: str) -> None:
 
 def _places(cases: Sequence[str]) -> tuple[dict[str, float], float]:
     """The row of each case, with room above each family for its name; and how many rows there are in all."""
-    places, y = {}, float(_SCORES)
+    places, y = dict[str, float](), float(_SCORES)
     for _, family in groupby(cases, _family):
         y += _HEADING
         for case in family:

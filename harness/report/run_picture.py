@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """The picture of one run: its final frame large, five earlier ones beside it, the scale of strain above."""
 
 from __future__ import annotations

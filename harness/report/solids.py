@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# PyVista's filters and meshes are known in part.
 """Obstacles as meshes that can be drawn, where they are at a time."""
 
 from __future__ import annotations

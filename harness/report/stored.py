@@ -15,7 +15,7 @@ from __future__ import annotations
 import tarfile
 import zipfile
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,7 +127,7 @@ def read(path: Path) -> dict[Key, Run]:
 
 
 @contextmanager
-def _folder(path: Path) -> Iterator[Path]:
+def _folder(path: Path) -> Generator[Path]:
     """The folder itself, or one with what an archive holds."""
     if path.is_dir():
         yield path
@@ -218,7 +218,7 @@ def _interval(logs: Array) -> tuple[float, float, float]:
 
 def _beside(old: Run, new: Run) -> tuple[str, str, str, str]:
     """What changed beside the time: iterations, residual, error, and whether the last positions are the same."""
-    told = []
+    told: list[str] = []
     for name in ("iterations", "residual", "error"):
         was, now = getattr(old, name), getattr(new, name)
         same = was == now or was is None or now is None

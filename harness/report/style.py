@@ -119,7 +119,7 @@ def shades(labelled: Iterable[tuple[str, str]]) -> dict[str, Mark]:
 
 def _varied(labelled: Iterable[tuple[str, str]], vary: Callable[[Mark, int, int], Mark]) -> dict[str, Mark]:
     pairs = sorted(set(labelled))
-    own, found = marks(solver for _, solver in pairs), {}
+    own, found = marks(solver for _, solver in pairs), dict[str, Mark]()
     for solver, mark in own.items():
         labels = [label for label, its in pairs if its == solver]
         found |= {label: vary(mark, k, len(labels)) for k, label in enumerate(labels)}

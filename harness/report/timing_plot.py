@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """Milliseconds a step and of preparing against vertices, by solver; a pair of panels for each scene."""
 
 from __future__ import annotations
@@ -5,16 +7,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import ceil
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
 
-from harness.report.labels import LINE, direct_labels
-from harness.report.page import axes, count, header, new_page, quantity, save, shorten, text
+from harness.report.labels import LINE, End, direct_labels
+from harness.report.page import axes, count, header, new_page, quantity, save, shorten, text, ticks
 from harness.report.style import DASH_DOTTED, DASHED, DOTTED, HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark, marks
 from harness.report.timing_table import RunTimes, labels, runs
 
@@ -58,8 +61,8 @@ def draw_timing(table: pa.Table, path: Path, title: str) -> None:
 
 def _facts(table: pa.Table) -> list[str]:
     """The machine, and what the marks mean."""
-    cpus = sorted(set(table["cpu"].drop_null().to_pylist()))
-    threads = sorted(set(table["threads"].drop_null().to_pylist()))
+    cpus: list[str] = sorted(set[Any](table["cpu"].drop_null().to_pylist()))
+    threads: list[int] = sorted(set[Any](table["threads"].drop_null().to_pylist()))
     facts = ["median and quartiles of all steps"]
     if threads:
         facts.append(f"{', '.join(map(str, threads))} thread{'s' if threads != [1] else ''}")
@@ -98,7 +101,7 @@ def _scene(
     _scales(step, sizes, _times(found, "step", "lower", "upper"), labels_share, crosses=crosses)
     _scales(prepare, sizes, _times(found, "cold", "warm"), labels_share)
     prepare.set_xlabel("vertices", fontsize=9.5, loc="left")
-    ends = []
+    ends: list[End] = []
     for (name, members), dash in zip(series.items(), _variants(series, looks), strict=True):
         look = looks[members[0].solver]
         ends += _draw_steps(step, name, members, look, dash)
@@ -109,9 +112,9 @@ def _scene(
         step.text(0.5, 0.5, "no run succeeded", transform=step.transAxes, ha="center", color=MUTED)
 
 
-def _variants(series: Mapping[str, Sequence[RunTimes]], looks: Mapping[str, Mark]) -> list:
+def _variants(series: Mapping[str, Sequence[RunTimes]], looks: Mapping[str, Mark]) -> list[Any]:
     """A line style for each series: the solver's own for the first of a solver."""
-    dashes = []
+    dashes: list[Any] = []
     solvers = [members[0].solver for members in series.values()]
     for k, solver in enumerate(solvers):
         own = looks[solver].dash
@@ -140,10 +143,10 @@ def _scales(
     ax.set_yscale("log")
     ax.set_ylim(low, high * (high / low) ** (0.16 if crosses else 0.0))
     ax.xaxis.set_major_locator(FixedLocator(_apart(ax, sizes)))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: count(round(value))))
+    ax.xaxis.set_major_formatter(ticks(lambda value: count(round(value))))
     wide = high / low > 300
     ax.yaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0), numticks=8 if wide else 12))
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: quantity(value)))
+    ax.yaxis.set_major_formatter(ticks(quantity))
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_minor_locator(NullLocator())
     ax.tick_params(length=3, labelsize=9)
@@ -161,7 +164,7 @@ def _apart(ax: Axes, sizes: Sequence[int]) -> list[int]:
     return kept
 
 
-def _draw_steps(ax: Axes, name: str, members: Sequence[RunTimes], look: Mark, dash) -> list:
+def _draw_steps(ax: Axes, name: str, members: Sequence[RunTimes], look: Mark, dash: Any) -> list[End]:
     """One line with its quartile band; returns where its direct label belongs, with its words and colour."""
     timed = sorted((run for run in members if run.step), key=lambda run: run.vertices or 0)
     if not timed:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Collection, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple
 
 import duckdb
 import numpy as np
@@ -173,5 +173,5 @@ def _methods(table: pa.Table) -> list[str]:
     return [f"{solver}: {cited(reference)}" for solver, reference in known.items() if reference]
 
 
-def _number(value, words) -> str:
+def _number(value: Any, words: Callable[[Any], str]) -> str:
     return "–" if value is None else words(value)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +81,7 @@ def voronoi_areas(rest: Points, triangles: Indices) -> Points:
     flat = doubled == 0
     nearest = squared * dots / np.where(flat, 1, doubled) / 8
     share = np.roll(nearest, 1, axis=1) + np.roll(nearest, -1, axis=1)
-    obtuse = np.where(dots < 0, doubled / 4, doubled / 8)
+    obtuse = cast(Points, np.where(dots < 0, doubled / 4, doubled / 8))
     share = np.where(np.any(dots < 0, axis=1, keepdims=True), obtuse, share)
     share = np.where(flat, 0.0, share)
     return np.bincount(triangles.ravel(), share.ravel(), minlength=len(rest)).astype(np.float64, copy=False)
@@ -89,7 +90,7 @@ def voronoi_areas(rest: Points, triangles: Indices) -> Points:
 def _pins(one_based: list[int], n: int, path: Path) -> NDArray[np.int64]:
     """Vertices from 0; refuses those that do not exist, and repetitions, which would double a penalty."""
     seen: set[int] = set()
-    mistakes = []
+    mistakes: list[tuple[int, str]] = []
     for position, vertex in enumerate(one_based):
         if not 1 <= vertex <= n:
             mistakes.append((position, f"vertex {vertex} does not exist; vertices are counted from 1 to {n}"))

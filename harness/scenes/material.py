@@ -35,10 +35,11 @@ liu2013      k_e = constant * (resolution - 1) / (reference - 1), constants [N/m
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 
 from harness.base.errors import InputError, Mistake, did_you_mean
 from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
@@ -91,7 +92,7 @@ def _overlaps(mesh: Mesh) -> NDArray[np.int64]:
     (i, j), (a, b) = (mesh.springs[mesh.families[family]].T for family in (STRETCH, BEND))
     n, name = len(mesh.rest), np.arange(1, len(i) + 1)
     spring = coo_array((np.tile(name, 2), (np.r_[i, j], np.r_[j, i])), shape=(n, n)).tocsr()
-    bend, middle = (spring[a] * spring[b]).nonzero()
+    bend, middle = cast(csr_array, spring[a] * spring[b]).nonzero()
     under = [np.asarray(spring[end[bend], middle]) for end in (a, b)]
     return np.bincount(np.concatenate(under) - 1, minlength=len(i))
 

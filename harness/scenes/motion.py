@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +92,7 @@ class Motion(Model):
 
 
 def _linear(times: NDArray[np.float64], values: NDArray[np.float64], t: float) -> NDArray[np.float64]:
-    return np.array([np.interp(t, times, column) for column in values.T])
+    return np.array([cast(float, np.interp(t, times, column)) for column in values.T])
 
 
 def _smooth(times: NDArray[np.float64], values: NDArray[np.float64], t: float) -> NDArray[np.float64]:

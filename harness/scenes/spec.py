@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, cast
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, SkipValidation, ValidationInfo, WithJsonSchema
 
@@ -33,7 +33,7 @@ def named_in(table: Table) -> Any:
     comes with the context of the validation."""
 
     def checked(value: str, info: ValidationInfo) -> str:
-        name = table.named(value, Path((info.context or {}).get("folder", ".")))
+        name = table.named(value, Path(cast(Mapping[str, Any], info.context or {}).get("folder", ".")))
         if name not in table:
             raise ValueError(f"came {json.dumps(value)[:60]}; should be {did_you_mean(value, table)}")
         return name

@@ -13,9 +13,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from time import CLOCK_MONOTONIC_RAW, clock_gettime, process_time, thread_time
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
 from solvers.problem import Prepared, StepProblem
@@ -41,7 +42,7 @@ class Watch:
     entered: int = 0
     process: float = 0.0
     thread: float = 0.0
-    began: list[float] = field(default_factory=list)
+    began: list[float] = field(default_factory=list[float])
 
     def __enter__(self) -> None:
         self.began = [process_time(), thread_time(), clock_gettime(CLOCK_MONOTONIC_RAW)]
@@ -86,12 +87,13 @@ def working(prepared: Prepared, problem: StepProblem) -> dict[str, Callable[[], 
     """
     phases = prepared.phases(problem)
     for phase, call in phases.items():
-        given = call()
+        given: Any = call()
         if not isinstance(given, np.ndarray):
             does = given is not None
         else:
-            known = np.isfinite(given).any()
-            given.fill(np.nan)
+            array = cast(NDArray[Any], given)
+            known = np.isfinite(array).any()
+            array.fill(np.nan)
             again = call()
             does = bool(np.isfinite(np.asarray(again)).any()) or not known or not len(problem.system.free)
         if not does:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,8 @@ class Checked(Passing):
         """The solver's answer; raises RunFailed where it is none, or something was written to."""
         before = {name: array.copy() for name, array in _of_problem(problem).items()}
         found: Any = self._prepared.solve(problem, stop)
-        line = _line(type(getattr(self._prepared, "usual", self._prepared)), "solve")
+        usual: Any = getattr(self._prepared, "usual", self._prepared)
+        line = _line(cast(Any, usual).__class__, "solve")
         written = _differing(before, _of_problem(problem))
         if written:
             line = self._writes(_restored(problem, before), stop) or line
@@ -62,7 +63,7 @@ class Checked(Passing):
         if not isinstance(found, Solution):
             raise RunFailed(f"{line}: gave a {type(found).__name__}; wanted a solvers.problem.Solution")
         p: Any = found.positions
-        came = f"{p.dtype} of shape {p.shape}" if isinstance(p, np.ndarray) else f"a {type(p).__name__}"
+        came = f"{p.dtype} of shape {p.shape}" if _is_array(p) else f"a {type(p).__name__}"
         if came != (wanted := f"float64 of shape {problem.target.shape}"):
             raise RunFailed(f"{line}: gave positions as {came}; wanted {wanted}")
         return found
@@ -91,7 +92,7 @@ def _line(of: type, method: str) -> str:
 def _of_problem(problem: StepProblem) -> Arrays:
     named = {f"problem.{f.name}": getattr(problem, f.name) for f in fields(problem)}
     named |= {f"problem.start.{f.name}": getattr(problem.start, f.name) for f in fields(problem.start)}
-    return {name: value for name, value in named.items() if isinstance(value, np.ndarray)}
+    return {name: value for name, value in named.items() if _is_array(value)}
 
 
 def _restored(problem: StepProblem, arrays: Arrays) -> StepProblem:
@@ -109,13 +110,18 @@ def _of_system(system: System) -> Arrays:
     named |= {f"system.pins.{f.name}": getattr(system.pins, f.name) for f in fields(system.pins)}
     for energy in system.energies:
         named |= {f"{type(energy).__name__}.{name}": value for name, value in _held(energy)}
-    return {name: value for name, value in named.items() if isinstance(value, np.ndarray)}
+    return {name: value for name, value in named.items() if _is_array(value)}
+
+
+def _is_array(value: object) -> TypeGuard[NDArray[Any]]:
+    return isinstance(value, np.ndarray)
 
 
 def _held(energy: Any) -> Iterator[tuple[str, Any]]:
     if is_dataclass(energy):
         return ((f.name, getattr(energy, f.name)) for f in fields(energy))
-    return iter(vars(energy).items() if hasattr(energy, "__dict__") else ())
+    own: dict[str, Any] = getattr(energy, "__dict__", {})
+    return iter(own.items())
 
 
 def _differing(before: Arrays, after: Arrays) -> list[str]:

@@ -21,9 +21,9 @@ def rows(measured: Measured) -> list[dict[str, Any]]:
     groups: dict[tuple[str, int | None], list[Timing]] = defaultdict(list)
     for timing in measured.timings:
         groups[timing.phase, measured.pass_of(timing)].append(timing)
-    adds_up, found = _adds_up(measured.timings), []
+    adds_up, found = _adds_up(measured.timings), list[dict[str, Any]]()
     for (phase, _), timings in groups.items():
-        told = [
+        told: list[dict[str, Any]] = [
             {"phase": phase, "frame": t.frame, "round": t.round, "seconds": t.seconds, "adds_up": adds_up.get(phase)}
             for t in timings
         ]

@@ -36,7 +36,8 @@ class EnergyNorm:
 
 def trace(prepared: Prepared, problem: StepProblem, norm: EnergyNorm, iterations: int) -> Convergence:
     """The convergence of a solve of `problem` over a number of iterations."""
-    residuals, objective, previous = [], [], problem.first_guess.copy()
+    residuals, objective = list[float](), list[float]()
+    previous = problem.first_guess.copy()
     for p in islice(prepared.iterates(problem), iterations):
         residuals.append(norm(p - previous))
         objective.append(problem.value(p))

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
+from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.sparse import csr_array
 
 from solvers.compiling import kept
@@ -38,8 +38,7 @@ class Inverse:
             raise NotPositiveDefinite(f"Q is not finite in row {v}: a stiffness, a mass or a pin weight there is not")
         inverse = dense
         if n:
-            potrf, potri = get_lapack_funcs(("potrf", "potri"), (dense,))
-            factor, info = potrf(dense, lower=1)
+            factor, info = dpotrf(dense, lower=1)
             lost = np.flatnonzero(factor.diagonal() ** 2 <= 4.0 * np.finfo(float).eps * dense.diagonal())
             if info or len(lost):
                 v = info - 1 if info else int(lost[0])
@@ -47,7 +46,7 @@ class Inverse:
                     f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point at vertex {v}: nothing "
                     "determines its position, or stiffnesses, masses and pin weights lie too far apart or are negative"
                 )
-            inverse, _ = potri(factor, lower=1)
+            inverse, _ = dpotri(factor, lower=1)
         padded = -(-n // _ROWS) * _ROWS
         stored = np.zeros((padded, padded), precision)
         stored[:n, :n] = np.tril(inverse) + np.tril(inverse, -1).T

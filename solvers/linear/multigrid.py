@@ -137,7 +137,7 @@ def _coarsen(A: csr_array) -> tuple[Level, csr_array]:
     T = csr_array((np.ones(len(inside)), of[inside], start.astype(A.indptr.dtype)), shape=(n, count))
     F = csr_array((kernels.filtered(A.indptr, A.indices, A.data, _STRENGTH), A.indices, A.indptr), shape=A.shape)
     # Lumping leaves a positive diagonal to springs; to other matrices, this does.
-    D = dia_array((1.0 / np.maximum(F.diagonal(), 0.05 * diagonal)[None, :], [0]), shape=(n, n))
+    D = dia_array((1.0 / np.maximum(F.diagonal(), 0.05 * diagonal)[None, :], np.array([0])), shape=(n, n))
     P = matrices.without_zeros(csr_array(T - (4.0 / 3.0 / largest) * (D @ (F @ T))))
     R = csr_array(P.T)
     coarse = csr_array(R @ csr_array(A @ P))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -48,7 +49,7 @@ def test_positions_come_back_exactly_to_float32(mesh: str, tmp_path: Path):
 @pytest.mark.parametrize(("mesh", "component"), [("cloth", "Mesh3D:vertex_colors"), ("chain", "Points3D:colors")])
 def test_each_frame_has_the_colours_of_its_own_strains(mesh: str, component: str, tmp_path: Path):
     of = info(mesh)
-    found: dict[int, list[int]] = {}
+    found: dict[Any, Any] = {}
     with open_recording(record(tmp_path / "a.rrd", of, count=12)) as source:
         for chunk in source.chunks(content="/scene/mesh", components=[component]):
             batch = chunk.to_record_batch()

@@ -8,9 +8,10 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import Field
 
-from harness.base.document import Document, Key, key_text, quote, read_yaml
+from harness.base.document import Document, Key, key_text, quote
 from harness.base.errors import InputError
 from harness.base.model import Model, Vector
+from harness.base.yaml import read_yaml
 
 VALUES = {
     "1e5": 100_000,

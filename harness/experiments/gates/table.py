@@ -15,10 +15,11 @@ from typing import Any
 
 from pydantic import Field
 
-from harness.base.document import Document, read_yaml
+from harness.base.document import Document
 from harness.base.errors import InputError, Mistake
 from harness.base.machine import pinned_threads
 from harness.base.model import Model
+from harness.base.yaml import read_yaml
 from harness.config.sweep import Iterations, Tolerance
 from harness.experiments.gates.agreement import AGREEMENT, difference
 from harness.experiments.gates.scenes import calls_of, pair, timed

@@ -1,10 +1,12 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """Convergence on a frozen step: gap, largest error and stationarity, against iterations and against seconds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -36,7 +38,8 @@ GUESSES = {"current": "from the current positions", "inertial": "from the inerti
 _LEAST = 1e-16  # what is smaller is drawn there: double precision knows nothing below
 
 
-class _Row(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class _Row:
     """A row of panels: what it shows of a curve, in words, and its share of the height."""
 
     name: str
@@ -53,7 +56,7 @@ _ROWS = (
 
 def draw_convergence(table: Table, folder: Path) -> list[Path]:
     """A picture for each problem that solvers were measured on; returns the files."""
-    drawn = []
+    drawn: list[Path] = []
     marked = looks((curve.label, curve.solver) for curve in table.curves)
     for problem in table.problems:
         curves = [curve for curve in table.curves if curve.problem is problem]
@@ -66,7 +69,7 @@ def draw_convergence(table: Table, folder: Path) -> list[Path]:
 
 def remarks(curves: Sequence[Curve]) -> list[str]:
     """What did not go well, in words: a sentence for each failure and each other minimum."""
-    words = []
+    words: list[str] = []
     for curve in curves:
         if curve.status != "ok":
             why = f": {curve.reason}" if curve.reason else ""
@@ -170,9 +173,9 @@ def _vertical(ax: Axes, row: _Row, curves: Sequence[Curve], problem: Problem, co
         ax.text(1.0, 1.03, "metres", transform=ax.transAxes, fontsize=8.5, color=MUTED)
 
 
-def _meanings(words: Sequence[str]) -> list[tuple[Line2D, str]]:
+def _meanings(words: Sequence[str]) -> list[tuple[Line2D | Patch, str]]:
     """What the other marks mean."""
-    shaded: list = [(Patch(color=MUTED, alpha=0.16, linewidth=0), "round-off")]
+    shaded: list[tuple[Line2D | Patch, str]] = [(Patch(color=MUTED, alpha=0.16, linewidth=0), "round-off")]
     if any(word.startswith("×") for word in words):
         cross = Line2D([], [], color=INK, marker="x", linestyle="", markersize=8, markeredgewidth=2)
         shaded.append((cross, "ended early, see foot"))

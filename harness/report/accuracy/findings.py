@@ -14,7 +14,7 @@ from harness.report.accuracy.convergence import GUESSES, remarks
 from harness.report.accuracy.growth import TARGET, growths
 from harness.report.accuracy.paper import FAR, FIGURE_2, ITERATIONS, Comparison, comparisons
 from harness.report.accuracy.profiles import least_ratios
-from harness.report.accuracy.table import Curve, Table, without_short
+from harness.report.accuracy.table import Curve, Table, Values, without_short
 from harness.report.accuracy.times import STEPS, TARGETS, crossings, power, races, reach, seconds_to
 from harness.report.references import cited
 
@@ -142,7 +142,7 @@ def _profiles(table: Table) -> Iterator[str]:
             yield f"To {power(target)}, of {count} problems: fastest is {told}."
 
 
-def _times_of(values) -> str:
+def _times_of(values: Values) -> str:
     worst = float(np.max(values))
     return f"{worst:.2g} times" if np.isfinite(worst) else "never reaching, against"
 

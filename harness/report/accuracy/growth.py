@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """Growth with size: the time to a gap of 1e-3 against the number of vertices, and the powers fitted to it."""
 
 from __future__ import annotations
@@ -57,7 +59,7 @@ def growths(table: Table) -> list[Growth]:
     for curve in table.curves:
         sizes = groups.setdefault((curve.problem.scene, curve.first_guess, curve.label), {})
         sizes.setdefault(curve.problem.vertices, []).append(curve)
-    found = []
+    found: list[Growth] = []
     for (scene, guess, label), sizes in groups.items():
         times = {n: middle(curves, TARGET) for n, curves in sorted(sizes.items())}
         reached = {n: t for n, t in times.items() if np.isfinite(t) and t > 0.0}

@@ -101,7 +101,7 @@ def _run(curve: Curve, pictures: Mapping[str, str]) -> Item:
 
 
 def _convergence(table: Table, pictures: Mapping[str, str], folder: Path) -> Item:
-    items = []
+    items: list[Item] = []
     for curve in table.curves:
         run = _run(curve, pictures)
         if run["recording"] and not (folder / run["recording"]).is_file():
@@ -139,7 +139,7 @@ def _convergence(table: Table, pictures: Mapping[str, str], folder: Path) -> Ite
 
 
 def _times(table: Table, pictures: Mapping[str, str]) -> Item:
-    items = []
+    items: list[Item] = []
     for curve in table.curves:
         found = [reach(curve, target) for target in TARGETS]
         if not any(found):
@@ -169,11 +169,11 @@ def _times(table: Table, pictures: Mapping[str, str]) -> Item:
 
 
 def _work(works: Sequence[Work]) -> Item:
-    chains: dict[tuple, list[Work]] = {}
+    chains: dict[tuple[Any, ...], list[Work]] = {}
     for w in works:
         if w.status == "ok":
             chains.setdefault((w.mesh, w.label, w.integrator, w.tolerance, w.iterations, w.first_guess), []).append(w)
-    items = []
+    items: list[Item] = []
     for (mesh, label, integrator, tolerance, iterations, _), members in chains.items():
         members.sort(key=lambda work: work.time_step)
         stop = f"{iterations} iterations" if tolerance is None else f"tolerance {tolerance:g}"
@@ -204,7 +204,7 @@ def _work(works: Sequence[Work]) -> Item:
 
 def _profiles(table: Table) -> Item:
     kinds = {"performance profile": least_ratios, "data profile": iteration_ratios}
-    items = []
+    items: list[Item] = []
     for kind, ratios in kinds.items():
         for target in TARGETS:
             for label, values in ratios(table, target).items():

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """Our curves over figures 2 and 3 of Liu et al. 2013, and by how much they differ.
 
 The paper's values are read from its figures and text: the relative error (g - g*)/(g0 - g*), g0 at the inertial target,
@@ -9,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -89,7 +91,7 @@ def stiffness(problem: Problem) -> float:
 
 def comparisons(table: Table) -> list[Comparison]:
     """All points of the paper that our rows have a counterpart of."""
-    found = []
+    found: list[Comparison] = []
     for curve in _long(table)[:1]:
         for iterations, (theirs, _) in FIGURE_2.items():
             ours = at(curve, iterations)
@@ -183,10 +185,17 @@ def _figure_2(
     _below(by_iterations, 0, f"ours / the paper's after {', '.join(map(str, FIGURE_2))}:", MUTED)
     _below(by_iterations, 1, f"81 × 81, k = 1200:   {'   '.join(ratios) or 'not measured'}", INK)
     errors, seconds = zip(*FIGURE_2.values(), strict=True)
-    look = {"color": INK, "linestyle": (0, (1, 1.6)), "mfc": PAGE, "markersize": 7, "mew": 1.4, "zorder": 6}
+    look: dict[str, Any] = {
+        "color": INK,
+        "linestyle": (0, (1, 1.6)),
+        "mfc": PAGE,
+        "markersize": 7,
+        "mew": 1.4,
+        "zorder": 6,
+    }
     by_iterations.plot([*FIGURE_2], errors, marker="o", **look)
     by_time.plot(seconds, errors, marker="o", **look)
-    by_time.plot(*zip(*FIGURE_2_NEWTON, strict=True), marker="D", **{**look, "linestyle": ""})
+    by_time.plot(*zip(*FIGURE_2_NEWTON, strict=True), marker="D", **(look | {"linestyle": ""}))
 
 
 def _figure_3(ax: Axes, compared: Sequence[Comparison], keys: Sequence[tuple[int, int]]) -> None:

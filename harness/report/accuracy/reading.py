@@ -28,7 +28,7 @@ _Label = Callable[[_Row], str]
 
 def read(folder: Path, files: Iterable[Path] | None = None) -> Table:
     """The rows in these files, all under `folder`/accuracy if left out. Raises InputError where there are none."""
-    tables = []
+    tables: list[pa.Table] = []
     for path in sorted((folder / "accuracy").rglob("*.parquet") if files is None else files):
         tables.append(read_rows([path], pa.schema([]), needed=("kind",)))
     if not tables:
@@ -103,7 +103,7 @@ _WHO = ("problem", "solver", "parameters", "threads")
 
 def _curves(kinds: dict[str, list[_Row]], problems: dict[str, Problem], label: _Label) -> Iterable[Curve]:
     prepared = {tuple(row[key] for key in _WHO): row for row in kinds["prepare"]}
-    groups: dict[tuple, list[_Row]] = defaultdict(list)
+    groups: dict[tuple[Any, ...], list[_Row]] = defaultdict(list)
     for row in kinds["curve"]:
         groups[*(row[key] for key in _WHO), row["first_guess"]].append(row)
     for key, rows in groups.items():

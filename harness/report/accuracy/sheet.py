@@ -1,10 +1,13 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """What the pictures of accuracy share: a page with one legend at its right, logarithmic axes, notes at its foot."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -12,11 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogFormatterMathtext, LogLocator, NullLocator
+from matplotlib.patches import Patch
+from matplotlib.ticker import FixedLocator, LogFormatterMathtext, LogLocator, NullLocator
+from numpy.typing import ArrayLike
 
 from harness.base.files import replacing
 from harness.report.accuracy.times import duration
-from harness.report.page import axes, header, new_page, quantity, save, shorten, text
+from harness.report.page import axes, header, new_page, quantity, save, shorten, text, ticks
 from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark
 
 LEFT, TOP, RIGHT, BOTTOM = 40, 118, 1384, HEIGHT - 34
@@ -26,7 +31,7 @@ _LINE, _NOTES = 17, 4
 
 
 @contextmanager
-def sheet(stem: Path, title: str, facts: Sequence[str]) -> Iterator[Figure]:
+def sheet(stem: Path, title: str, facts: Sequence[str]) -> Generator[Figure]:
     """A page that is saved as `stem`.png and `stem`.svg once it is drawn."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     # The salt makes the same picture the same file.
@@ -44,10 +49,10 @@ def files(stem: Path) -> list[Path]:
     return [stem.with_suffix(".png"), stem.with_suffix(".svg")]
 
 
-def line(ax: Axes, x, y, look: Mark, *, spaced: bool = True, **more) -> None:
+def line(ax: Axes, x: ArrayLike, y: ArrayLike, look: Mark, *, spaced: bool = True, **more: Any) -> None:
     """A solver's line; `spaced` markers keep a distance, as iterates lie dense."""
-    more = {"linewidth": 1.5, "markersize": 5 * size(look), **more}
-    more |= {"markevery": 0.12} if spaced and len(x) > 3 else {}
+    more = {"linewidth": 1.5, "markersize": 5 * size(look)} | more
+    more |= {"markevery": 0.12} if spaced and np.size(x) > 3 else {}
     ax.plot(x, y, color=look.color, linestyle=look.dash, marker=look.marker, mec=PAGE, mew=0.5, **more)
 
 
@@ -56,9 +61,9 @@ def size(look: Mark) -> float:
     return {"*": 1.8, "P": 1.35, "X": 1.35, "p": 1.2, "h": 1.15, "d": 1.2}.get(look.marker, 1.0)
 
 
-def legend(page: Figure, entries: Mapping[str, Mark], *, below: Sequence[tuple[Line2D, str]] = ()) -> None:
+def legend(page: Figure, entries: Mapping[str, Mark], *, below: Sequence[tuple[Line2D | Patch, str]] = ()) -> None:
     """The solvers at the page's right, then other marks and their meanings."""
-    handles = [
+    handles: list[Line2D | Patch] = [
         Line2D(
             [],
             [],
@@ -108,13 +113,12 @@ def panel(page: Figure, left: float, top: float, width: float, height: float, ti
 
 def log_axis(axis: Axis, low: float, high: float, *, unit: str = "power") -> None:
     """A logarithmic axis from low to high; unit: power (of ten), time, plain or percent."""
-    set_scale, set_limits = (
-        (axis.axes.set_xscale, axis.axes.set_xlim)
-        if axis is axis.axes.xaxis
-        else (axis.axes.set_yscale, axis.axes.set_ylim)
-    )
-    set_scale("log")
-    set_limits(low, high)
+    if axis is axis.axes.xaxis:
+        axis.axes.set_xscale("log")
+        axis.axes.set_xlim(low, high)
+    else:
+        axis.axes.set_yscale("log")
+        axis.axes.set_ylim(low, high)
     decades = np.log10(high / low)
     subs = (1.0,) if decades > 2.2 else (1.0, 3.0) if decades > 1.2 else (1.0, 2.0, 5.0)
     axis.set_major_locator(LogLocator(subs=subs, numticks=7 if decades > 2.2 else 12))
@@ -128,7 +132,7 @@ def iteration_axis(ax: Axes, last: float) -> None:
     ax.set_xlim(-0.08, 1.15 * max(last, 10.0))
     decades = [10.0**k for k in range(6) if 10.0**k <= max(last, 10.0)]
     ax.xaxis.set_major_locator(FixedLocator([0.0, *decades]))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: quantity(value)))
+    ax.xaxis.set_major_formatter(ticks(quantity))
     ax.xaxis.set_minor_locator(NullLocator())
 
 
@@ -143,7 +147,7 @@ def limits(values: Iterable[float], *, least: float = 0.0, margin: float = 1.3) 
 
 _FORMATTERS = {
     "power": LogFormatterMathtext(labelOnlyBase=False),
-    "time": FuncFormatter(lambda value, _: duration(value)),
-    "plain": FuncFormatter(lambda value, _: quantity(value)),
-    "percent": FuncFormatter(lambda value, _: f"{100 * value:.3g} %"),
+    "time": ticks(duration),
+    "plain": ticks(quantity),
+    "percent": ticks(lambda value: f"{100 * value:.3g} %"),
 }

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """Seconds to each accuracy for every solver on a mesh: the step alone, and with set-up spread over many steps."""
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ _COLUMNS = {None: "the step alone", **{n: f"set-up over {count(n)} step{'s' if n
 
 def draw_times(table: Table, folder: Path) -> list[Path]:
     """A picture for each mesh; of problems whose minimum is certified alone. Returns the files."""
-    drawn = []
+    drawn: list[Path] = []
     marked = looks((curve.label, curve.solver) for curve in table.curves)
     for mesh in dict.fromkeys(problem.mesh for problem in table.problems):
         sure = [curve for curve in table.curves if curve.problem.mesh == mesh and not curve.problem.doubt]
@@ -125,7 +127,7 @@ def _panel(
 
 def _words(curves: Sequence[Curve], guesses: Sequence[str]) -> list[str]:
     """Who overtakes whom on the hardest step, the one of the last moment, from each first guess."""
-    words = []
+    words: list[str] = []
     for guess in guesses:
         race = [curve for curve in curves if curve.problem is curves[-1].problem and curve.first_guess == guess]
         sentences = crossings(race)

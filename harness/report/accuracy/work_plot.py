@@ -1,9 +1,12 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """Work against precision: the error of a simulated second against the wall time that it takes, and the Pareto front."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -58,7 +61,7 @@ def front(works: Iterable[Work]) -> list[Work]:
 def findings(works: Sequence[Work]) -> list[str]:
     """The cheapest way to each error that the default does not reach, or reaches for more, in words."""
     base = default(works)
-    words = []
+    words: list[str] = []
     if base:
         words.append(
             f"the default ({base.setting}) has an error of {100 * base.error:.2g} % "
@@ -91,7 +94,7 @@ def same_method(work: Work, base: Work | None) -> bool:
 
 def draw_work(table: Table, folder: Path) -> list[Path]:
     """A picture for each mesh, a panel for each integrator; returns the files."""
-    drawn = []
+    drawn: list[Path] = []
     marked = looks((work.label, work.solver) for work in table.works)
     for mesh in dict.fromkeys(work.mesh for work in table.works):
         here = [work for work in table.works if work.mesh == mesh]
@@ -143,7 +146,7 @@ def _sizes(works: Iterable[Work]) -> dict[float | None, float]:
 
 def _panel(ax: Axes, works: list[Work], marked: dict[str, Mark], sizes: dict[float | None, float]) -> None:
     """Points of one integrator; those that differ in the time step alone are joined."""
-    chains: dict[tuple, list[Work]] = {}
+    chains: dict[tuple[str, float | None, int, str], list[Work]] = {}
     for work in works:
         chains.setdefault((work.label, work.tolerance, work.iterations, work.first_guess), []).append(work)
     for (label, tolerance, *_), members in chains.items():
@@ -175,7 +178,7 @@ def _front(ax: Axes, works: list[Work]) -> None:
 
 
 def _meanings(sizes: dict[float | None, float]) -> list[tuple[Line2D, str]]:
-    def dot(**more) -> Line2D:
+    def dot(**more: Any) -> Line2D:
         return Line2D([], [], color=MUTED, marker="o", linestyle="", **more)
 
     return [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import pyarrow as pa
@@ -82,7 +82,8 @@ class Machine:
     def bandwidth(self, threads: int, working_set: float, kernel: str = "read") -> float:
         """Bytes a second from a working set [bytes], between the measured ones by logarithms."""
         at = sorted(self._best[threads, kernel].items())
-        return float(np.exp(np.interp(np.log(working_set), *np.log(np.array(at)).T)))
+        known, rates = np.log(np.array(at)).T
+        return float(np.exp(cast(float, np.interp(np.log(working_set), known, rates))))
 
     def flops(self, threads: int, precision: str) -> float:
         """Flops a second; below float32 there is no arithmetic."""
@@ -116,7 +117,7 @@ def figures(table: pa.Table) -> list[Figures]:
     groups: dict[tuple[str, int], dict[str, list[Row]]] = defaultdict(dict)
     for found in runs.values():
         groups[found[0]["scene"], found[0]["size"]][labels[found[0]["run_id"]]] = found
-    out = []
+    out: list[Figures] = []
     for group in groups.values():
         machine = Machine([row for found in group.values() for row in found if row["solver"] == MACHINE])
         for label, found in group.items():

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from harness.base import machine
 from harness.report.speed.figures import STEP, Figures
 from harness.report.speed.size_plot import Series, draw_by_size
 
 
-class Picture(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Picture:
     """One picture: the stem of its file, its title, what it shows of a candidate, whether that is a share."""
 
     stem: str
@@ -46,7 +47,7 @@ def draw(found: Sequence[Figures], folder: Path) -> None:
 
 def _series(members: Sequence[Figures], picture: Picture) -> list[Series]:
     """A line for each candidate of a scene."""
-    lines = []
+    lines: list[Series] = []
     for label in dict.fromkeys(f.label for f in members):
         mine = [f for f in members if f.label == label]
         points = sorted((f.vertices, value) for f in mine if (value := picture.value(f)) is not None)

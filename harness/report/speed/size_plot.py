@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """One quantity against mesh size on a page of its own: a line for each candidate, named at the right."""
 
 from __future__ import annotations
@@ -8,10 +10,11 @@ from typing import NamedTuple
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MultipleLocator, NullLocator
+from matplotlib.ticker import FixedLocator, LogLocator, MultipleLocator, NullLocator
 
-from harness.report.page import axes, count, header, new_page, quantity, save, shorten
+from harness.report.page import axes, count, header, new_page, quantity, save, shorten, ticks
 from harness.report.style import HEIGHT, PAGE, RC, WIDTH, shades
 
 _LEFT, _TOP, _NAMES, _BELOW = 110, 130, 400, 70
@@ -70,22 +73,22 @@ def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[
         save(page, path)
 
 
-def _scales(ax, drawn: Sequence[Series], share: bool) -> None:
+def _scales(ax: Axes, drawn: Sequence[Series], share: bool) -> None:
     """Vertices by logarithms; times by logarithms too, shares from nothing up."""
     sizes = sorted({n for line in drawn for n in line.vertices})
     ax.set_xscale("log")
     ax.set_xlabel("vertices", fontsize=10, loc="left")
     ax.xaxis.set_major_locator(FixedLocator(sizes))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: count(round(value))))
+    ax.xaxis.set_major_formatter(ticks(lambda value: count(round(value))))
     if share:
         highest = max((max(line.values) for line in drawn), default=1.0)
         ax.set_ylim(0.0, max(1.0, 1.05 * highest))
         ax.yaxis.set_major_locator(MultipleLocator(0.1 * np.ceil(max(1.0, highest) / 1.5)))
-        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:.0f} %"))
+        ax.yaxis.set_major_formatter(ticks(lambda value: f"{100 * value:.0f} %"))
     else:
         ax.set_yscale("log")
         ax.yaxis.set_major_locator(LogLocator(numticks=12))
-        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: quantity(value)))
+        ax.yaxis.set_major_formatter(ticks(quantity))
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_minor_locator(NullLocator())
     ax.tick_params(length=3, labelsize=9.5)

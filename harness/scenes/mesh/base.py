@@ -35,7 +35,7 @@ class Mesh:
     dimension: int
     spacing: float
     resolution: int = 0
-    parts: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    parts: Mapping[str, NDArray[np.int64]] = field(default_factory=dict[str, NDArray[np.int64]])
     mass: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:

@@ -44,7 +44,7 @@ class Cells:
     """points: (n, 3) [m]; polygons: corners k >= 2 -> (f, k); segments: (s, 2); tetrahedra: (t, 4)."""
 
     points: Points
-    polygons: Mapping[int, Indices] = field(default_factory=dict)
+    polygons: Mapping[int, Indices] = field(default_factory=dict[int, Indices])
     segments: Indices = field(default_factory=lambda: NO_PAIRS)
     tetrahedra: Indices = field(default_factory=lambda: np.empty((0, 4), np.int64))
 

@@ -1,3 +1,5 @@
+# pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
+# meshio has no types.
 """Mesh files of other programs, as meshio reads them: what runs in the child that `harness.base.child` keeps.
 
 meshio takes some files for whole that were cut before their end. So the sections of a .msh must be closed, a PLY must
@@ -10,6 +12,7 @@ import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, Protocol, cast
 
 import meshio
 import numpy as np
@@ -19,11 +22,23 @@ Block = tuple[str, NDArray[np.int64]]
 """Cells of one kind: its name in meshio, and the points of each."""
 
 
+class _Cells(Protocol):
+    type: str
+    data: NDArray[Any]
+
+
+class _Raw(Protocol):
+    """What meshio makes of a file."""
+
+    points: NDArray[Any]
+    cells: list[_Cells]
+
+
 def read(path: Path) -> tuple[NDArray[np.float64], list[Block]]:
     """The points and the cells of a mesh file; raises anything on a broken file, ValueError on one that was cut."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        raw = meshio.read(path)
+        raw = cast(_Raw, meshio.read(path))
     missing = _MISSING.get(path.suffix.lower())
     if missing and (what := missing(path.read_bytes(), raw)):
         raise ValueError(f"{what}; the file was cut before its end, so write it once more")
@@ -35,7 +50,7 @@ _SECTION = re.compile(rb"^\$(End)?((?:MeshFormat|PhysicalNames|Entities|Nodes|El
 _PROMISE = re.compile(rb"^element (vertex|face) (\d+)", re.M)
 
 
-def _open_sections(content: bytes, raw: meshio.Mesh) -> str:
+def _open_sections(content: bytes, raw: _Raw) -> str:
     """Of Gmsh's .msh, whose other kind, ANSYS's, has none."""
     begun: dict[bytes, int] = {}
     for end, name in _SECTION.findall(content):
@@ -44,7 +59,7 @@ def _open_sections(content: bytes, raw: meshio.Mesh) -> str:
     return f"the section ${left} has no $End{left}" if left else ""
 
 
-def _broken_promise(content: bytes, raw: meshio.Mesh) -> str:
+def _broken_promise(content: bytes, raw: _Raw) -> str:
     """Of a PLY."""
     found = {b"vertex": len(raw.points), b"face": sum(len(block.data) for block in raw.cells)}
     for what, count in _PROMISE.findall(content.partition(b"end_header")[0]):
@@ -53,13 +68,13 @@ def _broken_promise(content: bytes, raw: meshio.Mesh) -> str:
     return ""
 
 
-def _not_ended(content: bytes, raw: meshio.Mesh) -> str:
+def _not_ended(content: bytes, raw: _Raw) -> str:
     """Of an STL; a binary one holds its count."""
     text = content.lstrip().startswith(b"solid") and b"facet" in content
     return "it has no endsolid" if text and b"endsolid" not in content else ""
 
 
-_MISSING: dict[str, Callable[[bytes, meshio.Mesh], str]] = {
+_MISSING: dict[str, Callable[[bytes, _Raw], str]] = {
     ".msh": _open_sections,
     ".ply": _broken_promise,
     ".stl": _not_ended,

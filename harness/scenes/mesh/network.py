@@ -59,7 +59,7 @@ class Network(Model):
         mass = None if self.mass is None else np.array(self.mass, float)
         families = {STRETCH: self.springs, SHEAR: self.shear, BEND: self.bend}
         springs = np.concatenate([np.array(pairs, np.int64).reshape(-1, 2) for pairs in families.values()])
-        ends = np.cumsum([0, *map(len, families.values())]).tolist()
+        ends: list[int] = np.cumsum([0, *map(len, families.values())]).tolist()
         i, j = springs.T
         lengths = np.linalg.norm(rest[i] - rest[j], axis=1)
         return Mesh(

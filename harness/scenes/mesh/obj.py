@@ -19,8 +19,8 @@ from harness.scenes.mesh.cells import MAX_COORDINATE, Cells, check_file
 from harness.scenes.mesh.generator import MAX_VERTICES
 from harness.scenes.mesh.topology import NO_PAIRS
 
-_PASSED_OVER = {"vt", "vn", "vp", "p", "g", "o", "s", "mg", "mtllib", "usemtl", "maplib", "usemap", "lod"}
-_PASSED_OVER |= {"bevel", "c_interp", "d_interp", "shadow_obj", "trace_obj"}
+_RENDERING = {"bevel", "c_interp", "d_interp", "shadow_obj", "trace_obj", "mtllib", "usemtl", "maplib", "usemap", "lod"}
+_PASSED_OVER = _RENDERING | {"vt", "vn", "vp", "p", "g", "o", "s", "mg"}
 _TOKEN = re.compile(r"([+-]?[0-9]+)(/[+-]?[0-9]*(/[+-]?[0-9]*)?)?")
 _MOST_MISTAKES = 20
 
@@ -86,7 +86,7 @@ class _Reader:
         """Zero-based vertices; whether they exist is known only at the end of the file."""
         if len(words) < 2:
             raise ValueError(f"a face or line needs at least 2 vertices, came {len(words)}")
-        corners = []
+        corners: list[int] = []
         for word in words:
             match = _TOKEN.fullmatch(word)
             index = int(match[1][:20]) if match else 0

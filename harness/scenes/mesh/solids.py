@@ -56,7 +56,7 @@ class Tower(Generator):
             springs=springs,
             weights=by_length(rest, members),
             dimension=1,
-            spacing=float(np.mean(np.linalg.norm(rest[members[:, 0]] - rest[members[:, 1]], axis=1))),
+            spacing=float(np.linalg.norm(rest[members[:, 0]] - rest[members[:, 1]], axis=1).mean()),
             resolution=size,
             parts={"base": index[0], "top": index[-1]},
         )

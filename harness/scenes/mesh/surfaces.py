@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, cast
 
 import numpy as np
 
@@ -113,7 +113,7 @@ class Balloon(Generator):
             triangles=triangles,
             weights=by_area(rest, triangles),
             dimension=2,
-            spacing=float(np.mean(np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1))),
+            spacing=float(np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1).mean()),
             resolution=size,
             parts={"pole_top": [0], "pole_bottom": [len(corners) - 1]},
         )
@@ -158,7 +158,7 @@ def _geodesic(faces: Indices, size: int) -> tuple[Indices, Indices, Indices]:
         index[:, weights[:, corner] == size] = faces[:, [corner]]
         on_edge = np.flatnonzero((weights[:, corner] == 0) & (weights[:, p] > 0) & (weights[:, q] > 0))
         start, end = faces[:, [p]], faces[:, [q]]
-        along = np.where(start < end, weights[on_edge, q], weights[on_edge, p])
+        along = cast(Indices, np.where(start < end, weights[on_edge, q], weights[on_edge, p]))
         index[:, on_edge] = 12 + edge_of[start, end] * (size - 1) + along - 1
 
     point = np.zeros((size + 1, size + 1), np.int64)

@@ -42,7 +42,7 @@ def unique_pairs(pairs: Indices) -> Indices:
         return NO_PAIRS
     i, j = pairs.T
     base = int(pairs.max()) + 1
-    codes = np.sort(np.minimum(i, j) * base + np.maximum(i, j))  # np.unique hashes them, ten times slower
+    codes: Indices = np.sort(np.minimum(i, j) * base + np.maximum(i, j))  # np.unique hashes them, ten times slower
     return np.stack(np.divmod(codes[np.diff(codes, prepend=-1) > 0], base), axis=1)
 
 
@@ -59,7 +59,7 @@ def corner_pairs(polygons: Indices) -> Indices:
 
 def fan(polygons: Indices) -> Indices:
     """Polygons of k corners, (f, k), as fans of triangles from their first corner, (f (k-2), 3)."""
-    k = np.arange(1, polygons.shape[1] - 1)
+    k = np.arange(1, polygons.shape[1] - 1, dtype=np.int64)
     first = np.repeat(polygons[:, :1], len(k), axis=1)
     return np.stack([first, polygons[:, k], polygons[:, k + 1]], axis=2).reshape(-1, 3)
 
@@ -98,7 +98,7 @@ def box_parts(rest: Points) -> dict[str, Indices]:
     low, high = rest.min(axis=0), rest.max(axis=0)
     near = 1e-6 * np.linalg.norm(high - low)
     names = (("left", "right"), ("bottom", "top"), ("back", "front"))
-    parts = {}
+    parts: dict[str, Indices] = {}
     for axis, (lower, upper) in enumerate(names):
         parts[lower] = np.flatnonzero(rest[:, axis] <= low[axis] + near)
         parts[upper] = np.flatnonzero(rest[:, axis] >= high[axis] - near)
@@ -118,7 +118,7 @@ def assemble(
 ) -> Mesh:
     """A mesh of springs given by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND."""
     blocks = [springs.get(family, NO_PAIRS) for family in (STRETCH, SHEAR, BEND)]
-    ends = np.cumsum([0, *map(len, blocks)])
+    ends: list[int] = np.cumsum([0, *map(len, blocks)]).tolist()
     return Mesh(
         rest=np.ascontiguousarray(rest, np.float64),
         springs=np.concatenate(blocks),

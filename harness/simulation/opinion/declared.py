@@ -57,13 +57,17 @@ Force = Callable[[Array, Array, float], tuple[Array, float]]
 round-off."""
 
 
+Pinned = tuple[float, Callable[[float], Wide]]
+"""The weight [N/m] of a pin, and its target (3,) [m] at a time [s]."""
+
+
 @dataclass(frozen=True)
 class Opinion:
     """What one effect is thought to contribute.
 
     begin: the energy of a step; resists: its share (n,) [N/m] of the diagonal of Q at the rate 1/dt, None for none;
     needs: the energy where it depends on the diagonal of Q (n,) [N/m] that all effects and inertia add up to;
-    force; decay: of velocities (n, 3) before a step; pins: vertex -> (weight [N/m], target (3,) [m] at a time [s]);
+    force; decay: of velocities (n, 3) before a step; pins: by vertex;
     shortest: the shortest length [m] that the energy goes by besides the springs', reach: the largest coordinate [m].
     """
 
@@ -72,7 +76,9 @@ class Opinion:
     needs: Callable[[Array], Begin] | None = None
     force: Force | None = None
     decay: Callable[[Array], Array] | None = None
-    pins: dict[int, tuple[float, Callable[[float], Wide]]] = field(default_factory=dict)
+    pins: dict[int, tuple[float, Callable[[float], Wide]]] = field(
+        default_factory=dict[int, tuple[float, Callable[[float], Wide]]]
+    )
     shortest: float = np.inf
     reach: float = 0.0
 

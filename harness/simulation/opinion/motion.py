@@ -7,6 +7,7 @@ Between keys straight, or by monotone cubics (Fritsch and Carlson 1980, with the
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,7 +58,7 @@ def blur(motion: Any, size: float, time: float) -> float:
     values = np.array([(*key.offset, np.deg2rad(key.turn)) for key in motion.keys])
     arm = size + float(np.abs(motion.about).max())
     steep = np.abs(np.diff(values, axis=0) / np.diff(times)[:, None]).max(axis=0, initial=0.0)
-    far = arm + float(np.abs(values[:, :3]).max()) + arm * np.deg2rad(np.abs(turns).max())
+    far = arm + float(np.abs(values[:, :3]).max()) + arm * math.radians(max(map(abs, turns)))
     return EPS * (far + max(time, *times) * (steep[:3].max() + arm * steep[3]))
 
 

@@ -54,7 +54,8 @@ def resistance(energies: Sequence[Energy], n: int, time_step: float) -> Array:
 def own_slope(own: Sequence[Energy], x: Array, d: Array, reach: float, shortest: float) -> tuple[Told, float | None]:
     """The values and gradients of energies along d at x, both (n, 3), and by how much of its size the gradient is not
     that of the value, None where it is."""
-    values, slopes, wrong = [], [], None
+    values, slopes = list[float](), list[float]()
+    wrong: float | None = None
     for energy in own:
         gradient = np.zeros_like(x)
         energy.add_gradient(x, gradient)

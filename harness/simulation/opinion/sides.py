@@ -12,7 +12,7 @@ from harness.scenes.bind import Scene
 from harness.scenes.effects.table import EFFECTS
 from harness.scenes.spec import SceneSpec
 from harness.simulation.opinion import contact, edges, forces, surfaces, vertices
-from harness.simulation.opinion.declared import Begin, Declared, Opinion
+from harness.simulation.opinion.declared import Array, Begin, Declared, Opinion
 from harness.simulation.opinion.outside import from_outside, resistance
 
 _OPINIONS: dict[str, Callable[[Any, Declared], Opinion]] = {
@@ -69,19 +69,21 @@ def side(spec: SceneSpec, scene: Scene) -> Side:
     outside = {k for k, effect in enumerate(declared.effects) if not _known(effect)}
     if any(owned[k] for k in outside):  # nobody knows what damping by stiffness makes of their energies
         outside |= {k for k, one in enumerate(declared.effects) if one.kind == "rayleigh" and one.stiffness}
-    opinions, resists = [], mass / dt**2
+    opinions = list[Opinion]()
+    resists: Array = mass / dt**2
     for k, (effect, part) in enumerate(zip(declared.effects, bound, strict=True)):
         if k in outside:
             opinions.append(from_outside(part))
             resists = resists + resistance(part.energies, len(mass), dt)
         else:
             opinions.append(Opinion() if part.empty else _OPINIONS[effect.kind](effect, declared))
-            resists = resists + (0.0 if opinions[k].resists is None else opinions[k].resists)
+            if (share := opinions[k].resists) is not None:
+                resists = resists + share
     begins = [opinion.needs(resists) if opinion.needs else opinion.begin for opinion in opinions]
     return Side(declared, opinions, begins, owned, outside)
 
 
 def _known(effect: Any) -> bool:
     """Whether an effect is the shipped one of its kind."""
-    kind = type(effect)
+    kind: type = effect.__class__
     return effect.kind in _OPINIONS and EFFECTS.get(effect.kind) == f"{kind.__module__}:{kind.__qualname__}"

@@ -1,0 +1,139 @@
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# ruamel.yaml says nothing of its nodes and marks.
+"""YAML files to plain data that remembers its lines.
+
+Only the plain values of YAML 1.2 are read (mappings, lists, text, numbers, booleans, null): a tag or a directive is
+refused, and so is a file that exceeds the limits below once its aliases are expanded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from ruamel.yaml.reader import ReaderError
+
+from harness.base.document import Document, Key, key_text, quote
+from harness.base.errors import InputError, Mistake
+
+MAX_BYTES, MAX_NODES, MAX_DEPTH = 2**18, 100_000, 32
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a config; InputError when it is missing, no plain file, unreadable or too large."""
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(Mistake("is not a file; give a scene or a sweep (*.yaml, *.json)", path))
+        with path.open("rb") as file:
+            raw = file.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(Mistake(f"cannot be read: {reason}", path)) from error
+    if len(raw) > MAX_BYTES:
+        raise InputError(Mistake(f"is larger than {MAX_BYTES} bytes; a config is small", path))
+    return raw
+
+
+def read_yaml(path: Path) -> Document:
+    """Read a YAML file that holds one mapping; InputError with the line for everything else."""
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = error.object.count(b"\n", 0, error.start) + 1
+        raise InputError(Mistake("is not text in UTF-8", path, line)) from error
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.startswith("%"):
+            raise InputError(Mistake("YAML directives (%) are not allowed; remove the line", path, number))
+    yaml = YAML(typ="safe", pure=True)
+    yaml.max_depth = MAX_DEPTH
+    try:
+        node = yaml.compose(text)
+    except ReaderError as error:
+        at = int(error.position)
+        problem = f"holds the character {chr(error.character)!r}, which is not allowed"
+        raise InputError(Mistake(problem, path, text.count("\n", 0, at) + 1)) from error
+    except (YAMLError, ValueError) as error:
+        line = error.problem_mark.line + 1 if isinstance(error, MarkedYAMLError) and error.problem_mark else None
+        parts = [getattr(error, name, None) for name in ("context", "problem")]
+        problem = ", ".join(filter(None, parts)) or "cannot be parsed"
+        raise InputError(Mistake(f"is not YAML: {problem}", path, line)) from error
+    document = Document(path, {})
+    if not isinstance(node, MappingNode):
+        document.lines = {(): node.start_mark.line + 1} if node else {}
+        document.report("should hold a mapping of keys to values; it is " + ("a value" if node else "empty"))
+    else:
+        document.data = _Converter(document).convert(node, (), 0)
+    if document.mistakes:
+        raise document.error()
+    return document
+
+
+_SCALARS: dict[str, Callable[[str], Any]] = {
+    "str": str,
+    "timestamp": str,
+    "null": lambda text: None,
+    "bool": lambda text: text.lower() == "true",
+    "int": lambda text: _integer(text.replace("_", "")),
+    "float": lambda text: _number(text.replace("_", "")),
+}
+_CORE = "tag:yaml.org,2002:"
+
+
+def _integer(text: str) -> int:
+    value = int(text, {"0x": 16, "0o": 8}.get(text.lstrip("+-")[:2], 10))
+    if abs(value) >= 2**63:
+        raise ValueError("too large")
+    return value
+
+
+def _number(text: str) -> float | int:
+    """A float; 1e5, a whole number without a point, may also stand where an integer is wanted."""
+    value = float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
+    return int(value) if "." not in text and abs(value) < 2**53 and value.is_integer() else value
+
+
+class _Converter:
+    """Turns composed nodes into plain data; the nodes are counted each time an alias repeats them."""
+
+    def __init__(self, document: Document) -> None:
+        self.document = document
+        self.nodes = 0
+
+    def convert(self, node: Node, at: Key, depth: int) -> Any:
+        document, line = self.document, node.start_mark.line + 1
+        self.nodes += 1
+        if self.nodes > MAX_NODES or depth > MAX_DEPTH:
+            problem = f"is too large: at most {MAX_NODES} values, nested {MAX_DEPTH} deep, aliases expanded"
+            raise InputError(Mistake(problem, document.path, line, key_text(at)))
+        document.lines.setdefault(at, line)
+        if isinstance(node, MappingNode) and node.tag == f"{_CORE}map":
+            return dict(self.items(node, at, depth))
+        if isinstance(node, SequenceNode) and node.tag == f"{_CORE}seq":
+            return [self.convert(item, (*at, i), depth + 1) for i, item in enumerate(node.value)]
+        scalar = _SCALARS.get(str(node.tag).removeprefix(_CORE))
+        if not isinstance(node, ScalarNode) or scalar is None:
+            document.report(f"the YAML tag {quote(str(node.tag))} is not allowed; write a plain value", at)
+            return None
+        try:
+            node.value.encode()  # escapes can spell lone surrogates, which no later writer could write
+            return scalar(node.value)
+        except ValueError:
+            document.report(f"cannot read the value {quote(node.value)}", at)
+            return None
+
+    def items(self, node: MappingNode, at: Key, depth: int) -> Iterator[tuple[str, Any]]:
+        first: dict[str, int] = {}
+        for name, value in node.value:
+            line, self.nodes = name.start_mark.line + 1, self.nodes + 1
+            if not isinstance(name, ScalarNode):
+                self.document.report("the keys of a mapping should be plain words", at)
+            elif name.value in first:
+                self.document.lines[*at, name.value] = line
+                self.document.report(f"duplicate key; it is first given in line {first[name.value]}", (*at, name.value))
+            else:
+                first[name.value] = self.document.lines[*at, name.value] = line
+                yield name.value, self.convert(value, (*at, name.value), depth + 1)
