@@ -166,8 +166,9 @@ def rows(folder: str | Path) -> Any:
     """The rows of a sweep's results, such as "results/quickstart": a DataFrame of polars where it is installed, else of
     pandas, else a table of pyarrow. Raises InputError."""
     from harness.base.rows import read
+    from harness.base.shelf import units
 
-    return _frame(read(sorted((Path(folder) / "rows").glob("*.parquet"))))
+    return _frame(read(units(Path(folder) / "rows")))
 
 
 def _frame(table: Any) -> Any:

@@ -20,6 +20,7 @@ from harness.base.console import err, out
 from harness.base.console import say as _say
 from harness.base.errors import InputError, Mistake
 from harness.experiments.ablation.command import ablate
+from harness.experiments.archive.command import compact
 from harness.experiments.gallery import gallery
 from harness.experiments.gates.command import gate
 from harness.experiments.gates.study_command import study
@@ -200,6 +201,7 @@ def report(
 
 
 app.command()(ablate)
+app.command()(compact)
 app.command()(gallery)
 app.command()(gate)
 app.add_typer(study, name="gate-study")

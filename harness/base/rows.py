@@ -1,8 +1,8 @@
 # pyright: reportUnknownMemberType=false
 # pyarrow's stubs say nothing of the kinds of files that Parquet is written to.
-"""The rows that a run leaves: one flat Parquet file a run, under `results/<sweep>/rows/`.
+"""The rows that a run leaves: one flat Parquet file a run, under `results/<sweep>/rows/`, written and read.
 
-`COLUMNS` is the schema and its documentation at once; `results/README.md` shows the same table.
+`harness.base.shelf` says where the rows of a unit lie once many were packed.
 """
 
 from __future__ import annotations
@@ -11,199 +11,26 @@ import fcntl
 import os
 import stat
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from harness.base import shelf, union
+from harness.base.columns import SCHEMA
 from harness.base.errors import InputError, Mistake
 from harness.base.files import replacing
 
-
-class Column(NamedTuple):
-    """One column: its name, Arrow type, unit ("" for none) and meaning."""
-
-    name: str
-    type: pa.DataType
-    unit: str
-    meaning: str
-
-
-_TEXT, _INT, _REAL = pa.string(), pa.int64(), pa.float64()
-
-COLUMNS = (
-    Column("run_id", _TEXT, "", "hash of all that determines the run's result and timing"),
-    Column("sweep", _TEXT, "", "name of the sweep, the stem of its file"),
-    Column("scene", _TEXT, "", "name of the scene, the stem of its file"),
-    Column("size", _INT, "", "mesh size of the sweep; 0 where the mesh comes from a file"),
-    Column("solver", _TEXT, "", "name of the solver"),
-    Column("parameters", _TEXT, "", "the solver's parameters, as JSON"),
-    Column("family", _TEXT, "", "what the solver has in common with others; `local-global` is the paper's method"),
-    Column("reference", _TEXT, "", "where the solver's method comes from: authors, year, title and doi, as JSON"),
-    Column("minimises", pa.bool_(), "", "whether the solver's iterates tend to a minimum of the step's objective"),
-    Column("own_steps", pa.bool_(), "", "whether the solver integrates time in substeps of its own"),
-    Column("vertices", _INT, "", "vertices of the mesh"),
-    Column("springs", _INT, "", "springs of the mesh"),
-    Column("time_step", _REAL, "s", "the time step dt"),
-    Column("integrator", _TEXT, "", "how time is integrated: implicit-euler, bdf2 or midpoint"),
-    Column("first_guess", _TEXT, "", "where each step's iteration starts: assignment, current or inertial"),
-    Column("max_iterations", _INT, "", "the iteration limit of a step"),
-    Column("tolerance", _REAL, "", "relative tolerance of the stop rule; null: all iterations are done"),
-    Column("threads", _INT, "", "threads of Numba and of BLAS"),
-    Column(
-        "phase",
-        _TEXT,
-        "",
-        "prepare, step, local, global, iteration or run (the run as a whole), and what else a solver times; "
-        "of a machine its kernel",
-    ),
-    Column("frame", _INT, "", "the step, from 1; null where the phase has none"),
-    Column("round", _INT, "", "repetition of the measurement, from 0; prepare: 0 is cold, later ones are warm"),
-    Column(
-        "seconds",
-        _REAL,
-        "s",
-        "wall time of the phase; local and global: of one such step; iteration: of a whole solve next to these, over "
-        "its iterations",
-    ),
-    Column(
-        "pass_seconds", _REAL, "s", "wall time, by another clock, of all of the phase in the run; of steps in the round"
-    ),
-    Column("summed_seconds", _REAL, "s", "what the rows' times add up to in it"),
-    Column("cpu_seconds", _REAL, "s", "CPU time of the process in it"),
-    Column(
-        "interrupted",
-        pa.bool_(),
-        "",
-        "whether more than 3 % and 1 ms of it went by without computing: stopped, or others had the processor",
-    ),
-    Column(
-        "adds_up",
-        pa.bool_(),
-        "",
-        "of the parts of an iteration: whether they add up to one within 15 %, by the medians over the frames",
-    ),
-    Column("iterations", _INT, "", "iterations done in the step"),
-    Column("stopped", _TEXT, "", "what ended the step's iterations: iterations, tolerance, floor or stalled"),
-    Column(
-        "residual",
-        _REAL,
-        "J^(1/2)",
-        "|Q^-1 grad g|_Q over the unpinned vertices at the positions that the step's solve returned; taken in the "
-        "untimed pass where the solver knows that of the iterate before alone; null where it does not minimise",
-    ),
-    Column(
-        "last_residual",
-        _REAL,
-        "J^(1/2)",
-        "the last one that the solve computed, by which the stop rule judged; null as the residual is",
-    ),
-    Column("residual_of", _TEXT, "", "the iterate that last_residual belongs to: returned, previous or none"),
-    Column("yardstick", _REAL, "J^(1/2)", "the residual at the step's start, which the tolerance refers to"),
-    Column(
-        "stationarity",
-        _REAL,
-        "",
-        "where judged, and the solver minimises: |Q^-1 grad g|_Q at the answer, by the oracle, over the larger of "
-        "its value at the current positions and round-off",
-    ),
-    Column("attainable", _REAL, "", "where judged: of the stationarity, what round-off may make at the answer"),
-    Column(
-        "beyond",
-        _REAL,
-        "",
-        "where judged: the stationarity of what round-off does not explain of the gradient, vertex by vertex; by this "
-        "a step is graded",
-    ),
-    Column("minimum", pa.bool_(), "", "where judged: whether the answer curves upwards beyond round-off"),
-    Column("flat", pa.bool_(), "", "where judged: whether its smallest curvature cannot be told from zero: a valley"),
-    Column(
-        "graded",
-        _REAL,
-        "",
-        "in the first, middle and last frame, if the solver minimises: the stationarity by the oracle, judged or not",
-    ),
-    Column(
-        "distance",
-        _REAL,
-        "",
-        "where judged: largest distance of a vertex from where a run of Newton's method to round-off has it in that "
-        "frame, over the size at rest of the component it belongs to; null from where that is lost",
-    ),
-    Column(
-        "second_opinion",
-        _TEXT,
-        "",
-        "where judged: whether the step's formulas, written once more, agree at random points: agrees, disagrees (in "
-        "what, and by how much), or single opinion (effects from outside, held against themselves)",
-    ),
-    Column("energy_springs", _REAL, "J", "elastic energy of the springs after the step"),
-    Column("energy_inertia", _REAL, "J", "inertia term of the step's objective"),
-    Column("energy_force", _REAL, "J", "external forces' term of the step's objective"),
-    Column("energy_pins", _REAL, "J", "pin penalty of the step's objective"),
-    Column("energy_effects", _REAL, "J", "all other energies of the step's objective: bending, gas, damping and so on"),
-    Column("objective", _REAL, "J", "the step's objective, the sum of all terms"),
-    Column("largest_strain", _REAL, "", "largest |length / rest length - 1| of a spring after the step"),
-    Column(
-        "penetration",
-        _REAL,
-        "m",
-        "how deep the deepest vertex is inside an obstacle after the step, 0 where none is; null without obstacles",
-    ),
-    Column("digest", _TEXT, "", "SHA-256 of the positions after the step (float64 bytes)"),
-    Column(
-        "recorded",
-        _TEXT,
-        "",
-        "SHA-256 of the positions that the recording ends with, read back from its file (float32 bytes)",
-    ),
-    Column("nnz_system", _INT, "", "stored entries of the system matrix Q"),
-    Column("nnz_factor", _INT, "", "stored entries of its triangular factor, null where the library hides it"),
-    Column("nnz_hessian_factor", _INT, "", "stored entries of the triangular factor of Newton's Hessian"),
-    Column("panel_bytes", _INT, "", "bytes in which the prepared factor is stored"),
-    Column("flops_per_solve", _INT, "", "additions and multiplications of one global step, padding included"),
-    Column("choice", _TEXT, "", "what the solver chose by itself, and why"),
-    Column("apart", _REAL, "", "how far the precision of the factor moves converged positions, in the scene's size"),
-    Column("bytes", _REAL, "", "bytes that the phase touches, vectors and springs included, by count"),
-    Column("flops", _REAL, "", "additions and multiplications of the phase, by count"),
-    Column("working_set", _REAL, "", "bytes that the phase goes through again and again"),
-    Column("load", _REAL, "", "load average over a minute when the phase was timed"),
-    Column(
-        "status",
-        _TEXT,
-        "",
-        "ok, unsupported, diverged, disputed (by the second opinion), failed (an error, or a crash), "
-        "time-limit, killed (from outside) or skipped",
-    ),
-    Column("reason", _TEXT, "", "why the status is not ok"),
-    Column("time_limit", _REAL, "s", "wall time that the run might take; null: any"),
-    Column("memory_limit", _REAL, "GiB", "memory that the run might take; null: any"),
-    Column("machine", _TEXT, "", "id of the machine: hash of its processor, cores and memory"),
-    Column("cpu", _TEXT, "", "name of the processor"),
-    Column("cores", _INT, "", "cores this process may use"),
-    Column("memory_gib", _REAL, "GiB", "memory of the machine"),
-    Column("system", _TEXT, "", "operating system and its release"),
-    Column("versions", _TEXT, "", "versions of Python and the libraries, as JSON"),
-    Column("commit", _TEXT, "", "commit of the code, with -dirty where files differed from it"),
-    Column("code", _TEXT, "", "hash of all sources that the run depends on: rows made by other code differ"),
-    Column("own", _TEXT, "", "somebody's own code in the run: names, modules, versions, as JSON; null without"),
-    Column("started", _TEXT, "", "when the run started, UTC, ISO 8601"),
-)
-
-
-def schema_of(columns: Iterable[Column]) -> pa.Schema:
-    """The Arrow schema of columns, in their order."""
-    return pa.schema([pa.field(c.name, c.type) for c in columns])
-
-
-SCHEMA = schema_of(COLUMNS)
+_CODE = pa.schema([SCHEMA.field("code")])
 Row = Mapping[str, Any]
 
 
 MOST = 2_000_000
 """No file may hold more rows: a few bytes can claim any number of them."""
+_FEW = 8
+"""So many units are read one by one, before DuckDB is loaded."""
 
 
 def write(path: Path, rows: Iterable[Row], schema: pa.Schema = SCHEMA) -> None:
@@ -219,21 +46,63 @@ def write(path: Path, rows: Iterable[Row], schema: pa.Schema = SCHEMA) -> None:
         os.fsync(file.fileno())
 
 
-def read(paths: Iterable[Path], schema: pa.Schema = SCHEMA, *, needed: Sequence[str] = ()) -> pa.Table:
-    """All rows of the files, in the order of the paths; files of an older schema get nulls.
+def read(
+    paths: Iterable[Path],
+    schema: pa.Schema = SCHEMA,
+    *,
+    needed: Sequence[str] = (),
+    promote: union.Promote = "default",
+    named: bool = False,
+) -> pa.Table:
+    """All rows of units, in the order of their paths; those of an older schema get nulls.
 
-    needed: columns without which a row is none of ours. Raises InputError, with its name, for a file that is damaged,
-    foreign or without rows.
+    needed: columns without which a row is none of ours; promote: whether columns of one name may differ in type
+    ("permissive"); named: with a column of the units' names, shelf.FILE. Raises InputError that names all files that
+    are damaged, foreign or without rows.
     """
-    tables = [_one(path, schema, needed) for path in paths]
+    paths = list(paths)
+    if len(paths) > _FEW:
+        with suppress(union.Unfit):
+            return union.table(paths, schema, needed, most=MOST, promote=promote, named=named)
+    tables, mistakes = list[pa.Table](), list[Mistake]()
+    for path in paths:
+        try:
+            table = _one(path, schema, needed)
+            names = pa.array([path.stem] * len(table) if named else [], pa.string())
+            tables.append(table.append_column(shelf.FILE, names) if named else table)
+        except InputError as error:
+            mistakes += error.mistakes
+    if mistakes:
+        raise InputError(mistakes)
     try:
-        return pa.concat_tables([schema.empty_table(), *tables], promote_options="default")
+        return pa.concat_tables([schema.empty_table(), *tables], promote_options=promote)
     except pa.ArrowException as error:  # two foreign columns of one name
         raise InputError(f"rows do not fit together ({error}); take the foreign files out of the results") from error
 
 
+def heads(
+    paths: Iterable[Path], columns: Sequence[str], schema: pa.Schema = SCHEMA, *, needed: Sequence[str] = ()
+) -> dict[Path, dict[str, Any] | str]:
+    """These columns of the first row of each unit that is there, or in words what is wrong with the unit's rows.
+
+    columns, needed: of the schema. Raises InputError for a packed file that is damaged.
+    """
+    paths = [path for path in paths if shelf.there(path)]
+    found: dict[int, dict[str, Any]] = {}
+    if len(paths) > _FEW:
+        try:
+            found = union.heads(paths, columns, schema, needed)
+        except union.Unfit as unfit:
+            if unfit.damaged and len(unfit.damaged) < len(paths):
+                whole = [path for number, path in enumerate(paths) if number not in unfit.damaged]
+                bad = {paths[number]: first(paths[number], schema, needed=needed) for number in unfit.damaged}
+                found_of = heads(whole, columns, schema, needed=needed) | bad
+                return {path: found_of[path] for path in paths}
+    return {path: found.get(k) or first(path, schema, needed=needed) for k, path in enumerate(paths)}
+
+
 def first(path: Path, schema: pa.Schema = SCHEMA, *, needed: Sequence[str] = ()) -> dict[str, Any] | str:
-    """The first row of a file, or in words what is wrong with the file."""
+    """The first row of a unit, or in words what is wrong with its rows."""
     try:
         return _one(path, schema, needed).slice(0, 1).to_pylist()[0]
     except InputError as error:
@@ -242,12 +111,7 @@ def first(path: Path, schema: pa.Schema = SCHEMA, *, needed: Sequence[str] = ())
 
 def _one(path: Path, schema: pa.Schema, needed: Sequence[str]) -> pa.Table:
     try:
-        if not path.is_file():  # a pipe would be waited for
-            raise OSError("it is no plain file")
-        with pq.ParquetFile(path) as file:
-            if file.metadata.num_rows > MOST:
-                raise OSError(f"it claims {file.metadata.num_rows:,} rows, and at most {MOST:,} are read")
-            table = pa.concat_tables([schema.empty_table(), file.read()], promote_options="default")
+        table = pa.concat_tables([schema.empty_table(), _rows(path)], promote_options="default")
     except (pa.ArrowException, OSError) as error:
         raise InputError(Mistake(f"holds no rows ({error}); take it out of the results", path)) from error
     lacking = [name for name in needed if name not in table.column_names or table[name].null_count]
@@ -257,10 +121,45 @@ def _one(path: Path, schema: pa.Schema, needed: Sequence[str]) -> pa.Table:
     return table
 
 
+def _rows(unit: Path) -> pa.Table:
+    if os.path.lexists(unit):
+        with suppress(FileNotFoundError):  # it was packed a moment ago
+            return _file(unit)
+    if unit.stem not in shelf.packed_units(unit.parent):
+        raise OSError("it is no plain file")
+    only = pq.read_table(shelf.packed_file(unit.parent), filters=[(shelf.FILE, "==", unit.stem)])
+    return only.drop_columns([shelf.FILE])
+
+
+def _file(path: Path) -> pa.Table:
+    if not path.is_file() and path.exists():  # a pipe would be waited for
+        raise OSError("it is no plain file")
+    with pq.ParquetFile(path) as file:
+        if file.metadata.num_rows > MOST:
+            raise OSError(f"it claims {file.metadata.num_rows:,} rows, and at most {MOST:,} are read")
+        return file.read()
+
+
+def same(one: pa.Table, other: pa.Table) -> bool:
+    """Whether rows are equal to the bit: what is not a number equals itself here."""
+    return one.schema.equals(other.schema) and all(
+        _same(a.combine_chunks(), b.combine_chunks())
+        for a, b in zip(one.itercolumns(), other.itercolumns(), strict=True)
+    )
+
+
+def _same(one: Any, other: Any) -> bool:
+    if pa.types.is_list(one.type):
+        return one.value_lengths().equals(other.value_lengths()) and _same(one.flatten(), other.flatten())
+    if pa.types.is_float64(one.type):
+        one, other = one.view(pa.int64()), other.view(pa.int64())
+    return one.equals(other)
+
+
 def of_other_code(paths: Iterable[Path], code: str) -> str:
-    """A remark on how many of the whole files that are there were made by other code than this; empty for none."""
-    there = [row for path in paths if path.exists() and isinstance(row := first(path, pa.schema([])), dict)]
-    older = sum(row.get("code") != code for row in there)
+    """A remark on how many of the whole units that are there were made by other code than this; empty for none."""
+    there = [row for row in heads(paths, ["code"], _CODE).values() if isinstance(row, dict)]
+    older = sum(row["code"] != code for row in there)
     return f"{older} of {len(there)} there are by other code than today's; --again does all anew" if older else ""
 
 

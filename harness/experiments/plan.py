@@ -22,6 +22,9 @@ DONE, MISSING = "done", "missing"
 NEEDED = ("run_id", "scene", "size", "solver", "status", "code")
 """Columns without which a row tells nothing of a run."""
 
+_TOLD = ("status", "code", "time_limit", "memory_limit")
+"""Columns that tell how a run stands."""
+
 _LIMITED = ("failed", "time-limit", "killed")
 """How a run may end for its limits."""
 
@@ -63,25 +66,25 @@ class Planned:
 def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
     """Each run with its files and what is there already."""
     codes: dict[frozenset[type | Plugin], str] = {}
-    planned = []
-    for run in runs:
-        files = Files.of(run, folder)
+    planned: list[Planned] = []
+    placed = [(run, Files.of(run, folder)) for run in runs]
+    heads = rows.heads((files.rows for _, files in placed), _TOLD, needed=NEEDED)
+    for run, files in placed:
         state, older, damage = MISSING, False, ""
-        if files.rows.exists():
-            there = rows.first(files.rows, needed=NEEDED)
-            if isinstance(there, str):
-                damage = f"{files.rows} {there}"
-            else:
-                state = DONE if there["status"] == "ok" else there["status"]
-                limits = there["time_limit"], there["memory_limit"]
-                if state in _LIMITED and limits != (run.time_limit, run.memory_limit):
-                    state = MISSING  # who failed within other limits has said nothing of these
-                if (made_of := parts(run)) not in codes:
-                    codes[made_of] = code(made_of)
-                older = there["code"] != codes[made_of]
-            if state == DONE and run.record:
-                damage = _unfit(files.recording)
-                state = MISSING if damage or not files.recording.exists() else DONE
+        there = heads.get(files.rows)
+        if isinstance(there, str):
+            damage = f"{files.rows} {there}"
+        elif there is not None:
+            state = DONE if there["status"] == "ok" else there["status"]
+            limits = there["time_limit"], there["memory_limit"]
+            if state in _LIMITED and limits != (run.time_limit, run.memory_limit):
+                state = MISSING  # who failed within other limits has said nothing of these
+            if (made_of := parts(run)) not in codes:
+                codes[made_of] = code(made_of)
+            older = there["code"] != codes[made_of]
+        if state == DONE and run.record:
+            damage = _unfit(files.recording)
+            state = MISSING if damage or not files.recording.exists() else DONE
         planned.append(Planned(run, files, state, older, damage))
     return planned
 

@@ -1,12 +1,15 @@
 """SQL over the rows of all sweeps, accuracy configs and ablations (DuckDB on the Parquet files).
 
-A query runs in the child that `harness.base.child` keeps: it may ask for more time or memory than there is.
+A query runs in the child that `harness.base.child` keeps: it may ask for more time or memory than there is. What only
+reads is answered from the files; for other statements (PIVOT, CREATE) all rows are read into memory first.
 """
 
 from __future__ import annotations
 
 import csv
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -15,11 +18,18 @@ import pyarrow as pa
 from rich.table import Table
 from rich.text import Text
 
-from harness.base import child, rows
+from harness.base import child, columns, rows, shelf, union
 from harness.base.errors import InputError, Mistake
 
-_TABLES: dict[str, pa.Schema] = {"rows": rows.SCHEMA, "accuracy": pa.schema([]), "ablation": pa.schema([])}
+_TABLES: dict[str, pa.Schema] = {"rows": columns.SCHEMA, "accuracy": pa.schema([]), "ablation": pa.schema([])}
 """The tables by the names of their folders, with the columns that they have even where no row has them."""
+
+_OPENING = 1e-3
+"""Seconds of processor time more for each file: a file takes a third of that."""
+_OF_FILES = (duckdb.IOException, duckdb.InvalidInputException)
+"""What damaged files raise; and the base of all errors, as it is."""
+_TRIES = 2
+"""Files that are packed while a query reads them are looked for again."""
 
 SHOWN, PRINTED = 1_000, 1_000_000
 """Rows of an answer in a table and in CSV; the rest of them is left out."""
@@ -68,22 +78,37 @@ def answer(sql: str, results: Path, *, most: int = SHOWN, seconds: float = 15.0)
     """
     if not 0.0 < seconds <= 1e6:
         raise InputError(Mistake(f"came {seconds:g}; wanted a number of seconds above 0", key="--seconds"))
-    files = {table: sorted(results.glob(f"*/{table}/*.parquet")) for table in _TABLES}
-    if not any(files.values()):
+    folders = {table: shelf.folders(results, table, "*/") for table in _TABLES}
+    every = list(chain(*folders.values()))
+    files = sum(len(shelf.own_files(folder)) for folder in every)
+    if not files and not any(shelf.packed_file(folder).exists() for folder in every):
         raise InputError(f"{results}: holds no rows; run a sweep first, or name its folder with --results")
+    limits = child.Limits(seconds + _OPENING * files, MEMORY)
     try:
-        return child.call(_answered, sql, files, most, limits=child.Limits(seconds, MEMORY))
+        return child.call(_answered, sql, folders, most, limits=limits)
     except child.Lost as error:
         raise InputError(f"query: {error}; ask for less, or give it more with --seconds") from None
 
 
-def _answered(sql: str, files: dict[str, list[Path]], most: int) -> Answer:
-    with duckdb.connect(config={"memory_limit": f"{MEMORY // 2}B", "threads": 1, "temp_directory": ""}) as connection:
-        for table, schema in _TABLES.items():
-            if files[table] or len(schema):
-                connection.register(table, rows.read(files[table], schema))
-        connection.execute("SET enable_external_access = false; SET lock_configuration = true")
+def _answered(sql: str, folders: dict[str, list[Path]], most: int) -> Answer:
+    units = {table: [unit for folder in folders[table] for unit in shelf.units(folder)] for table in _TABLES}
+    for _ in range(_TRIES - 1):
+        with suppress(union.Unfit):  # units were packed since they were looked for
+            return _found(sql, units, most)
+    try:
+        return _found(sql, units, most)
+    except union.Unfit as error:  # else units are damaged
+        why = str(error)
+    heads = {unit: rows.first(unit, schema) for table, schema in _TABLES.items() for unit in units[table]}
+    damaged = [Mistake(said, unit) for unit, said in heads.items() if isinstance(said, str)]
+    raise InputError(damaged or f"query: {why[:2000]}")
+
+
+def _found(sql: str, units: dict[str, list[Path]], most: int) -> Answer:
+    with union.connected(MEMORY // 2) as connection:
         try:
+            lazily = all(s.type == duckdb.StatementType.SELECT for s in connection.extract_statements(sql))
+            _offer(connection, units, lazily=lazily)
             found: Any = connection.execute(sql)
             if found is None or found.description is None:
                 raise InputError("query: came without a statement; wanted one, such as SELECT count(*) FROM rows")
@@ -91,10 +116,31 @@ def _answered(sql: str, files: dict[str, list[Path]], most: int) -> Answer:
             while len(values) <= most and characters < _CHARACTERS and (row := found.fetchone()):
                 values.append(_plain(row))
                 characters += sum(len(value) for value in values[-1] if isinstance(value, str))
-        except (duckdb.Error, ValueError, OverflowError) as error:  # dates and numbers that Python does not have
+        except duckdb.Error as error:
+            if isinstance(error, _OF_FILES) or type(error) is duckdb.Error:
+                raise
             raise InputError(f"query: {str(error)[:2000]}") from error
-        columns = [column[0] for column in found.description]
-        return Answer(columns, values[:most], len(values) > most or characters >= _CHARACTERS)
+        except (ValueError, OverflowError) as error:  # dates and numbers that Python does not have
+            raise InputError(f"query: {str(error)[:2000]}") from error
+        names = [column[0] for column in found.description]
+        return Answer(names, values[:most], len(values) > most or characters >= _CHARACTERS)
+
+
+def _offer(connection: duckdb.DuckDBPyConnection, units: dict[str, list[Path]], *, lazily: bool) -> None:
+    """The tables of rows, and no way to anything else. lazily: read while they are asked for, from files that are then
+    within reach, so this is for statements that only read; else the tables are in memory."""
+    files: list[str] = []
+    for table, schema in _TABLES.items():
+        if not units[table] and not len(schema):
+            continue
+        if lazily:
+            whole = union.union(connection, table, units[table], schema, "default")
+            connection.execute(f"CREATE VIEW {table} AS {whole.select()}")
+            files += [file for part in whole.parts for file in part.files]
+        else:
+            connection.register(table, rows.read(units[table], schema))
+    connection.execute("SET allowed_paths = $files", {"files": files})
+    connection.execute("SET enable_external_access = false; SET lock_configuration = true")
 
 
 def _plain(row: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from rich.table import Table
 
-from harness.base import rows
+from harness.base import rows, shelf
 from harness.base.errors import InputError
 from harness.config.sweep import OPTIONS
 from solvers.registry import OPTIONAL, SOLVERS
@@ -107,7 +107,7 @@ def read_cells(folder: Path) -> list[Cell]:
 
     Raises InputError where no run was judged.
     """
-    files = sorted((folder / "rows").glob("*.parquet"))
+    files = shelf.units(folder / "rows")
     table = rows.read(files, needed=("run_id", "scene", "size", "solver", "phase", "status", "started")).to_pylist()
     runs: dict[str, list[dict[str, Any]]] = {}
     for row in table:

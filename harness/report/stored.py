@@ -30,7 +30,7 @@ from rich.markup import escape
 from rich.table import Table
 from scipy.stats import bootstrap
 
-from harness.base import rows
+from harness.base import rows, shelf
 from harness.base.errors import InputError, Mistake
 
 MARGIN = 0.10
@@ -114,7 +114,7 @@ def compare(old: Path, new: Path, console: Console, yardstick: str | None = None
 def read(path: Path) -> dict[Key, Run]:
     """The runs of a folder of results or of an archive of one, by what they were asked to do. Raises InputError."""
     with _folder(path) as folder:
-        files = sorted(folder.glob("**/rows/*.parquet"))
+        files = [unit for of_rows in shelf.folders(folder, "rows") for unit in shelf.units(of_rows)]
         if not files:
             raise InputError(
                 Mistake("holds no rows (rows/*.parquet); wanted results that `springbench run` left", path)

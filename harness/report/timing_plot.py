@@ -38,7 +38,7 @@ def timing(rows: pa.Table, folder: Path) -> list[Path]:
 def draw_timing(table: pa.Table, path: Path, title: str) -> None:
     """Draw the times of a sweep's runs to `path`, WIDTH x HEIGHT pixels, PNG.
 
-    table: rows (schema: `harness.base.rows.SCHEMA`). Runs that failed are crosses at the upper edge, and words.
+    table: rows (schema: `harness.base.columns.SCHEMA`). Runs that failed are crosses at the upper edge, and words.
     """
     found = runs(table)
     names = labels(found)

@@ -75,7 +75,7 @@ from numbered group by run_id order by min(place)
 
 
 def runs(table: pa.Table) -> list[RunTimes]:
-    """The runs in a table of rows (schema: `harness.base.rows.SCHEMA`), in the order of their first rows."""
+    """The runs in a table of rows (schema: `harness.base.columns.SCHEMA`), in the order of their first rows."""
     numbered = table.append_column("place", pa.array(np.arange(len(table))))
     with duckdb.connect() as connection:
         connection.register("numbered", numbered)

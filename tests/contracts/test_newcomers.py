@@ -115,7 +115,7 @@ def test_no_report_knows_an_effect_by_name():
 def test_a_sweep_and_its_reports_take_a_new_solver_and_effect(configs: Path):
     import pyarrow as pa
 
-    from harness.base.rows import SCHEMA
+    from harness.base.columns import SCHEMA
 
     found = []
     (configs / "rows").mkdir()

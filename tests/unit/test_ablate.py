@@ -14,8 +14,8 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from harness.base.claim import claimed
-from harness.base.rows import COLUMNS as RUN_COLUMNS
-from harness.base.rows import Column
+from harness.base.columns import COLUMNS as RUN_COLUMNS
+from harness.base.columns import Column
 from harness.cli import app
 from harness.config.load import load_any, load_scene
 from harness.experiments.ablation import suggest

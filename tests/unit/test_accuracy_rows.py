@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.base import rows
-from harness.base.rows import COLUMNS as RUN_COLUMNS
+from harness.base import columns, rows
+from harness.base.columns import COLUMNS as RUN_COLUMNS
 from harness.experiments.accuracy.rows import COLUMNS, SCHEMA
 from harness.report.query import answer
 
@@ -16,7 +16,7 @@ SHARED = {column.name for column in RUN_COLUMNS} - {"status", "seconds"}
 
 
 @pytest.mark.parametrize("column", [c for c in COLUMNS if c.name not in SHARED], ids=lambda column: column.name)
-def test_every_column_of_its_own_is_documented(column: rows.Column) -> None:
+def test_every_column_of_its_own_is_documented(column: columns.Column) -> None:
     line = f"| `{column.name}` | {column.unit} | {column.meaning.replace('|', chr(92) + '|')} |"
     assert line in README.read_text().splitlines()
 

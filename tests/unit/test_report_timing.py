@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
-from harness.base.rows import SCHEMA
+from harness.base.columns import SCHEMA
 from harness.report import page, timing_plot
 from harness.report.labels import LINE, spread
 from harness.report.style import HEIGHT, WIDTH, marks

@@ -5,7 +5,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from harness.base import rows
+from harness.base import columns, rows
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_results_readme_documents_every_column_with_its_unit():
     text = (ROOT / "results" / "README.md").read_text()
     table = [line for line in text.splitlines() if line.startswith("| `")]
-    for column in rows.COLUMNS:
+    for column in columns.COLUMNS:
         meaning = column.meaning.replace("|", "\\|")
         assert f"| `{column.name}` | {column.unit} | {meaning} |" in table
 
@@ -22,14 +22,14 @@ def test_rows_come_back_in_the_order_of_the_files(tmp_path: Path):
     for k in (1, 0):
         rows.write(tmp_path / f"{k}.parquet", [{"run_id": f"run {k}", "frame": f, "seconds": 0.5} for f in (1, 2)])
     table = rows.read([tmp_path / "0.parquet", tmp_path / "1.parquet"])
-    assert table.schema.equals(rows.SCHEMA)
+    assert table.schema.equals(columns.SCHEMA)
     assert table["run_id"].to_pylist() == ["run 0", "run 0", "run 1", "run 1"]
     assert table["size"].null_count == 4
 
 
 def test_no_files_give_an_empty_table_with_all_columns():
     assert rows.read([]).num_rows == 0
-    assert rows.read([]).schema.names == rows.SCHEMA.names
+    assert rows.read([]).schema.names == columns.SCHEMA.names
 
 
 def test_a_column_that_the_schema_does_not_have_is_refused_and_nothing_is_left(tmp_path: Path):

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from harness.base.columns import SCHEMA
 from harness.base.errors import InputError
-from harness.base.rows import SCHEMA
 from harness.cli import run
 from harness.config.load import Sweep, load_any, load_scene, load_sweep
 from harness.config.schema import schema

@@ -7,7 +7,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from harness.base.rows import SCHEMA
+from harness.base.columns import SCHEMA
 from harness.report.speed.counts import count
 from harness.report.speed.figures import Figures, Machine, figures
 from harness.report.speed.table import exponents, remarks

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import pyarrow as pa
 
-from harness.base.rows import COLUMNS as RUN_COLUMNS
-from harness.base.rows import Column, schema_of
+from harness.base.columns import COLUMNS as RUN_COLUMNS
+from harness.base.columns import Column, schema_of
 
 _TEXT, _INT, _REAL = pa.string(), pa.int64(), pa.float64()
 _SHARED = {column.name: column for column in RUN_COLUMNS}

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from harness.base import machine, rows
+from harness.base import machine, rows, shelf
 from harness.base.claim import claimed
 from harness.base.document import Document
 from harness.base.errors import InputError, Mistake, RunFailed
@@ -137,7 +137,8 @@ def _known(
     """What was measured of this scene on this machine: the ways that have an error, the cheapest first, and the rows
     of those that have none."""
     here, ways, without = machine.describe().id, [], []
-    for path in sorted(results.glob(f"*/accuracy/{name}-{size}-work-*.parquet")):
+    units = (unit for folder in shelf.folders(results, "accuracy", "*/") for unit in shelf.units(folder))
+    for path in sorted(unit for unit in units if unit.name.startswith(f"{name}-{size}-work-")):
         row = rows.read([path], SCHEMA).to_pylist()[0]
         unit = _unit(row, name, scene)
         if path.stem != unit.label() or row["machine"] != here or row["horizon"] != horizon:

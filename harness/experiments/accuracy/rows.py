@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import pyarrow as pa
 
-from harness.base.rows import COLUMNS as RUN_COLUMNS
-from harness.base.rows import Column, schema_of
+from harness.base.columns import COLUMNS as RUN_COLUMNS
+from harness.base.columns import Column, schema_of
 
 _TEXT, _INT, _REAL, _YES = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 _SHARED = {column.name: column for column in RUN_COLUMNS}

@@ -13,7 +13,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from harness.base import machine, rows
+from harness.base import machine, rows, shelf
 from harness.base.errors import InputError
 from harness.base.progress import Display
 from harness.base.stated import stated
@@ -68,7 +68,7 @@ def run_accuracy(
         finally:
             display.end()
     paths = [*map(run.path, units), *map(run.problem_path, accuracy.curves)]
-    return [path for path in dict.fromkeys(paths) if path.exists()]
+    return [path for path in dict.fromkeys(paths) if shelf.there(path)]
 
 
 def references(results: Path) -> Store:
@@ -105,7 +105,7 @@ class _Run:
     def done(self, unit: Unit, problem: str | None = None) -> bool:
         """Whether the rows are there as the config asks for them now, and are of this problem if one is given."""
         path = self.path(unit)
-        if self._again or not path.exists():
+        if self._again or not shelf.there(path):
             return False
         there = rows.first(path, SCHEMA)
         if isinstance(there, str):

@@ -22,7 +22,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.stats import mannwhitneyu
 
-from harness.base import rows
+from harness.base import columns, rows
 from harness.base.errors import InputError
 from harness.experiments.gates.against import Options, Request, started
 from harness.experiments.gates.pair import Side
@@ -30,16 +30,16 @@ from harness.experiments.gates.sequential import Answer, Rule
 from harness.experiments.gates.turns import orders
 
 COLUMNS = (
-    rows.Column("gate", pa.string(), "", "what takes turns"),
-    rows.Column("condition", pa.string(), "", "what was run beside it: nothing, busy or bursty"),
-    rows.Column("start", pa.int64(), "", "which pair of processes, from 0"),
-    rows.Column("order", pa.string(), "", "ABBA or BAAB"),
-    *(rows.Column(f"call_{k}", pa.float64(), "s", f"time of the turn's call {k}") for k in range(4)),
-    rows.Column("wall", pa.float64(), "s", "wall time of the whole turn"),
-    rows.Column("load", pa.float64(), "", "load average over a minute"),
-    rows.Column("planted", pa.float64(), "", "extra work of A, as a part of its iterations"),
+    columns.Column("gate", pa.string(), "", "what takes turns"),
+    columns.Column("condition", pa.string(), "", "what was run beside it: nothing, busy or bursty"),
+    columns.Column("start", pa.int64(), "", "which pair of processes, from 0"),
+    columns.Column("order", pa.string(), "", "ABBA or BAAB"),
+    *(columns.Column(f"call_{k}", pa.float64(), "s", f"time of the turn's call {k}") for k in range(4)),
+    columns.Column("wall", pa.float64(), "s", "wall time of the whole turn"),
+    columns.Column("load", pa.float64(), "", "load average over a minute"),
+    columns.Column("planted", pa.float64(), "", "extra work of A, as a part of its iterations"),
 )
-SCHEMA = rows.schema_of(COLUMNS)
+SCHEMA = columns.schema_of(COLUMNS)
 
 CONDITIONS = ("nothing", "busy", "bursty")
 STRETCH = 25

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from harness.base import shelf
 from harness.base.errors import InputError, Mistake
 from harness.base.rows import read as read_rows
 from harness.report.accuracy.table import Curve, Problem, Table, Values, Work
@@ -28,14 +29,12 @@ _Label = Callable[[_Row], str]
 
 def read(folder: Path, files: Iterable[Path] | None = None) -> Table:
     """The rows in these files, all under `folder`/accuracy if left out. Raises InputError where there are none."""
-    tables: list[pa.Table] = []
-    for path in sorted((folder / "accuracy").rglob("*.parquet") if files is None else files):
-        tables.append(read_rows([path], pa.schema([]), needed=("kind",)))
-    if not tables:
+    units = shelf.units(folder / "accuracy") if files is None else sorted(files)
+    if not units:
         raise InputError(Mistake("holds no accuracy rows; run `springbench accuracy CONFIG` first", folder))
     kinds: dict[str, list[_Row]] = defaultdict(list)
     missing = dict.fromkeys(("family", "reference", "minimises", "own_steps"))  # in rows made before there were any
-    for row in pa.concat_tables(tables, promote_options="permissive").to_pylist():
+    for row in read_rows(units, pa.schema([]), needed=("kind",), promote="permissive").to_pylist():
         kinds[row["kind"]].append(missing | row)
     for rows in kinds.values():  # files come by their names, 122 before 22
         rows.sort(key=lambda row: (row["scene"], row["size"]))

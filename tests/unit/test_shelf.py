@@ -1,0 +1,151 @@
+"""Rows at scale: many units are read at once, packed or not, and give the same rows as one by one."""
+
+import os
+import signal
+from collections.abc import Callable
+from multiprocessing import get_context
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from harness.base import rows, shelf
+from harness.base.errors import InputError
+from harness.experiments.archive import compact as module
+from harness.experiments.archive.compact import compact
+from harness.report.query import answer
+from tests.dummies import dummy_rows, write_dummies
+
+COUNT = 12
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Path:
+    """A sweep of so many runs: of two schemas, one with a column of somebody's own."""
+    units = write_dummies(tmp_path / "sweep", COUNT)
+    older = pq.read_table(units[3]).drop_columns(["graded", "second_opinion"])
+    pq.write_table(older, units[3])
+    pq.write_table(pq.read_table(units[5]).append_column("colour", pa.array(["red", "blue"])), units[5])
+    return tmp_path / "sweep"
+
+
+def told(table: pa.Table) -> list[str]:
+    """The rows as text, because what is not a number equals nothing."""
+    return list(map(repr, table.to_pylist()))
+
+
+def one_by_one(units: list[Path]) -> pa.Table:
+    return pa.concat_tables([rows.read([unit]) for unit in units], promote_options="default")
+
+
+def test_many_units_are_read_as_one_by_one_in_the_order_asked_for(sweep: Path):
+    units = shelf.units(sweep / "rows")
+    for asked in (units, units[::-1]):
+        assert told(rows.read(asked)) == told(one_by_one(asked))
+        assert rows.read(asked).schema.equals(one_by_one(asked).schema)
+    heads = rows.heads(units, ["status", "digest"], needed=("run_id",))
+    assert heads == {u: {"status": "ok", "digest": rows.read([u])["digest"][0].as_py()} for u in units}
+
+
+def test_all_damaged_units_of_many_are_named(sweep: Path):
+    units = shelf.units(sweep / "rows")
+    os.truncate(units[1], 1000)
+    rows.write(units[4], [])
+    pq.write_table(pa.table({"status": ["ok"], "seconds": ["soon"]}), units[7])
+    with pytest.raises(InputError) as caught:
+        rows.read(units, needed=("status",))
+    assert [mistake.file for mistake in caught.value.mistakes] == [units[k] for k in (1, 4, 7)]
+    heads = rows.heads(units, ["status"], needed=("status",))
+    assert [u for u, head in heads.items() if isinstance(head, str)] == [units[k] for k in (1, 4, 7)]
+    with pytest.raises(InputError, match=units[1].name):
+        answer("SELECT count(*) FROM rows", sweep.parent)
+
+
+QUERY = "SELECT * FROM rows ORDER BY run_id, frame"
+
+
+def test_packed_rows_are_the_same_to_all_who_read(sweep: Path):
+    units = shelf.units(sweep / "rows")
+    before, asked = told(rows.read(units)), repr(answer(QUERY, sweep.parent).values)
+    heads = rows.heads(units, ["code"])
+    assert compact(sweep.parent, lambda line: None) == COUNT
+    assert list((sweep / "rows").iterdir()) == []
+    assert shelf.units(sweep / "rows") == units
+    assert told(rows.read(units)) == before
+    assert repr(answer(QUERY, sweep.parent).values) == asked
+    assert rows.heads(units, ["code"]) == heads
+    first = rows.first(units[2])
+    assert isinstance(first, dict)
+    assert first["run_id"] == units[2].stem[-12:]
+    turned = answer("PIVOT rows ON solver USING count(*) GROUP BY status", sweep.parent)
+    assert turned.columns == ["status", "hybrid", "lbfgs", "numba", "sparse", "xpbd"]
+
+
+def test_a_run_that_is_done_again_takes_the_place_of_its_packed_rows_and_packing_goes_on(sweep: Path):
+    compact(sweep, lambda line: None)
+    unit = shelf.units(sweep / "rows")[0]
+    number = int(unit.stem[-12:], 16)
+    rows.write(unit, [row | {"status": "failed"} for row in dummy_rows(number)])
+    write_dummies(sweep, 1, first=COUNT)
+    for _ in range(2):
+        found = answer("SELECT status, count(*) FROM rows GROUP BY ALL ORDER BY ALL", sweep.parent)
+        assert found.values == [("failed", 2), ("ok", 2 * COUNT)]
+        compact(sweep, lambda line: None)
+    assert list((sweep / "rows").iterdir()) == []
+
+
+def test_damaged_and_recent_units_are_left_as_they_are(sweep: Path):
+    units = shelf.units(sweep / "rows")
+    os.truncate(units[1], 1000)
+    said: list[str] = []
+    assert compact(sweep, said.append, days=1.0) == 0
+    assert compact(sweep, said.append) == COUNT - 1
+    assert any("1 damaged file left" in line for line in said)
+    assert [path.name for path in (sweep / "rows").iterdir()] == [units[1].name]
+    with pytest.raises(InputError, match=units[1].name):
+        rows.read(shelf.units(sweep / "rows"))
+
+
+def test_a_packed_file_that_is_damaged_is_named(sweep: Path):
+    compact(sweep, lambda line: None)
+    os.truncate(shelf.packed_file(sweep / "rows"), 1000)
+    for look in (lambda: shelf.units(sweep / "rows"), lambda: answer("SELECT 1", sweep.parent)):
+        with pytest.raises(InputError, match=r"rows\.parquet"):
+            look()
+
+
+def killed_at(call: int, sweep: Path) -> None:
+    """Pack, and die before the so-many-th of the calls that change what is on the disk."""
+    count = 0
+
+    def deadly(function: Callable[..., object]) -> Callable[..., object]:
+        def counted(*arguments: object, **named: object) -> object:
+            nonlocal count
+            count += 1
+            if count > call:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return function(*arguments, **named)
+
+        return counted
+
+    os.replace, Path.unlink, os.fsync = deadly(os.replace), deadly(Path.unlink), deadly(os.fsync)  # type: ignore[assignment]
+    pq.ParquetWriter.write_table = deadly(pq.ParquetWriter.write_table)  # type: ignore[method-assign]
+    module._BATCH = 5
+    compact(sweep, lambda line: None)
+
+
+@pytest.mark.parametrize("call", [0, 1, 2, 4, 9])
+def test_packing_that_is_killed_loses_and_doubles_nothing_and_goes_on(sweep: Path, call: int):
+    units = shelf.units(sweep / "rows")
+    before = told(rows.read(units))
+    process = get_context("fork").Process(target=killed_at, args=(call, sweep))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    assert shelf.units(sweep / "rows") == units
+    assert told(rows.read(units)) == before
+    compact(sweep, lambda line: None)
+    assert {path.name for path in sweep.iterdir()} == {"rows", "rows.parquet", ".lock"}
+    assert list((sweep / "rows").iterdir()) == []
+    assert told(rows.read(units)) == before
