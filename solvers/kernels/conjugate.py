@@ -46,6 +46,7 @@ class Newton(NamedTuple):
     """A Newton equation H d = -g that is being solved.
 
     hessian: see `hessian.multiply`; factor, threads: of a solve with Q, None for one; held: vertices that do not move;
+    shrunk: of the preconditioner (S Q S)^-1 the vertices (c,) and their blocks S^-1 (c, 3, 3), None for Q^-1;
     d, r, p, z, product (n, 3): the iterate, its residual, its direction, what the factor makes of the residual, and
     the Hessian of the direction.
     """
@@ -54,6 +55,7 @@ class Newton(NamedTuple):
     factor: Factor
     threads: int | None
     held: NDArray[np.int64]
+    shrunk: tuple[NDArray[np.int64], NDArray[np.float64]] | None
     d: NDArray[np.float64]
     r: NDArray[np.float64]
     p: NDArray[np.float64]
@@ -84,9 +86,36 @@ def _go(state, product, curvature):
             newton.d[i, c] += length * newton.p[i, c]
             newton.r[i, c] -= length * newton.product[i, c]
     at = newton.factor
-    solve(at.squares, at.panels, at.places, at.chunks, at.spans, at.by_slot, at.by_vertex, at.work, newton.r, newton.z,
+    b = _scaled(newton.shrunk, newton.r, newton.product)
+    solve(at.squares, at.panels, at.places, at.chunks, at.spans, at.by_slot, at.by_vertex, at.work, b, newton.z,
           at.team, newton.threads)  # fmt: skip
+    _shrink(newton.shrunk, newton.z)
     return _dot(newton.r, newton.z)
+
+
+@inner
+def _scaled(shrunk, r, out):
+    """S^-1 r (n, 3), written to `out`; r itself where nothing is shrunk."""
+    if shrunk is None:
+        return r
+    for v in range(len(r)):
+        for c in range(3):
+            out[v, c] = r[v, c]
+    _shrink(shrunk, out)
+    return out
+
+
+@inner
+def _shrink(shrunk, x):
+    """Multiply x (n, 3) by S^-1."""
+    if shrunk is None:
+        return
+    vertices, root = shrunk
+    for k in range(len(vertices)):
+        v = vertices[k]
+        x0, x1, x2 = x[v, 0], x[v, 1], x[v, 2]
+        for c in range(3):
+            x[v, c] = root[k, c, 0] * x0 + root[k, c, 1] * x1 + root[k, c, 2] * x2
 
 
 @inner
@@ -107,8 +136,8 @@ _iterate = compiled_over(_turn, _go, _convex, _near)
 def direction(newton, gradient, descent, eta, most):
     """Write newton.d (n, 3) [m]: -Q^-1 g, where the Hessian is not convex along that.
 
-    gradient, descent (n, 3): g [N] and Q^-1 g [m]; eta: what is left of |g|; most: products with H. Vectors of
-    `newton` are zero at the held vertices.
+    gradient, descent (n, 3): g [N] and Q^-1 g [m], or (S Q S)^-1 g; eta: what is left of |g|; most: products with H.
+    Vectors of `newton` are zero at the held vertices.
     """
     for i in range(len(newton.d)):
         for c in range(3):

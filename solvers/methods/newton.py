@@ -14,21 +14,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from solvers.about import About, Reference
-from solvers.contact.touching import is_contact
+from solvers.contact.touching import settling_for
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
 from solvers.core.saddles import certified, leave
 from solvers.problem import Positions, System
-
-if TYPE_CHECKING:
-    from solvers.contact.settling import Settling
 
 _LEVELS = ((1.0, 0.0), (0.9, 0.0), (0.5, 0.0), (0.0, 0.0), *((0.0, 10.0**k) for k in range(-4, 9, 2)))
 """What is kept of negative lateral parts, and what multiple of Q's diagonal is added: the first that factorises."""
@@ -64,11 +61,7 @@ class NewtonMethod:
     def __init__(self, metric: Metric) -> None:
         self._metric = metric
         self._diagonal: NDArray[np.float64] = np.repeat(metric.diagonal, 3)
-        self._settling: Settling | None = None
-        if any(is_contact(energy) for energy in metric.system.energies):
-            from solvers.contact.settling import Settling  # for those who need it
-
-            self._settling = Settling(metric)
+        self._settling = settling_for(metric)
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
         """The points after `start`."""

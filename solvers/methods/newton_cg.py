@@ -7,6 +7,7 @@ negative curvature, with what they have: from the first direction of all that is
 
 Contact is far stiffer than Q, on a few vertices. There P = S Q S takes the place of Q, with S_i = (I + W_i/Q_ii)^(1/2)
 of the blocks W_i that it adds to H: on these vertices P is Q + W but for what couples them, and it is Q on all others.
+An iteration settles friction, and may be several steps, as that of Newton's method.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.about import About, Reference
+from solvers.contact.touching import settling_for
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import Hessian, StepObjective
@@ -67,7 +69,9 @@ Preconditioner = Callable[[Positions], Positions]
 
 
 class Scaled:
-    """(S Q S)^-1 with S_i = (I + W_i/Q_ii)^(1/2) for some vertices, I for all others."""
+    """(S Q S)^-1 with S_i = (I + W_i/Q_ii)^(1/2) for some vertices, I for all others.
+
+    shrunk: these vertices (c,), and S_i^-1 (c, 3, 3)."""
 
     def __init__(self, metric: Metric, vertices: NDArray[np.int64], blocks: NDArray[np.float64]) -> None:
         """blocks: W (c, 3, 3) [N/m] of vertices (c,), positive semidefinite."""
@@ -76,7 +80,7 @@ class Scaled:
         resists[system.free] = metric.diagonal
         size, axes = np.linalg.eigh(blocks)
         shrunk = (1.0 + np.maximum(0.0, size) / resists[vertices, None]) ** -0.5
-        self._vertices, self._root = vertices, (axes * shrunk[:, None, :]) @ axes.transpose(0, 2, 1)
+        self.shrunk = vertices, (axes * shrunk[:, None, :]) @ axes.transpose(0, 2, 1)
 
     def __call__(self, b: Positions) -> Positions:
         """(S Q S)^-1 b, (n, 3)."""
@@ -87,7 +91,8 @@ class Scaled:
         return x
 
     def _shrink(self, x: Positions) -> None:
-        x[self._vertices] = np.einsum("vij,vj->vi", self._root, x[self._vertices])
+        vertices, root = self.shrunk
+        x[vertices] = np.einsum("vij,vj->vi", root, x[vertices])
 
 
 class Method:
@@ -96,18 +101,19 @@ class Method:
     def __init__(self, metric: Metric, objective: Objective) -> None:
         self._metric = metric
         self.compiled = _Compiled(objective, factor) if (factor := _known(metric)) else None
+        self._settling = settling_for(metric)
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
         """The points after `start`."""
         loose = _TOUCHED if step.touched else _LOOSE
-        point, eta = start, loose
+        point, eta = self._settling.start(step, start) if self._settling and step.touched else start, loose
         hessian, solve = self._at(step, point)
         descent = solve(point.gradient)
         while not point.stalled:
             found = None
             if dot(point.gradient, descent) > self._metric.round_off(point.positions):
                 direction = self._direction(step, hessian, solve, point, descent, eta)
-                found = search(step, point, direction) or search(step, point, -descent)
+                found = self._along(step, point, direction, eta) or search(step, point, -descent)
             if found is None:
                 yield point._replace(stalled=True)
                 return
@@ -118,6 +124,17 @@ class Method:
             eta = min(loose, max(_TIGHT, following, 0.9 * eta**2 if 0.9 * eta**2 > 0.1 else 0.0))
             point = found
             yield point
+
+    def _along(self, step: StepObjective, at: Point, direction: Positions, eta: float) -> Point | None:
+        """A lower point by a direction, None for none."""
+        if self._settling is None or not step.touched:
+            return search(step, at, direction)
+
+        def following(point: Point) -> Positions:
+            hessian, solve = self._at(step, point)
+            return self._direction(step, hessian, solve, point, solve(point.gradient), eta)
+
+        return self._settling.search(step, at, direction, following)
 
     def _at(self, step: StepObjective, at: Point) -> tuple[Hessian, Preconditioner]:
         """The Hessian at a point, and what preconditions it there."""
@@ -147,8 +164,8 @@ class Method:
         eta: float,
     ) -> Positions:
         """What conjugate gradients make of -H^-1 g; descent: what `solve`, the preconditioner, makes of g."""
-        if self.compiled and not step.own and not step.touched:
-            return self.compiled.direction(hessian, at, descent, eta)
+        if self.compiled and not step.own:
+            return self.compiled.direction(hessian, solve, at, descent, eta)
         product = dot(at.gradient, descent)
         newton = _Newton(hessian, solve, at.gradient, descent, eta**2 * product)
         count, ended = newton.iterate(product, _MOST)
@@ -204,10 +221,13 @@ class _Compiled:
         self._factor = conjugate.Factor.of(factor, system.free)
         self._scratch = np.zeros((4, system.vertices, 3))
 
-    def direction(self, hessian: Hessian, at: Point, descent: Positions, eta: float) -> Positions:
+    def direction(
+        self, hessian: Hessian, solve: Preconditioner, at: Point, descent: Positions, eta: float
+    ) -> Positions:
         """See `Method._direction`."""
         d = np.empty_like(descent)
-        solving = self._factor, self._threads(), self._held
+        shrunk = solve.shrunk if isinstance(solve, Scaled) else None
+        solving = self._factor, self._threads(), self._held, shrunk
         newton = conjugate.Newton(hessian.compiled, *solving, d, *self._scratch)
         conjugate.direction(newton, at.gradient, descent, eta, _MOST)
         return d
