@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 from hypothesis import settings
 
 import harness  # noqa: F401  sets what Numba and OpenMP read when they load
@@ -11,3 +13,9 @@ settings.register_profile("suite", derandomize=True, deadline=None, max_examples
 # `pytest --hypothesis-profile=search tests/stability` looks for examples that fail, for an hour; keep them as cases.
 settings.register_profile("search", deadline=None, max_examples=2000, database=None, print_blob=True)
 settings.load_profile("suite")
+
+
+def pytest_collection_finish() -> None:
+    """What is there now stays: collections of garbage, automatic or asked for, need not look at it again."""
+    gc.collect()
+    gc.freeze()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import tracemalloc
 from collections.abc import Iterable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -67,6 +68,13 @@ def bound(*effects: Effect) -> tuple[Scene, Prepared]:
     return made, prepare(made, SparseLocalGlobal())
 
 
+@cache
+def plain() -> tuple[int, int]:
+    """The arrays of a scene without the effect, and the most bytes of a step."""
+    made, prepared = bound()
+    return arrays(made, prepared), most_in_a_step(made, prepared)
+
+
 def most_in_a_step(made: Scene, prepared: Prepared) -> int:
     """The most bytes that a step which is not the first allocates at once; the least of some runs, for Python itself
     allocates now and then."""
@@ -85,15 +93,15 @@ def most_in_a_step(made: Scene, prepared: Prepared) -> int:
 
 @pytest.mark.parametrize("effect", IDLE.values(), ids=IDLE)
 def test_an_effect_that_does_nothing_has_no_array(effect: Effect):
-    assert arrays(*bound(effect)) == arrays(*bound())
+    assert arrays(*bound(effect)) == plain()[0]
 
 
 @pytest.mark.parametrize("effect", PRESENT, ids=lambda effect: effect.kind)
 def test_an_effect_that_does_something_has_arrays(effect: Effect):
-    assert arrays(*bound(effect)) > arrays(*bound())
+    assert arrays(*bound(effect)) > plain()[0]
 
 
 @pytest.mark.parametrize("effect", IDLE.values(), ids=IDLE)
 def test_a_step_allocates_nothing_for_an_effect_that_does_nothing(effect: Effect):
     # An array of one number at each vertex has 3200 bytes; what Python itself allocates differs by some hundreds.
-    assert abs(most_in_a_step(*bound(effect)) - most_in_a_step(*bound())) < 8 * SIDE**2
+    assert abs(most_in_a_step(*bound(effect)) - plain()[1]) < 8 * SIDE**2

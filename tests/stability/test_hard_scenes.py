@@ -77,8 +77,8 @@ def refusal(made: Scene, solver: Solver) -> list[str]:
     return []
 
 
+@methods  # which vary faster than the cases, so that each scene is built once
 @cases
-@methods
 def test_a_hard_scene_is_refused_by_name_or_stays_finite_descends_and_repeats_itself(case: str, method: str):
     made, solver = scene(case), METHODS[method]
     if (case, method) in REFUSED:
