@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 
+import pytest
 from hypothesis import settings
 
 import harness  # noqa: F401  sets what Numba and OpenMP read when they load
@@ -13,6 +14,22 @@ settings.register_profile("suite", derandomize=True, deadline=None, max_examples
 # `pytest --hypothesis-profile=search tests/stability` looks for examples that fail, for an hour; keep them as cases.
 settings.register_profile("search", deadline=None, max_examples=2000, database=None, print_blob=True)
 settings.load_profile("suite")
+
+
+_COMPILES = "test_solver_contract.py"
+"""It calls nearly all kernels, and has them compiled where they are not there yet."""
+_NEEDS_NONE = tuple(f"test_{name}" for name in ("hostile", "plugins", "worker_runs", "full_disk", "damaged", "gate_"))
+"""Files that need few of them: what runs beside it, so that no kernel is compiled twice at once."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files go to the test runner's processes in this order, which its `--no-loadscope-reorder` keeps."""
+
+    def order(item: pytest.Item) -> int:
+        name = item.path.name
+        return 0 if name == _COMPILES else 1 if name.startswith(_NEEDS_NONE) else 2
+
+    items.sort(key=order)
 
 
 def pytest_collection_finish() -> None:

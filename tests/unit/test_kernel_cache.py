@@ -258,6 +258,7 @@ for name in ("numba", "lbfgs", "vbd"):
 """
 
 
+@pytest.mark.long
 def test_the_process_that_compiles_a_kernel_finds_the_bits_of_those_that_load_it(tmp_path: Path):
     root = Path(__file__).resolve().parents[2]
     compiling, loading = (
