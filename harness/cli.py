@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from harness.base.commands import Commands
+from harness.base.commands import Again, Changed, Commands, InThisProcess, Results
 from harness.base.console import err, out
 from harness.base.console import say as _say
 from harness.base.errors import InputError, Mistake
@@ -35,7 +35,6 @@ app = typer.Typer(
 )
 
 Config = Annotated[Path, typer.Argument(help="A sweep or a scene (YAML), or an assignment's scene (JSON).")]
-Results = Annotated[Path, typer.Option(help="The folder that holds a folder for each sweep.")]
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings (.rrd).")]
 
 
@@ -58,13 +57,9 @@ def run(
     positions: Annotated[
         Path | None, typer.Option(help="Store the positions after every step (float64, .npz) of one run.")
     ] = None,
-    again: Annotated[bool, typer.Option("--again", help="Do all runs, also those that are there.")] = False,
-    changed: Annotated[
-        bool, typer.Option("--changed", help="Do also the runs that are there by other code than today's.")
-    ] = False,
-    here: Annotated[
-        bool, typer.Option("--here", help="Do runs in this process, without limits, as a debugger wants them.")
-    ] = False,
+    again: Again = False,
+    changed: Changed = False,
+    here: InThisProcess = False,
 ) -> None:
     """Do what is missing of a sweep, or of the one scene in a file."""
     from harness.base.claim import claimed
@@ -106,12 +101,15 @@ def speed(
     config: Config,
     results: Results = Path("results"),
     budget: Annotated[float, typer.Option(help="Seconds that a candidate may take at a size.")] = 210.0,
-    again: Annotated[bool, typer.Option("--again", help="Do all sizes, also those that are there.")] = False,
+    again: Again = False,
+    changed: Changed = False,
+    here: InThisProcess = False,
 ) -> None:
     """Time a sweep's solvers in turns, beside a yardstick in C++ and the machine's own limits."""
     from harness.base.claim import claimed
+    from harness.base.progress import display
     from harness.config.load import load_sweep
-    from harness.experiments.speed.report import run_speed
+    from harness.experiments.speed.comparison import run_speed
     from harness.report.speed.figures import figures
     from harness.report.speed.pictures import draw
     from harness.report.speed.table import remarks, speed_table
@@ -120,7 +118,8 @@ def speed(
         raise InputError(Mistake(f"came {budget:g}; wanted a number of seconds above 0", key="--budget"))
     sweep = load_sweep(config)
     folder = claimed(results / sweep.name, config)
-    found = figures(run_speed(sweep, folder, _say, again=again, budget=budget))
+    how = {"again": again, "changed": changed, "isolated": not here}
+    found = figures(run_speed(sweep, folder, display(err), _say, budget=budget, **how))
     out.print(speed_table(found))
     for line in remarks(found):
         _say(line)
@@ -133,18 +132,20 @@ def speed(
 def accuracy(
     config: Annotated[Path, typer.Argument(help="An accuracy config (YAML).")],
     results: Results = Path("results"),
-    again: Annotated[bool, typer.Option("--again", help="Measure all again, also what is there.")] = False,
+    again: Again = False,
+    changed: Changed = False,
+    here: InThisProcess = False,
 ) -> None:
     """Measure what accuracy costs in time: convergence on frozen steps, and errors of whole simulations."""
     from harness.base.claim import claimed
     from harness.base.progress import display
     from harness.config.accuracy_load import load_accuracy
-    from harness.experiments.accuracy.run import failures, run_accuracy
+    from harness.experiments.accuracy.studies import failures, run_accuracy
     from harness.report.accuracy import draw
 
     asked = load_accuracy(config)
     folder = claimed(results / asked.name, config)
-    files = run_accuracy(asked, folder, display(err), _say, again=again)
+    files = run_accuracy(asked, folder, display(err), _say, again=again, changed=changed, isolated=not here)
     drawn = draw(folder, files)
     _say(f"rows are in {folder / 'accuracy'}; {len(drawn)} pictures and pages tell of them, {drawn[-1]} of all")
     failed = failures(files)
@@ -216,8 +217,8 @@ def list_runs(config: Config, results: Results = Path("results")) -> None:
     sweep = load_any(config, opens=False)
     table = Table("run", "scene", "size", "solver", "iterations", "frames", "threads", "state")
     for p in plan(sweep.runs(), results / sweep.name):
-        r = p.run
-        state = p.state + (" (by other code)" if p.older else "") + (" (damaged)" if p.damage else "")
+        r, there = p.run, p.standing
+        state = there.state + (" (by other code)" if there.older else "") + (" (damaged)" if there.damage else "")
         cells = (
             p.files.rows.stem[-12:],
             r.scene_name,

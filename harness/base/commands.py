@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -12,6 +13,13 @@ from typer.core import TyperGroup
 from harness.base.console import say, show_log
 from harness.base.errors import SpringbenchError
 from harness.base.files import MISTAKES, told
+
+Results = Annotated[Path, typer.Option(help="The folder that holds a folder for each config.")]
+Again = Annotated[bool, typer.Option("--again", help="Do all, also what is there.")]
+Changed = Annotated[bool, typer.Option("--changed", help="Do also what is there by other code than today's.")]
+InThisProcess = Annotated[
+    bool, typer.Option("--here", help="Do all in this process, without limits, as a debugger wants it.")
+]
 
 
 class Commands(TyperGroup):

@@ -17,6 +17,12 @@ from solvers.plugins import identity
 Moment = Literal["early", "middle", "violent"] | Frames
 """A moment of the scene that is found from its own run, or the number of a frame."""
 
+
+def moment_name(moment: str | int) -> str:
+    """A moment in rows: early, middle, violent or frame-k."""
+    return f"frame-{moment}" if isinstance(moment, int) else moment
+
+
 TimeLimit = Annotated[float, Field(gt=0, le=1e5)]
 
 
@@ -111,7 +117,7 @@ class How:
 
 
 @dataclass(frozen=True, slots=True)
-class CurveUnit:
+class CurveSpec:
     """The curves of one solver on one frozen step; `moment` as in the config."""
 
     case: Case
@@ -143,7 +149,7 @@ class CurveUnit:
 
 
 @dataclass(frozen=True, slots=True)
-class WorkUnit:
+class WorkSpec:
     """One simulation up to the horizon [s]."""
 
     case: Case
@@ -167,10 +173,6 @@ class WorkUnit:
     def label(self) -> str:
         """The name of its file; measured otherwise, it takes the place of what was there."""
         return f"{self.case.scene_name}-{self.case.size}-work-{in_file_name(self.solver.name)}-{_hash(self.point())}"
-
-
-Unit = CurveUnit | WorkUnit
-"""What is measured at once, and stands in one file."""
 
 
 def _hash(content: Any) -> str:

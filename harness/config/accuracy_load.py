@@ -11,7 +11,7 @@ from typing import TypeVar
 from harness.base.document import Document, Key, quote
 from harness.base.errors import InputError, Mistake, did_you_mean
 from harness.base.yaml import read_yaml
-from harness.config.accuracy import AccuracyFields, Case, CurveStudy, CurveUnit, How, Study, WorkStudy, WorkUnit
+from harness.config.accuracy import AccuracyFields, Case, CurveSpec, CurveStudy, How, Study, WorkSpec, WorkStudy
 from harness.config.expand import check_size
 from harness.config.load import check_name, misfits, scenes_of, solvers_of
 from harness.config.sweep import SolverSpec
@@ -27,8 +27,8 @@ class Accuracy:
     """A checked config: its name, and its units of work without duplicates."""
 
     name: str
-    curves: tuple[CurveUnit, ...]
-    work: tuple[WorkUnit, ...]
+    curves: tuple[CurveSpec, ...]
+    work: tuple[WorkSpec, ...]
 
 
 def load_accuracy(path: Path) -> Accuracy:
@@ -68,7 +68,7 @@ def expand(
     )
 
 
-U = TypeVar("U", CurveUnit, WorkUnit)
+U = TypeVar("U", CurveSpec, WorkSpec)
 
 
 def _distinct(units: Sequence[U]) -> tuple[U, ...]:
@@ -85,7 +85,7 @@ class _Expansion:
     def __init__(self, document: Document, scenes: Mapping[str, SceneSpec], solvers: Sequence[SolverSpec]) -> None:
         self.document, self.scenes, self.solvers = document, scenes, solvers
 
-    def curves(self, study: CurveStudy, at: Key) -> Iterator[CurveUnit]:
+    def curves(self, study: CurveStudy, at: Key) -> Iterator[CurveSpec]:
         """One for each problem and solver; solvers that do not minimise have none."""
         how = How(study.threads, study.rounds, study.time_limit)
         solvers = [solver for solver in self._solvers(study, at) if minimises(load(EVERY[solver.name]))]
@@ -94,9 +94,9 @@ class _Expansion:
                 problem = f"frame {moment} is not among the {case.scene.frames} frames of {case.scene_name}"
                 self.document.report(problem, (*at, "moment"))
             recordings = study.recordings
-            yield CurveUnit(case, moment, solver, study.first_guess, study.iterations, recordings, how)
+            yield CurveSpec(case, moment, solver, study.first_guess, study.iterations, recordings, how)
 
-    def work(self, study: WorkStudy, at: Key) -> Iterator[WorkUnit]:
+    def work(self, study: WorkStudy, at: Key) -> Iterator[WorkSpec]:
         how = How(study.threads, study.rounds, study.time_limit)
         for case in self._cases(study, at):
             dt = case.scene.time_step
@@ -106,7 +106,7 @@ class _Expansion:
                 self.document.report(problem, (*at, "horizon"))
             settings = product(self._solvers(study, at), study.first_guess, study.iterations, study.tolerance)
             for solver, first_guess, iterations, tolerance in settings:
-                yield WorkUnit(case, study.horizon, solver, first_guess, iterations, tolerance, how)
+                yield WorkSpec(case, study.horizon, solver, first_guess, iterations, tolerance, how)
 
     def _cases(self, study: Study, at: Key) -> list[Case]:
         found = []

@@ -15,10 +15,10 @@ import pyarrow as pa
 from harness.base import machine, rows
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts
+from harness.experiments.resume import DONE, MISSING, Standing
 from harness.record.sound import whole_messages
 from solvers.plugins import Plugin
 
-DONE, MISSING = "done", "missing"
 NEEDED = ("run_id", "scene", "size", "solver", "status", "code")
 """Columns without which a row tells nothing of a run."""
 
@@ -49,24 +49,23 @@ class Files:
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
-    """A run of a sweep, its files, and its state: done, missing, or the status of a run that failed.
-
-    older: whether its rows were made by other code than today's; damage: what is wrong with its rows or its recording,
-    for which it is missing.
-    """
+class PlannedRun:
+    """A run of a sweep, its files, and what is there of it (`harness.experiments.resume.Planned`)."""
 
     run: RunSpec
     files: Files
-    state: str
-    older: bool
-    damage: str = ""
+    standing: Standing
+
+    @property
+    def title(self) -> str:
+        """The run in words."""
+        return self.run.title
 
 
-def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
+def plan(runs: Iterable[RunSpec], folder: Path) -> list[PlannedRun]:
     """Each run with its files and what is there already."""
     codes: dict[frozenset[type | Plugin], str] = {}
-    planned: list[Planned] = []
+    planned: list[PlannedRun] = []
     placed = [(run, Files.of(run, folder)) for run in runs]
     heads = rows.heads((files.rows for _, files in placed), _TOLD, needed=NEEDED)
     for run, files in placed:
@@ -85,7 +84,7 @@ def plan(runs: Iterable[RunSpec], folder: Path) -> list[Planned]:
         if state == DONE and run.record:
             damage = _unfit(files.recording)
             state = MISSING if damage or not files.recording.exists() else DONE
-        planned.append(Planned(run, files, state, older, damage))
+        planned.append(PlannedRun(run, files, Standing(state, older, damage)))
     return planned
 
 

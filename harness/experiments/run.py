@@ -22,9 +22,9 @@ from harness.base.files import replacing
 from harness.base.worker import Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts, solver_class
-from harness.experiments.columns import asked, common
 from harness.experiments.failure import failure
 from harness.experiments.plan import Files
+from harness.experiments.provenance import asked, common
 from harness.experiments.standing import standing
 from harness.record.base import RecordingInfo
 from harness.record.obstacles import listed

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pyarrow as pa
@@ -15,14 +16,12 @@ from harness.base.progress import Display
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts
-from harness.experiments.columns import common
 from harness.experiments.core import do_all, require_threads
-from harness.experiments.plan import MISSING, NEEDED, Files, Planned, plan
+from harness.experiments.plan import NEEDED, Files, plan
+from harness.experiments.provenance import common
+from harness.experiments.resume import wanted
 from harness.experiments.run import execute
 from harness.report.sweep import Pictured, draw_sweep
-
-_NAMED = 8
-"""So many runs are named where more are meant."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,13 +97,7 @@ def run_sweep(
         (folder / part).mkdir(parents=True, exist_ok=True)
     with rows.alone(folder):
         planned = plan(runs, folder)
-        todo = [p for p in planned if p.state == MISSING or again or positions or (changed and p.older)]
-        if len(todo) < len(planned):
-            say(f"{len(planned) - len(todo)} of {len(planned)} runs are there already")
-        _say_older([p for p in planned if p.older and p not in todo], say)
-        for p in todo:
-            if p.damage:
-                say(f"{p.damage}; its run is done again")
+        todo = wanted(planned, "runs", say, again=again or positions is not None, changed=changed)
         do_all([RunUnit(p.run, p.files, positions) for p in todo], display, isolated=isolated)
         table = rows.read((p.files.rows for p in planned), needed=NEEDED)
         pictured = [Pictured(p.run, p.files.recording, p.files.picture) for p in planned]
@@ -112,19 +105,11 @@ def run_sweep(
     return table
 
 
-def _say_older(older: list[Planned], say: Callable[[str], None]) -> None:
-    """Say which runs that are shown were done by other code."""
-    if older:
-        more = f" and {len(older) - _NAMED} more" if len(older) > _NAMED else ""
-        say(f"{len(older)} of them by other code than today's: {', '.join(p.run.title for p in older[:_NAMED])}{more}")
-        say("--changed does these again, --again does all")
-
-
 def _outcome(found: list[dict[str, Any]]) -> str:
     if found[0]["status"] != "ok":
         return f"{found[0]['status']}: {found[0]['reason']}"
-    best = min(row["seconds"] for row in found if row["phase"] == "step")
-    return f"{1e3 * best:.3g} ms a step"
+    middle = median(row["seconds"] for row in found if row["phase"] == "step")
+    return f"{1e3 * middle:.3g} ms a step"
 
 
 def failures(table: pa.Table) -> list[str]:

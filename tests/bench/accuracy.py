@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from harness.config.load import load_scene
-from harness.experiments.accuracy.run import references
+from harness.experiments.accuracy.units import references
 from harness.reference.frozen import bind
 from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.springs import Springs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,13 +16,14 @@ from harness.base.progress import Display
 from harness.cli import main
 from harness.config.accuracy_load import load_accuracy
 from harness.experiments.accuracy.rows import SCHEMA
-from harness.experiments.accuracy.run import run_accuracy
+from harness.experiments.accuracy.studies import run_accuracy
 from harness.record.reader import read_replay
 from harness.reference import store
 from harness.reference.minimiser import ROUGH, Reference, certify
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Positions, Prepared, System
 from solvers.registry import SOLVERS
+from tests.displays import Quiet
 
 SCENE = """
 mesh: {kind: grid}
@@ -34,33 +36,13 @@ CONFIG = """
 scenes: [cloth.yaml]
 solvers: [sparse, newton, symplectic-euler]
 curves:
-  - {size: 4, moment: [early, violent], iterations: 60, rounds: 2, recordings: true}
+  - {size: 4, moment: [early, violent], iterations: 60, rounds: 2, time_limit: 100, recordings: true}
 work:
-  - {size: 4, horizon: 0.2, integrator: implicit-euler, time_step: [1/30, 1/60], iterations: 20, rounds: 2}
+  - {size: 4, horizon: 0.2, time_step: [1/30, 1/60], iterations: 20, rounds: 2, time_limit: 100}
 """
 UNITS = 2 * 2 + 2 * 3
 TIMES = ("seconds", "cold", "seconds_per_simulated", "started", "commit", "code")
 """Columns that tell how long something took, and when and by which state of the code it was done."""
-
-
-class Quiet:
-    """A display that shows nothing, and is stopped after some units."""
-
-    def __init__(self, stop_after: int = 10**9) -> None:
-        self.finished_units, self._stop_after = 0, stop_after
-
-    def begin(self, runs: int, work: float) -> None: ...
-
-    def run(self, title: str, ticks: int, work: float) -> None: ...
-
-    def tick(self, phase: str) -> None: ...
-
-    def finished(self, outcome: str) -> None:
-        self.finished_units += 1
-        if self.finished_units == self._stop_after:
-            raise KeyboardInterrupt
-
-    def end(self) -> None: ...
 
 
 class Home:
@@ -72,10 +54,10 @@ class Home:
         self.config, self.folder = folder / "config.yaml", folder / "results" / "config"
         self.config.write_text(config)
 
-    def run(self, display: Display | None = None) -> int:
-        """How many units were done."""
+    def run(self, display: Display | None = None, *, isolated: bool = False) -> int:
+        """How many units were done. isolated: in workers."""
         display = display or Quiet()
-        run_accuracy(load_accuracy(self.config), self.folder, display, lambda line: None)
+        run_accuracy(load_accuracy(self.config), self.folder, display, lambda line: None, isolated=isolated)
         return getattr(display, "finished_units", 0)
 
     def rows(self, kind: str, **values: Any) -> list[dict[str, Any]]:
@@ -100,7 +82,7 @@ class Home:
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
     made = Home(tmp_path_factory.mktemp("accuracy") / "home")
-    assert made.run() == UNITS
+    assert made.run(isolated=True) == UNITS
     return made
 
 
@@ -151,7 +133,8 @@ def test_methods_that_do_not_minimise_have_work_and_no_curves(home: Home) -> Non
     assert {(row["solver"], row["time_step"]) for row in work} == {
         (solver, dt) for solver in ("sparse", "newton", "symplectic-euler") for dt in (1 / 30, 1 / 60)
     }
-    assert all(row["status"] == "ok" and row["error"] > 0.0 for row in work)
+    assert {(row["status"], row["reason"]) for row in work} == {("ok", None)}
+    assert all(row["error"] > 0.0 for row in work)
 
 
 def test_what_is_done_is_not_done_again(home: Home) -> None:
@@ -187,7 +170,7 @@ def test_what_is_not_asked_for_any_more_stays_and_is_not_counted(tmp_path: Path)
     made.run()
     before = set(made.written())
     made.config.write_text(made.config.read_text().replace("[early, violent]", "early"))
-    files = run_accuracy(load_accuracy(made.config), made.folder, Quiet(), lambda line: None)
+    files = run_accuracy(load_accuracy(made.config), made.folder, Quiet(), lambda line: None, isolated=False)
     assert set(made.written()) == before
     moments = rows.read(files, SCHEMA)["moment"].to_pylist()
     assert set(moments) == {"early"}
@@ -247,6 +230,33 @@ def test_a_solver_that_fails_is_a_row_and_the_others_are_measured(
         assert row["status"] == "failed"
         assert "ArithmeticError: it slipped" in row["reason"]
     assert {row["status"] for row in made.rows("curve", solver="newton")} == {"ok"}
+
+
+@dataclass(frozen=True)
+class Crashing(Broken):
+    """A solver that takes its process along."""
+
+    def prepare(self, system: System) -> Prepared:
+        os.abort()
+
+
+def test_a_solver_that_crashes_is_a_row_and_the_others_are_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(SOLVERS, "crashing", f"{__name__}:Crashing")
+    config = CONFIG.partition("work:")[0].replace("[sparse,", "[crashing,").replace("[early, violent]", "early")
+    made = Home(tmp_path, config)
+    assert made.run(isolated=True) == 2
+    (problem,) = made.rows("problem")
+    lost = made.rows("curve", solver="crashing")
+    assert [(row["problem"], row["first_guess"]) for row in lost] == [
+        (problem["problem"], guess) for guess in ("current", "inertial")
+    ]
+    for row in lost:
+        assert row["status"] == "failed"
+        assert "crashed by SIGABRT" in row["reason"]
+    assert {row["status"] for row in made.rows("curve", solver="newton")} == {"ok"}
+    assert made.run() == 0
 
 
 def commanded(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[int, str]:

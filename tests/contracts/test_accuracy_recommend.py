@@ -16,7 +16,7 @@ from harness.cli import main
 from harness.experiments.accuracy import recommend as module
 from harness.experiments.accuracy.recommend import Recommendation, recommend
 from harness.experiments.accuracy.rows import SCHEMA
-from tests.contracts.test_accuracy import Quiet
+from tests.displays import Quiet
 
 SCENE = """
 mesh: {kind: chain, length: 2.0}
@@ -67,7 +67,7 @@ def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: 
     assert 0 < len(within) < len(table), "the error separates nothing"
     cheapest = min(within, key=lambda row: row["seconds_per_simulated"])
     assert (found.best.error, found.best.cost) == (cheapest["error"], cheapest["seconds_per_simulated"])
-    assert found.best.unit.case.scene.time_step == cheapest["time_step"]
+    assert found.best.spec.case.scene.time_step == cheapest["time_step"]
     assert found.checked.error == found.best.error  # the same simulation gives the same positions
     assert found.checked.cost > 0.0
 

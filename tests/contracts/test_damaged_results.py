@@ -95,7 +95,7 @@ def test_the_runs_of_damaged_rows_and_recordings_are_done_again(home: Path):
     assert told.exit_code == 0, told.output
     said = " ".join(told.output.split())
     assert f"{first.name} holds no rows" in said
-    assert f"{recording.name} is cut before its end; its run is done again" in said
+    assert f"{recording.name} is cut before its end" in said
     assert rows.read([first, second], needed=("status",)).num_rows > 0
     assert len(read_replay(recording).frames) == 3
     again = CliRunner().invoke(app, ["run", str(home / "sweep.yaml"), "--results", str(home / "results")])

@@ -17,7 +17,7 @@ from harness.config.accuracy_load import load_accuracy
 from harness.config.load import load_any
 from harness.config.schema import schema
 from harness.experiments.ablation.suggest import seen, suggestions
-from harness.experiments.accuracy.run import run_accuracy
+from harness.experiments.accuracy.studies import run_accuracy
 from harness.experiments.plan import Files
 from harness.experiments.run import execute
 from harness.report.accuracy import draw
@@ -31,7 +31,7 @@ from harness.scenes.mesh.base import Mesh
 from solvers.about import About, Reference
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.registry import SOLVERS
-from tests.contracts.test_accuracy import Quiet
+from tests.displays import Quiet
 from tests.scenes import cloth
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -133,7 +133,7 @@ def test_a_sweep_and_its_reports_take_a_new_solver_and_effect(configs: Path):
 
 def test_the_accuracy_report_takes_a_new_solver_and_effect(configs: Path):
     asked = load_accuracy(configs / "accuracy.yaml")
-    files = run_accuracy(asked, configs / "results", Quiet(), lambda line: None)
+    files = run_accuracy(asked, configs / "results", Quiet(), lambda line: None, isolated=False)
     drawn = {path.name: path for path in draw(configs / "results", files)}
     assert "@misc{noether1918," in drawn["references.bib"].read_text()
     assert "mine: Noether 1918, Invariante Variationsprobleme" in drawn["findings.md"].read_text()

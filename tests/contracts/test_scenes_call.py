@@ -8,8 +8,9 @@ import pytest
 
 from harness.config.load import load_any
 from harness.experiments.ablation.command import SOLVER, TOLERANCE
-from harness.experiments.ablation.run import ablate
+from harness.experiments.ablation.unit import run_ablation
 from harness.report.ablation import of_kind, read, verdict
+from tests.displays import Quiet
 
 SCENES = Path(__file__).resolve().parents[2] / "configs" / "scenes"
 QUICK: dict[str, int | None] = {"heavy-bob": None, "tower": 8, "hanging-cloth": 12}
@@ -34,7 +35,7 @@ def test_a_scene_has_the_effects_that_its_motion_calls_for_and_no_others(name: s
     size = (QUICK | LONG)[name]
     asked = {"solvers": [SOLVER], "tolerance": TOLERANCE, "sizes": [size] if size else [], "rounds": 1, "threads": 1}
     sweep = load_any(SCENES / f"{name}.yaml", **asked)
-    rows = read(ablate(sweep, tmp_path, pairs=False, tick=lambda phase: None))
+    rows = read(run_ablation(sweep, tmp_path, Quiet(), lambda line: None, pairs=False, isolated=False))
     told = {row["name"]: verdict(row, rows) for row in of_kind(rows, "without")}
     assert {name: words for name, words in told.items() if not any(called in words for called in CALLED)} == {}
     # Contact of a mesh with itself is no effect yet: no scene can list it.

@@ -19,16 +19,17 @@ from harness.base.columns import Column
 from harness.cli import app
 from harness.config.load import load_any, load_scene
 from harness.experiments.ablation import suggest
-from harness.experiments.ablation.cases import Case, cases
 from harness.experiments.ablation.command import SOLVER
 from harness.experiments.ablation.rows import COLUMNS
-from harness.experiments.ablation.run import ablate
 from harness.experiments.ablation.suggest import Suggestion
-from harness.experiments.ablation.turns import Turn, cost
+from harness.experiments.ablation.turns import Contender, cost
+from harness.experiments.ablation.unit import run_ablation
+from harness.experiments.ablation.variants import Variant, variants
 from harness.report.ablation import read, sentences, verdict
 from harness.scenes.bind import Scene
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.grid import Grid
+from tests.displays import Quiet
 from tests.effects import cloth
 from tests.scenes import scene
 
@@ -62,7 +63,7 @@ def rows_of(scene: str, tmp_path: Path, *, pairs: bool = False, **options: Any) 
     path = tmp_path / "scene.yaml"
     path.write_text(scene)
     sweep = load_any(path, solvers=["sparse"], threads=1, rounds=2, **options)
-    return read(ablate(sweep, tmp_path, pairs=pairs, tick=lambda phase: None))
+    return read(run_ablation(sweep, tmp_path, Quiet(), lambda line: None, pairs=pairs, isolated=False))
 
 
 def by_name(rows: Sequence[dict[str, Any]], kind: str = "without") -> dict[str, dict[str, Any]]:
@@ -78,8 +79,16 @@ def test_every_effect_is_left_out_once_and_every_pair_on_request(tmp_path: Path)
     path = tmp_path / "scene.yaml"
     path.write_text(CLOTH + "  - {kind: pins, at: [bottom]}\n")
     scene = load_scene(path)
-    alone, both = cases(scene, pairs=False), cases(scene, pairs=True)
-    assert [case.name for case in alone] == ["", "springs", "gravity", "bending", "air-drag", "pins[4]", "pins[5]"]
+    alone, both = variants(scene, pairs=False), variants(scene, pairs=True)
+    assert [one.name for one in alone] == [
+        "",
+        "springs",
+        "gravity",
+        "bending",
+        "air-drag",
+        "pins[4]",
+        "pins[5]",
+    ]
     assert len(both) == 1 + 6 + 15
     assert [e.kind for e in both[7].scene.effects] == ["bending", "air-drag", "pins", "pins"]
     assert alone[0].scene.effects == scene.effects
@@ -135,9 +144,9 @@ def test_the_cost_is_the_difference_of_frames_that_were_timed_together():
     scene: Any = None
     rng = np.random.default_rng(1)
     drift = rng.uniform(1.0, 5.0, (5, 40))
-    whole, without = (Turn(Case((), scene), seconds=(drift + more).tolist()) for more in (0.3, 0.0))
+    whole, without = (Contender(Variant((), scene), seconds=(drift + more).tolist()) for more in (0.3, 0.0))
     assert cost(whole, without) == pytest.approx((0.3, 0.3, 0.3))
-    noisy = Turn(Case((), scene), seconds=(drift + 0.3 + 0.05 * rng.standard_normal((5, 40))).tolist())
+    noisy = Contender(Variant((), scene), seconds=(drift + 0.3 + 0.05 * rng.standard_normal((5, 40))).tolist())
     middle, low, high = cost(noisy, without)
     assert low < middle < high
     # 40 frames, the median of 5 rounds each: the mean is known to 0.05 / sqrt(40 * 3), 0.005; six of these.

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.config.accuracy import Case, How, WorkUnit
+from harness.config.accuracy import Case, How, WorkSpec
 from harness.config.sweep import SolverSpec
-from harness.experiments.accuracy.run import trajectory_of
+from harness.experiments.accuracy.units import trajectory_of
 from harness.experiments.accuracy.work import work_rows
 from harness.reference.frozen import bind
 from harness.reference.store import Store
@@ -36,7 +36,7 @@ CHAIN = SceneSpec(
     path=Path("chain.yaml"),
 )
 HORIZON = 0.2
-UNIT = WorkUnit(
+UNIT = WorkSpec(
     Case("chain", CHAIN, 5, "implicit-euler"),
     HORIZON,
     SolverSpec("sparse", {}),
@@ -54,7 +54,7 @@ def trajectory(tmp_path_factory: pytest.TempPathFactory) -> Trajectory:
     return found
 
 
-def row(unit: WorkUnit, trajectory: Trajectory | Exception) -> dict[str, Any]:
+def row(unit: WorkSpec, trajectory: Trajectory | Exception) -> dict[str, Any]:
     (found,) = work_rows(unit, trajectory, lambda: None)
     return found
 

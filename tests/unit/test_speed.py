@@ -9,6 +9,7 @@ from time import perf_counter, thread_time
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from harness.base import machine
@@ -18,7 +19,7 @@ from harness.config.load import load_any, load_sweep
 from harness.config.sweep import RunSpec, SolverSpec
 from harness.experiments.speed import candidates, limits, turns
 from harness.experiments.speed.candidates import Reading, average
-from harness.experiments.speed.report import run_speed
+from harness.experiments.speed.comparison import run_speed
 from harness.experiments.speed.rest import apart, rest_of
 from harness.experiments.speed.turns import PREPARES, Past, measure, name, predicted
 from harness.report.speed.counts import count
@@ -26,6 +27,7 @@ from harness.report.speed.figures import figures
 from harness.report.speed.table import remarks, speed_table
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Unsupported
+from tests.displays import Quiet
 from tests.scenes import cloth, first_problem
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -197,13 +199,19 @@ def sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 def test_a_folder_is_for_one_report_at_a_time(sweep, tmp_path: Path):
     (tmp_path / "out" / "rows").mkdir(parents=True)
     with alone(tmp_path / "out"), pytest.raises(InputError, match="another springbench"):
-        run_speed(sweep, tmp_path / "out", print)
+        run_speed(sweep, tmp_path / "out", Quiet(), print)
 
 
 def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     said: list[str] = []
-    table = run_speed(sweep, tmp_path / "out", said.append)
-    assert said == [f"yardstick-cloth {size}: 5 candidates take turns" for size in (4, 5)]
+    display = Quiet()
+
+    def done() -> pa.Table:
+        return run_speed(sweep, tmp_path / "out", display, said.append, isolated=False)
+
+    table = done()
+    titles = [f"yardstick-cloth {size}: 5 candidates take turns" for size in (4, 5)]
+    assert (display.titles, said) == (titles, [])
     found = figures(table)
     assert [(f.size, f.label, f.status) for f in found] == [
         (size, label, status)
@@ -219,16 +227,13 @@ def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path, monkeypatch: 
     assert all(f.reached and f.local and f.global_ and f.step and f.warm for f in found if f.status == "ok")
     assert speed_table(found).row_count == len(found)
     assert sum("there is no C++ compiler" in line and line.endswith("(at 4, 5)") for line in remarks(found)) == 2
-    # A new size is measured; what is there is not.
-    again = run_speed(sweep, tmp_path / "out", said.append)
-    assert len(said) == 2
-    assert again.equals(table)
+    # What is there is not measured again.
+    assert done().equals(table)
+    assert (display.titles, said) == (titles, ["2 of 2 sizes are there already"])
     # What other code measured is shown, and said to be so.
     monkeypatch.setattr(machine, "code_hash", lambda: "another")
-    run_speed(sweep, tmp_path / "out", said.append)
-    assert said[2:] == [
-        f"yardstick-cloth {size}: 5 of 5 there are by other code than today's; --again does all anew" for size in (4, 5)
-    ]
+    done()
+    assert said[2] == f"2 of them by other code than today's: {', '.join(titles)}"
     assert all((tmp_path / "out" / "rows").glob("*.parquet"))
 
 

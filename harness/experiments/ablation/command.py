@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from harness.base.console import out, say
+from harness.base.commands import Again, Changed, InThisProcess, Results
+from harness.base.console import err, out, say
 
 SOLVER, TOLERANCE = "hybrid", 1e-4
 """It takes all effects, and converges: what an effect changes is not to drown in the solver's own error."""
@@ -15,7 +16,7 @@ SOLVER, TOLERANCE = "hybrid", 1e-4
 
 def ablate(
     scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
-    results: Annotated[Path, typer.Option(help="The folder that holds a folder for each scene.")] = Path("results"),
+    results: Results = Path("results"),
     solver: Annotated[str | None, typer.Option(help=f"{SOLVER}, to {TOLERANCE:g}, if left out.")] = None,
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
     frames: Annotated[int | None, typer.Option(help="How many steps; the scene's if left out.")] = None,
@@ -23,11 +24,15 @@ def ablate(
     tolerance: Annotated[float | None, typer.Option(help="Relative tolerance of a step.")] = None,
     rounds: Annotated[int, typer.Option(help="How often each step is timed.")] = 5,
     pairs: Annotated[bool, typer.Option("--pairs", help="Leave out each pair of effects too.")] = False,
+    again: Again = False,
+    changed: Changed = False,
+    here: InThisProcess = False,
 ) -> None:
     """Leave out each effect of a scene: what it costs, what it changes, and which effects the motion calls for."""
     from harness.base.claim import claimed
+    from harness.base.progress import display
     from harness.config.load import load_any
-    from harness.experiments.ablation.run import ablate as run_ablation
+    from harness.experiments.ablation.unit import run_ablation
     from harness.report.ablation import ablation_table, read, sentences
     from harness.report.ablation_plot import draw_ablation
 
@@ -36,8 +41,12 @@ def ablate(
     options = {"frames": frames, "iterations": iterations, "tolerance": tolerance, "rounds": rounds, "threads": 1}
     sweep = load_any(scene, solvers=[solver], sizes=[size] if size else [], **options)
     folder = claimed(results / sweep.name, scene)
-    path = run_ablation(sweep, folder, pairs=pairs, tick=lambda phase: None)
+    how = {"pairs": pairs, "again": again, "changed": changed, "isolated": not here}
+    path = run_ablation(sweep, folder, display(err), say, **how)
     rows, picture = read(path), folder / "pictures" / f"ablation-{path.stem}.png"
+    if rows[0]["status"] != "ok":  # of the whole scene, with which all others are compared
+        say(f"{sweep.name}: {rows[0]['status']}: {rows[0]['reason']}")
+        raise typer.Exit(1)
     out.print(ablation_table(rows))
     for line in sentences(rows):
         say(line)

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from harness.scenes.bind import Scene
 
-Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
+States = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Positions [m] and velocities [m/s], (frames, n, 3) each."""
 
 
-def difference(scene: Scene, a: Motion, b: Motion) -> dict[str, float]:
+def difference(scene: Scene, a: States, b: States) -> dict[str, float]:
     """The columns `largest`, `rms`, `energy`, `centre` of two motions; the scene is the whole one."""
     (p, _), (q, _) = a, b
     unit, mass = rest_length(scene), scene.system.mass

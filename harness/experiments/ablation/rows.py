@@ -31,7 +31,12 @@ COLUMNS = (
     *_as_in_runs("first_guess", "max_iterations", "tolerance", "threads"),
     Column("frames", _INT, "", "steps simulated"),
     Column("rounds", _INT, "", "how often each of them was timed"),
-    Column("status", _TEXT, "", "ok, impossible (the scene has no answer without them), or unknown (an error)"),
+    Column(
+        "status",
+        _TEXT,
+        "",
+        "ok, impossible (the scene has no answer without them), unknown (an error); of the whole scene as in runs",
+    ),
     Column("reason", _TEXT, "", "why the status is not ok; of a suggestion the evidence"),
     Column("seconds", _REAL, "s", "CPU time of a step, the mean over the frames of the median over the rounds"),
     Column("cost", _REAL, "s", "what the effects cost a step: the same of the differences from the whole scene"),

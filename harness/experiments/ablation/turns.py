@@ -12,7 +12,7 @@ of an effect is a difference of times of the same frame in the same round:
 from __future__ import annotations
 
 import tracemalloc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from time import thread_time
 
@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from harness.base.errors import InputError
 from harness.base.statistics import Interval, added
-from harness.experiments.ablation.cases import Case
+from harness.base.worker import Tick
+from harness.experiments.ablation.variants import Variant
 from harness.scenes.bind import Scene, build
 from harness.simulation.measure import Settings, StepFailed, steps
 from harness.simulation.step import Step, prepare
@@ -31,11 +32,11 @@ Array = NDArray[np.float64]
 
 
 @dataclass(eq=False)
-class Turn:
-    """A case on its way. seconds: (rounds, frames); positions: (frames, n, 3) [m]; velocities likewise [m/s];
+class Contender:
+    """A variant on its way. seconds: (rounds, frames); positions: (frames, n, 3) [m]; velocities likewise [m/s];
     failure: why there is no answer, empty where there is one."""
 
-    case: Case
+    variant: Variant
     scene: Scene | None = None
     prepared: Prepared | None = None
     bytes: int = 0
@@ -46,14 +47,19 @@ class Turn:
 
 
 def turns(
-    cases: Sequence[Case], size: int, integrator: str, solver: Solver, settings: Settings, tick: Callable[[str], None]
-) -> list[Turn]:
-    """Every case simulated `rounds` times, after a pass that warms up and keeps the motion.
+    variants: Sequence[Variant],
+    size: int,
+    integrator: str,
+    solver: Solver,
+    settings: Settings,
+    tick: Tick,
+) -> list[Contender]:
+    """Every variant simulated `rounds` times, after a pass that warms up and keeps the motion.
 
-    Raises InputError and Unsupported for the first case, the whole scene; the others say so themselves.
+    Raises InputError and Unsupported for the first variant, the whole scene; the others say so themselves.
     """
-    _prepared(cases[0], size, integrator, solver)  # what is compiled and imported is not the scene's memory
-    found = [_prepared(case, size, integrator, solver) for case in cases]
+    _prepared(variants[0], size, integrator, solver)  # what is compiled and imported is not the scene's memory
+    found = [_prepared(variant, size, integrator, solver) for variant in variants]
     for turn in found:
         _keep_motion(turn, settings)
         tick("motion")
@@ -73,25 +79,25 @@ def turns(
     return found
 
 
-def cost(whole: Turn, without: Turn) -> Interval:
+def cost(whole: Contender, without: Contender) -> Interval:
     """What a step of the whole scene takes more of CPU time [s]."""
     return added(np.array(whole.seconds) - np.array(without.seconds))
 
 
-def seconds(turn: Turn) -> float:
+def seconds(turn: Contender) -> float:
     """CPU time of a step [s], the mean over the frames of the median over the rounds."""
     return float(np.median(np.array(turn.seconds), axis=0).mean())
 
 
-def _prepared(case: Case, size: int, integrator: str, solver: Solver) -> Turn:
-    turn = Turn(case)
+def _prepared(variant: Variant, size: int, integrator: str, solver: Solver) -> Contender:
+    turn = Contender(variant)
     tracemalloc.start()
     try:
-        turn.scene = build(case.scene, size, integrator)
+        turn.scene = build(variant.scene, size, integrator)
         turn.prepared = prepare(turn.scene, solver)
         turn.bytes = tracemalloc.get_traced_memory()[0]
     except (InputError, NotPositiveDefinite, Unsupported) as error:
-        if not case.left_out:
+        if not variant.left_out:
             raise
         turn.failure = str(error)
     finally:
@@ -99,21 +105,21 @@ def _prepared(case: Case, size: int, integrator: str, solver: Solver) -> Turn:
     return turn
 
 
-def _keep_motion(turn: Turn, settings: Settings) -> None:
+def _keep_motion(turn: Contender, settings: Settings) -> None:
     """Simulate once, and keep positions and velocities."""
     if turn.failure:
         return
     try:
         kept = [(step.state.now.positions, step.state.now.velocity) for step in _steps(turn, settings)]
     except StepFailed as error:
-        if not turn.case.left_out:
+        if not turn.variant.left_out:
             raise
         turn.failure = f"{error}: {error.__cause__}"
         return
     turn.positions, turn.velocities = (np.array(part) for part in zip(*kept, strict=True))
 
 
-def _steps(turn: Turn, settings: Settings) -> Iterator[Step]:
+def _steps(turn: Contender, settings: Settings) -> Iterator[Step]:
     assert turn.scene is not None
     assert turn.prepared is not None
     return steps(turn.scene, turn.prepared, settings)

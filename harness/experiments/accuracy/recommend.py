@@ -19,12 +19,13 @@ from harness.base.claim import claimed
 from harness.base.document import Document
 from harness.base.errors import InputError, Mistake, RunFailed
 from harness.base.progress import Display
-from harness.config.accuracy import AccuracyFields, Case, How, WorkUnit
+from harness.config.accuracy import AccuracyFields, Case, How, WorkSpec
 from harness.config.accuracy_load import Accuracy, expand
 from harness.config.load import load_scene, solvers_of
 from harness.config.sweep import SolverSpec
 from harness.experiments.accuracy.rows import SCHEMA
-from harness.experiments.accuracy.run import references, run_accuracy, trajectory_of
+from harness.experiments.accuracy.studies import run_accuracy
+from harness.experiments.accuracy.units import references, trajectory_of
 from harness.experiments.accuracy.work import work_rows
 from harness.reference.store import Store
 from harness.scenes.mesh.generator import Generator
@@ -53,12 +54,12 @@ def candidates() -> list[dict[str, Any]]:
 class Way:
     """A way to simulate the scene, its relative error, and its wall seconds per simulated second."""
 
-    unit: WorkUnit
+    spec: WorkSpec
     error: float
     cost: float
 
     def __str__(self) -> str:
-        u = self.unit
+        u = self.spec
         stop = f"{u.iterations} iterations" if u.tolerance is None else f"tolerance {u.tolerance:g}"
         return f"{u.case.integrator}, time step {u.case.scene.time_step:.6g} s, {stop}, solver {u.solver.name}"
 
@@ -140,30 +141,30 @@ def _known(
     units = (unit for folder in shelf.folders(results, "accuracy", "*/") for unit in shelf.units(folder))
     for path in sorted(unit for unit in units if unit.name.startswith(f"{name}-{size}-work-")):
         row = rows.read([path], SCHEMA).to_pylist()[0]
-        unit = _unit(row, name, scene)
-        if path.stem != unit.label() or row["machine"] != here or row["horizon"] != horizon:
+        spec = _spec(row, name, scene)
+        if path.stem != spec.label() or row["machine"] != here or row["horizon"] != horizon:
             continue  # the scene was another then, or the machine, or the question
         if row["status"] == "ok":
-            ways.append(Way(unit, row["error"], row["seconds_per_simulated"]))
+            ways.append(Way(spec, row["error"], row["seconds_per_simulated"]))
         else:
             without.append(row)
     return sorted(ways, key=lambda way: way.cost), without
 
 
-def _unit(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkUnit:
+def _spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSpec:
     """What a row was measured of, if the scene is still the same."""
     case = Case(name, scene.stepped(row["time_step"]), row["size"], row["integrator"])
     solver = SolverSpec(row["solver"], json.loads(row["parameters"]))
     how = How(row["threads"], rounds=1, time_limit=float("inf"))
-    return WorkUnit(case, row["horizon"], solver, row["first_guess"], row["iterations"], row["tolerance"], how)
+    return WorkSpec(case, row["horizon"], solver, row["first_guess"], row["iterations"], row["tolerance"], how)
 
 
 def _check(best: Way, store: Store) -> Way:
     """The same once more."""
-    row = work_rows(best.unit, trajectory_of(best.unit, store), lambda: None)[0]
+    row = work_rows(best.spec, trajectory_of(best.spec, store), lambda: None)[0]
     if row["status"] != "ok":
         raise RunFailed(f"the check of {best} ended otherwise than before: {row['status']}: {row['reason']}")
-    return Way(best.unit, row["error"], row["seconds_per_simulated"])
+    return Way(best.spec, row["error"], row["seconds_per_simulated"])
 
 
 def _nothing(ways: list[Way], without: list[dict[str, Any]], error: float, horizon: float) -> str:

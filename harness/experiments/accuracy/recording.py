@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from harness.base import machine
-from harness.config.accuracy import CurveUnit
+from harness.config.accuracy import CurveSpec
 from harness.experiments.accuracy.curves import Curve
 from harness.experiments.accuracy.scales import round_off
 from harness.record.base import Frame, RecordingInfo
@@ -37,13 +37,13 @@ class Step(Protocol):
         ...
 
 
-def record(unit: CurveUnit, graded: Step, scene: Scene, first_guess: str, curve: Curve, folder: Path) -> Path:
+def record(spec: CurveSpec, graded: Step, scene: Scene, first_guess: str, curve: Curve, folder: Path) -> Path:
     """Write the recording of a curve under `folder`/recordings and return its path. Raises RunFailed."""
-    path = folder / "recordings" / f"{unit.label()}-{first_guess}.rrd"
+    path = folder / "recordings" / f"{spec.label()}-{first_guess}.rrd"
     problem = graded.frozen.problem
     info = RecordingInfo(
-        title=f"{unit.case.title}, {graded.moment}: {unit.solver.name} from the {first_guess} positions",
-        run_id=f"{unit.unit_id(machine.describe().id)}-{first_guess}",
+        title=f"{spec.case.title}, {graded.moment}: {spec.solver.name} from the {first_guess} positions",
+        run_id=f"{spec.unit_id(machine.describe().id)}-{first_guess}",
         mesh=scene.mesh,
         springs=scene.springs.edges,
         rest_lengths=scene.springs.rest_length,
@@ -51,9 +51,9 @@ def record(unit: CurveUnit, graded: Step, scene: Scene, first_guess: str, curve:
         time_step=problem.system.time_step,
         strain_range=0.1,
         properties={
-            "scene": unit.case.scene_name,
-            "size": unit.case.size,
-            "solver": unit.solver.name,
+            "scene": spec.case.scene_name,
+            "size": spec.case.size,
+            "solver": spec.solver.name,
             "moment": graded.moment,
             "step": graded.frozen.frame,
             "problem": graded.frozen.digest,

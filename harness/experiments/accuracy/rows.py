@@ -37,7 +37,7 @@ COLUMNS = (
         "status",
         _TEXT,
         "",
-        "ok, saddle, unsupported, diverged, no-progress, time-limit, failed or uncertified (the reference)",
+        "ok, saddle, unsupported, diverged, no-progress, time-limit, failed, killed or uncertified (the reference)",
     ),
     _SHARED["reason"],
     Column("problem", _TEXT, "", "digest of the frozen step; of work the digest of the reference trajectory"),

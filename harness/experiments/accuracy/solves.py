@@ -11,12 +11,12 @@ from time import perf_counter
 from typing import Any
 
 from harness.base import machine
-from harness.config.accuracy import Case, CurveUnit
+from harness.config.accuracy import Case, CurveSpec, moment_name
 from harness.experiments.accuracy.curves import Curve, measure
 from harness.experiments.accuracy.failures import lost
 from harness.experiments.accuracy.recording import record
 from harness.experiments.accuracy.scales import distances, stiffness_ratio
-from harness.experiments.columns import provenance
+from harness.experiments.provenance import provenance
 from harness.reference.frozen import Frozen, bind
 from harness.reference.minimiser import Minimum, Reference
 from harness.reference.oracle import Oracle
@@ -36,7 +36,7 @@ CLOSE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Graded:
+class GradedStep:
     """A frozen step of a case, and what grades it. moment: as rows tell it; store: of the truth."""
 
     case: Case
@@ -45,15 +45,14 @@ class Graded:
     store: Store
 
     @classmethod
-    def find(cls, case: Case, moment: str | int, store: Store) -> Graded:
+    def find(cls, case: Case, moment: str | int, store: Store) -> GradedStep:
         """The step at a moment; finds its minima. Raises InputError, RunFailed."""
         scene, size, integrator = case.scene, case.size, case.integrator
         if isinstance(moment, int):
             frozen = store.frames(scene, size, [moment], integrator)[moment]
-            moment = f"frame-{moment}"
         else:
             frozen = store.moments(scene, size, integrator)[moment]
-        return cls(case, moment, frozen, store)
+        return cls(case, moment_name(moment), frozen, store)
 
     @cached_property
     def scene(self) -> Scene:
@@ -128,26 +127,26 @@ class Graded:
         return found if found.certified else None
 
 
-def curve_rows(unit: CurveUnit, graded: Graded, folder: Path, tick: Callable[[], None]) -> list[Row]:
+def curve_rows(spec: CurveSpec, graded: GradedStep, folder: Path, tick: Callable[[], None]) -> list[Row]:
     """The rows of one solver on one step: its preparation, and a curve from each first guess.
 
     folder: of the config's results; tick: called after each curve. What a solver raises is a row.
     """
-    solver: Solver = load(EVERY[unit.solver.name])(**unit.solver.parameters)
+    solver: Solver = load(EVERY[spec.solver.name])(**spec.solver.parameters)
     shared = graded.common()
     try:
-        with machine.pinned_threads(unit.how.threads):
-            prepared, row = _prepared(solver, graded, unit.how.rounds)
+        with machine.pinned_threads(spec.how.threads):
+            prepared, row = _prepared(solver, graded, spec.how.rounds)
             found = [shared | row]
-            for first_guess in unit.first_guesses:
-                found += [shared | row for row in _curve(unit, prepared, graded, first_guess, folder)]
+            for first_guess in spec.first_guesses:
+                found += [shared | row for row in _curve(spec, prepared, graded, first_guess, folder)]
                 tick()
     except Exception as error:  # whatever a solver raises, the others go on
-        return [shared | lost(error) | {"kind": "curve", "first_guess": guess} for guess in unit.first_guesses]
+        return [shared | lost(error) | {"kind": "curve", "first_guess": guess} for guess in spec.first_guesses]
     return found
 
 
-def _prepared(solver: Solver, graded: Graded, rounds: int) -> tuple[Prepared, Row]:
+def _prepared(solver: Solver, graded: GradedStep, rounds: int) -> tuple[Prepared, Row]:
     system, seconds = graded.frozen.problem.system, []
     began = perf_counter()
     prepared = solver.prepare(system)
@@ -159,22 +158,22 @@ def _prepared(solver: Solver, graded: Graded, rounds: int) -> tuple[Prepared, Ro
     return prepared, {"kind": "prepare", "cold": cold, "seconds": seconds}
 
 
-def _curve(unit: CurveUnit, prepared: Prepared, graded: Graded, first_guess: str, folder: Path) -> list[Row]:
+def _curve(spec: CurveSpec, prepared: Prepared, graded: GradedStep, first_guess: str, folder: Path) -> list[Row]:
     known = graded.reference.minima
     curve = measure(
         prepared,
         graded.frozen.stated(first_guess),
         graded.oracle,
         known[0].g if known else None,
-        iterations=unit.iterations,
-        time_limit=unit.how.time_limit,
-        rounds=unit.how.rounds,
+        iterations=spec.iterations,
+        time_limit=spec.how.time_limit,
+        rounds=spec.how.rounds,
     )
     reached = graded.reached(curve.positions[-1], curve.stationarity[-1]) if curve.status != "saddle" else None
     shared: Row = {
         "kind": "curve",
         "first_guess": first_guess,
-        "iterations": unit.iterations,
+        "iterations": spec.iterations,
         "status": curve.status,
         "reason": curve.reason or None,
     }
@@ -183,8 +182,8 @@ def _curve(unit: CurveUnit, prepared: Prepared, graded: Graded, first_guess: str
         shared |= {"status": "uncertified", "reason": reference.reason}
     if reached:
         shared["branch"] = reference.branch(reached)
-    if unit.recordings and first_guess == unit.first_guesses[0]:
-        shared["recording"] = str(record(unit, graded, graded.scene, first_guess, curve, folder).relative_to(folder))
+    if spec.recordings and first_guess == spec.first_guesses[0]:
+        shared["recording"] = str(record(spec, graded, graded.scene, first_guess, curve, folder).relative_to(folder))
     against = reached or next(iter(reference.minima), None)
     return [shared | row for row in _points(curve, graded.frozen.problem.system, against)]
 

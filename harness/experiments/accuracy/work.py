@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from harness.base import machine
-from harness.config.accuracy import WorkUnit
+from harness.config.accuracy import WorkSpec
 from harness.experiments.accuracy.failures import OverTime, lost
 from harness.reference.frozen import bind
 from harness.reference.trajectory import Trajectory
@@ -31,7 +31,7 @@ WARM_UP = 2
 """Steps done before the clock counts: they compile, and touch memory for the first time."""
 
 
-def work_rows(unit: WorkUnit, trajectory: Trajectory | Exception, tick: Callable[[], None]) -> list[Row]:
+def work_rows(spec: WorkSpec, trajectory: Trajectory | Exception, tick: Callable[[], None]) -> list[Row]:
     """The row of one simulation; what it raises is told there.
 
     trajectory: the reference up to the horizon, or why there is none; tick: called after each round.
@@ -39,48 +39,48 @@ def work_rows(unit: WorkUnit, trajectory: Trajectory | Exception, tick: Callable
     shared: Row = {
         "kind": "work",
         "status": "ok",
-        "first_guess": unit.first_guess,
-        "iterations": unit.iterations,
-        "tolerance": unit.tolerance,
-        "horizon": unit.horizon,
+        "first_guess": spec.first_guess,
+        "iterations": spec.iterations,
+        "tolerance": spec.tolerance,
+        "horizon": spec.horizon,
     }
     try:
         if isinstance(trajectory, Exception):
             raise trajectory
-        with machine.pinned_threads(unit.how.threads):
-            return [shared | _simulated(unit, trajectory, tick)]
+        with machine.pinned_threads(spec.how.threads):
+            return [shared | _simulated(spec, trajectory, tick)]
     except Exception as error:  # whatever a solver raises, the others go on
         return [shared | lost(error)]
 
 
-def _simulated(unit: WorkUnit, trajectory: Trajectory, tick: Callable[[], None]) -> Row:
-    case = unit.case
+def _simulated(spec: WorkSpec, trajectory: Trajectory, tick: Callable[[], None]) -> Row:
+    case = spec.case
     scene = bind(case.scene, case.size, case.integrator)
-    solver: Solver = load(EVERY[unit.solver.name])(**unit.solver.parameters)
+    solver: Solver = load(EVERY[spec.solver.name])(**spec.solver.parameters)
     prepared = prepare(scene, solver)
     row: Row = {"vertices": scene.system.vertices, "springs": len(scene.springs.edges), "seconds": []}
-    frames = round(unit.horizon / case.scene.time_step)
-    p, *_ = _run(unit, scene, prepared, min(WARM_UP, frames))
-    for _ in range(unit.how.rounds):
-        p, seconds, row["iterations_done"] = _run(unit, scene, prepared, frames)
+    frames = round(spec.horizon / case.scene.time_step)
+    p, *_ = _run(spec, scene, prepared, min(WARM_UP, frames))
+    for _ in range(spec.how.rounds):
+        p, seconds, row["iterations_done"] = _run(spec, scene, prepared, frames)
         row["seconds"].append(seconds)
         tick()
     away = (p - trajectory.positions[-1])[scene.system.free]
     row["error"] = trajectory.error(-1, p)
     row["error_rms_m"] = float(np.sqrt(np.mean(np.einsum("ij,ij->i", away, away))))
-    row["seconds_per_simulated"] = float(np.median(row["seconds"])) / unit.horizon
+    row["seconds_per_simulated"] = float(np.median(row["seconds"])) / spec.horizon
     trajectory.require(row["error"])
     return row
 
 
-def _run(unit: WorkUnit, scene: Scene, prepared: Prepared, frames: int) -> tuple[Positions, float, int]:
+def _run(spec: WorkSpec, scene: Scene, prepared: Prepared, frames: int) -> tuple[Positions, float, int]:
     """The last positions (n, 3) [m], the wall seconds of all steps, and the iterations done in them.
 
     Raises RunFailed where another clock saw other seconds go by.
     """
-    stop, seconds, iterations = StopRule(unit.iterations, unit.tolerance), 0.0, 0
-    p, watch = scene.mesh.rest, Watch(unit.how.threads)
-    run = simulate(scene, prepared, stop, first_guess=unit.first_guess, frames=frames)
+    stop, seconds, iterations = StopRule(spec.iterations, spec.tolerance), 0.0, 0
+    p, watch = scene.mesh.rest, Watch(spec.how.threads)
+    run = simulate(scene, prepared, stop, first_guess=spec.first_guess, frames=frames)
     for _ in range(frames):
         with watch:
             step = next(run)
@@ -89,7 +89,7 @@ def _run(unit: WorkUnit, scene: Scene, prepared: Prepared, frames: int) -> tuple
         iterations += step.solution.iterations
         if not np.isfinite(p).all():
             raise Diverged(f"positions are not finite from frame {step.index} on")
-        if seconds > unit.how.time_limit and step.index < frames:
-            raise OverTime(f"the limit of {unit.how.time_limit:g} s was reached in frame {step.index} of {frames}")
+        if seconds > spec.how.time_limit and step.index < frames:
+            raise OverTime(f"the limit of {spec.how.time_limit:g} s was reached in frame {step.index} of {frames}")
     watch.columns("step", [seconds])
     return p, seconds, iterations

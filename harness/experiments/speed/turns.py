@@ -17,9 +17,10 @@ import numpy as np
 
 from harness.base import machine
 from harness.base.errors import RunFailed
+from harness.base.worker import Tick
 from harness.config.sweep import RunSpec
-from harness.experiments.columns import common
 from harness.experiments.failure import failure
+from harness.experiments.provenance import common
 from harness.experiments.speed.candidates import Candidate, Reading
 from harness.simulation.measure import digest
 from solvers.problem import Positions
@@ -46,11 +47,16 @@ class Past(NamedTuple):
 
 
 def measure(
-    candidates: Sequence[Candidate], counts: Row, past: Mapping[str, list[Past]], budget: float
+    candidates: Sequence[Candidate],
+    counts: Row,
+    past: Mapping[str, list[Past]],
+    budget: float,
+    tick: Tick = lambda phase: None,
 ) -> list[list[Row]]:
     """The rows of each candidate.
 
-    counts: columns that all share; past: by `name` of a run, smaller sizes first; budget: seconds a candidate.
+    counts: columns that all share; past: by `name` of a run, smaller sizes first; budget: seconds a candidate; tick:
+    told of each round.
     """
     rows: dict[Candidate, list[Row]] = {}
     alive: list[Candidate] = []
@@ -72,10 +78,12 @@ def measure(
                     seconds = candidate.prepare()
                     if seconds is not None:
                         rows[candidate].append(_row(Reading("prepare", seconds, {}), round))
+            tick("prepare")
         for round in range(max((candidate.run.rounds for candidate in alive), default=0)):
             for candidate in list(alive):
                 with _guarded(candidate, rows[candidate], alive):
                     rows[candidate] += [_row(reading, round) for reading in candidate.turn()]
+            tick("turns")
         _compare(rows, alive)
         for candidate in alive:
             rows[candidate] = [candidate.columns | {"status": "ok"} | row for row in rows[candidate]]

@@ -1,4 +1,4 @@
-"""The scenes that are compared: the whole one, and without each effect or each pair of them."""
+"""The variants of a scene that are compared: the whole one, and without each effect or each pair of them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from harness.scenes.spec import SceneSpec
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Case:
+class Variant:
     """A scene without the effects `left_out`, by name; none are left out of the whole scene."""
 
     left_out: tuple[str, ...]
@@ -22,13 +22,13 @@ class Case:
         return "+".join(self.left_out)
 
 
-def cases(scene: SceneSpec, *, pairs: bool) -> list[Case]:
+def variants(scene: SceneSpec, *, pairs: bool) -> list[Variant]:
     """The whole scene, then without each of its effects in their order; with `pairs` also without each two."""
     names = effect_names(scene)
     chosen = [(), *((i,) for i in range(len(names)))]
     if pairs:
         chosen += combinations(range(len(names)), 2)
-    return [Case(tuple(names[i] for i in out), _without(scene, out)) for out in chosen]
+    return [Variant(tuple(names[i] for i in out), _without(scene, out)) for out in chosen]
 
 
 def effect_names(scene: SceneSpec) -> list[str]:

@@ -1,0 +1,204 @@
+"""An ablation as a unit: the whole scene, without each effect, and with better answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from harness.base import machine, rows
+from harness.base.errors import InputError
+from harness.base.progress import Display
+from harness.base.workers import Limits, Lost, Tick
+from harness.config.load import Sweep
+from harness.config.sweep import RunSpec
+from harness.experiments.ablation.difference import States, difference, rest_length
+from harness.experiments.ablation.rows import SCHEMA
+from harness.experiments.ablation.suggest import seen, suggestions
+from harness.experiments.ablation.turns import Contender, cost, motion, seconds, turns
+from harness.experiments.ablation.variants import variants
+from harness.experiments.core import do_all
+from harness.experiments.failure import failure
+from harness.experiments.provenance import asked, provenance
+from harness.experiments.resume import Standing, standings, wanted
+from harness.scenes.bind import Scene, build
+from harness.simulation.measure import Settings
+from solvers.problem import Solver, StopRule
+from solvers.registry import EVERY, SOLVERS, load
+
+Row = dict[str, Any]
+
+_BETTER_ANSWERS = ("solver", "time-step")
+"""In what the better answers are better."""
+
+BETTER = "newton"
+"""Whose answer tells how far the scene's own solver is from the minimum."""
+CONVERGED = StopRule(200, 1e-8)
+"""Far below any difference that an effect makes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ablation:
+    """A run of a scene, the whole and without its effects, taking turns in one process
+    (`harness.experiments.core.Unit`). pairs: whether each pair of effects is left out too."""
+
+    run: RunSpec
+    folder: Path
+    pairs: bool
+
+    @property
+    def path(self) -> Path:
+        """The file of rows."""
+        label = self.run.label(machine.describe().id) + ("-pairs" if self.pairs else "")
+        return self.folder / "ablation" / f"{label}.parquet"
+
+    @property
+    def standing(self) -> Standing:
+        """Whether its rows are there."""
+        return standings({self.path: lambda row: True}, (), SCHEMA)[self.path]
+
+    @property
+    def title(self) -> str:
+        """See Unit."""
+        return f"{self.run.title}: without each effect"
+
+    @property
+    def ticks(self) -> int:
+        """A motion of each variant, the timed rounds, two better answers."""
+        return len(variants(self.run.scene, pairs=self.pairs)) + self.run.rounds + len(_BETTER_ANSWERS)
+
+    @property
+    def work(self) -> float:
+        """See Unit."""
+        return 1.0
+
+    @property
+    def limits(self) -> Limits:
+        """Those of a run."""
+        return Limits(self.run.time_limit, self.run.memory_limit)
+
+    def do(self, tick: Tick) -> str:
+        """See Unit."""
+        try:
+            found = _measured(self.run, self.pairs, tick)
+        except InputError:
+            raise
+        except Exception as error:  # without the whole scene there is nothing to compare
+            told = failure(error)
+            found = [self._unanswered(told["status"], told["reason"])]
+        return self._written(found)
+
+    def lost(self, lost: Lost) -> str:
+        """See Unit."""
+        return self._written([self._unanswered(lost.status, str(lost))])
+
+    def _unanswered(self, status: str, reason: str) -> Row:
+        why = {"kind": "whole", "name": "", "status": status, "reason": reason}
+        return asked(self.run) | provenance() | why
+
+    def _written(self, found: list[Row]) -> str:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        rows.write(self.path, found, SCHEMA)
+        return "ok" if found[0]["status"] == "ok" else f"{found[0]['status']}: {found[0]['reason']}"
+
+
+def run_ablation(
+    sweep: Sweep,
+    folder: Path,
+    display: Display,
+    say: Callable[[str], None],
+    *,
+    pairs: bool,
+    again: bool = False,
+    changed: bool = False,
+    isolated: bool = True,
+) -> Path:
+    """Ablate the one run of a scene's sweep, whose rounds are those of the timing, where that is not done; returns the
+    file of rows. Where the whole scene has no answer, that is its one row.
+
+    isolated: see `harness.experiments.core.do_all`. Raises InputError for what the user can mend.
+    """
+    (run,) = sweep.runs()
+    run.scene.require_even_steps()
+    unit = Ablation(run, folder, pairs)
+    folder.mkdir(parents=True, exist_ok=True)
+    with rows.alone(folder):
+        do_all(wanted([unit], "ablations", say, again=again, changed=changed), display, isolated=isolated)
+    return unit.path
+
+
+def _measured(run: RunSpec, pairs: bool, tick: Tick) -> list[Row]:
+    """The rows. Raises Unsupported and what else the whole scene's solver raises."""
+    settings = Settings(StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
+    solver: Solver = load(EVERY[run.solver.name])(**run.solver.parameters)
+    with machine.pinned_threads(machine.threads(run.threads).number):
+        found = turns(variants(run.scene, pairs=pairs), run.size, run.integrator, solver, settings, tick)
+        whole = found[0]
+        assert whole.scene is not None
+        told = [_whole(whole), *(_without(whole, turn) for turn in found[1:])]
+        told += _errors(run, whole, settings, tick)
+        kinds = {effect.kind for effect in run.scene.effects}
+        motion_seen = seen(whole.scene, kinds, whole.positions, whole.velocities)
+        told += [
+            {"kind": "suggestion", "name": s.effect, "reason": s.evidence} for s in suggestions(motion_seen, kinds)
+        ]
+    return _shared(run, whole.scene, told)
+
+
+def _whole(whole: Contender) -> Row:
+    return {"kind": "whole", "name": "", "status": "ok", "seconds": seconds(whole)} | _built(whole)
+
+
+def _without(whole: Contender, turn: Contender) -> Row:
+    row: Row = {"kind": "without", "name": turn.variant.name}
+    if turn.failure:
+        return row | {"status": "impossible", "reason": turn.failure}
+    assert whole.scene is not None
+    middle, low, high = cost(whole, turn)
+    costs = {"seconds": seconds(turn), "cost": middle, "cost_low": low, "cost_high": high}
+    apart = difference(whole.scene, (whole.positions, whole.velocities), (turn.positions, turn.velocities))
+    return row | {"status": "ok"} | costs | _built(turn) | apart
+
+
+def _built(turn: Contender) -> Row:
+    assert turn.prepared is not None
+    facts = turn.prepared.facts
+    factor = facts.get("nnz_hessian_factor", facts.get("nnz_factor"))
+    counts = {"nnz_system": facts.get("nnz_system"), "nnz_factor": factor}
+    return {"bytes": turn.bytes, **{name: None if value is None else int(value) for name, value in counts.items()}}
+
+
+def _errors(run: RunSpec, whole: Contender, settings: Settings, tick: Tick) -> list[Row]:
+    """How far the whole scene is from the minima of its steps, and those from the minima of half the time step."""
+    assert whole.scene is not None
+    settings = replace(settings, stop=CONVERGED)
+    found: list[Row] = []
+    finer: States = (whole.positions, whole.velocities)
+    for every, name in enumerate(_BETTER_ANSWERS, start=1):
+        row: Row = {"kind": "error", "name": name}
+        try:
+            scene = build(run.scene.stepped(run.scene.time_step / every), run.size, run.integrator)
+            coarser, finer = finer, motion(scene, load(SOLVERS[BETTER])(), settings, every=every)
+            found.append(row | {"status": "ok"} | difference(whole.scene, coarser, finer))
+        except Exception as error:  # the better solver may fail in any way: then the error is not known
+            told = failure(error)
+            found += [
+                {"kind": "error", "name": n, "status": "unknown", "reason": told["reason"]}
+                for n in _BETTER_ANSWERS[every - 1 :]
+            ]
+            break
+        tick(f"error of the {name}")
+    return found
+
+
+def _shared(run: RunSpec, scene: Scene, told: list[Row]) -> list[Row]:
+    """The rows with the columns that are the same in all of them."""
+    shared = asked(run) | {
+        "vertices": len(scene.mesh.rest),
+        "springs": len(scene.springs.edges),
+        "frames": run.frames,
+        "rounds": run.rounds,
+        "extent": scene.mesh.size / rest_length(scene),
+    }
+    return [shared | provenance() | row for row in told]

@@ -1,0 +1,122 @@
+"""Does what is missing of an accuracy config: the frozen steps first, then the curves on them, and simulations.
+
+A unit that the config asks for in another way by now, or of another frozen step, is done again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from harness.base import machine, rows
+from harness.base.progress import Display
+from harness.config.accuracy import CurveSpec, WorkSpec
+from harness.config.accuracy_load import Accuracy
+from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.units import CurveUnit, Home, StepsUnit, WorkUnit
+from harness.experiments.core import do_all, require_threads
+from harness.experiments.resume import Standing, standings, wanted
+
+
+@dataclass(frozen=True, slots=True)
+class _Planned:
+    """See `harness.experiments.resume.Planned`."""
+
+    unit: CurveUnit | WorkUnit
+    standing: Standing
+
+    @property
+    def title(self) -> str:
+        return self.unit.title
+
+
+def run_accuracy(
+    accuracy: Accuracy,
+    folder: Path,
+    display: Display,
+    say: Callable[[str], None],
+    *,
+    again: bool = False,
+    changed: bool = False,
+    isolated: bool = True,
+) -> list[Path]:
+    """Do what is missing (all of it with `again`, with `changed` also what other code measured) and return the files
+    of all units and their frozen steps.
+
+    What an earlier state of the config asked for is left where it is, and not among these.
+
+    folder: of the config's results, beside which the truth is kept for all configs; say: prints a remark; isolated: see
+    `harness.experiments.core.do_all`. Raises InputError, CannotWrite.
+    """
+    home = Home(accuracy.name, folder)
+    require_threads({spec.how.threads for spec in (*accuracy.curves, *accuracy.work)})
+    (folder / "accuracy").mkdir(parents=True, exist_ok=True)
+    with rows.alone(folder):
+        do_all(_steps(accuracy.curves, home), display, isolated=isolated)  # quick where they were found before
+        planned = _planned([*_curves(accuracy.curves, home), *_work(accuracy.work, home)], home)
+        todo = wanted(planned, "units", say, again=again, changed=changed)
+        do_all([p.unit for p in todo], display, isolated=isolated)
+    paths = [home.rows(label) for p in planned for label in _labels(p.unit.spec)]
+    return list(dict.fromkeys(paths))
+
+
+def failures(files: Sequence[Path]) -> list[str]:
+    """Scene, size, moment, solver and reason of what failed; other statuses are results."""
+    found = [rows.read([path], SCHEMA).to_pylist()[0] for path in files]
+    return [
+        f"{r['scene']} {r['size']} {r['moment'] or r['integrator']} {r['solver']}: {r['reason']}"
+        for r in found
+        if r["kind"] != "problem" and r["status"] in ("failed", "killed")
+    ]
+
+
+def _labels(spec: CurveSpec | WorkSpec) -> list[str]:
+    return [spec.label(), spec.problem_label()] if isinstance(spec, CurveSpec) else [spec.label()]
+
+
+def _steps(curves: Sequence[CurveSpec], home: Home) -> list[StepsUnit]:
+    """One for each case."""
+    moments: dict[str, CurveSpec] = {}
+    for spec in curves:
+        moments.setdefault(spec.problem_label(), spec)
+    cases: dict[str, list[CurveSpec]] = {}
+    for spec in moments.values():
+        cases.setdefault(_case(spec), []).append(spec)
+    return [StepsUnit(tuple(specs), home) for specs in cases.values()]
+
+
+def _case(spec: CurveSpec) -> str:
+    return f"{spec.case.scene_name} {spec.case.identity()}"
+
+
+def _curves(curves: Sequence[CurveSpec], home: Home) -> Iterator[CurveUnit]:
+    """The curves of each step, once where two moments of a case are one step."""
+    paths = dict.fromkeys(home.rows(spec.problem_label()) for spec in curves)
+    steps = rows.heads(paths, ("problem", "moment", "frame", "status", "reason"), SCHEMA)
+    moments: dict[tuple[str, str], str] = {}
+    for spec in curves:
+        label = spec.problem_label()
+        step = steps.get(home.rows(label))
+        if isinstance(step, dict) and moments.setdefault((_case(spec), step["problem"] or label), label) == label:
+            yield CurveUnit(spec, home, step)
+
+
+def _work(work: Sequence[WorkSpec], home: Home) -> Iterator[WorkUnit]:
+    for spec in sorted(work, key=lambda spec: (spec.case.scene_name, spec.case.size, spec.horizon)):
+        yield WorkUnit(spec, home)
+
+
+def _planned(units: Sequence[CurveUnit | WorkUnit], home: Home) -> list[_Planned]:
+    """Units, and whether their rows are as they are asked for, and of the step that there is now."""
+    here = machine.describe().id
+
+    def as_asked(unit: CurveUnit | WorkUnit, row: Mapping[str, Any]) -> bool:
+        of_step = not isinstance(unit, CurveUnit) or row["problem"] == unit.step["problem"]
+        return of_step and row["unit"] == unit.spec.unit_id(here)
+
+    asked = {home.rows(unit.spec.label()): partial(as_asked, unit) for unit in units}
+    found = standings(asked, ("unit", "problem"), SCHEMA)
+    return [_Planned(unit, found[home.rows(unit.spec.label())]) for unit in units]

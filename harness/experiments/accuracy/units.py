@@ -1,0 +1,277 @@
+"""Frozen steps, curves and simulations as units of an accuracy config (`harness.experiments.core.Unit`).
+
+Each leaves a Parquet file under `<folder>/accuracy`, written when all of it is measured.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from harness.base import machine, rows
+from harness.base.errors import InputError
+from harness.base.stated import stated
+from harness.base.workers import Limits, Lost, Tick
+from harness.config.accuracy import Case, CurveSpec, WorkSpec, moment_name
+from harness.experiments.accuracy.failures import lost as ended
+from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.solves import GradedStep, curve_rows
+from harness.experiments.accuracy.work import work_rows
+from harness.experiments.provenance import provenance
+from harness.reference.store import Store
+from harness.reference.trajectory import Trajectory
+
+Row = dict[str, Any]
+
+PATIENCE = 3600.0
+"""Wall seconds that a unit may take beside what its solver may: compiling, grading, finding minima."""
+SHARE = 4.0
+"""How many times as much wall time as its solver is allowed a pass may take: iterates are graded meanwhile."""
+
+
+@dataclass(frozen=True, slots=True)
+class Home:
+    """The results of a config of this name; the truth is kept beside them, for all configs."""
+
+    name: str
+    folder: Path
+
+    @property
+    def store(self) -> Store:
+        """The truth."""
+        return references(self.folder.parent)
+
+    def rows(self, label: str) -> Path:
+        """A file of rows."""
+        return self.folder / "accuracy" / f"{label}.parquet"
+
+
+def references(results: Path) -> Store:
+    """The truth of all configs whose results are in one folder."""
+    return Store(results / ".references")
+
+
+@dataclass(frozen=True, slots=True)
+class StepsUnit:
+    """Finds the frozen steps of a case and their minima: one for each of these specs, which differ in the moment.
+
+    A moment whose step could not be found has one row, without a problem; one whose step is that of another moment has
+    none, so that the step is measured once.
+    """
+
+    specs: tuple[CurveSpec, ...]
+    home: Home
+    work: float = 1.0
+
+    @property
+    def title(self) -> str:
+        """See Unit."""
+        return f"{self.specs[0].case.title} {self.specs[0].case.integrator}: steps to freeze"
+
+    @property
+    def ticks(self) -> int:
+        """The moments."""
+        return len(self.specs)
+
+    @property
+    def limits(self) -> Limits:
+        """See Unit."""
+        return Limits(PATIENCE * len(self.specs))
+
+    def do(self, tick: Tick) -> str:
+        """See Unit."""
+        told: list[str] = []
+        known: set[str] = set()
+        for spec in self.specs:
+            path = self.home.rows(spec.problem_label())
+            try:
+                step = _graded(_Asked.of(spec, self.home))
+                found = step.rows()
+            except InputError:
+                raise
+            except Exception as error:  # no solver can be graded here; the other steps go on
+                found = [_unfound(spec, ended(error))]
+                told.append(f"{spec.moment}: {found[0]['status']}: {found[0]['reason']}")
+            else:
+                if step.frozen.digest in known:
+                    continue
+                known.add(step.frozen.digest)
+            _write_step(path, self.home, found)
+            tick(str(spec.moment))
+        return "; ".join(told) or "ok"
+
+    def lost(self, lost: Lost) -> str:
+        """See Unit."""
+        why = {"status": lost.status, "reason": str(lost)}
+        for spec in self.specs:
+            _write_step(self.home.rows(spec.problem_label()), self.home, [_unfound(spec, why)])
+        return f"{lost.status}: {lost}"
+
+
+def _unfound(spec: CurveSpec, why: Row) -> Row:
+    """The row of a step that could not be found."""
+    return why | {"kind": "problem", "moment": moment_name(spec.moment)} | _of_case(spec.case) | provenance()
+
+
+def _write_step(path: Path, home: Home, found: Sequence[Row]) -> None:
+    rows.write(path, [{"sweep": home.name, "unit": row.get("problem")} | row for row in found], SCHEMA)
+
+
+@dataclass(frozen=True, slots=True)
+class CurveUnit:
+    """The curves of one solver on one step. step: the first row of the step's file."""
+
+    spec: CurveSpec
+    home: Home
+    step: Mapping[str, Any]
+    work: float = 1.0
+
+    @property
+    def title(self) -> str:
+        """See Unit."""
+        return f"{self.spec.case.title} {self.step['moment']} {self.spec.solver.name}"
+
+    @property
+    def ticks(self) -> int:
+        """The curves."""
+        return len(self.spec.first_guesses)
+
+    @property
+    def limits(self) -> Limits:
+        """See Unit."""
+        how = self.spec.how
+        return Limits(PATIENCE + SHARE * how.time_limit * (how.rounds + 2) * self.ticks)
+
+    def do(self, tick: Tick) -> str:
+        """See Unit."""
+        return _written(self.home, self.spec, self._measured(tick))
+
+    def lost(self, lost: Lost) -> str:
+        """See Unit."""
+        return _written(self.home, self.spec, self._without({"status": lost.status, "reason": str(lost)}))
+
+    def _measured(self, tick: Tick) -> list[Row]:
+        if self.step["problem"] is None:
+            return self._without({key: self.step[key] for key in ("status", "reason")})
+        try:
+            graded = _graded(_Asked.of(self.spec, self.home))
+        except InputError:
+            raise
+        except Exception as error:
+            return self._without(ended(error))
+        found = curve_rows(self.spec, graded, self.home.folder, lambda: tick(graded.moment))
+        # The curves may have found more minima; the step is told of them before its curves are there.
+        _write_step(self.home.rows(self.spec.problem_label()), self.home, graded.rows())
+        return found
+
+    def _without(self, why: Row) -> list[Row]:
+        of_step = {key: self.step[key] for key in ("problem", "moment", "frame")}
+        return [of_step | why | {"kind": "curve", "first_guess": guess} for guess in self.spec.first_guesses]
+
+
+@dataclass(frozen=True, slots=True)
+class WorkUnit:
+    """One simulation of a scene up to a horizon."""
+
+    spec: WorkSpec
+    home: Home
+    work: float = 1.0
+
+    @property
+    def title(self) -> str:
+        """See Unit."""
+        case = self.spec.case
+        return f"{case.title} {case.integrator} dt {case.scene.time_step:.3g} {self.spec.solver.name}"
+
+    @property
+    def ticks(self) -> int:
+        """The rounds."""
+        return self.spec.how.rounds
+
+    @property
+    def limits(self) -> Limits:
+        """See Unit."""
+        return Limits(PATIENCE + SHARE * self.spec.how.time_limit * (self.spec.how.rounds + 1))
+
+    def do(self, tick: Tick) -> str:
+        """See Unit."""
+        trajectory = _trajectory(_Asked.of_motion(self.spec, self.home))
+        return _written(self.home, self.spec, work_rows(self.spec, trajectory, lambda: tick("rounds")))
+
+    def lost(self, lost: Lost) -> str:
+        """See Unit."""
+        spec = self.spec
+        row = {"kind": "work", "status": lost.status, "reason": str(lost), "horizon": spec.horizon}
+        row |= {key: getattr(spec, key) for key in ("first_guess", "iterations", "tolerance")}
+        return _written(self.home, spec, [row])
+
+
+def _written(home: Home, spec: CurveSpec | WorkSpec, found: Sequence[Row]) -> str:
+    """Write what was measured, and say in words what became of it."""
+    shared = {
+        "unit": spec.unit_id(machine.describe().id),
+        "sweep": home.name,
+        **_of_case(spec.case),
+        "solver": spec.solver.name,
+        "parameters": json.dumps(dict(spec.solver.parameters), sort_keys=True),
+        **stated(spec.solver.name),
+        "threads": spec.how.threads,
+        **provenance(),
+    }
+    rows.write(home.rows(spec.label()), [shared | row for row in found], SCHEMA)
+    bad = next((row for row in found if row["status"] != "ok"), None)
+    return f"{bad['status']}: {bad['reason']}" if bad else "ok"
+
+
+def _of_case(case: Case) -> Row:
+    return {
+        "scene": case.scene_name,
+        "size": case.size,
+        "integrator": case.integrator,
+        "time_step": case.scene.time_step,
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What units that come one after the other ask for alike; two of one key are the same."""
+
+    key: tuple[Any, ...]
+    spec: Any = field(compare=False)
+    store: Store = field(compare=False)
+
+    @classmethod
+    def of(cls, spec: CurveSpec, home: Home) -> _Asked:
+        return cls((spec.problem_label(), home.folder), spec, home.store)
+
+    @classmethod
+    def of_motion(cls, spec: WorkSpec, home: Home) -> _Asked:
+        """The trajectory is the same for every time step."""
+        return cls((spec.case.scene.stepped(1.0).digest, spec.case.size, spec.horizon, home.folder), spec, home.store)
+
+
+@lru_cache(maxsize=1)
+def _graded(asked: _Asked) -> GradedStep:
+    return GradedStep.find(asked.spec.case, asked.spec.moment, asked.store)
+
+
+@lru_cache(maxsize=1)
+def _trajectory(asked: _Asked) -> Trajectory | Exception:
+    return trajectory_of(asked.spec, asked.store)
+
+
+def trajectory_of(spec: WorkSpec, store: Store) -> Trajectory | Exception:
+    """The reference up to a simulation's horizon, or why there is none; which errors it can tell, each row asks.
+
+    Raises InputError.
+    """
+    try:
+        return store.trajectory(spec.case.scene, spec.case.size, [spec.horizon], error=1.0)
+    except InputError:
+        raise
+    except Exception as error:
+        return error

@@ -1,0 +1,185 @@
+"""The speed report: the runs of a sweep, side by side with the yardstick and the machine's limits, size by size.
+
+An ordinary sweep says what runs; here all runs of a size are one unit, and are timed in turns in one process, each from
+the same first step of its scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import pyarrow as pa
+
+from harness.base import machine, rows
+from harness.base.columns import SCHEMA
+from harness.base.progress import Display
+from harness.base.workers import Limits, Lost, Tick
+from harness.config.load import Sweep
+from harness.config.sweep import RunSpec, SolverSpec
+from harness.experiments.core import do_all, require_threads
+from harness.experiments.plan import Files
+from harness.experiments.provenance import common
+from harness.experiments.resume import MISSING, Standing, standings, wanted
+from harness.experiments.speed import yardstick
+from harness.experiments.speed.candidates import Candidate, MachineCandidate, SolverCandidate, YardstickCandidate
+from harness.experiments.speed.rest import precision, rest_of
+from harness.experiments.speed.turns import PREPARES, Past, measure, name
+from harness.report.speed.figures import MACHINE, YARDSTICK
+from harness.scenes.bind import build
+from harness.simulation.step import problem, start
+from solvers.problem import Prepared
+
+TEMPORARIES = {"default": "", "cheap": yardstick.CHEAP_TEMPORARIES}
+"""How the yardstick's memory is set up: as it comes, or so that temporaries cost least."""
+
+
+PATIENCE = 3600.0
+"""Wall seconds that a size may take beside four times the budget of each candidate: compiling, preparing, checking."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """The runs of one scene and size, and what is timed beside them (`harness.experiments.core.Unit`).
+
+    folder: of the results; smaller: the name and the file of rows of each candidate of a smaller size, the
+    smallest first; budget: seconds that a candidate may take, as its smaller sizes predict.
+    """
+
+    members: tuple[RunSpec, ...]
+    folder: Path
+    smaller: tuple[tuple[str, Path], ...]
+    budget: float
+
+    @property
+    def files(self) -> list[Path]:
+        """The rows of each candidate."""
+        return [Files.of(run, self.folder).rows for run in self.members]
+
+    @property
+    def title(self) -> str:
+        """See Unit."""
+        first = self.members[0]
+        return f"{first.scene_name} {first.size}: {len(self.members)} candidates take turns"
+
+    @property
+    def ticks(self) -> int:
+        """Rounds of preparing and of turns."""
+        return PREPARES + max(run.rounds for run in self.members)
+
+    @property
+    def work(self) -> float:
+        """See Unit: by vertices."""
+        return float(self.members[0].size or 32) ** 2
+
+    @property
+    def limits(self) -> Limits:
+        """See Unit."""
+        return Limits(PATIENCE + 4.0 * self.budget * len(self.members))
+
+    @property
+    def standing(self) -> Standing:
+        """Whether the rows of all candidates are there."""
+        found = list(standings(dict.fromkeys(self.files, lambda row: True), (), SCHEMA).values())
+        missing = next((one for one in found if one.state == MISSING), None)
+        return missing or found[0]._replace(older=any(one.older for one in found))
+
+    def do(self, tick: Tick) -> str:
+        """See Unit."""
+        past: dict[str, list[Past]] = {}
+        for candidate, path in self.smaller:
+            past.setdefault(candidate, []).extend(_past(rows.read([path]).to_pylist()))
+        return self._written(_measured(self.members, self.folder, past, self.budget, tick))
+
+    def lost(self, lost: Lost) -> str:
+        """See Unit."""
+        why = {"phase": "run", "status": lost.status, "reason": str(lost)}
+        return self._written([[common(run) | why] for run in self.members])
+
+    def _written(self, measured: Sequence[list[dict[str, Any]]]) -> str:
+        for path, found in zip(self.files, measured, strict=True):
+            rows.write(path, found)
+        bad = [found[0]["solver"] for found in measured if found[0]["status"] not in ("ok", "skipped", "unsupported")]
+        return f"{', '.join(dict.fromkeys(bad))} failed" if bad else "ok"
+
+
+def run_speed(
+    sweep: Sweep,
+    folder: Path,
+    display: Display,
+    say: Callable[[str], None],
+    *,
+    again: bool = False,
+    changed: bool = False,
+    budget: float = 210.0,
+    isolated: bool = True,
+) -> pa.Table:
+    """Do the sizes of a sweep that are missing (all with `again`, with `changed` also those measured by other code) and
+    return all rows.
+
+    budget: seconds that a candidate may take at a size, as its smaller sizes predict; say: prints a remark; isolated:
+    see `harness.experiments.core.do_all`. Raises InputError.
+    """
+    runs = [replace(run, threads=machine.threads(run.threads).number) for run in sweep.runs()]
+    require_threads({machine.threads(run.threads).number for run in runs})
+    (folder / "rows").mkdir(parents=True, exist_ok=True)
+    with rows.alone(folder):
+        planned: list[Comparison] = []
+        smaller: list[tuple[str, Path]] = []
+        for group in _groups(runs):
+            planned.append(Comparison((*group, *_beside(group)), folder, tuple(smaller), budget))
+            smaller += zip(map(name, planned[-1].members), planned[-1].files, strict=True)
+        do_all(wanted(planned, "sizes", say, again=again, changed=changed), display, isolated=isolated)
+        return rows.read(path for size in planned for path in size.files)
+
+
+def _groups(runs: Sequence[RunSpec]) -> list[list[RunSpec]]:
+    """The runs of each scene and size, smaller sizes first."""
+    groups: dict[tuple[str, int], list[RunSpec]] = {}
+    for run in sorted(runs, key=lambda run: run.size):
+        groups.setdefault((run.scene_name, run.size), []).append(run)
+    return list(groups.values())
+
+
+def _beside(group: Sequence[RunSpec]) -> list[RunSpec]:
+    """What is timed beside the runs of a size: the yardstick on one thread, the machine on as many as they use."""
+    first = group[0]
+    eigen = [
+        replace(first, threads=1, solver=SolverSpec(YARDSTICK, {"temporaries": setting})) for setting in TEMPORARIES
+    ]
+    threads = sorted({run.threads for run in group})
+    return eigen + [replace(first, threads=t, solver=SolverSpec(MACHINE, {})) for t in threads]
+
+
+def _measured(
+    runs: Sequence[RunSpec], folder: Path, past: dict[str, list[Past]], budget: float, tick: Tick
+) -> list[list[dict[str, Any]]]:
+    """The rows of each run of one scene and size."""
+    scene = build(runs[0].scene, runs[0].size)
+    stated = problem(scene, start(scene), runs[0].first_guess)
+    program = partial(yardstick.build, folder / "build")
+    prepared: dict[str, Prepared] = {}
+    rest = rest_of(stated) if any(precision(run) != "float64" for run in runs) else None
+
+    def candidate(run: RunSpec) -> Candidate:
+        if run.solver.name == MACHINE:
+            return MachineCandidate(run)
+        if run.solver.name == YARDSTICK:
+            return YardstickCandidate(run, scene, stated, program, TEMPORARIES[run.solver.parameters["temporaries"]])
+        return SolverCandidate(run, scene, stated, prepared, rest)
+
+    counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
+    return measure([candidate(run) for run in runs], counts, past, budget, tick)
+
+
+def _past(found: Sequence[dict[str, Any]]) -> list[Past]:
+    """What the rows of a run tell about larger sizes; nothing where it failed or has no steps."""
+    prepare = [row["seconds"] for row in found if row["phase"] == "prepare"]
+    iteration = [row["seconds"] / row["iterations"] for row in found if row["phase"] == "step"]
+    if not (prepare and iteration):
+        return []
+    return [Past(found[0]["vertices"], median(prepare), median(iteration))]

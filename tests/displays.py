@@ -1,0 +1,26 @@
+"""What is told of an experiment's progress, for tests."""
+
+from __future__ import annotations
+
+
+class Quiet:
+    """A display that shows nothing, and is stopped after some units, those that find steps apart."""
+
+    def __init__(self, stop_after: int = 10**9) -> None:
+        self.finished_units, self._stop_after, self._counts = 0, stop_after, True
+        self.titles: list[str] = []
+
+    def begin(self, runs: int, work: float) -> None: ...
+
+    def run(self, title: str, ticks: int, work: float) -> None:
+        self.titles.append(title)
+        self._counts = not title.endswith("steps to freeze")
+
+    def tick(self, phase: str) -> None: ...
+
+    def finished(self, outcome: str) -> None:
+        self.finished_units += self._counts
+        if self.finished_units == self._stop_after:
+            raise KeyboardInterrupt
+
+    def end(self) -> None: ...
