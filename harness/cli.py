@@ -19,6 +19,7 @@ from harness.base.commands import Again, Changed, Commands, InThisProcess, Resul
 from harness.base.console import err, out
 from harness.base.console import say as _say
 from harness.base.errors import InputError, Mistake
+from harness.config.command_line import taking
 from harness.experiments.ablation.command import ablate
 from harness.experiments.archive.command import compact
 from harness.experiments.gallery import gallery
@@ -38,22 +39,13 @@ Config = Annotated[Path, typer.Argument(help="A sweep or a scene (YAML), or an a
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings (.rrd).")]
 
 
-@app.command()
+@app.command(cls=taking())
 def run(
+    given: typer.Context,
     config: Config,
     results: Results = Path("results"),
     solver: Annotated[list[str] | None, typer.Option(help="For a scene: solvers; repeatable.")] = None,
     size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
-    frames: Annotated[int | None, typer.Option(help="For a scene: how many steps.")] = None,
-    iterations: Annotated[int | None, typer.Option(help="For a scene: iteration limit of a step.")] = None,
-    tolerance: Annotated[float | None, typer.Option(help="For a scene: relative tolerance of a step.")] = None,
-    integrator: Annotated[str | None, typer.Option(help="For a scene: implicit-euler, bdf2, midpoint.")] = None,
-    time_step: Annotated[float | None, typer.Option(help="For a scene: time step [s].")] = None,
-    first_guess: Annotated[str | None, typer.Option(help="For a scene: assignment, current, inertial.")] = None,
-    threads: Annotated[
-        str | None, typer.Option(help="For a scene: threads of Numba and BLAS; auto, the default: of idle cores.")
-    ] = None,
-    rounds: Annotated[int | None, typer.Option(help="For a scene: repetitions of the timed pass.")] = None,
     positions: Annotated[
         Path | None, typer.Option(help="Store the positions after every step (float64, .npz) of one run.")
     ] = None,
@@ -70,17 +62,7 @@ def run(
     from harness.report.named import draw_reports
     from harness.report.timing_table import summary_table
 
-    options = {
-        "frames": frames,
-        "iterations": iterations,
-        "tolerance": tolerance,
-        "integrator": integrator,
-        "time_step": time_step,
-        "first_guess": first_guess,
-        "threads": int(threads) if threads and threads.isdecimal() and len(threads) < 10 else threads,
-        "rounds": rounds,
-    }
-    sweep = load_any(config, solvers=solver or (), sizes=size or (), **options)
+    sweep = load_any(config, solvers=solver or (), sizes=size or (), **given.obj)
     _check_positions(positions)
     folder = claimed(results / sweep.name, config)
     runs = sweep.runs()
@@ -201,7 +183,7 @@ def report(
     _say(f"the map is {picture}, with reasons and recordings {page}")
 
 
-app.command()(ablate)
+app.command(cls=taking("frames", "iterations", "tolerance", "rounds"))(ablate)
 app.command()(compact)
 app.command()(gallery)
 app.command()(gate)

@@ -23,7 +23,6 @@ from harness.base.columns import SCHEMA
 from harness.base.errors import InputError, Mistake
 from harness.base.files import replacing
 
-_CODE = pa.schema([SCHEMA.field("code")])
 Row = Mapping[str, Any]
 
 
@@ -154,13 +153,6 @@ def _same(one: Any, other: Any) -> bool:
     if pa.types.is_float64(one.type):
         one, other = one.view(pa.int64()), other.view(pa.int64())
     return one.equals(other)
-
-
-def of_other_code(paths: Iterable[Path], code: str) -> str:
-    """A remark on how many of the whole units that are there were made by other code than this; empty for none."""
-    there = [row for row in heads(paths, ["code"], _CODE).values() if isinstance(row, dict)]
-    older = sum(row["code"] != code for row in there)
-    return f"{older} of {len(there)} there are by other code than today's; --again does all anew" if older else ""
 
 
 @contextmanager

@@ -10,8 +10,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from harness.base.model import Many, Model
-from harness.config.sweep import Iterations, Rounds, SolverSpec, Threads, Tolerance, in_file_name
-from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, Size, TimeStep
+from harness.config.options import Iterations, Rounds, Threads, lists
+from harness.config.sweep import SolverSpec, in_file_name
+from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, Size
 from solvers.plugins import identity
 
 Moment = Literal["early", "middle", "violent"] | Frames
@@ -26,7 +27,7 @@ def moment_name(moment: str | int) -> str:
 TimeLimit = Annotated[float, Field(gt=0, le=1e5)]
 
 
-class Study(Model):
+class Study(lists("integrator", "time_step")):
     """What every study says: of its lists, all combinations are measured."""
 
     scene: Many[str] = ()
@@ -35,10 +36,6 @@ class Study(Model):
     """Mesh sizes; each scene's default if left out."""
     solver: Many[str] = ()
     """Names of solvers that the config lists; all of them if left out."""
-    integrator: Many[IntegratorName] = ("implicit-euler",)
-    """How time is integrated."""
-    time_step: Many[TimeStep | None] = (None,)
-    """Time step [s]; null takes the scene's."""
     threads: Threads = 1
     """Threads of Numba and of BLAS."""
     rounds: Rounds = 3
@@ -60,17 +57,11 @@ class CurveStudy(Study):
     """Whether the solve from the first of the guesses is recorded, to scrub through its iterates beside the mesh."""
 
 
-class WorkStudy(Study):
+class WorkStudy(Study, lists("iterations", "tolerance", first_guess=("current",))):
     """Error and wall time of whole trajectories."""
 
     horizon: Annotated[float, Field(gt=0, le=1e4)] = 1.0
     """Simulated time [s]; a multiple of every time step."""
-    first_guess: Many[FirstGuess] = ("current",)
-    """Where a step's iteration starts."""
-    iterations: Many[Iterations] = (50,)
-    """Iteration limits of a step."""
-    tolerance: Many[Tolerance] = (None,)
-    """Relative tolerances that end a step's iterations; null does all of them."""
 
 
 class AccuracyFields(Model):

@@ -9,7 +9,8 @@ from typing import Any
 
 from harness.base.document import Document, Key, quote
 from harness.base.errors import did_you_mean
-from harness.config.sweep import OPTIONS, Exclude, Include, RunSpec, SolverSpec, SweepFields
+from harness.config.options import OF_SCENE, OPTIONS
+from harness.config.sweep import Exclude, Include, Kept, RunSpec, SolverSpec, SweepFields
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
 
@@ -59,19 +60,18 @@ class Expansion:
         options: Mapping[str, Sequence[Any]],
     ) -> Iterable[RunSpec]:
         scene = self.scenes[scene_name]
-        fixed = {k: v for k, v in self.fields.options if k not in OPTIONS}
-        usual = {"frames": scene.frames, "first_guess": scene.first_guess, "time_step": scene.time_step}
+        kept = {name: getattr(self.fields.options, name) for name in Kept.model_fields}
         for size, solver, values in product(sizes, solvers, product(*options.values())):
             chosen: dict[str, Any] = dict(zip(options, values, strict=True))
-            chosen |= {key: value for key, value in usual.items() if chosen[key] is None}
-            yield RunSpec(
+            chosen |= {name: getattr(scene, name) for name in OF_SCENE if chosen[name] is None}
+            yield RunSpec.model_construct(
                 sweep=self.name,
                 scene_name=scene_name,
                 scene=scene.stepped(chosen["time_step"]),
                 size=size,
                 solver=solver,
                 **chosen,
-                **fixed,
+                **kept,
             )
 
     def _sizes(self, scene_name: str) -> Sequence[int]:

@@ -16,8 +16,9 @@ from harness.base.errors import InputError, Mistake
 from harness.base.model import Model
 from harness.base.yaml import read_yaml
 from harness.config.expand import Expansion
+from harness.config.options import AUTO
 from harness.config.own import UnopenedEffect, UnopenedMesh, chosen, given, opened
-from harness.config.sweep import AUTO, Options, RunSpec, SolverSpec, SweepFields
+from harness.config.sweep import Options, RunSpec, SolverSpec, SweepFields
 from harness.scenes.assignment import FORCE, PIN_WEIGHT, TIME_STEP, read_assignment
 from harness.scenes.bind import build
 from harness.scenes.effects import table as effect_table

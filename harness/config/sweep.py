@@ -6,13 +6,14 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, SkipValidation
 
 from harness.base.model import Many, Model
-from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, Size, TimeStep, named_in
+from harness.config.options import OPTIONS, Chosen, lists
+from harness.scenes.spec import SceneSpec, Size, named_in
 from solvers.plugins import Plugin, Table, found, identity
 
 REPORTS: dict[str, str] = {"medians": "harness.report.medians:medians", "timing": "harness.report.timing_plot:timing"}
@@ -26,53 +27,13 @@ if TYPE_CHECKING:
 else:
     ReportName = named_in(EVERY_REPORT)
 
-Iterations = Annotated[int, Field(ge=1, le=100_000)]
-Tolerance = Annotated[float, Field(gt=0, lt=1)] | None
-Threads = Annotated[int, Field(ge=1, le=1024)]
-AUTO: Literal["auto"] = "auto"
-Rounds = Annotated[int, Field(ge=1, le=1000)]
 
-
-class Option(NamedTuple):
-    """What is known of an option besides its type: how its value is named where space is short, and its column of rows
-    ("" for none)."""
-
-    short: str
-    column: str = ""
-
-
-class Varied(Model):
+class Varied(lists(*OPTIONS)):
     """Options that a sweep can vary: one value, or a list of values to run each of."""
 
-    iterations: Annotated[Many[Iterations], Option("{} it.", "max_iterations")] = (50,)
-    """Iteration limit of a step."""
-    tolerance: Annotated[Many[Tolerance], Option("tol. {}", "tolerance")] = (None,)
-    """Relative tolerance that ends a step's iterations; null does all of them."""
-    integrator: Annotated[Many[IntegratorName], Option("{}", "integrator")] = ("implicit-euler",)
-    """How time is integrated."""
-    time_step: Annotated[Many[TimeStep | None], Option("dt {:.3g}", "time_step")] = (None,)
-    """Time step [s]; null takes the scene's."""
-    first_guess: Annotated[Many[FirstGuess | None], Option("{}", "first_guess")] = (None,)
-    """Where a step's iteration starts; null is `assignment` for JSON scenes, else `current`."""
-    threads: Annotated[Many[Threads | Literal["auto"]], Option("{} thr.", "threads")] = (1,)
-    """Threads of Numba and of BLAS; auto: as many as there are cores that nobody else uses."""
-    frames: Annotated[Many[Frames | None], Option("{} frames")] = (None,)
-    """Number of steps; null takes the scene's."""
-    rounds: Annotated[Many[Rounds], Option("{} rounds")] = (2,)
-    """How often the timed part is repeated."""
 
-
-OPTIONS: dict[str, Option] = {
-    name: option
-    for name, field in Varied.model_fields.items()
-    for option in field.metadata
-    if isinstance(option, Option)
-}
-"""By name. What a sweep varies, what its entries match, how runs and their rows are named follow from it."""
-
-
-class Options(Varied):
-    """Options of a sweep's runs."""
+class Kept(Model):
+    """Options that are the same for all runs of a sweep."""
 
     convergence_frames: tuple[Annotated[int, Field(ge=1)], ...] | None = None
     """Frames whose convergence is measured; null is the first, the middle and the last."""
@@ -88,6 +49,10 @@ class Options(Varied):
     """Wall time [s] that a run may take, all of it; null is any. One that takes longer is ended, and is a row."""
     memory_limit: float | None = Field(default=None, gt=0, le=1e6)
     """Memory [GiB] that a run may take beyond what a process has anyway; null is any."""
+
+
+class Options(Kept, Varied):
+    """Options of a sweep's runs."""
 
 
 def _without_defaults(schema: dict[str, Any]) -> None:
@@ -151,35 +116,24 @@ class SolverSpec:
     parameters: Mapping[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class RunSpec:
-    """One run. size: 0 where the mesh comes from a file.
+class RunSpec(Kept, Chosen):
+    """One run, made with `model_construct` of what was checked before.
 
-    frames, time_step (which is the scene's own here) and first_guess are resolved; tolerance: None does all iterations;
-    convergence_frames: None is the first, the middle and the last; strain_range: strain at the colour scale's ends;
-    time_limit, memory_limit: what the run may take [s] [GiB], None is any.
+    size: 0 where the mesh comes from a file; frames, time_step (which is the scene's own here) and first_guess are
+    resolved.
     """
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
 
     sweep: str
     scene_name: str
-    scene: SceneSpec
+    scene: SkipValidation[SceneSpec]
     size: int
-    solver: SolverSpec
-    iterations: int
-    tolerance: float | None
-    integrator: IntegratorName
-    time_step: float
-    first_guess: FirstGuess
-    threads: int | Literal["auto"]
-    frames: int
-    rounds: int
-    convergence_frames: tuple[int, ...] | None
-    strain_range: float
-    record: bool
-    pictures: bool
-    judge: bool
-    time_limit: float | None
-    memory_limit: float | None
+    solver: SkipValidation[SolverSpec]
+
+    def but(self, **other: Any) -> RunSpec:
+        """The same run with other values."""
+        return self.model_copy(update=other)
 
     @property
     def title(self) -> str:
@@ -190,7 +144,7 @@ class RunSpec:
         """All that determines the run's result and timing on one machine, as canonical JSON; pictures come later, from
         the recording, and limits only say when to give up."""
         left_out = ("sweep", "scene_name", "pictures", "time_limit", "memory_limit")
-        settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
+        settings = {name: value for name, value in self if name not in left_out}
         settings |= {"scene": self.scene.digest, "solver": [identity(self.solver.name), dict(self.solver.parameters)]}
         settings["integrator"] = identity(self.integrator)
         return json.dumps(settings, sort_keys=True, separators=(",", ":"))

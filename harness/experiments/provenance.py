@@ -8,7 +8,8 @@ from typing import Any
 
 from harness.base import machine
 from harness.base.stated import stated
-from harness.config.sweep import OPTIONS, RunSpec
+from harness.config.options import OPTIONS
+from harness.config.sweep import RunSpec
 
 
 def common(run: RunSpec) -> dict[str, Any]:

@@ -34,7 +34,15 @@ class Planned(Protocol):
         ...
 
     @property
-    def standings(
+    def standing(self) -> Standing:
+        """What is there of it."""
+        ...
+
+
+P = TypeVar("P", bound=Planned)
+
+
+def standings(
     asked: Mapping[Path, Callable[[Mapping[str, Any]], bool]], columns: Sequence[str], schema: pa.Schema
 ) -> dict[Path, Standing]:
     """How units stand, by the path of their rows. asked: whether these columns of a unit's first row, and `code`, are

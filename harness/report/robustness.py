@@ -21,7 +21,7 @@ from rich.table import Table
 
 from harness.base import rows, shelf
 from harness.base.errors import InputError
-from harness.config.sweep import OPTIONS
+from harness.config.options import OPTIONS
 from solvers.registry import OPTIONAL, SOLVERS
 
 SLACK = 1.1

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import pyarrow as pa
 
-from harness.config.sweep import OPTIONS, RunSpec
+from harness.config.options import OPTIONS
+from harness.config.sweep import RunSpec
 from harness.record.compare import Look, side_by_side
 from harness.record.reader import read_replay
 from harness.report import opengl

@@ -113,7 +113,7 @@ COMMANDS: dict[str, tuple[list[str], int, str]] = {
     "threads of words": (["run", "good.yaml", "--threads", "all"], 2, "threads"),
     "threads in other digits": (["run", "good.yaml", "--threads", "٣"], 2, "threads"),
     "a size of 30 digits": (["run", "good.yaml", "--size", "9" * 30], 2, "size"),
-    "frames of 5000 digits": (["run", "good.yaml", "--frames", "9" * 5000], 2, "--frames"),
+    "frames of 5000 digits": (["run", "good.yaml", "--frames", "9" * 5000], 2, "frames"),
     "a time step of infinity": (["run", "good.yaml", "--time-step", "inf"], 2, "time_step"),
     "a negative time step": (["run", "good.yaml", "--time-step", "-1"], 2, "time_step"),
     "an integrator of another program": (["run", "good.yaml", "--integrator", "rk4"], 2, "integrator"),

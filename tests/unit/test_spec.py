@@ -5,20 +5,25 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import fields, replace
-from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from harness.base.columns import SCHEMA
 from harness.base.errors import InputError
+<<<<<<< HEAD
 from harness.cli import run
+=======
+from harness.base.rows import SCHEMA
+from harness.cli import app
+>>>>>>> 5d60c06 (State the options of a run once)
 from harness.config.load import Sweep, load_any, load_scene, load_sweep
+from harness.config.options import OPTIONS
 from harness.config.schema import schema
-from harness.config.sweep import OPTIONS, Include, RunSpec, Varied
+from harness.config.sweep import Include, RunSpec, Varied
 from harness.scenes.bind import build
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -183,7 +188,7 @@ def test_the_names_of_the_sweep_and_of_the_mesh_file_are_no_part_of_the_run_id(f
     (folder / "mesh.obj").rename(folder / "renamed.obj")
     (folder / "file.yaml").write_text(FILE.replace("mesh.obj", "renamed.obj"))
     (again,) = load_any(folder / "file.yaml").runs()
-    assert replace(again, sweep="other").run_id("m") == run.run_id("m")
+    assert again.but(sweep="other").run_id("m") == run.run_id("m")
 
 
 def test_the_content_of_the_mesh_file_is_part_of_the_run_id(folder: Path) -> None:
@@ -273,8 +278,9 @@ def test_mistakes_of_two_scenes_are_reported_together(folder: Path) -> None:
 
 def test_each_option_that_a_sweep_varies_is_one_of_a_run_of_the_command_line_and_of_rows() -> None:
     assert set(OPTIONS) == set(Varied.model_fields), "what it is called for short, and its column"
-    assert set(OPTIONS) <= {field.name for field in fields(RunSpec)}
-    assert set(OPTIONS) <= set(signature(run).parameters)
+    assert set(OPTIONS) <= set(RunSpec.model_fields)
+    told = CliRunner().invoke(app, ["run", "--help"]).output
+    assert {name for name in OPTIONS if f"--{name.replace('_', '-')} VALUE" in told} == set(OPTIONS)
     assert {option.column for option in OPTIONS.values()} - {""} <= set(SCHEMA.names)
 
 

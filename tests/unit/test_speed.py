@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from time import perf_counter, thread_time
 from typing import Any
@@ -39,7 +38,7 @@ ROUNDS = 3
 def run(solver: str, **parameters: Any) -> RunSpec:
     """A run of the yardstick cloth under another solver's name."""
     (made,) = load_any(SCENE, solvers=["sparse"], sizes=[4], rounds=ROUNDS, threads=1).runs()
-    return replace(made, solver=SolverSpec(solver, parameters))
+    return made.but(solver=SolverSpec(solver, parameters))
 
 
 class Scripted:

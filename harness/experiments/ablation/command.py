@@ -13,16 +13,16 @@ from harness.base.console import err, out, say
 SOLVER, TOLERANCE = "hybrid", 1e-4
 """It takes all effects, and converges: what an effect changes is not to drown in the solver's own error."""
 
+ROUNDS = 5
+"""How often each step is timed, if the command line does not say."""
+
 
 def ablate(
+    given: typer.Context,
     scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
     results: Results = Path("results"),
     solver: Annotated[str | None, typer.Option(help=f"{SOLVER}, to {TOLERANCE:g}, if left out.")] = None,
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
-    frames: Annotated[int | None, typer.Option(help="How many steps; the scene's if left out.")] = None,
-    iterations: Annotated[int, typer.Option(help="Iteration limit of a step.")] = 50,
-    tolerance: Annotated[float | None, typer.Option(help="Relative tolerance of a step.")] = None,
-    rounds: Annotated[int, typer.Option(help="How often each step is timed.")] = 5,
     pairs: Annotated[bool, typer.Option("--pairs", help="Leave out each pair of effects too.")] = False,
     again: Again = False,
     changed: Changed = False,
@@ -36,10 +36,8 @@ def ablate(
     from harness.report.ablation import ablation_table, read, sentences
     from harness.report.ablation_plot import draw_ablation
 
-    if solver is None:
-        solver, tolerance = SOLVER, tolerance or TOLERANCE
-    options = {"frames": frames, "iterations": iterations, "tolerance": tolerance, "rounds": rounds, "threads": 1}
-    sweep = load_any(scene, solvers=[solver], sizes=[size] if size else [], **options)
+    usual = {"rounds": ROUNDS, "threads": 1} | ({} if solver else {"tolerance": TOLERANCE})
+    sweep = load_any(scene, solvers=[solver or SOLVER], sizes=[size] if size else [], **usual | given.obj)
     folder = claimed(results / sweep.name, scene)
     how = {"pairs": pairs, "again": again, "changed": changed, "isolated": not here}
     path = run_ablation(sweep, folder, display(err), say, **how)

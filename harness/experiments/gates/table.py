@@ -20,7 +20,7 @@ from harness.base.errors import InputError, Mistake
 from harness.base.machine import pinned_threads
 from harness.base.model import Model
 from harness.base.yaml import read_yaml
-from harness.config.sweep import Iterations, Tolerance
+from harness.config.options import Iterations, Tolerance
 from harness.experiments.gates.agreement import AGREEMENT, difference
 from harness.experiments.gates.scenes import calls_of, pair, timed
 from harness.experiments.gates.sequential import ALPHA, Rule

@@ -7,7 +7,7 @@ the same first step of its scene.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -124,7 +124,7 @@ def run_speed(
     budget: seconds that a candidate may take at a size, as its smaller sizes predict; say: prints a remark; isolated:
     see `harness.experiments.core.do_all`. Raises InputError.
     """
-    runs = [replace(run, threads=machine.threads(run.threads).number) for run in sweep.runs()]
+    runs = [run.but(threads=machine.threads(run.threads).number) for run in sweep.runs()]
     require_threads({machine.threads(run.threads).number for run in runs})
     (folder / "rows").mkdir(parents=True, exist_ok=True)
     with rows.alone(folder):
@@ -148,11 +148,9 @@ def _groups(runs: Sequence[RunSpec]) -> list[list[RunSpec]]:
 def _beside(group: Sequence[RunSpec]) -> list[RunSpec]:
     """What is timed beside the runs of a size: the yardstick on one thread, the machine on as many as they use."""
     first = group[0]
-    eigen = [
-        replace(first, threads=1, solver=SolverSpec(YARDSTICK, {"temporaries": setting})) for setting in TEMPORARIES
-    ]
+    eigen = [first.but(threads=1, solver=SolverSpec(YARDSTICK, {"temporaries": setting})) for setting in TEMPORARIES]
     threads = sorted({run.threads for run in group})
-    return eigen + [replace(first, threads=t, solver=SolverSpec(MACHINE, {})) for t in threads]
+    return eigen + [first.but(threads=t, solver=SolverSpec(MACHINE, {})) for t in threads]
 
 
 def _measured(

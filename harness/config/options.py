@@ -1,0 +1,93 @@
+"""The options of a run, stated once.
+
+From `Chosen` follow what a sweep and an accuracy study list, the options of the command line, what entries of a sweep
+match, how runs are told apart where space is short, columns of their rows, and their hash.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
+
+from pydantic import Field, create_model
+
+from harness.base.model import Many, Model
+from harness.scenes.spec import FirstGuess, Frames, IntegratorName, TimeStep
+
+AUTO: Literal["auto"] = "auto"
+
+Iterations = Annotated[int, Field(ge=1, le=100_000)]
+Tolerance = Annotated[float, Field(gt=0, lt=1)] | None
+Threads = Annotated[int, Field(ge=1, le=1024)]
+Rounds = Annotated[int, Field(ge=1, le=1000)]
+
+
+class Option(NamedTuple):
+    """What is known of an option besides its type and meaning.
+
+    short: how its value is named where space is short; column: of rows, "" for none; null: what it means to leave it
+    out, for what the scene says else.
+    """
+
+    short: str
+    column: str = ""
+    null: str = ""
+
+
+_OF_SCENE = "null takes the scene's"
+
+
+class Chosen(Model):
+    """How a run is done: one value of each option that can be varied."""
+
+    iterations: Annotated[Iterations, Option("{} it.", "max_iterations")] = 50
+    """Iteration limit of a step."""
+    tolerance: Annotated[Tolerance, Option("tol. {}", "tolerance")] = None
+    """Relative tolerance that ends a step's iterations; null does all of them."""
+    integrator: Annotated[IntegratorName, Option("{}", "integrator")] = "implicit-euler"
+    """How time is integrated."""
+    time_step: Annotated[TimeStep, Option("dt {:.3g}", "time_step", _OF_SCENE)]
+    """Time step [s]."""
+    first_guess: Annotated[
+        FirstGuess, Option("{}", "first_guess", "null is `assignment` for JSON scenes, else `current`")
+    ]
+    """Where a step's iteration starts."""
+    threads: Annotated[Threads | Literal["auto"], Option("{} thr.", "threads")] = 1
+    """Threads of Numba and of BLAS; auto: as many as there are cores that nobody else uses."""
+    frames: Annotated[Frames, Option("{} frames", "", _OF_SCENE)]
+    """Number of steps."""
+    rounds: Annotated[Rounds, Option("{} rounds")] = 2
+    """How often the timed part is repeated."""
+
+
+OPTIONS: dict[str, Option] = {
+    name: option
+    for name, field in Chosen.model_fields.items()
+    for option in field.metadata
+    if isinstance(option, Option)
+}
+"""The options by name."""
+
+OF_SCENE = tuple(name for name, option in OPTIONS.items() if option.null)
+"""Those that the scene says where nobody else does."""
+
+
+def meaning(name: str) -> str:
+    """What an option is, in a sentence."""
+    said, null = (Chosen.model_fields[name].description or "").removesuffix("."), OPTIONS[name].null
+    return f"{said}; {null}." if null else f"{said}."
+
+
+def lists(*names: str, **usual: tuple[Any, ...]) -> Any:
+    """A model that has a list of values of each of these options, or a single value.
+
+    usual: more options, with other values than their own where they are left out.
+    """
+    hints = get_type_hints(Chosen, include_extras=True)
+    fields: dict[str, Any] = {}
+    for name in dict.fromkeys((*names, *usual)):
+        of_scene = name in OF_SCENE and name not in usual
+        values = usual.get(name, (None if of_scene else Chosen.model_fields[name].default,))
+        item = hints[name] | None if of_scene else hints[name]
+        says = meaning(name) if of_scene else Chosen.model_fields[name].description
+        fields[name] = (Many[item], Field(default=values, description=says))
+    return create_model("Lists", __base__=Model, **fields)
