@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from harness.base.document import Document, Key, quote
 from harness.base.errors import InputError, Mistake, did_you_mean
@@ -104,15 +104,16 @@ class _Expansion:
             if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:  # round-off of the quotient, and no more
                 problem = f"{study.horizon:g} s is no multiple of the time step {dt:.6g} s of {case.scene_name}"
                 self.document.report(problem, (*at, "horizon"))
-            settings = product(self._solvers(study, at), study.first_guess, study.iterations, study.tolerance)
-            for solver, first_guess, iterations, tolerance in settings:
-                yield WorkSpec(case, study.horizon, solver, first_guess, iterations, tolerance, how)
+            lists: Any = study.first_guess, study.iterations, study.tolerance
+            for solver, options in product(self._solvers(study, at), product(*lists)):
+                yield WorkSpec(case, study.horizon, solver, *options, how=how)
 
     def _cases(self, study: Study, at: Key) -> list[Case]:
         found = []
         for name in self._named("scene", study.scene, list(self.scenes), at):
             scene = self.scenes[name]
-            for size, integrator, time_step in product(self._sizes(name, study, at), study.integrator, study.time_step):
+            lists: Any = study.integrator, study.time_step
+            for size, (integrator, time_step) in product(self._sizes(name, study, at), product(*lists)):
                 found.append(Case(name, scene.stepped(time_step or scene.time_step), size, integrator))
         return found
 

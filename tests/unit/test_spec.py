@@ -14,12 +14,7 @@ from typer.testing import CliRunner
 
 from harness.base.columns import SCHEMA
 from harness.base.errors import InputError
-<<<<<<< HEAD
-from harness.cli import run
-=======
-from harness.base.rows import SCHEMA
 from harness.cli import app
->>>>>>> 5d60c06 (State the options of a run once)
 from harness.config.load import Sweep, load_any, load_scene, load_sweep
 from harness.config.options import OPTIONS
 from harness.config.schema import schema
