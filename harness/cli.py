@@ -21,7 +21,7 @@ from harness.base.console import say as _say
 from harness.base.errors import InputError, Mistake
 from harness.config.command_line import taking
 from harness.experiments.ablation.command import ablate
-from harness.experiments.archive.command import compact
+from harness.experiments.archive.command import compact, merge, publish, verify
 from harness.experiments.gallery import gallery
 from harness.experiments.gates.command import gate
 from harness.experiments.gates.study_command import study
@@ -185,6 +185,9 @@ def report(
 
 app.command(cls=taking("frames", "iterations", "tolerance", "rounds"))(ablate)
 app.command()(compact)
+app.command()(merge)
+app.command()(publish)
+app.command()(verify)
 app.command()(gallery)
 app.command()(gate)
 app.add_typer(study, name="gate-study")

@@ -1,0 +1,193 @@
+"""Results of several folders in one: rows are told apart by their content, so that nothing is lost and nothing doubled.
+
+A run on two machines has two ids, so both keep their rows. Where the rows of one unit differ, since it was done twice,
+the newer keep its name and the others are named by their content, `<unit>~<digest>`. Runs that should have ended at
+the same positions and did not are reported.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from harness.base import columns, rows, shelf, union
+from harness.base.claim import NAME as CLAIM
+from harness.base.claim import claimed
+from harness.base.errors import InputError, Mistake
+from harness.base.files import replacing
+from harness.experiments.archive.compact import TABLES
+from harness.report.stored import ASKED
+
+_ANY = pa.schema([])
+_STARTED = pa.schema([columns.SCHEMA.field("started")])
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """What a merge did: units written and those that were there; conflicts: in words, runs of one machine and one code
+    that end at other positions; others: the same between machines or codes, which may differ in the last bits."""
+
+    written: int
+    known: int
+    conflicts: list[str]
+    others: list[str]
+
+
+def sweeps(results: Path) -> list[Path]:
+    """The folders in a folder of results that hold rows; itself, where that does. Raises InputError for none."""
+    found = {folder.parent for table in TABLES for folder in shelf.folders(results, table)}
+    found = {folder for folder in found if not any(part.startswith(".") for part in folder.relative_to(results).parts)}
+    if not found:
+        raise InputError(Mistake("holds no rows; wanted a folder of results, or that of a sweep", results))
+    return sorted(found)
+
+
+def merge(sources: Sequence[Path], into: Path, say: Callable[[str], None]) -> Merged:
+    """Bring the rows of folders together, with the recordings and pictures of their runs, in a folder that may have
+    some already. A merge that was stopped is gone on with by the same command.
+
+    Raises InputError where a folder has no rows, where one lies in another, or is of a sweep and another of several,
+    and for damaged rows.
+    """
+    for source in sources:
+        if into.resolve().is_relative_to(source.resolve()) or source.resolve().is_relative_to(into.resolve()):
+            raise InputError(
+                Mistake(f"and {source} lie in each other; wanted a folder beside them", into, key="--into")
+            )
+    places = {(source, folder.relative_to(source)) for source in sources for folder in sweeps(source)}
+    if len({place == Path() for _, place in places}) > 1:
+        raise InputError("merge: one folder is that of a sweep, another holds several; wanted folders of one kind")
+    written = known = 0
+    for place in sorted({place for _, place in places}):
+        home = into / place
+        home.mkdir(parents=True, exist_ok=True)
+        with rows.alone(home):
+            for table in TABLES:
+                found = [source / place / table for source in sources if (source, place) in places]
+                count = _table([folder for folder in found if shelf.units(folder)], home / table)
+                written, known = written + count[0], known + count[1]
+        for source in sources:
+            _claim(source / place, home)
+        say(f"{home}: {len(shelf.units(home / 'rows'))} runs")
+    return Merged(written, known, *_conflicts([folder for s in sweeps(into) for folder in [s / "rows"]]))
+
+
+def _table(folders: Sequence[Path], home: Path) -> tuple[int, int]:
+    """Bring one table's units together: how many were written, and how many were there."""
+    by_name: dict[str, list[Path]] = defaultdict(list)
+    for folder in (home, *folders):
+        for unit in shelf.units(folder):
+            by_name[unit.stem].append(unit)
+    written = known = 0
+    single = [units[0] for units in by_name.values() if len(units) == 1]
+    for unit, table in _tables([unit for unit in single if unit.parent != home]):
+        _put(table, unit, home / unit.name)
+        written += 1
+    known += sum(unit.parent == home for unit in single)
+    for name, units in by_name.items():
+        if len(units) == 1:
+            continue
+        heads = rows.heads(units, ["started"], _STARTED)
+        tables = [(unit, rows.read([unit], _ANY)) for unit in units]
+        newest = sorted(tables, key=lambda pair: _started(heads[pair[0]]), reverse=True)  # the first where they tie
+        kept = list[pa.Table]()
+        named = list[tuple[Path, pa.Table, Path]]()
+        for unit, table in newest:
+            if any(rows.same(table, other) for other in kept):
+                known += 1
+                continue
+            named.append((unit, table, home / (f"{name}~{content(table)}.parquet" if kept else f"{name}.parquet")))
+            kept.append(table)
+        for unit, table, target in reversed(named):  # what gives its name to a newer one is there under another first
+            if not shelf.there(target) or not rows.same(rows.read([target], _ANY), table):
+                _put(table, unit, target)
+                written += 1
+    return written, known
+
+
+def _started(head: dict[str, object] | str) -> str:
+    if isinstance(head, str):
+        raise InputError(head)
+    return str(head["started"] or "")
+
+
+def _tables(units: Sequence[Path], batch: int = 1_000) -> Iterator[tuple[Path, pa.Table]]:
+    """The rows of each unit; packed ones are read many at once."""
+    for start in range(0, len(units), batch):
+        chosen = units[start : start + batch]
+        packed = [unit for unit in chosen if not unit.exists()]
+        yield from ((unit, rows.read([unit], _ANY)) for unit in chosen if unit.exists())
+        if packed:
+            table = rows.read(packed, _ANY, named=True)
+            ends = pa.array(table[shelf.FILE]).to_pylist()
+            at = 0
+            for unit in packed:
+                length = ends.count(unit.stem)
+                yield unit, table.slice(at, length).drop_columns([shelf.FILE])
+                at += length
+
+
+def content(table: pa.Table) -> str:
+    """8 hexadecimal digits of SHA-256 over rows, wherever they are stored; empty columns are none."""
+    full = [name for name in table.column_names if table[name].null_count < len(table)]
+    return hashlib.sha256(repr(table.select(sorted(full)).to_pylist()).encode()).hexdigest()[:8]
+
+
+def _put(table: pa.Table, unit: Path, target: Path) -> None:
+    """Write a unit's rows, after its recordings and its picture: where rows are, all is."""
+    source, home = unit.parent.parent, target.parent.parent
+    for part in ("recordings", "pictures"):
+        for path in sorted((source / part).glob(f"{unit.stem}[.-]*")):
+            if path.is_file() and path.suffix in (".rrd", ".png"):
+                _copy(path, home / part / (target.stem + path.name[len(unit.stem) :]))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(target) as partial, partial.open("wb") as file:
+        pq.write_table(table, file)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _copy(path: Path, target: Path) -> None:
+    if target.exists() and target.samefile(path):
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(target) as partial:
+        shutil.copyfile(path, partial)
+
+
+def _claim(source: Path, home: Path) -> None:
+    """The merged folder belongs to the config of its sources, where that is still there."""
+    note = source / CLAIM
+    config = source / note.read_text(errors="replace").strip() if note.is_file() else None
+    if config and config.is_file() and not (home / CLAIM).exists():
+        claimed(home, config)
+
+
+def _conflicts(folders: Sequence[Path]) -> tuple[list[str], list[str]]:
+    """Runs that were asked the same and ended a step at other positions: of one machine and code, and of several."""
+    units = [unit for folder in folders for unit in shelf.units(folder)]
+    asked = ", ".join(f'"{name}"' for name in ASKED)
+    with union.connected() as connection:
+        whole = union.union(connection, "files", units, columns.SCHEMA, "default")
+        connection.execute(f"CREATE VIEW rows AS {whole.select()}")
+
+        def differing(key: str) -> list[str]:
+            each = f"SELECT {key}, {asked}, frame FROM rows WHERE phase = 'step' AND digest IS NOT NULL GROUP BY ALL"
+            found = connection.execute(
+                f"SELECT scene, size, solver, parameters, first FROM (SELECT {key}, {asked}, min(frame) AS first "
+                f"FROM ({each} HAVING count(DISTINCT digest) > 1) GROUP BY ALL) ORDER BY ALL"
+            ).fetchall()
+            return [
+                f"{scene}{f' {size}' if size else ''} {solver}{'' if given == '{}' else f' {given}'}: from step {first}"
+                for scene, size, solver, given, first in found
+            ]
+
+        return differing("run_id, code"), differing("0")

@@ -1,0 +1,199 @@
+"""Puts results into one file that others can cite, read and check: `springbench verify` does runs of it again.
+
+    results/<sweep>/       rows, recordings, pictures, pages
+    configs/<sweep>/       the config, and the scenes, meshes and code that it names
+    environment/           the machine, and the installed packages as `pip install -r` takes them
+    CITATION.cff, ro-crate-metadata.json, SHA256SUMS
+
+It unpacks to a folder of results: `springbench list`, `query` and `gate` work on it as on any other. The metadata are
+those of RO-Crate 1.1 (https://w3id.org/ro/crate/1.1), the checksums are for `sha256sum -c`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import mimetypes
+import os
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from importlib.metadata import distributions, version
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from harness.base import machine, rows, shelf
+from harness.base.claim import NAME as CLAIM
+from harness.base.errors import InputError, Mistake
+from harness.base.files import replacing
+from harness.config.load import load_any
+from harness.experiments.archive.merge import sweeps
+from harness.scenes.mesh.scene_json import read_scene_json
+from solvers.plugins import Plugin, found
+
+SUMS, CRATE, CITATION = "SHA256SUMS", "ro-crate-metadata.json", "CITATION.cff"
+_PACKAGE = Path(__file__).resolve().parents[2]
+_KINDS = {".parquet": "application/vnd.apache.parquet", ".rrd": "application/octet-stream", ".yaml": "application/yaml"}
+_BUFFER = 2**20
+
+Content = Path | bytes
+
+
+def publish(results: Path, archive: Path, say: Callable[[str], None], *, license: str = "") -> int:
+    """Write an archive (.zip) of a folder of results, or of one sweep's; how many files it holds.
+
+    license: what others may do with it, a name or a URL. Damaged rows are refused. Raises InputError, CannotWrite.
+    """
+    if archive.suffix.lower() != ".zip":
+        raise InputError(Mistake("wanted a name that ends in .zip", archive, key="--output"))
+    content: dict[str, Content] = {}
+    for folder in sweeps(results):
+        name = "/".join(folder.relative_to(results).parts) or folder.resolve().name
+        rows.read(shelf.units(folder / "rows"))  # names what is damaged
+        content |= {f"results/{name}/{file.relative_to(folder).as_posix()}": file for file in _shown(folder)}
+        if config := config_of(folder):
+            root, files = _needed(config)
+            content |= {f"configs/{name}/{file.relative_to(root).as_posix()}": file for file in files}
+            way = os.path.relpath(f"configs/{name}/{config.relative_to(root).as_posix()}", f"results/{name}")
+            content[f"results/{name}/{CLAIM}"] = f"{way}\n".encode()
+        else:
+            say(f"{folder}: its config is not there any more, so nobody can do its runs again")
+    content |= {"environment/machine.json": _environment(), "environment/requirements.txt": _requirements()}
+    if citation := next((p for p in (_PACKAGE.parent / CITATION, _PACKAGE / CITATION) if p.is_file()), None):
+        content[CITATION] = citation
+    with replacing(archive) as partial:
+        _write(partial, content, results.resolve().name, license)
+    return len(content) + 2
+
+
+def _shown(folder: Path) -> Iterator[Path]:
+    """The files of a sweep's results that are meant to be read."""
+    for path in sorted(folder.rglob("*")):
+        place = path.relative_to(folder)
+        hidden = any(part.startswith(".") for part in place.parts)
+        if path.is_file() and not path.is_symlink() and not hidden and place.parts[0] != "build":
+            yield path
+
+
+def config_of(folder: Path) -> Path | None:
+    """The config whose results a folder holds, if it is there."""
+    note = folder / CLAIM
+    said = note.read_text(errors="replace").strip() if note.is_file() else ""
+    config = folder / said
+    return config.resolve() if said and "\0" not in said and config.is_file() else None
+
+
+def _needed(config: Path) -> tuple[Path, list[Path]]:
+    """A config and the files that it names, and the folder that all lie in. None of its code is run."""
+    files = {config}
+    try:
+        sweep = load_any(config, opens=False)
+    except InputError:  # a config of another kind, or one that was changed; what it is goes along all the same
+        return config.parent, [config]
+    plugins = found(sweep.reports)
+    for run in sweep.runs():
+        scene = run.scene
+        files.add(scene.path)
+        for part in (scene.mesh, *scene.effects):
+            files |= {value for value in vars(part).values() if isinstance(value, Path)}
+        for _, given in scene.own.values():  # names of files come with their digests there
+            files |= {scene.path.parent / value[0] for value in given.values() if _is_file(value, scene.path.parent)}
+        plugins += run.own()
+    files |= {Path(plugin.source) for plugin in plugins if _is_beside(plugin)}
+    files |= {path.parent / read_scene_json(path).obj for path in files if path.suffix.lower() == ".json"}
+    there = sorted({Path(os.path.abspath(path)) for path in files})
+    return Path(os.path.commonpath([path.parent for path in there])), there
+
+
+def _is_file(value: Any, folder: Path) -> bool:
+    return isinstance(value, list) and len(value) == 2 and isinstance(value[0], str) and (folder / value[0]).is_file()
+
+
+def _is_beside(plugin: Plugin) -> bool:
+    return plugin.startswith("./") and Path(plugin.source).is_file()
+
+
+def _environment() -> bytes:
+    told = asdict(machine.describe()) | {"versions": machine.versions(), "commit": machine.commit()}
+    return (json.dumps(told, indent=2, sort_keys=True, default=str) + "\n").encode()
+
+
+def _requirements() -> bytes:
+    return "".join(sorted({f"{d.metadata['Name']}=={d.version}\n" for d in distributions()}, key=str.lower)).encode()
+
+
+def _write(path: Path, content: Mapping[str, Content], title: str, license: str) -> None:
+    sums: dict[str, str] = {}
+    sizes: dict[str, int] = {}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as packed:
+
+        def put(name: str, data: Content) -> None:
+            digest, size = hashlib.sha256(), 0
+            with packed.open(zipfile.ZipInfo.from_file(data, name) if isinstance(data, Path) else name, "w") as into:
+                for chunk in _chunks(data):
+                    digest.update(chunk)
+                    into.write(chunk)
+                    size += len(chunk)
+            sums[name], sizes[name] = digest.hexdigest(), size
+
+        for name, data in sorted(content.items()):
+            put(name, data)
+        put(CRATE, (json.dumps(_crate(sums, sizes, title, license), indent=2) + "\n").encode())
+        packed.writestr(SUMS, "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items())))
+
+
+def _chunks(data: Content) -> Iterator[bytes]:
+    if isinstance(data, bytes):
+        yield data
+        return
+    with data.open("rb") as file:
+        while chunk := file.read(_BUFFER):
+            yield chunk
+
+
+def _crate(sums: Mapping[str, str], sizes: Mapping[str, int], title: str, license: str) -> dict[str, Any]:
+    """The metadata: what this is, the files, and the program that made them."""
+    files = [
+        {
+            "@id": name,
+            "@type": "File",
+            "name": PurePosixPath(name).name,
+            "encodingFormat": _KINDS.get(PurePosixPath(name).suffix) or mimetypes.guess_type(name)[0] or "text/plain",
+            "contentSize": str(sizes[name]),
+            "sha256": digest,
+        }
+        for name, digest in sums.items()
+    ]
+    program = {
+        "@id": "#springbench",
+        "@type": "SoftwareApplication",
+        "name": "springbench",
+        "softwareVersion": version("springbench"),
+        "description": f"at the commit {machine.commit()}",
+    }
+    made = {
+        "@id": "#runs",
+        "@type": "CreateAction",
+        "name": "The runs of these sweeps",
+        "instrument": {"@id": "#springbench"},
+        "object": [{"@id": name} for name in sums if name.startswith("configs/")],
+        "result": [{"@id": name} for name in sums if name.startswith("results/")],
+    }
+    root = {
+        "@id": "./",
+        "@type": "Dataset",
+        "name": f"springbench results: {title}",
+        "description": "Measurements of implicit time stepping of mass-spring systems, with what made them",
+        "datePublished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "license": license or "not stated; ask those who published it",
+        "hasPart": [{"@id": file["@id"]} for file in files],
+        "mentions": [{"@id": "#runs"}],
+    }
+    about = {
+        "@id": CRATE,
+        "@type": "CreativeWork",
+        "conformsTo": {"@id": "https://w3id.org/ro/crate/1.1"},
+        "about": {"@id": "./"},
+    }
+    return {"@context": "https://w3id.org/ro/crate/1.1/context", "@graph": [about, root, program, made, *files]}

@@ -1,0 +1,82 @@
+"""Merging results: nothing is lost, nothing is doubled, and what should be equal and is not is told."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.base import rows, shelf
+from harness.base.errors import InputError
+from harness.experiments.archive.compact import compact
+from harness.experiments.archive.merge import Merged, merge
+from tests.dummies import dummy_rows, write_dummies
+
+
+def merged(folder: Path, *names: str) -> Merged:
+    return merge([folder / name for name in names], folder / "all", lambda line: None)
+
+
+def rewritten(unit: Path, **changed: Any) -> None:
+    """A unit's rows with other values."""
+    rows.write(unit, [row | changed for row in dummy_rows(int(unit.stem[-12:], 16))])
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> Path:
+    """A folder of `a` and `b`, results of a sweep each, of which run 2 is in both; `b` is packed."""
+    for name, first in (("a", 0), ("b", 2)):
+        units = write_dummies(tmp_path / name / "sweep", 3, first=first)
+        for part, kind in (("recordings", "rrd"), ("pictures", "png")):
+            (tmp_path / name / "sweep" / part).mkdir()
+            for unit in units:
+                (tmp_path / name / "sweep" / part / f"{unit.stem}.{kind}").write_text(name)
+    compact(tmp_path / "b", lambda line: None)
+    return tmp_path
+
+
+def test_all_runs_are_there_once_with_their_recordings_and_again_changes_nothing(two: Path):
+    assert merged(two, "a", "b") == Merged(5, 1, [], [])
+    units = shelf.units(two / "all" / "sweep" / "rows")
+    assert sorted(set(rows.read(units)["run_id"].to_pylist())) == [f"{k:012x}" for k in range(5)]
+    for part in ("recordings", "pictures"):
+        assert [path.stem for path in sorted((two / "all" / "sweep" / part).iterdir())] == [u.stem for u in units]
+    before = {path: path.stat().st_mtime_ns for path in two.rglob("*") if path.is_file()}
+    assert merged(two, "b", "a").written == 0
+    assert {path: path.stat().st_mtime_ns for path in two.rglob("*") if path.is_file()} == before
+
+
+def test_a_run_that_was_done_twice_keeps_both_rows_and_the_newer_its_name(two: Path):
+    (unit,) = (unit for unit in shelf.units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
+    rewritten(unit, started="2027-01-01T00:00:00+00:00", seconds=9.0)
+    for order in (("a", "b"), ("b", "a")):
+        found = merge([two / name for name in order], two / f"all-{order[0]}", lambda line: None)
+        assert found == Merged(6, 0, [], [])
+        there = [u for u in shelf.units(two / f"all-{order[0]}" / "sweep" / "rows") if unit.stem in u.stem]
+        assert [rows.read([u])["seconds"][0].as_py() for u in there] == [9.0, 0.003]
+        assert there[0].stem == unit.stem
+        assert there[1].stem.startswith(f"{unit.stem}~")
+
+
+def test_positions_that_differ_are_a_conflict_on_one_machine_and_told_between_two(two: Path):
+    (unit,) = (unit for unit in shelf.units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
+    rewritten(unit, digest="f" * 64)
+    found = merged(two, "a", "b")
+    assert found.conflicts == found.others == ["scene2 10 hybrid: from step 1"]
+    rows.write(unit.with_name("there.parquet"), [r | {"digest": "e" * 64, "run_id": "e"} for r in dummy_rows(2)])
+    unit.unlink()
+    found = merge([two / "a", two / "b"], two / "others", lambda line: None)
+    assert (found.conflicts, found.others) == ([], ["scene2 10 hybrid: from step 1"])
+
+
+def test_what_cannot_be_merged_is_the_users_mistake(two: Path):
+    with pytest.raises(InputError, match="of one kind"):
+        merge([two / "a", two / "b" / "sweep"], two / "all", lambda line: None)
+    with pytest.raises(InputError, match="in each other"):
+        merge([two / "a", two / "b"], two / "a" / "all", lambda line: None)
+    (two / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no rows"):
+        merged(two, "a", "empty")
+    unit = shelf.units(two / "a" / "sweep" / "rows")[0]
+    unit.write_bytes(b"PAR1")
+    with pytest.raises(InputError, match=unit.name):
+        merged(two, "a", "b")
