@@ -152,7 +152,7 @@ def claim(home: Path, factor: float, *, interrupted: bool = False, machine: str 
     with verify.unpacked(home / "x.zip") as folder:
         run = verify.published(folder, print, own_code=False)[0].run
     old = [row | {"interrupted": False} for row in dummy_rows(1)]
-    there = (Published(old, run), Published(old, replace(run, size=5)))
+    there = (Published(old, run), Published(old, run.but(size=5)))
     slower = [row | {"seconds": row["seconds"] * factor, "interrupted": interrupted} for row in old]
     here = [[row | {"machine": machine} for row in found] for found in (slower, old)]
     return verify._ratio(there, (here[0], here[1]))
@@ -169,7 +169,7 @@ def test_a_ratio_holds_or_not_or_cannot_be_told(home: Path):
 def test_a_tenth_is_chosen_and_each_has_another_solver_beside_it(home: Path):
     with verify.unpacked(home / "x.zip") as folder:
         (a, b) = verify.published(folder, print, own_code=False)
-    runs = [replace(one, run=replace(one.run, size=size)) for size in range(10) for one in (a, b)]
+    runs = [replace(one, run=one.run.but(size=size)) for size in range(10) for one in (a, b)]
     for seed in range(20):
         taken = verify.chosen(runs, seed)
         assert len(taken) in (2, 4)

@@ -21,7 +21,7 @@ import zipfile
 from collections import defaultdict
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from statistics import median
@@ -188,7 +188,7 @@ def again(runs: Sequence[Published], folder: Path, display: Display) -> list[Cla
     """Do runs again, in this folder, and say what holds. Raises InputError."""
     for part in ("rows", "recordings", "pictures"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    bare = [replace(one.run, record=False, pictures=False) for one in runs]
+    bare = [one.run.but(record=False, pictures=False) for one in runs]
     units = [RunUnit(run, Files.of(run, folder)) for run in bare]
     do_all(units, display)
     new = [rows.read([unit.files.rows]).to_pylist() for unit in units]
