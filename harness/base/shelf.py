@@ -14,7 +14,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from harness.base.errors import InputError, Mistake
@@ -64,7 +63,7 @@ def _packed(path: Path, *state: int) -> frozenset[str]:
         names = pq.read_table(path, columns=[FILE])[FILE]
         if names.null_count:
             raise OSError(f"rows without a {FILE}")
-        return frozenset(pc.unique(names.cast(pa.string())).to_pylist())  # pyright: ignore[reportAttributeAccessIssue]
+        return frozenset(names.cast(pa.string()).unique().to_pylist())
     except (pa.ArrowException, OSError, KeyError) as error:
         raise InputError(Mistake(f"holds no packed rows ({error}); take it out of the results", path)) from error
 

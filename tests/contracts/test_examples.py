@@ -39,23 +39,3 @@ def test_what_scripts_use_is_all_that_harness_shows(tmp_path: Path):
     names, loaded = python("-c", program, folder=tmp_path).splitlines()
     wanted = ["Picture", "Simulation", "draw", "load_scene", "make_scene", "open_recording", "rows", "run"]
     assert (names, loaded) == (str(wanted), "False False")
-
-
-def test_help_imports_nothing_heavy(tmp_path: Path):
-    heavy = {
-        "matplotlib",
-        "plotly",
-        "pyvista",
-        "vtkmodules",
-        "rerun",
-        "duckdb",
-        "numba",
-        "scipy",
-        "pydantic",
-        "pyarrow",
-    }
-    program = (
-        "import sys\nfrom harness.cli import app\n"
-        "try:\n    app(['--help'])\nexcept SystemExit:\n    pass\nprint('\\nloaded', *sys.modules)"
-    )
-    assert not heavy & set(python("-c", program, folder=tmp_path).rpartition("loaded")[2].split())

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from statistics import median
 from typing import Annotated
 
-import numpy as np
 import typer
 from rich.table import Table
 
@@ -63,7 +63,7 @@ def replay(
             found = of.replay(starts, slower, Rule(limit), room, replays)
             others = [of.replay_other(rule, starts, slower, room / 2, replays // 10) for rule in of.OTHERS.values()]
             parts = [f"{part:.2%}" for part in (found.fails, found.holds, found.undecided)]
-            load = f"{np.median([start.load for start in starts]):.1f}"
+            load = f"{median(start.load for start in starts):.1f}"
             cells = [gate, condition, load, f"{slower - 1:.0%}", f"{limit - 1:.0%}", *parts, f"{found.seconds:.1f}"]
             table.add_row(*cells, *(f"{part:.1%}" for part in others))
     out.print(table)
