@@ -16,18 +16,21 @@ settings.register_profile("search", deadline=None, max_examples=2000, database=N
 settings.load_profile("suite")
 
 
-_COMPILES = "test_solver_contract.py"
+_COMPILES = "solver_contract.py"
 """It calls nearly all kernels, and has them compiled where they are not there yet."""
-_NEEDS_NONE = tuple(f"test_{name}" for name in ("hostile", "plugins", "worker_runs", "full_disk", "damaged", "gate_"))
-"""Files that need few of them: what runs beside it, so that no kernel is compiled twice at once."""
+_NEEDS_NONE = ("worker", "bare_", "other_code", "damaged", "full_disk", "plugins", "hostile", "gate_")
+"""Files that need few of them: what runs beside it, so that no kernel is compiled twice at once. The first ones run
+sweeps, whose workers are forks as long as no thread of Numba runs."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files go to the test runner's processes in this order, which its `--no-loadscope-reorder` keeps."""
 
     def order(item: pytest.Item) -> int:
-        name = item.path.name
-        return 0 if name == _COMPILES else 1 if name.startswith(_NEEDS_NONE) else 2
+        name = item.path.name.removeprefix("test_")
+        if name == _COMPILES:
+            return -1
+        return next((rank for rank, start in enumerate(_NEEDS_NONE) if name.startswith(start)), len(_NEEDS_NONE))
 
     items.sort(key=order)
 
