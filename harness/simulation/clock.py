@@ -2,7 +2,8 @@
 
     pass_seconds = wall time of all that a phase did, by the kernel's raw clock
     lost         = pass_seconds - CPU time             the process was stopped, or others had its processor
-    |pass_seconds - sum of the phase's times| <= max(3 % of it, 1 ms), and below that by no more than was lost besides
+    |pass_seconds - sum of the phase's times| <= max(3 % of it, 1 ms), and below that by no more than half as much
+                                                 again as was lost besides: who comes back finds the caches cold
 
 The times themselves are taken by `perf_counter`, call by call, elsewhere: an error in one place shows in the other. A
 delay can fall between two calls and be in the first sum alone; then it is in `lost` as well, and no failure.
@@ -24,6 +25,8 @@ from solvers.problem import Prepared, StepProblem
 SHARE, LEAST, CALL = 0.03, 1e-3, 5e-6
 """The share of a wall time, and the seconds, by which two clocks may differ; seconds that reading them may take each
 time, with the call in between: a tenth of the shortest steps there are."""
+COLD = 1.5
+"""Of the seconds that were lost, what may be missing: caches are cold after them."""
 
 ITERATION_SHARE = 0.15
 """The share of an iteration's time by which that of its phases may differ before their rows say so."""
@@ -67,7 +70,7 @@ class Watch:
     def columns(self, what: str, seconds: Iterable[float]) -> dict[str, Any]:
         """The columns of rows with these times of `what`, which were taken within. Raises RunFailed for a lie."""
         told = sum(seconds)
-        if not -self.tolerance <= self.wall - told <= self.tolerance + self.lost:  # so that NaN fails too
+        if not -self.tolerance <= self.wall - told <= self.tolerance + COLD * self.lost:  # so that NaN fails too
             raise RunFailed(
                 f"the times of {what} add up to {told:.6g} s, where another clock saw {self.wall:.6g} s go by, "
                 f"{self.lost:.3g} s of them without computing: one of the two does not measure what it says"
