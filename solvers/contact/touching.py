@@ -9,16 +9,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeGuard, runtime_checkable
+from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from solvers.problem import Energy, LaggedEnergy, Positions, StepProblem, System
-
-if TYPE_CHECKING:
-    from solvers.contact.settling import Settling
-    from solvers.core.descent import Metric
 
 
 class Rows(NamedTuple):
@@ -66,15 +62,6 @@ def touching(problem: StepProblem) -> list[ContactEnergy]:
     """The step's contacts, less those that are idle; begun apart from the other energies, which may not be needed."""
     begun = [energy.begin_step(problem.start) for energy in problem.system.energies if is_contact(energy)]
     return [energy for energy in begun if is_contact(energy) and not energy.idle()]
-
-
-def settling_for(metric: Metric) -> Settling | None:
-    """What Newton's methods do about contact between their steps; None for a system without."""
-    if not any(is_contact(energy) for energy in metric.system.energies):
-        return None
-    from solvers.contact.settling import Settling  # for those who need it
-
-    return Settling(metric)
 
 
 def without_contact(system: System) -> System:

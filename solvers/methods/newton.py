@@ -14,18 +14,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from solvers.about import About, Reference
-from solvers.contact.touching import settling_for
+from solvers.contact.touching import is_contact
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
 from solvers.core.saddles import certified, leave
 from solvers.problem import Positions, System
+
+if TYPE_CHECKING:
+    from solvers.contact.settling import Settling
 
 _LEVELS = ((1.0, 0.0), (0.9, 0.0), (0.5, 0.0), (0.0, 0.0), *((0.0, 10.0**k) for k in range(-4, 9, 2)))
 """What is kept of negative lateral parts, and what multiple of Q's diagonal is added: the first that factorises."""
@@ -115,3 +118,12 @@ class NewtonMethod:
         """The direction from a point by the exact Hessian, None where it is not positive definite."""
         hessian = step.hessian(at.positions)
         return -hessian.solve(at.gradient) if hessian.factorise() else None
+
+
+def settling_for(metric: Metric) -> Settling | None:
+    """What Newton's methods do about contact between their steps; None for a system without."""
+    if not any(is_contact(energy) for energy in metric.system.energies):
+        return None
+    from solvers.contact.settling import Settling  # for those who need it
+
+    return Settling(metric)

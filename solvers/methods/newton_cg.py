@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.about import About, Reference
-from solvers.contact.touching import settling_for
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import Hessian, StepObjective
@@ -28,6 +27,7 @@ from solvers.kernels import conjugate
 from solvers.linear.inverse import Inverse
 from solvers.linear.krylov import CURVED, Iteration
 from solvers.linear.supernodal import Supernodal
+from solvers.methods.newton import settling_for
 from solvers.problem import Positions, System
 
 _LOOSE, _TIGHT = 0.5, 1e-10
