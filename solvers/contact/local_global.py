@@ -25,6 +25,7 @@ from solvers.core.driver import Iterating, Iterative, largest
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
 from solvers.core.prefactored import PreparedLocalGlobal
+from solvers.linear.krylov import Iteration
 from solvers.problem import Positions, Prepared, ResidualOf, Solver, StepProblem, System
 
 _FEW = 900
@@ -126,21 +127,41 @@ class Corrections:
         """Conjugate gradients; Q times a direction follows from the residuals that Q^-1 was asked for."""
         U = _columns(rows, len(plain))
         pulls = csr_array(U * rows.weight) @ U.T
-        residual = -gradient - (U @ (rows.weight * rows.gap)).reshape(-1, 3)
-        z = self.plain(residual)
-        x, along, image = np.zeros_like(z), z.copy(), residual.copy()
-        left = first = float(np.vdot(residual, z))
-        for _ in range(_ITERATIONS):
-            if left <= _TOLERANCE**2 * first:
-                break
-            product = image + (pulls @ along.ravel()).reshape(-1, 3)
-            length = left / float(np.vdot(along, product))
-            x += length * along
-            residual -= length * product
-            z = self.plain(residual)
-            before, left = left, float(np.vdot(residual, z))
-            along, image = z + left / before * along, residual + left / before * image
-        return x
+        model = _Model(self.plain, pulls, -gradient - (U @ (rows.weight * rows.gap)).reshape(-1, 3))
+        model.iterate(model.product, _ITERATIONS)
+        return model.x
+
+
+class _Model(Iteration):
+    """(Q + W) x = b, preconditioned by Q^-1; solve: Q^-1 of it; pulls: W (3n, 3n)."""
+
+    def __init__(self, solve: Callable[[Positions], Positions], pulls: csr_array, b: Positions) -> None:
+        self._solve, self._pulls, self._residual = solve, pulls, b
+        self.x, self._along, self._image = np.zeros((3, *b.shape))
+        self.product = self._preconditioned()
+        self._enough = _TOLERANCE**2 * self.product
+
+    def _preconditioned(self) -> float:
+        self._z = self._solve(self._residual)
+        return float(np.vdot(self._residual, self._z))
+
+    def turn(self, product: float, before: float) -> float:
+        """See Iteration."""
+        scale = product / before
+        self._along, self._image = self._z + scale * self._along, self._residual + scale * self._image
+        self._product = self._image + (self._pulls @ self._along.ravel()).reshape(-1, 3)
+        return float(np.vdot(self._along, self._product))
+
+    def go(self, product: float, curvature: float) -> float:
+        """See Iteration."""
+        length = product / curvature
+        self.x += length * self._along
+        self._residual -= length * self._product
+        return self._preconditioned()
+
+    def near(self, product: float) -> bool:
+        """See Iteration."""
+        return product <= self._enough
 
 
 def _columns(rows: Rows, n: int) -> csr_array:

@@ -1,9 +1,8 @@
 """What methods with exact gradients share: their points, and a line search that tells a descent from round-off.
 
-The line search halves a step until the objective falls by at least DECREASE of what the slope promises (Armijo 1966).
-The rise is computed from differences (see `solvers.kernels.objective`), so that this works until the gradient itself
-is round-off. What other energies' values lose to round-off is allowed for; there the slope has to shrink as well (the
-approximate Wolfe condition of Hager and Zhang 2005).
+The line search halves a step until the objective falls enough (`solvers.kernels.line_search`). The rise is computed
+from differences (see `solvers.kernels.objective`), so that this works until the gradient itself is round-off. What
+other energies' values lose to round-off is allowed for; there the slope has to shrink instead.
 """
 
 from __future__ import annotations
@@ -20,12 +19,10 @@ from solvers import matrices
 from solvers.core.driver import Iterating, Iterative, largest
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
+from solvers.kernels.line_search import DECREASE, falls, flattens
 from solvers.linear.choice import factorise
 from solvers.linear.factors import DenseCholesky
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
-
-DECREASE = 1e-4
-"""Of what the slope promises, the least that a step must bring."""
 
 _HALVINGS = 60
 """A step so often halved has no digit left."""
@@ -80,11 +77,11 @@ def search(
         if lower is not p and step.rise(at.positions, lower)[0] <= DECREASE * t * (slope + 0.5 * t * curvature):
             return Point(lower, step.gradient(lower))
         rise, noise = step.rise(at.positions, p)
-        if rise <= DECREASE * t * (slope + 0.5 * t * curvature):
+        if falls(rise, t, slope, curvature):
             return Point(p, step.gradient(p))
         if rise <= noise and 0.0 < noise < np.inf:
             gradient = step.gradient(p)
-            if abs(dot(gradient, direction)) <= (1.0 - 2.0 * DECREASE) * -slope:
+            if flattens(abs(dot(gradient, direction)), slope, DECREASE):
                 return Point(p, gradient)
         t *= 0.5
     return None

@@ -5,14 +5,10 @@
     s_j = p_(j+1) - p_j,   y_j = grad g(p_(j+1)) - grad g(p_j),   w_j = Q^-1 y_j = c_j - c_(j+1)
 
 A method is nothing but its coefficients (see `accelerate_coefficients`), which it takes from scalar products of the
-window's vectors. An iteration tries p + d, then shorter steps, then the plain correction, shorter and shorter:
-
-    g(p + t d) <= g(p) + DECREASE t min(0, grad g(p) d)           Armijo (1966)
-    grad g(p + t d) d <= (2 FLATTER - 1) grad g(p) d              approximate Wolfe (Hager and Zhang 2005), instead of
-                                                                  it where round-off hides how far g falls
-
-For projective energies Q majorises the Hessian, so that the plain correction passes at full length. Vectors are flat
-and know nothing of what their entries stand for; entries of vertices that do not move are zero.
+window's vectors. An iteration tries p + d, then shorter steps, then the plain correction, shorter and shorter, until
+one descends enough (`solvers.kernels.line_search`). For projective energies Q majorises the Hessian, so that the plain
+correction passes at full length. Vectors are flat and know nothing of what their entries stand for; entries of vertices
+that do not move are zero.
 """
 
 from __future__ import annotations
@@ -25,8 +21,9 @@ from numpy.typing import NDArray
 from solvers.compiling import inner, kernel
 from solvers.kernels.accelerate_coefficients import coefficients
 from solvers.kernels.dots import dot, dots
+from solvers.kernels.line_search import falls, flattens
 
-DECREASE, FLATTER = 1e-4, 0.1
+_FLATTER = 0.1
 AGAIN, ACCEPTED, STALLED = 0, 1, 2
 """What `judge` says: evaluate the next trial, go there, or that round-off lets nothing descend."""
 
@@ -114,10 +111,10 @@ def judge(window):
     even = abs(now.rise) <= now.noise < np.inf
     if even:
         there = -dot(window.direction, window.descent_there, len(window.direction))
-        enough = now.slope <= 0.0 and there <= (2.0 * FLATTER - 1.0) * now.slope
+        enough = now.slope <= 0.0 and flattens(there, now.slope, _FLATTER)
         excess = 0.5 * now.length * (there - now.slope)
     else:
-        enough = now.rise <= DECREASE * now.length * min(0.0, now.slope)
+        enough = falls(now.rise, now.length, min(0.0, now.slope), 0.0)
         excess = now.rise - now.length * now.slope
     if enough:
         now.fallen -= 0.0 if even else now.rise

@@ -63,9 +63,9 @@ class Iteration(ABC):
     def go(self, product: Any, curvature: Any) -> Any:
         """x, r and z, and r'z."""
 
-    @abstractmethod
     def convex(self, curvature: Any) -> bool:
-        """Whether it goes on along p."""
+        """Whether it goes on along p; always where A is known to be positive definite."""
+        return True
 
     @abstractmethod
     def near(self, product: Any) -> bool:

@@ -29,9 +29,10 @@ import numpy as np
 
 from solvers.about import About, Reference
 from solvers.core.acceleration import Accelerating
-from solvers.core.descent import DECREASE, Metric, Point, PreparedDescent, dot, search
+from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import Hessian, StepObjective
+from solvers.kernels.line_search import falls
 from solvers.kernels.loop import NEVER, STALLED, Limits, at_most
 from solvers.methods.lbfgs import Lbfgs
 from solvers.methods.newton import NewtonMethod
@@ -205,7 +206,7 @@ class _Predicting:
         if step.rise(at.positions, p)[0] <= _KEPT * slope:
             return 1.0, Point(p, step.gradient(p)), True
         relaxed = self._method.relaxed(step, p)
-        if step.rise(at.positions, relaxed.positions)[0] <= DECREASE * slope:
+        if falls(step.rise(at.positions, relaxed.positions)[0], 1.0, slope, 0.0):
             return 1.0, relaxed, False
         found = search(step, at, direction)
         if found is None:
