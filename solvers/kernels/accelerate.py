@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 from solvers.kernels.accelerate_coefficients import coefficients
-from solvers.kernels.dots import dot, dots
 from solvers.kernels.line_search import falls, flattens
+from solvers.vectors.dots import dot, dots
 
 _FLATTER = 0.1
 AGAIN, ACCEPTED, STALLED = 0, 1, 2

@@ -9,18 +9,15 @@ in the last place of the energy that is at stake. A massless vertex that no pin 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from solvers.compiling import inner
 from solvers.kernels.springs import TINY_SQUARED, Bundles, add_short, kinds
-from solvers.vectors.intrinsics import unpacked
-from solvers.vectors.springs import F64, I64, LANES, LEAST, MOST, RIGHT, WIDE, Vectors, constant
+from solvers.vectors import descent
+from solvers.vectors.springs import LANES, RIGHT
 
 
 class Shares(NamedTuple):
@@ -49,66 +46,13 @@ class Shares(NamedTuple):
         return cls(*kinds(share), bundles.in_lanes(inverse), places.astype(np.int64), 2.0 * float(share @ pull**2))
 
 
-def _bundle(typingctx, x, own, bundle, neighbour, kind, weights, part, shares, begin, end, right, inverse, out):
-    """A bundle's code: writes its rows of `out`, returns its energy; -1, and writes none, if a spring is short."""
-
-    def generate(context, builder: Any, signature, args):
-        x, own, bundle, neighbour, kind, weights, part, shares, begin, end, right, inverse, out = unpacked(
-            context, builder, signature, args
-        )
-        v = Vectors(context, builder)
-        centre = v.gather(x, v.places(own, bundle))
-        sums = [cgutils.alloca_once(builder, WIDE) for _ in range(4)]
-        for accumulator in sums:
-            builder.store(constant(0.0), accumulator)
-        shortest = cgutils.alloca_once(builder, WIDE)
-        builder.store(constant(MOST), shortest)
-
-        def read(entry):
-            """What an entry's springs need: k r, k, 1/(4 k), and the vector from their other ends."""
-            others = v.gather(x, v.places(neighbour, entry))
-            numbers = [*v.eights(weights, kind, entry), *v.eights(shares, part, entry, 1)]
-            return [*numbers, *(builder.fsub(a, b) for a, b in zip(centre, others, strict=True))]
-
-        def add(values):
-            """Add an entry's springs to the sums."""
-            pull, k, share, *arrow = values
-            squared = v.dot(arrow)
-            builder.store(v.least(builder.load(shortest), squared), shortest)
-            scale = builder.fsub(builder.fmul(pull, v.inverse_root(squared)), k)
-            energy = builder.fmul(builder.fmul(share, scale), scale)
-            factors, terms = [scale] * 3 + [energy], [*arrow, squared]
-            for factor, term, accumulator in zip(factors, terms, sums, strict=True):
-                builder.store(v.multiply_add(factor, term, builder.load(accumulator)), accumulator)
-
-        v.over_entries(begin, end, read, add)
-        *total, energy = [builder.load(accumulator) for accumulator in sums]
-        short = v.any(builder.fcmp_ordered("<=", builder.load(shortest), constant(LEAST)))
-        with builder.if_then(builder.not_(short), likely=True):
-            *constants, held = v.right(right, bundle)
-            away = [v.subtract_product(a, held, b) for a, b in zip(constants, centre, strict=True)]
-            half = v.load(builder.gep(inverse, [builder.mul(bundle, I64(LANES))]), WIDE)
-            builder.store(v.multiply_add(half, v.dot(away), energy), sums[3])
-            total = [builder.fadd(a, b) for a, b in zip(total, away, strict=True)]
-            for place, row in zip(v.places(own, bundle), v.rows(total), strict=True):
-                at = builder.bitcast(builder.gep(out, [place]), row.type.as_pointer())
-                builder.store(row, at, align=8)
-        return builder.select(short, F64(-1.0), v.total(builder.load(sums[3])))
-
-    arguments = x, own, bundle, neighbour, kind, weights, part, shares, begin, end, right, inverse, out
-    return types.float64(*arguments), generate
-
-
-_descend: Any = intrinsic(_bundle)
-
-
 @inner
 def descend(bundles, shares, p, right, out):
     """Write minus the gradient at p to the rows of `out`, and return the objective."""
     own, start, neighbour, kind, weights, _spring, _direction = bundles
     total = 0.0
     for b in range(len(start) - 1):
-        energy = _descend(
+        energy = descent.descend(
             *(p, own, b, neighbour, kind, weights, shares.kind, shares.shares),
             *(start[b], start[b + 1], right, shares.inverse, out),
         )

@@ -59,7 +59,7 @@ def over(advance: Callable[..., Any], residual: Callable[..., Any]) -> Callable[
     ended them.
     """
 
-    def iterate(state, limits):
+    def iterate(state: Any, limits: Any) -> Any:
         count, found, ended = 0, np.nan, ITERATIONS
         while ended == ITERATIONS and count < limits.iterations:
             moved = advance(state)

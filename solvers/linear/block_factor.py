@@ -11,7 +11,7 @@ above the diagonal is never read; on it are the inverses of L's entries.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,7 @@ class Fronts(NamedTuple):
     diagonal: NDArray[np.int64]
 
 
-def whole(rows):
+def whole(rows: Any) -> Any:
     """The rows of so many whole vectors as hold these."""
     return (rows + ROWS - 1) // ROWS * ROWS
 

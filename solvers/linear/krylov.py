@@ -32,7 +32,7 @@ def over(
     iterate(state, product, most): from r'z, how many iterations were done, at most so many, and what ended them.
     """
 
-    def iterate(state, product, most):
+    def iterate(state: Any, product: Any, most: int) -> tuple[int, int]:
         count, before = 0, np.inf
         while not near(state, product):
             if count == most:

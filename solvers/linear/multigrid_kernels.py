@@ -7,55 +7,14 @@ entry multiplies is one load.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from llvmlite import ir
-from numba import prange, types
-from numba.core import cgutils
-from numba.extending import intrinsic
+from numba import prange
 
 from solvers.compiling import kept
+from solvers.vectors.rows import gather
 
 BLOCK = 512
 """Rows that a thread does at a time."""
-
-_I64 = ir.IntType(64)
-
-
-def _gather(typingctx, values, columns, begin, end, x):
-    """sum over begin <= e < end of values[e] x[columns[e]], as four numbers of x's type."""
-    number = x.dtype
-    signature = types.UniTuple(number, 4)(values, columns, types.int64, types.int64, x)
-
-    def generate(context, builder, signature, args):
-        values, columns, x = (
-            context.make_array(kind)(context, builder, args[k]).data
-            for k, kind in ((0, signature.args[0]), (1, signature.args[1]), (4, signature.args[4]))
-        )
-        scalar = context.get_data_type(number)
-        vector = ir.VectorType(scalar, 4)
-        zero, lanes = ir.Constant(vector, None), ir.Constant(ir.VectorType(ir.IntType(32), 4), None)
-        total = cgutils.alloca_once_value(builder, zero)
-        builder.store(zero, total)
-        with cgutils.for_range_slice(builder, args[2], args[3], _I64(1), intp=_I64) as (e, _):
-            place = builder.mul(builder.sext(builder.load(builder.gep(columns, [e])), _I64), _I64(4))
-            source = builder.bitcast(builder.gep(x, [place]), vector.as_pointer())
-            value = builder.insert_element(zero, builder.load(builder.gep(values, [e])), ir.IntType(32)(0))
-            value = builder.shuffle_vector(value, zero, lanes)
-            load = builder.load(source)
-            load.align = 8  # NumPy promises no more than its items' alignment
-            product = builder.fmul(value, load, flags=("contract",))
-            builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
-        result = builder.load(total)
-        parts = [builder.extract_element(result, ir.IntType(32)(k)) for k in range(4)]
-        return context.make_tuple(builder, signature.return_type, parts)
-
-    return signature, generate
-
-
-# Numba passes the first argument itself, which type checkers do not know.
-gather: Any = intrinsic(_gather)
 
 
 @kept(parallel=True)

@@ -49,39 +49,39 @@ def _place(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any
     return builder.gep(context.make_array(kind)(context, builder, array).data, [index])
 
 
-def _swap(typingctx, signals, place, before, after):
+def _swap(typingctx: Any, signals: Any, place: Any, before: Any, after: Any) -> Any:
     """Whether signals[place] was `before`, and now is `after`."""
 
-    def generate(context, builder, signature, args):
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         at = _place(context, builder, signature.args[0], args[0], args[1])
         return builder.extract_value(builder.cmpxchg(at, args[2], args[3], "acq_rel", "monotonic"), 1)
 
     return types.boolean(signals, types.int64, types.int64, types.int64), generate
 
 
-def _add_one(typingctx, signals, place):
+def _add_one(typingctx: Any, signals: Any, place: Any) -> Any:
     """Add one to signals[place], and return what it was."""
 
-    def generate(context, builder, signature, args):
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         at = _place(context, builder, signature.args[0], args[0], args[1])
         return builder.atomic_rmw("add", at, ir.Constant(ir.IntType(64), 1), "acq_rel")
 
     return types.int64(signals, types.int64), generate
 
 
-def _read(typingctx, signals, place):
+def _read(typingctx: Any, signals: Any, place: Any) -> Any:
     """signals[place], and sight of all that was written before it."""
 
-    def generate(context, builder, signature, args):
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.load_atomic(_place(context, builder, signature.args[0], args[0], args[1]), "acquire", 8)
 
     return types.int64(signals, types.int64), generate
 
 
-def _write(typingctx, signals, place, value):
+def _write(typingctx: Any, signals: Any, place: Any, value: Any) -> Any:
     """Write signals[place], after all that was written before."""
 
-    def generate(context, builder, signature, args):
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         builder.store_atomic(args[2], _place(context, builder, signature.args[0], args[0], args[1]), "release", 8)
         return context.get_dummy_value()
 

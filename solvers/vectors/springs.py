@@ -21,14 +21,12 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from solvers.energies.springs import TINY
-from solvers.vectors.intrinsics import ask, unpacked
+from solvers.vectors.intrinsics import F64, I8, I64, Vectors, ask, unpacked
 
 LANES = 8
 RIGHT = 4 * LANES
 """Numbers of a bundle's constant right-hand side: x, y and z of eight vertices, and what holds each [N/m]."""
-I32, I64, F64 = ir.IntType(32), ir.IntType(64), ir.DoubleType()
-ROW, WIDE = ir.VectorType(F64, 4), ir.VectorType(F64, LANES)
-I8, MASK = ir.IntType(8), ir.VectorType(ir.IntType(1), LANES)
+ROW, WIDE, MASK = ir.VectorType(F64, 4), ir.VectorType(F64, LANES), ir.VectorType(ir.IntType(1), LANES)
 BITS = ir.VectorType(I64, LANES)
 _GUESS, _ESTIMATE = 0x5FE6EB50C7B537A9, "llvm.x86.avx512.rsqrt14.pd.512"
 LEAST, MOST = TINY * TINY, 1.7e308
@@ -45,26 +43,8 @@ def constant(value: float) -> ir.Constant:
     return ir.Constant(WIDE, [value] * LANES)
 
 
-class Vectors:
-    """Vectors of eight float64, written with a builder. estimates: whether the processor estimates inverse roots."""
-
-    def __init__(self, context: Any, builder: Any) -> None:
-        self.builder = builder
-        self.estimates = "+avx512f" in context.codegen().magic_tuple()[2]
-
-    def shuffle(self, a: ir.Value, b: ir.Value, lanes: list[int]) -> Any:
-        return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))
-
-    def load(self, pointer: Any, kind: ir.Type, align: int = 8) -> ir.Value:
-        return self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()), align=align)
-
-    def multiply_add(self, a: Any, b: Any, c: Any) -> Any:
-        """a b + c; `contract` lets the target fuse them where it can."""
-        return self.builder.fadd(self.builder.fmul(a, b, flags=("contract",)), c, flags=("contract",))
-
-    def subtract_product(self, c: Any, a: Any, b: Any) -> Any:
-        """c - a b."""
-        return self.builder.fsub(c, self.builder.fmul(a, b, flags=("contract",)), flags=("contract",))
+class Eights(Vectors):
+    """Vectors of eight float64: of the springs that end at eight vertices, one each."""
 
     def places(self, indices: Any, bundle: Any) -> list[Any]:
         """The places of eight rows, the bundle's of those that are listed, int32."""
@@ -87,6 +67,28 @@ class Vectors:
         b = self.builder
         begin = b.zext(b.load(b.gep(kind, [entry])), I64)
         return [self.load(b.gep(table, [b.add(begin, I64(LANES * k))]), WIDE) for k in range(many)]
+
+    def sums(self, many: int) -> list[Any]:
+        """So many vectors to add up in, of zeros."""
+        return [cgutils.alloca_once_value(self.builder, constant(0.0)) for _ in range(many)]
+
+    def arrow(self, x: Any, centre: list[Any], neighbour: Any, entry: Any) -> list[Any]:
+        """The vectors to eight vertices from the other ends of an entry's springs."""
+        others = self.gather(x, self.places(neighbour, entry))
+        return [self.builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
+
+    def add_products(self, factors: list[Any], terms: list[Any], sums: list[Any]) -> None:
+        """Add a factor times a term to each sum."""
+        for factor, term, total in zip(factors, terms, sums, strict=True):
+            self.builder.store(self.multiply_add(factor, term, self.builder.load(total)), total)
+
+    def note_least(self, value: Any, least: Any) -> None:
+        """Keep the lesser of a vector's numbers and those in memory."""
+        self.builder.store(self.least(self.builder.load(least), value), least)
+
+    def short(self, least: Any) -> Any:
+        """Whether one of the least squares in memory is too small for an inverse root."""
+        return self.any(self.builder.fcmp_ordered("<=", self.builder.load(least), constant(LEAST)))
 
     def over_entries(
         self, begin: Any, end: Any, read: Callable[[Any], list[Any]], *stages: Callable[[list[Any]], Any]
@@ -139,21 +141,9 @@ class Vectors:
             squared = self.multiply_add(component, component, squared)
         return squared
 
-    def total(self, a: Any) -> Any:
-        """The sum of the lanes, taken pairwise."""
-        return self.paired([self.builder.extract_element(a, I32(lane)) for lane in range(LANES)])
-
-    def paired(self, terms: list[Any]) -> Any:
-        """The sum of as many terms as a power of two, taken pairwise."""
-        while len(terms) > 1:
-            terms = [self.builder.fadd(p, q) for p, q in zip(terms[::2], terms[1::2], strict=True)]
-        return terms[0]
-
     def add_to(self, pointer: Any, row: Any) -> None:
         """Add a row to one in memory."""
-        size = 8 if row.type.element == F64 else 4
-        total = self.builder.fadd(self.load(pointer, row.type, size), row)
-        self.builder.store(total, self.builder.bitcast(pointer, row.type.as_pointer()), align=size)
+        self.store(self.builder.fadd(self.load(pointer, row.type), row), pointer)
 
     def clamped(self, s: Any) -> Any:
         """s, between LEAST and MOST."""
@@ -180,14 +170,10 @@ class Vectors:
         for k in range(LANES // 2):
             ask(b, b.gep(neighbour, [b.add(first, I64(2 * LANES * k))]))
 
-    def any(self, mask: Any) -> Any:
-        """Whether one of eight is true."""
-        return self.builder.icmp_unsigned("!=", self.builder.bitcast(mask, I8), I8(0))
-
     def guess(self, s: Any) -> tuple[Any, Any]:
         """y, nearly 1/sqrt(s), and 1 - s y^2, for s between LEAST and MOST; `correction` does the rest."""
         b = self.builder
-        if self.estimates:
+        if self.wide:
             kind = ir.FunctionType(WIDE, [WIDE, WIDE, I8])
             estimate = b.module.globals.get(_ESTIMATE) or ir.Function(b.module, kind, _ESTIMATE)
             y = b.call(estimate, [s, constant(0.0), I8(-1)])
@@ -200,7 +186,7 @@ class Vectors:
 
     def correction(self, e: Any) -> Any:
         """((1 - e)^(-1/2) - 1)/e, as far as a guess needs it."""
-        return self.series(e, *(5 / 16, 3 / 8, 1 / 2) if self.estimates else (3 / 8, 1 / 2))
+        return self.series(e, *(5 / 16, 3 / 8, 1 / 2) if self.wide else (3 / 8, 1 / 2))
 
     def series(self, e: Any, *coefficients: float) -> Any:
         """The polynomial in e with these coefficients, the highest power's first."""
@@ -215,35 +201,33 @@ class Vectors:
         return self.multiply_add(self.builder.fmul(y, e), self.correction(e), y)
 
 
-def _over_bundle(kind: Kind):
+def _over_bundle(kind: Kind) -> Callable[..., Any]:
     """The code for a bundle: its eight vertices and their springs."""
 
-    def declare(typingctx, x, own, bundle, neighbour, kinds, weights, begin, end, right, out):
-        def generate(context, builder: Any, signature, args):
+    def declare(
+        typingctx: Any, x: Any, own: Any, bundle: Any, neighbour: Any, kinds: Any, weights: Any, begin: Any, end: Any,
+        right: Any, out: Any,
+    ) -> Any:  # fmt: skip
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             x, own, bundle, neighbour, kinds, weights, begin, end, right, out = unpacked(
                 context, builder, signature, args
             )
-            v = Vectors(context, builder)
+            v = Eights(context, builder)
             places = v.places(own, bundle)
             centre = v.gather(x, places)
             if kind != "energy":
                 v.ask_ahead(bundle, places, begin, right, out, neighbour)
-            sums = [cgutils.alloca_once(builder, WIDE) for _ in range(3)]
-            for accumulator in sums:
-                builder.store(constant(0.0), accumulator)
-            shortest = cgutils.alloca_once(builder, WIDE)
-            builder.store(constant(MOST), shortest)
+            sums, shortest = v.sums(3), cgutils.alloca_once_value(builder, constant(MOST))
 
-            def read(entry):
+            def read(entry: Any) -> list[Any]:
                 """What an entry's springs need: k r, k, and the vector from their other ends with its square."""
-                others = v.gather(x, v.places(neighbour, entry))
-                arrow = [builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
+                arrow = v.arrow(x, centre, neighbour, entry)
                 return [*v.eights(weights, kinds, entry), v.dot(arrow), *arrow]
 
-            def scale(values):
+            def scale(values: list[Any]) -> list[Any]:
                 """What the vectors are multiplied by, as a guess and what is to be added to it."""
                 pull, stiffness, squared, *arrow = values
-                builder.store(v.least(builder.load(shortest), squared), shortest)
+                v.note_least(squared, shortest)
                 y, e = v.guess(squared)
                 guess = builder.fmul(pull, y)
                 short = builder.fmul(guess, e)
@@ -251,22 +235,21 @@ def _over_bundle(kind: Kind):
                     guess = builder.fsub(guess, stiffness)
                 return [guess, short, e, *arrow]
 
-            def add(values):
+            def add(values: list[Any]) -> None:
                 """Add an entry's springs to the sums."""
                 if kind == "energy":
-                    _, factor, *terms = values[:3]
+                    _, stiffness, squared, *_ = values
+                    v.add_products([stiffness], [squared], sums[:1])
                 else:
-                    guess, short, e, *terms = values
-                    factor = v.multiply_add(short, v.correction(e), guess)
-                for term, accumulator in zip(terms, sums, strict=False):
-                    builder.store(v.multiply_add(factor, term, builder.load(accumulator)), accumulator)
+                    guess, short, e, *arrow = values
+                    v.add_products([v.multiply_add(short, v.correction(e), guess)] * 3, arrow, sums)
 
             v.over_entries(begin, end, read, *([add] if kind == "energy" else [scale, add]))
             total = [builder.load(accumulator) for accumulator in sums]
             if kind == "energy":
                 held = v.load(builder.gep(right, [builder.mul(bundle, I64(LANES))]), WIDE)
                 return v.total(v.multiply_add(v.dot(centre), held, builder.fmul(constant(0.5), total[0])))
-            short = v.any(builder.fcmp_ordered("<=", builder.load(shortest), constant(LEAST)))
+            short = v.short(shortest)
             with builder.if_then(builder.not_(short), likely=True):
                 *constants, held = v.right(right, bundle)
                 total = [builder.fadd(a, b) for a, b in zip(total, constants, strict=True)]

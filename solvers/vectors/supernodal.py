@@ -22,19 +22,17 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from solvers.vectors.intrinsics import ask, signature, unpacked
+from solvers.vectors.intrinsics import I64, Vectors, ask, signature, unpacked
 
-_I32 = ir.IntType(32)
-_I64 = ir.IntType(64)
 _AHEAD = 4096
 """How many bytes ahead a panel is asked for on the way down, which the hardware's own guess follows less well."""
 
 
-class _Tiles:
+class _Tiles(Vectors):
     """Tiles of 4 m columns in vectors of 512 bits, written with a builder; `element` is the work vector's type."""
 
     def __init__(self, context: Any, builder: Any, element: types.Float, m: int) -> None:
-        self.builder = builder
+        super().__init__(context, builder)
         self.element = context.get_value_type(element)
         self.size = element.bitwidth // 8
         self.lanes = 16 // self.size  # of a vector
@@ -44,24 +42,17 @@ class _Tiles:
     def zero(self, lanes: int) -> ir.Constant:
         return ir.Constant(ir.VectorType(self.element, 4 * lanes), [0.0] * (4 * lanes))
 
-    def load(self, pointer: Any, lanes: int = 1) -> Any:
-        kind = ir.VectorType(self.element, 4 * lanes)
-        return self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()), align=self.size)
-
-    def store(self, value: Any, pointer: Any) -> None:
-        self.builder.store(value, self.builder.bitcast(pointer, value.type.as_pointer()), align=self.size)
+    def lane(self, pointer: Any, lanes: int = 1) -> Any:
+        """So many lanes of four numbers."""
+        return self.load(pointer, ir.VectorType(self.element, 4 * lanes))
 
     def panel(self, tile: Any, kind: types.Array, z: int) -> Any:
         """Vector z of a tile of a panel of this kind; float16 is widened."""
-        at = self.builder.gep(tile, [_I64(4 * self.lanes * z)])
+        at = self.builder.gep(tile, [I64(4 * self.lanes * z)])
         if kind.dtype != types.uint16:
-            return self.load(at, self.lanes)
+            return self.lane(at, self.lanes)
         half, wide = (ir.VectorType(e, 4 * self.lanes) for e in (ir.HalfType(), self.element))
-        return self.builder.fpext(self.builder.load(self.builder.bitcast(at, half.as_pointer()), align=2), wide)
-
-    def shuffle(self, a: Any, b: Any, places: Any) -> Any:
-        places = list(places)
-        return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(places)), places))
+        return self.builder.fpext(self.load(at, half), wide)
 
     def picked(self, a: Any, b: Any, lanes: list[int]) -> Any:
         """These lanes of two vectors, counted through both."""
@@ -79,17 +70,12 @@ class _Tiles:
             rows = [self.picked(a, b, list(range(2 * many))) for a, b in zip(rows[::2], rows[1::2], strict=True)]
         return rows[0]
 
-    def spread(self, vector: Any, c: int) -> Any:
+    def repeated(self, vector: Any, c: int) -> Any:
         """Of each lane its number c, four times."""
         return self.shuffle(vector, vector, [i // 4 * 4 + c for i in range(vector.type.count)])
 
     def add(self, a: Any, b: Any) -> Any:
         return self.builder.fadd(a, b)
-
-    def multiply_add(self, a: Any, b: Any, c: Any) -> Any:
-        """a b + c; a b for no c. `contract` lets the target fuse them where it can."""
-        product = self.builder.fmul(a, b, flags=("contract",))
-        return product if c is None else self.builder.fadd(product, c, flags=("contract",))
 
     def rows(self, totals: list[Any]) -> list[Any]:
         """The lanes of each of three or four vectors summed, and the four rows, filled up with zero, that they are."""
@@ -131,58 +117,62 @@ class _Tiles:
 
 def _named(builder: Any, index: Any, first: Any, rows: Any) -> list[Any]:
     """Where the four rows are that `index` names from `first` on."""
-    names = [builder.zext(builder.load(builder.gep(index, [builder.add(first, _I64(r))])), _I64) for r in range(4)]
-    return [builder.gep(rows, [builder.mul(name, _I64(4))]) for name in names]
+    names = [builder.zext(builder.load(builder.gep(index, [builder.add(first, I64(r))])), I64) for r in range(4)]
+    return [builder.gep(rows, [builder.mul(name, I64(4))]) for name in names]
 
 
-def _add_forward(typingctx, panel, offset, index, at, count, x, x_row, y, y_row, numbers, quads):
+def _add_forward(
+    typingctx: Any, panel: Any, offset: Any, index: Any, at: Any, count: Any, x: Any, x_row: Any, y: Any, y_row: Any,
+    numbers: Any, quads: Any,
+) -> Any:  # fmt: skip
     """y[y_row + index[at + r]] += sum_j W[r, j] x[x_row + j] for r < count, a multiple of four; W from `offset` on.
 
     numbers: how many of a row of x are not zero, 3 or 4."""
     declared = signature(panel, offset, index, at, count, x, x_row, y, y_row, numbers, quads, compiled_in=2)
 
-    def generate(context, builder, signature, args):
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         panel, offset, index, at, count, x, x_row, y, y_row, numbers, m = unpacked(context, builder, signature, args)
         kind = signature.args[0]
         t = _Tiles(context, builder, signature.args[7].dtype, m)
         panel, index = builder.gep(panel, [offset]), builder.gep(index, [at])
-        x, y = (builder.gep(rows, [builder.mul(first, _I64(4))]) for rows, first in ((x, x_row), (y, y_row)))
-        columns = [t.load(builder.gep(x, [_I64(4 * j)])) for j in range(4 * m)]
+        x, y = (builder.gep(rows, [builder.mul(first, I64(4))]) for rows, first in ((x, x_row), (y, y_row)))
+        columns = [t.lane(builder.gep(x, [I64(4 * j)])) for j in range(4 * m)]
         held = [t.joined(columns[j : j + t.lanes]) for j in range(0, 4 * m, t.lanes)]
-        factors = [[t.spread(vector, c) for c in range(numbers)] for vector in held]
-        with cgutils.for_range(builder, builder.lshr(count, _I64(2))) as loop:
-            first = builder.mul(loop.index, _I64(4))
-            tile = builder.gep(panel, [builder.mul(loop.index, _I64(t.entries))])
+        factors = [[t.repeated(vector, c) for c in range(numbers)] for vector in held]
+        with cgutils.for_range(builder, builder.lshr(count, I64(2))) as loop:
+            first = builder.mul(loop.index, I64(4))
+            tile = builder.gep(panel, [builder.mul(loop.index, I64(t.entries))])
             sums: list[Any] = [None] * numbers
             for z, three in enumerate(factors):
                 w = t.panel(tile, kind, z)
                 sums = [t.multiply_add(w, factor, total) for factor, total in zip(three, sums, strict=True)]
             for row, place in zip(t.rows(sums), _named(builder, index, first, y), strict=True):
-                t.store(t.add(row, t.load(place)), place)
+                t.store(t.add(row, t.lane(place)), place)
         return context.get_dummy_value()
 
     return declared, generate
 
 
-def _set_backward(typingctx, square, start, own, panel, offset, index, at, below, y, x_row, quads):
+def _set_backward(
+    typingctx: Any, square: Any, start: Any, own: Any, panel: Any, offset: Any, index: Any, at: Any, below: Any, y: Any,
+    x_row: Any, quads: Any,
+) -> Any:  # fmt: skip
     """y[x_row + j] = sum over r < 4 quads of S[r, j] y[x_row + r] + sum over r < below of W[r, j] y[index[at + r]];
     S from `start` on, and none where `own` is zero; W from `offset` on, `below` a multiple of four."""
     declared = signature(square, start, own, panel, offset, index, at, below, y, x_row, quads)
 
-    def generate(context, builder, signature, args):
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         square, start, own, panel, offset, index, at, below, y, x_row, m = unpacked(context, builder, signature, args)
         square_kind, panel_kind = signature.args[0], signature.args[3]
         t = _Tiles(context, builder, signature.args[8].dtype, m)
         square, panel, index = (builder.gep(a, [begin]) for a, begin in ((square, start), (panel, offset), (index, at)))
-        out = builder.gep(y, [builder.mul(x_row, _I64(4))])
+        out = builder.gep(y, [builder.mul(x_row, I64(4))])
         vector = t.zero(t.lanes)
-        sums = [[cgutils.alloca_once(builder, vector.type) for _ in range(3)] for _ in range(t.vectors)]
-        for total in (total for three in sums for total in three):
-            builder.store(vector, total)
+        sums = [[cgutils.alloca_once_value(builder, vector) for _ in range(3)] for _ in range(t.vectors)]
 
-        def add(tile, kind, places):
+        def add(tile: Any, kind: Any, places: list[Any]) -> None:
             t.ask(tile, kind)
-            factors = t.transposed([t.load(place) for place in places])
+            factors = t.transposed([t.lane(place) for place in places])
             for z, three in reversed(list(enumerate(sums))):
                 w = t.panel(tile, kind, z)
                 for factor, total in zip(factors, three, strict=True):
@@ -190,18 +180,18 @@ def _set_backward(typingctx, square, start, own, panel, offset, index, at, below
 
         # From the last row to the first: the panels are then read strictly downwards, as they were read upwards before,
         # so that what is still in the cache is read first.
-        tiles = builder.lshr(below, _I64(2))
+        tiles = builder.lshr(below, I64(2))
         with cgutils.for_range(builder, tiles) as loop:
-            k = builder.sub(builder.sub(tiles, _I64(1)), loop.index)
-            tile = builder.gep(panel, [builder.mul(k, _I64(t.entries))])
-            add(tile, panel_kind, _named(builder, index, builder.mul(k, _I64(4)), y))
-        with builder.if_then(builder.icmp_signed(">", own, _I64(0)), likely=True):
+            k = builder.sub(builder.sub(tiles, I64(1)), loop.index)
+            tile = builder.gep(panel, [builder.mul(k, I64(t.entries))])
+            add(tile, panel_kind, _named(builder, index, builder.mul(k, I64(4)), y))
+        with builder.if_then(builder.icmp_signed(">", own, I64(0)), likely=True):
             for k in reversed(range(m)):
-                places = [builder.gep(out, [_I64(4 * (4 * k + r))]) for r in range(4)]
-                add(builder.gep(square, [_I64(t.entries * k)]), square_kind, places)
+                places = [builder.gep(out, [I64(4 * (4 * k + r))]) for r in range(4)]
+                add(builder.gep(square, [I64(t.entries * k)]), square_kind, places)
         done = [t.summed(*(builder.load(total) for total in three)) for three in sums]
         for z, rows in enumerate(done):
-            t.store(rows, builder.gep(out, [_I64(4 * t.lanes * z)]))
+            t.store(rows, builder.gep(out, [I64(4 * t.lanes * z)]))
         return context.get_dummy_value()
 
     return declared, generate

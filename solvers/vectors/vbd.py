@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from solvers.vectors.intrinsics import unpacked
-from solvers.vectors.springs import I64, LANES, LEAST, MASK, WIDE, Vectors, constant
+from solvers.vectors.intrinsics import I64, unpacked
+from solvers.vectors.springs import LANES, LEAST, MASK, WIDE, Eights, constant
 
 NUMBERS = 4
 """What is kept of each spring between the two passes: its vector and its length."""
@@ -21,7 +21,7 @@ _ROUND_OFF = 1e-14
 _ZERO, _HALF, _ONE = constant(0.0), constant(0.5), constant(1.0)
 
 
-def _newton(v: Vectors, block: list[Any], g: list[Any]) -> tuple[list[Any], Any]:
+def _newton(v: Eights, block: list[Any], g: list[Any]) -> tuple[list[Any], Any]:
     """-B^-1 g for B = [[a, b, c], [b, d, e], [c, e, f]] by its factors L D L', and where B is positive definite."""
     builder: Any = v.builder
     a, b, c, d, e, f = block
@@ -43,83 +43,106 @@ def _newton(v: Vectors, block: list[Any], g: list[Any]) -> tuple[list[Any], Any]
     return [x0, x1, x2], builder.and_(builder.and_(large[0], large[1]), large[2])
 
 
-def _bundle(typingctx, x, own, bundle, neighbour, kind, weights, begin, end, right, majorant, near):
+class _Springs(NamedTuple):
+    """A bundle's springs in memory, and `near`, where what both passes need of them is kept."""
+
+    neighbour: Any
+    kind: Any
+    weights: Any
+    begin: Any
+    end: Any
+    near: Any
+
+    def kept(self, builder: Any, entry: Any) -> list[Any]:
+        """Where an entry's vector and length are kept."""
+        begins = builder.mul(builder.sub(entry, self.begin), I64(LANES * NUMBERS))
+        return [builder.gep(self.near, [builder.add(begins, I64(LANES * k))]) for k in range(NUMBERS)]
+
+
+def _model(
+    v: Eights, springs: _Springs, x: Any, centre: list[Any], load: list[Any], weight: Any
+) -> tuple[list[Any], list[Any], Any]:
+    """Minus the gradients, the upper triangles of the blocks, row by row, and whether a spring is too short.
+
+    load: what inertia, forces and pins pull with; weight: what they hold with.
+    """
+    builder: Any = v.builder
+    sums = [cgutils.alloca_once_value(builder, one) for one in (*load, weight, _ZERO, _ZERO, weight, _ZERO, weight)]
+    short = cgutils.alloca_once_value(builder, ir.Constant(MASK, [0] * LANES))
+    with cgutils.for_range_slice(builder, springs.begin, springs.end, I64(1), I64) as (entry, _):
+        arrow = v.arrow(x, centre, springs.neighbour, entry)
+        squared = v.dot(arrow)
+        tiny = builder.fcmp_ordered("<=", squared, constant(LEAST))
+        builder.store(builder.or_(builder.load(short), tiny), short)
+        root = v.inverse_root(v.clamped(squared))
+        for value, pointer in zip([*arrow, builder.fmul(squared, root)], springs.kept(builder, entry), strict=True):
+            v.store(value, pointer)
+        pull, k = v.eights(springs.weights, springs.kind, entry)
+        inward = builder.fmul(pull, root)
+        tension = builder.fsub(inward, k)
+        # A spring whose k is negative is a form's, has no rest length and is never compressed.
+        compressed = [builder.fcmp_ordered(">", force, _ZERO) for force in (tension, inward)]
+        lateral = builder.select(builder.and_(*compressed), _ZERO, builder.fsub(_ZERO, tension))
+        axial = builder.fsub(k, lateral)
+        n = [builder.fmul(component, root) for component in arrow]
+        along = [builder.fmul(axial, component) for component in n]
+        added = [(tension, component) for component in arrow]
+        added += [(along[i], n[j]) for i in range(3) for j in range(i, 3)]
+        for index, ((one, other), accumulator) in enumerate(zip(added, sums, strict=True)):
+            total = v.multiply_add(one, other, builder.load(accumulator))
+            builder.store(builder.fadd(total, lateral) if index in (3, 6, 8) else total, accumulator)
+    found = [builder.load(total) for total in sums]
+    return found[:3], found[3:], v.any(builder.load(short))
+
+
+def _rise(v: Eights, springs: _Springs, load: list[Any], weight: Any, d: list[Any]) -> Any:
+    """By how much steps d raise the energy, from differences of lengths, which do not cancel."""
+    builder: Any = v.builder
+    rise = builder.fmul(builder.fmul(_HALF, weight), v.dot(d))
+    for component, own_force in zip(d, load, strict=True):
+        rise = v.subtract_product(rise, component, own_force)
+    rises = cgutils.alloca_once_value(builder, rise)
+    with cgutils.for_range_slice(builder, springs.begin, springs.end, I64(1), I64) as (entry, _):
+        *arrow, length = [v.load(pointer, WIDE) for pointer in springs.kept(builder, entry)]
+        moved = [builder.fadd(a, b) for a, b in zip(arrow, d, strict=True)]
+        squared = v.dot(moved)
+        both = v.multiply_add(squared, v.inverse_root(v.clamped(squared)), length)
+        change = builder.fmul(builder.fadd(arrow[0], moved[0]), d[0])
+        for c in (1, 2):
+            change = v.multiply_add(builder.fadd(arrow[c], moved[c]), d[c], change)
+        pull, k = v.eights(springs.weights, springs.kind, entry)
+        factor = builder.fsub(builder.fmul(_HALF, k), builder.fdiv(pull, both))
+        v.add_products([factor], [change], [rises])
+    return builder.load(rises)
+
+
+def _bundle(
+    typingctx: Any, x: Any, own: Any, bundle: Any, neighbour: Any, kind: Any, weights: Any, begin: Any, end: Any,
+    right: Any, majorant: Any, near: Any,
+) -> Any:  # fmt: skip
     """A bundle's code: moves its vertices in x, and returns whether a spring is too short, when it moves none."""
 
-    def generate(context, builder: Any, signature, args):
-        x, own, bundle, neighbour, kind, weights, begin, end, right, majorant, near = unpacked(
-            context, builder, signature, args
-        )
-        v = Vectors(context, builder)
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        x, own, bundle, *given, right, majorant, near = unpacked(context, builder, signature, args)
+        v, springs = Eights(context, builder), _Springs(*given, near)
         places = v.places(own, bundle)
-
-        def kept(entry):
-            begins = builder.mul(builder.sub(entry, begin), I64(LANES * NUMBERS))
-            return [builder.gep(near, [builder.add(begins, I64(LANES * k))]) for k in range(NUMBERS)]
-
         centre = v.gather(x, places)
         *constants, weight = v.right(right, bundle)
         load = [v.subtract_product(here, weight, p) for here, p in zip(constants, centre, strict=True)]
-        # Minus the gradient, then the block's upper triangle, row by row.
-        first = [*load, weight, _ZERO, _ZERO, weight, _ZERO, weight]
-        sums = [cgutils.alloca_once_value(builder, value) for value in first]
-        short = cgutils.alloca_once_value(builder, ir.Constant(MASK, [0] * LANES))
-        with cgutils.for_range_slice(builder, begin, end, I64(1), I64) as (entry, _):
-            others = v.gather(x, v.places(neighbour, entry))
-            arrow = [builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
-            squared = v.dot(arrow)
-            tiny = builder.fcmp_ordered("<=", squared, constant(LEAST))
-            builder.store(builder.or_(builder.load(short), tiny), short)
-            root = v.inverse_root(v.clamped(squared))
-            for value, pointer in zip([*arrow, builder.fmul(squared, root)], kept(entry), strict=True):
-                builder.store(value, builder.bitcast(pointer, WIDE.as_pointer()), align=8)
-            pull, k = v.eights(weights, kind, entry)
-            inward = builder.fmul(pull, root)
-            tension = builder.fsub(inward, k)
-            # A spring whose k is negative is a form's, has no rest length and is never compressed.
-            compressed = [builder.fcmp_ordered(">", force, _ZERO) for force in (tension, inward)]
-            lateral = builder.select(builder.and_(*compressed), _ZERO, builder.fsub(_ZERO, tension))
-            axial = builder.fsub(k, lateral)
-            n = [builder.fmul(component, root) for component in arrow]
-            along = [builder.fmul(axial, component) for component in n]
-            added = [(tension, component) for component in arrow]
-            added += [(along[i], n[j]) for i in range(3) for j in range(i, 3)]
-            for index, ((one, other), accumulator) in enumerate(zip(added, sums, strict=True)):
-                total = v.multiply_add(one, other, builder.load(accumulator))
-                builder.store(builder.fadd(total, lateral) if index in (3, 6, 8) else total, accumulator)
-        force, block = [builder.load(s) for s in sums[:3]], [builder.load(s) for s in sums[3:]]
+        force, block, short = _model(v, springs, x, centre, load, weight)
         d, definite = _newton(v, block, [builder.fsub(_ZERO, component) for component in force])
-
-        # By how much the step raises the energy, from differences of lengths, which do not cancel.
-        half = builder.fmul(_HALF, weight)
-        rise = builder.fmul(half, v.dot(d))
-        for component, own_force in zip(d, load, strict=True):
-            rise = v.subtract_product(rise, component, own_force)
-        rises = cgutils.alloca_once_value(builder, rise)
-        with cgutils.for_range_slice(builder, begin, end, I64(1), I64) as (entry, _):
-            *arrow, length = [v.load(pointer, WIDE) for pointer in kept(entry)]
-            moved = [builder.fadd(a, b) for a, b in zip(arrow, d, strict=True)]
-            squared = v.dot(moved)
-            both = v.multiply_add(squared, v.inverse_root(v.clamped(squared)), length)
-            change = builder.fmul(builder.fadd(arrow[0], moved[0]), d[0])
-            for c in (1, 2):
-                change = v.multiply_add(builder.fadd(arrow[c], moved[c]), d[c], change)
-            pull, k = v.eights(weights, kind, entry)
-            factor = builder.fsub(builder.fmul(_HALF, k), builder.fdiv(pull, both))
-            builder.store(v.multiply_add(factor, change, builder.load(rises)), rises)
-        better = builder.and_(definite, builder.fcmp_ordered("<=", builder.load(rises), _ZERO))
+        falls = builder.fcmp_ordered("<=", _rise(v, springs, load, weight, d), _ZERO)
+        better = builder.and_(definite, falls)
         scale = builder.fdiv(_ONE, v.load(builder.gep(majorant, [builder.mul(bundle, I64(LANES))]), WIDE))
         safe = [builder.fmul(scale, component) for component in force]
         ends = [builder.fadd(p, builder.select(better, a, b)) for p, a, b in zip(centre, d, safe, strict=True)]
-        any_short = v.any(builder.load(short))
-        with builder.if_then(builder.not_(any_short), likely=True):
+        with builder.if_then(builder.not_(short), likely=True):
             for place, row in zip(places, v.rows(ends), strict=True):
-                builder.store(row, builder.bitcast(builder.gep(x, [place]), row.type.as_pointer()), align=8)
-        return any_short
+                v.store(row, builder.gep(x, [place]))
+        return short
 
     arguments = x, own, bundle, neighbour, kind, weights, begin, end, right, majorant, near
     return types.boolean(*arguments), generate
 
 
-# Numba passes the first argument itself, which type checkers do not know.
-descend: Any = intrinsic(_bundle)
+descend: Any = intrinsic(_bundle)  # Numba passes the first argument itself, which type checkers do not know

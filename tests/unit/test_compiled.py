@@ -24,7 +24,7 @@ from solvers.matrices import assemble, energy_norm
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, StepProblem, StopRule
-from solvers.vectors.springs import WIDE, Vectors
+from solvers.vectors.springs import WIDE, Eights
 from tests.scenes import cloth, first_problem, random_network, random_problem
 
 LINEAR: tuple[Linear, ...] = ("inverse", "supernodal")
@@ -98,8 +98,8 @@ def inverse_roots(estimates: bool):
 
     def declare(typingctx, s, out):
         def generate(context, builder, signature, args):
-            v = Vectors(context, builder)
-            v.estimates = estimates
+            v = Eights(context, builder)
+            v.wide = estimates
             s, out = (
                 context.make_array(kind)(context, builder, x).data for kind, x in zip(signature.args, args, strict=True)
             )
@@ -112,7 +112,7 @@ def inverse_roots(estimates: bool):
     return numba.njit(lambda s, out: root(s, out))  # noqa: TID251
 
 
-ESTIMATES = Vectors(cpu_target.target_context, None).estimates
+ESTIMATES = Eights(cpu_target.target_context, None).estimates
 
 
 @pytest.mark.parametrize("estimates", [False, True] if ESTIMATES else [False])

@@ -8,6 +8,7 @@ vectors and then the lanes are added pairwise, and what is left over one by one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -15,17 +16,17 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from solvers.vectors.intrinsics import unpacked
-from solvers.vectors.springs import F64, I64, LANES, WIDE, Vectors, constant
+from solvers.vectors.intrinsics import F64, I64, Vectors, unpacked
+from solvers.vectors.springs import LANES, WIDE, constant
 
 _TOGETHER = 4
 """Vectors that are added to side by side."""
 
 
-def _sums(*pairs: tuple[int, int]):
+def _sums(*pairs: tuple[int, int]) -> Callable[..., Any]:
     """The code for the scalar products of these pairs of arrays, over their first `count` entries."""
 
-    def generate(context, builder: Any, signature, args):
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         *arrays, count = unpacked(context, builder, signature, args)
         v = Vectors(context, builder)
         whole = builder.and_(count, I64(-_TOGETHER * LANES))
@@ -33,7 +34,7 @@ def _sums(*pairs: tuple[int, int]):
         def read(array: Any, place: Any, lanes: int) -> Any:
             kept = array.type.pointee
             narrow, wide = (ir.VectorType(kept, lanes), WIDE) if lanes > 1 else (kept, F64)
-            term = v.load(builder.gep(array, [place]), narrow, 8 if kept == F64 else 4)
+            term = v.load(builder.gep(array, [place]), narrow)
             return term if kept == F64 else builder.fpext(term, wide)
 
         def add(place: Any, lanes: int, sums: list[Any]) -> None:
@@ -59,12 +60,12 @@ def _sums(*pairs: tuple[int, int]):
     return generate
 
 
-def _dot(typingctx, a, b, count):
+def _dot(typingctx: Any, a: Any, b: Any, count: Any) -> Any:
     """a b."""
     return types.float64(a, b, count), _sums((0, 1))
 
 
-def _dots(typingctx, s, w, g, count):
+def _dots(typingctx: Any, s: Any, w: Any, g: Any, count: Any) -> Any:
     """s g and w g."""
     return types.UniTuple(types.float64, 2)(s, w, g, count), _sums((0, 2), (1, 2))
 

@@ -1,0 +1,36 @@
+"""Rows of a sparse matrix times vectors of four numbers a vertex, in LLVM vectors: an entry multiplies a whole load."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from solvers.vectors.intrinsics import I32, I64, Vectors, unpacked
+
+
+def _gather(typingctx: Any, values: Any, columns: Any, begin: Any, end: Any, x: Any) -> Any:
+    """sum over begin <= e < end of values[e] x[columns[e]], as four numbers of x's type."""
+    number = x.dtype
+    declared = types.UniTuple(number, 4)(values, columns, types.int64, types.int64, x)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        values, columns, begin, end, x = unpacked(context, builder, signature, args)
+        v, row = Vectors(context, builder), ir.VectorType(context.get_data_type(number), 4)
+        total = cgutils.alloca_once_value(builder, ir.Constant(row, None))
+        with cgutils.for_range_slice(builder, begin, end, I64(1), intp=I64) as (e, _):
+            place = builder.mul(builder.sext(builder.load(builder.gep(columns, [e])), I64), I64(4))
+            value = v.spread(builder.load(builder.gep(values, [e])), 4)
+            source = v.load(builder.gep(x, [place]), row)
+            builder.store(v.multiply_add(value, source, builder.load(total)), total)
+        result = builder.load(total)
+        parts = [builder.extract_element(result, I32(k)) for k in range(4)]
+        return context.make_tuple(builder, signature.return_type, parts)
+
+    return declared, generate
+
+
+gather: Any = intrinsic(_gather)  # Numba passes the first argument itself, which type checkers do not know

@@ -1,0 +1,214 @@
+"""What the vectors of `solvers.vectors` do, as one writes it in Numba: drop-in functions, the same arguments.
+
+Where a vector kernel refuses a bundle of springs, kernels go on with a plain one: refusing all of them is that.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from solvers.vectors.block import ROWS
+from solvers.vectors.springs import LANES, RIGHT
+
+
+def refuse(x, own, bundle, neighbour, kinds, weights, begin, end, right, out):
+    """Springs: `solvers.kernels.springs.add_short` does the bundle."""
+    return True
+
+
+def refuse_energy(x, own, bundle, neighbour, kind, weights, part, shares, begin, end, right, inverse, out):
+    """The objective and its gradient: `add_short` and `_short` do the bundle."""
+    return -1.0
+
+
+def energy(x, own, bundle, neighbour, kinds, weights, begin, end, right, out):
+    """Half of each spring's k |v|^2, and what holds each vertex."""
+    total = 0.0
+    for lane in range(LANES):
+        i = own[LANES * bundle + lane]
+        for c in range(3):
+            total += right[LANES * bundle + lane] * x[i + c] ** 2
+            for entry in range(begin, end):
+                v = x[i + c] - x[neighbour[LANES * entry + lane] + c]
+                total += 0.5 * weights[kinds[entry] + LANES + lane] * v * v
+    return total
+
+
+def newton(x, own, bundle, neighbour, kind, weights, begin, end, right, majorant, near):
+    """Vertex block descent: a Newton step of each vertex; springs that are short are not looked for."""
+    for lane in range(LANES):
+        i, at = own[LANES * bundle + lane], RIGHT * bundle + lane
+        held = right[at + 3 * LANES]
+        p0, p1, p2 = x[i], x[i + 1], x[i + 2]
+        load0, load1, load2 = (
+            right[at] - held * p0,
+            right[at + LANES] - held * p1,
+            right[at + 2 * LANES] - held * p2,
+        )
+        g0, g1, g2 = load0, load1, load2
+        a, b, c, d, e, f = held, 0.0, 0.0, held, 0.0, held
+        for entry in range(begin, end):
+            j, w = neighbour[LANES * entry + lane], kind[entry] + lane
+            v0, v1, v2 = p0 - x[j], p1 - x[j + 1], p2 - x[j + 2]
+            pull, k, root = weights[w], weights[w + LANES], 1.0 / np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+            tension = pull * root - k
+            lateral = 0.0 if tension > 0.0 and pull > 0.0 else -tension
+            n0, n1, n2, axial = v0 * root, v1 * root, v2 * root, k - lateral
+            g0, g1, g2 = g0 + tension * v0, g1 + tension * v1, g2 + tension * v2
+            a, b, c = a + lateral + axial * n0 * n0, b + axial * n0 * n1, c + axial * n0 * n2
+            d, e, f = d + lateral + axial * n1 * n1, e + axial * n1 * n2, f + lateral + axial * n2 * n2
+        l1, l2 = b / a, c / a
+        second, below = d - l1 * b, e - l2 * b
+        l3 = below / second
+        third = f - l2 * c - l3 * below
+        y1 = g1 - l1 * g0
+        s2 = (g2 - l2 * g0 - l3 * y1) / third
+        s1 = y1 / second - l3 * s2
+        s0 = g0 / a - l1 * s1 - l2 * s2
+        least = 1e-14 * (a + d + f)
+        rise = 0.5 * held * (s0 * s0 + s1 * s1 + s2 * s2) - s0 * load0 - s1 * load1 - s2 * load2
+        for entry in range(begin, end):
+            j, w = neighbour[LANES * entry + lane], kind[entry] + lane
+            v0, v1, v2 = p0 - x[j], p1 - x[j + 1], p2 - x[j + 2]
+            m0, m1, m2 = v0 + s0, v1 + s1, v2 + s2
+            both = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2) + np.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
+            change = (v0 + m0) * s0 + (v1 + m1) * s1 + (v2 + m2) * s2
+            rise += (0.5 * weights[w + LANES] - weights[w] / both) * change
+        if not (a > least and second > least and third > least and rise <= 0.0):
+            scale = 1.0 / majorant[LANES * bundle + lane]
+            s0, s1, s2 = scale * g0, scale * g1, scale * g2
+        near[3 * lane], near[3 * lane + 1], near[3 * lane + 2] = p0 + s0, p1 + s1, p2 + s2
+    for lane in range(LANES):
+        for axis in range(3):
+            x[own[LANES * bundle + lane] + axis] = near[3 * lane + axis]
+    return False
+
+
+def dot(a, b, count):
+    """a b."""
+    total = 0.0
+    for k in range(count):
+        total += a[k] * b[k]
+    return total
+
+
+def dots(s, w, g, count):
+    """s g and w g."""
+    first, second = 0.0, 0.0
+    for k in range(count):
+        first += s[k] * g[k]
+        second += w[k] * g[k]
+    return first, second
+
+
+def gather(values, columns, begin, end, x):
+    """sum over begin <= e < end of values[e] x[columns[e]]."""
+    s0 = s1 = s2 = zero = x[0, 0] * 0
+    for e in range(begin, end):
+        j, value = columns[e], values[e]
+        s0, s1, s2 = s0 + value * x[j, 0], s1 + value * x[j, 1], s2 + value * x[j, 2]
+    return s0, s1, s2, zero
+
+
+def add_forward(panel, offset, index, at, count, x, x_row, y, y_row, numbers, quads):
+    """y += W x of a panel, row by row."""
+    width, zero = 4 * quads, y[0] * 0
+    for tile in range(count // 4):
+        for r in range(4):
+            s0 = s1 = s2 = s3 = zero
+            for j in range(width):
+                w, row = panel[offset + 4 * tile * width + 4 * j + r], 4 * (x_row + j)
+                s0, s1, s2 = s0 + w * x[row], s1 + w * x[row + 1], s2 + w * x[row + 2]
+                if numbers == 4:
+                    s3 += w * x[row + 3]
+            row = 4 * (y_row + index[at + 4 * tile + r])
+            y[row] += s0
+            y[row + 1] += s1
+            y[row + 2] += s2
+            if numbers == 4:
+                y[row + 3] += s3
+
+
+def set_backward(square, start, own, panel, offset, index, at, below, y, x_row, quads):
+    """y = S y + W'y of a panel: S y by way of the rows' fourth numbers, one axis at a time."""
+    width, zero = 4 * quads, y[0] * 0
+    for c in range(3):
+        for j in range(width):
+            total = zero
+            for r in range(width if own > 0 else 0):
+                total += square[start + 4 * (r // 4) * width + 4 * j + r % 4] * y[4 * (x_row + r) + c]
+            y[4 * (x_row + j) + 3] = total
+        for j in range(width):
+            y[4 * (x_row + j) + c] = y[4 * (x_row + j) + 3]
+    for j in range(width):
+        s0 = s1 = s2 = y[4 * (x_row + j) + 3] = zero
+        for tile in range(below // 4):
+            for r in range(4):
+                w, row = panel[offset + 4 * tile * width + 4 * j + r], 4 * index[at + 4 * tile + r]
+                s0, s1, s2 = s0 + w * y[row], s1 + w * y[row + 1], s2 + w * y[row + 2]
+        y[4 * (x_row + j)] += s0
+        y[4 * (x_row + j) + 1] += s1
+        y[4 * (x_row + j) + 2] += s2
+
+
+def subtract_product(L, at, top, stride, depth, C, to, step, strips, columns):
+    """A tile less the product of all columns to the left."""
+    for j in range(columns):
+        for k in range(depth):
+            factor = L[top + j + stride * k]
+            for r in range(ROWS * strips):
+                C[to + r + step * j] -= L[at + r + stride * k] * factor
+
+
+def divide(L, at, stride, triangle, strips, columns):
+    """A tile divided by its own triangle."""
+    for j in range(columns):
+        for k in range(j):
+            for r in range(at, at + ROWS * strips):
+                L[r + stride * j] -= L[r + stride * k] * triangle[j, k]
+        for r in range(at, at + ROWS * strips):
+            L[r + stride * j] *= triangle[j, j]
+
+
+def factorise_corner(L, at, stride, least, triangle, columns):
+    """The Cholesky factor of a tile's corner."""
+    for j in range(columns):
+        for i in range(j, columns):
+            entry = L[at + stride * j + i]
+            for k in range(j):
+                entry -= triangle[i, k] * triangle[j, k]
+            if i == j:
+                if not entry > least[j]:
+                    return False
+                triangle[j, j] = 1.0 / np.sqrt(entry)
+            else:
+                triangle[i, j] = entry * triangle[j, j]
+    return True
+
+
+def solve_columns(L, at, stride, x, to, strips, columns):
+    """A tile's pass forwards."""
+    for j in range(columns):
+        for k in range(j):
+            x[to + j] -= L[at + stride * k + j] * x[to + k]
+        x[to + j] *= L[at + stride * j + j]
+    for j in range(columns):
+        for r in range(columns, columns + ROWS * strips):
+            x[to + r] -= L[at + stride * j + r] * x[to + j]
+
+
+def solve_rows(L, at, stride, x, to, strips, columns):
+    """A tile's pass backwards."""
+    for j in range(columns - 1, -1, -1):
+        total = x[to + j]
+        for r in range(columns, columns + ROWS * strips):
+            total -= L[at + stride * j + r] * x[to + r]
+        for k in range(columns - 1, j, -1):
+            total -= L[at + stride * j + k] * x[to + k]
+        x[to + j] = total * L[at + stride * j + j]
+
+
+def add(source, at, target, to, count):
+    """target += source."""
+    for r in range(count):
+        target[to + r] += source[at + r]

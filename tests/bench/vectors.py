@@ -1,0 +1,227 @@
+"""What code written for vector registers buys beside plain Numba: `python -m tests.bench.vectors` prints a table.
+
+A kernel is compiled twice, as it is and with plain functions (`tests.bench.plain`) in the place of the vectors that it
+calls. Both must find the same, and are then timed in turns, A B B A or B A A B by a coin, by this thread's CPU time;
+the interval is the gates' (see README.md). What buys less than 15 % has no place in `solvers/vectors`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from math import ceil
+from os import getloadavg
+from time import thread_time
+from types import FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+from numba import njit  # noqa: TID251
+from scipy.sparse import csr_array
+
+from harness.base.machine import describe, pinned_threads
+from harness.experiments.gates.sequential import interval
+from harness.experiments.gates.turns import CALL, Turn, orders
+from harness.simulation.step import problem, start
+from solvers.kernels import accelerate, accelerate_springs, accelerate_step, springs, vbd
+from solvers.linear import block, block_factor, multigrid_kernels, supernodal, supernodal_solve
+from solvers.linear.conjugate_gradients import ConjugateGradients
+from solvers.linear.supernodal import Supernodal
+from solvers.problem import Positions
+from tests.bench import plain
+from tests.bench.gates import STOP, prepare, sheet
+from tests.bench.solves import system_matrix
+
+SIZE, TURNS = 64, 40
+ROUND_OFF = 1e-5
+"""Of the largest entry: the same sums in another order, in float32 or among pins of 1e10 N/m in float64."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A kernel with the arguments of a call, and what takes the place of which names in it and in what it calls.
+
+    found: which of the arguments hold what it finds, beside what it returns; they are set back before a comparison.
+    """
+
+    what: str
+    kernel: Any
+    arguments: tuple[Any, ...]
+    plain: dict[str, Callable[..., Any]]
+    found: tuple[int, ...]
+
+
+def recompiled(kernel: Any, plain: dict[str, Callable[..., Any]]) -> Any:
+    """The kernel, to be called from Python, with what is plain in the place of what has these names."""
+    function = kernel.py_func
+    names: dict[str, Any] = {}
+    for name in function.__code__.co_names:
+        value = function.__globals__.get(name)
+        if name in plain and value is not None:
+            names[name] = _compiled(plain[name])
+        elif isinstance(value, ModuleType) and value.__name__.startswith("solvers."):
+            names[name] = ModuleType(name)
+            found = {key: part for key, part in plain.items() if hasattr(value, key)}
+            vars(names[name]).update(vars(value) | {key: _compiled(part) for key, part in found.items()})
+        elif hasattr(value, "py_func") and value.__module__.startswith("solvers.") and _reaches(value, set(plain)):
+            names[name] = recompiled(value, plain)
+    copy = FunctionType(function.__code__, function.__globals__ | names, function.__name__, function.__defaults__)
+    return _compiled(copy)
+
+
+def _compiled(function: Callable[..., Any]) -> Any:
+    return njit(nogil=True, _nrt=False)(function)
+
+
+def _reaches(kernel: Any, names: set[str], seen: frozenset[Any] = frozenset()) -> bool:
+    """Whether a kernel calls what has one of these names, or calls one that does."""
+    function = kernel.py_func
+    called = [function.__globals__.get(name) for name in function.__code__.co_names]
+    inner = [one for one in called if hasattr(one, "py_func") and one not in seen]
+    return bool(names & set(function.__code__.co_names)) or any(
+        _reaches(one, names, seen | {kernel}) for one in inner if one is not kernel
+    )
+
+
+def given(module: Any, name: str, work: Callable[[], object]) -> tuple[Any, ...]:
+    """The arguments of the last call of a kernel in a module while something is done."""
+    kernel, calls = getattr(module, name), list[tuple[Any, ...]]()
+
+    def noted(*arguments: Any) -> Any:
+        calls.append(arguments)
+        return kernel(*arguments)
+
+    setattr(module, name, noted)
+    try:
+        work()
+    finally:
+        setattr(module, name, kernel)
+    return calls[-1]
+
+
+def solving(solver: str) -> Callable[[], object]:
+    """A solver's first step of the sheet of 64 x 64 vertices."""
+    scene = sheet(SIZE)
+    stated, prepared = problem(scene, start(scene), "current"), prepare(solver, scene)
+    return lambda: prepared.solve(stated, STOP)
+
+
+def of_springs() -> Iterator[Case]:
+    """Over bundles of eight vertices with their springs."""
+    state, _, window, _, _ = given(accelerate_step, "run", solving("lbfgs"))
+    parts, p, out = state.bundles, window.trial, window.descent_there.copy()
+    whole = 0, len(parts.start) - 1
+    short = {"project": plain.refuse, "correct": plain.refuse}
+    yield Case("projections", springs.add_projection, (parts, *whole, p, state.right, out, 0), short, (5,))
+    yield Case("gradient", springs.add_descent, (parts, *whole, p, state.right, out, 0), short, (5,))
+    norm = state.form, 0, len(state.form.start) - 1, window.direction.copy(), state.plan.measure
+    yield Case("norm of Q", springs.squared_norm, norm, {"energy": plain.energy}, ())
+    none = {"descend": plain.refuse_energy}
+    descent = parts, state.shares, p, state.right, out
+    yield Case("objective and gradient", accelerate_springs.descend, descent, none, (4,))
+
+
+def of_dots() -> Iterator[Case]:
+    """Over the vectors of L-BFGS."""
+    _, _, window, _, _ = given(accelerate_step, "run", solving("lbfgs"))
+    both = {"dot": plain.dot, "dots": plain.dots}
+    yield Case("a step of L-BFGS", accelerate.accept, (window, window.correction.copy()), both, ())
+
+
+def of_vbd() -> Iterator[Case]:
+    """Over colours."""
+    blocks, spaces, right, _, work, p, _ = given(vbd, "iterate", solving("vbd"))
+    yield Case("sweep", vbd._sweep, (blocks, spaces, right, p, work), {"descend": plain.newton}, (3,))
+
+
+def of_supernodal() -> Iterator[Case]:
+    """Over the panels of Q's factor."""
+    Q, b = system()
+    panel = {"add_forward": plain.add_forward, "set_backward": plain.set_backward}
+    for precision in ("float64", "float32"):
+        factor = Supernodal(Q, precision=precision)
+        solve = given(supernodal, "solve", lambda factor=factor: factor.solve(b, np.empty_like(b)))
+        yield Case(f"solve, {precision}", supernodal_solve.solve, solve, panel, (9,))
+
+
+def of_block() -> Iterator[Case]:
+    """Over the fronts of a Hessian."""
+    names = ("subtract_product", "divide", "factorise_corner", "solve_columns", "solve_rows", "add")
+    tiles = {name: getattr(plain, name) for name in names}
+    newton = solving("newton")
+    yield Case("factorisation", block_factor.factorise, given(block, "factorise", newton), tiles, (2,))
+    yield Case("solve", block_factor.solve, given(block, "solve", newton), tiles, (2,))
+
+
+def of_rows() -> Iterator[Case]:
+    """Over sparse rows, of Q and of the levels above it."""
+    Q, b = system()
+    cg, rows = ConjugateGradients(Q), {"gather": plain.gather}
+    for what, name, found in (("product with Q", "multiply_and_dot", (4,)), ("smoothing, float32", "smooth", (7, 9))):
+        arguments = given(multigrid_kernels, name, lambda: cg.solve(b, np.empty_like(b)))
+        yield Case(what, getattr(multigrid_kernels, name), arguments, rows, found)
+
+
+def system() -> tuple[csr_array, Positions]:
+    """Q of the sheet, and a right-hand side."""
+    scene = sheet(SIZE)
+    return system_matrix(scene), np.random.default_rng(0).uniform(-1.0, 1.0, (scene.system.vertices, 3))
+
+
+CASES = {
+    "springs": of_springs,
+    "dots": of_dots,
+    "vbd": of_vbd,
+    "supernodal": of_supernodal,
+    "block": of_block,
+    "rows": of_rows,
+}
+"""By the file of `solvers/vectors`."""
+
+
+def ratio(case: Case) -> tuple[float, float, float]:
+    """Plain over vectors: the median, and the interval around it. Raises AssertionError where they find otherwise."""
+    kernels = [recompiled(case.kernel, names) for names in (case.plain, {})]
+    kept, answers = [np.copy(case.arguments[k]) for k in case.found], []
+    for kernel in kernels:
+        for k, before in zip(case.found, kept, strict=True):
+            case.arguments[k][...] = before
+        told = kernel(*case.arguments)
+        answers.append([np.copy(case.arguments[k]) for k in case.found] + [told] * isinstance(told, float))
+    for one, other in zip(*answers, strict=True):
+        assert np.abs(one - other).max() <= ROUND_OFF * np.abs(other).max(), f"{case.what}: others"
+    once = min(_seconds(kernel, case, 3) for kernel in kernels)
+    repeats = max(1, ceil(CALL / once / 2))
+    turns = []
+    for order in islice(orders(), TURNS):
+        seconds = tuple(_seconds(kernels["AB".index(who)], case, repeats) for who in order)
+        turns.append(Turn(order, seconds).log_ratio)
+    found = interval(turns)
+    return found.ratio, found.low, found.high
+
+
+def _seconds(kernel: Any, case: Case, repeats: int) -> float:
+    """How long a call takes."""
+    for k in case.found:
+        case.arguments[k][...] = case.arguments[k]
+    began = thread_time()
+    for _ in range(repeats):
+        kernel(*case.arguments)
+    return (thread_time() - began) / repeats
+
+
+def main() -> None:
+    """Measure the files that are named, or all, and print a table."""
+    print(f"{describe().cpu}, one thread, {SIZE} x {SIZE} vertices; load {getloadavg()[0]:.1f}\n")
+    print("| file | what | plain Numba takes | between |\n|---|---|---|---|")
+    with pinned_threads(1):
+        for file in sys.argv[1:] or CASES:
+            for case in CASES[file]():
+                median, low, high = ratio(case)
+                print(f"| `{file}` | {case.what} | {median:.2f} times as long | {low:.2f} and {high:.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
