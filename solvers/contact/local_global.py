@@ -137,7 +137,8 @@ class _Model(Iteration):
 
     def __init__(self, solve: Callable[[Positions], Positions], pulls: csr_array, b: Positions) -> None:
         self._solve, self._pulls, self._residual = solve, pulls, b
-        self.x, self._along, self._image = np.zeros((3, *b.shape))
+        self.x: Positions = np.zeros_like(b)
+        self._along, self._image = np.zeros_like(b), np.zeros_like(b)
         self.product = self._preconditioned()
         self._enough = _TOLERANCE**2 * self.product
 

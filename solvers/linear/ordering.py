@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from solvers.compiling import kept, part
 from solvers.linear.minimum_degree import minimum_degree, of_piece
-from solvers.linear.separator import LANDMARKS, TOGETHER, refine, separate
+from solvers.linear.refinement import refine
+from solvers.linear.separator import LANDMARKS, TOGETHER, separate
 
 _LEAF = 96
 """Pieces up to this size are not cut further: below it a separator saves less than minimum degree does."""

@@ -1,4 +1,4 @@
-"""A small vertex separator of a connected piece of a graph: cut a field of distances, then refine it.
+"""A small vertex separator of a connected piece of a graph: where a field of distances is cut.
 
 `piece` lists the vertices; `owner[v] == number` tells that v is one of them. A side is 0 or 1, or 2 for the separator.
 """
@@ -39,12 +39,8 @@ _FIELDS = _fields()
 _SHEET = 1.5
 """A square sheet is cut by the square root of its vertices; more fields are tried where it takes this much more."""
 
-_SMALLEST_SIDE = 0.25
+SMALLEST_SIDE = 0.25
 """The least share of the vertices that a side may have."""
-
-_PASSES = 4
-_PATIENCE = 60
-"""How many moves in a row may leave the separator no better before a pass of refinement ends."""
 
 
 @part
@@ -130,7 +126,7 @@ def separate(pointers, neighbours, owner, number, piece, dist, field, queue):
                 below += count[cut, k]
                 boundary += enter[cut, k]
                 left, right = below - boundary, size - below
-                if min(left, right) >= _SMALLEST_SIDE * (size - boundary):
+                if min(left, right) >= SMALLEST_SIDE * (size - boundary):
                     cost = boundary * (1.0 + 2.0 * ((left - right) / size) ** 2)
                     if cost < best:
                         best, best_block, best_field, best_cut = cost, block, k, cut + low[k]
@@ -165,105 +161,3 @@ def _combine(dist, weights, piece, field, low, high):
             field[v, k] = total[k]
             low[k] = min(low[k], total[k])
             high[k] = max(high[k], total[k])
-
-
-@part
-def refine(pointers, neighbours, piece, side, local):
-    """Shrink the separator in `side` by moving its vertices to a side, which pulls their neighbours there in.
-
-    A pass moves each vertex once at most, always the one that shrinks the separator most (ties to the smaller side),
-    and then goes back to the best state it saw. `local` (n,) is -1 on entry and on return.
-    """
-    size = len(piece)
-    for i in range(size):
-        local[piece[i]] = i
-    counts = np.zeros(3, np.int64)
-    for i in range(size):
-        counts[side[i]] += 1
-    moved = np.zeros(size, np.bool_)
-    separator = np.empty(size, np.int64)
-    pull = np.zeros((size, 2), np.int64)  # how many neighbours on the other side a move to this side pulls in
-    trail = np.empty((2 * size, 2), np.int64)  # vertex, side it had
-    for _ in range(_PASSES):
-        moved[:] = False
-        listed = 0
-        for i in range(size):
-            if side[i] == 2:
-                separator[listed] = i
-                listed += 1
-                _count_pull(pointers, neighbours, piece, side, local, i, pull)
-        best, best_gap, best_at, at = counts[2], abs(counts[0] - counts[1]), 0, 0
-        since = 0
-        limit = (1.0 - _SMALLEST_SIDE) * size
-        while since < _PATIENCE:
-            choice, choice_key, to = -1, -(1 << 60), 0
-            for k in range(listed):
-                i = separator[k]
-                for s in range(2):
-                    if counts[s] + 1 <= limit:
-                        key = (1 - pull[i, s]) * 2 + (1 if counts[s] < counts[1 - s] else 0)
-                        if key > choice_key:
-                            choice, choice_key, to = k, key, s
-            if choice < 0:
-                break
-            i = separator[choice]
-            v = piece[i]
-            if at + 1 + pointers[v + 1] - pointers[v] > len(trail):
-                break
-            listed -= 1
-            separator[choice] = separator[listed]
-            moved[i] = True
-            trail[at, 0], trail[at, 1] = i, 2
-            at += 1
-            side[i] = to
-            counts[2] -= 1
-            counts[to] += 1
-            for e in range(pointers[v], pointers[v + 1]):
-                j = local[neighbours[e]]
-                if j < 0 or j == i:
-                    continue
-                if side[j] == 2:
-                    pull[j, 1 - to] += 1
-                elif side[j] == 1 - to:
-                    trail[at, 0], trail[at, 1] = j, 1 - to
-                    at += 1
-                    side[j] = 2
-                    counts[2] += 1
-                    counts[1 - to] -= 1
-                    _count_pull(pointers, neighbours, piece, side, local, j, pull)
-                    if not moved[j]:
-                        separator[listed] = j
-                        listed += 1
-                    w = piece[j]
-                    for f in range(pointers[w], pointers[w + 1]):
-                        k = local[neighbours[f]]
-                        if k >= 0 and side[k] == 2:
-                            pull[k, to] -= 1
-            gap = abs(counts[0] - counts[1])
-            if counts[2] < best or (counts[2] == best and gap < best_gap):
-                best, best_gap, best_at, since = counts[2], gap, at, 0
-            else:
-                since += 1
-        improved = best_at > 0
-        while at > best_at:
-            at -= 1
-            i, was = trail[at]
-            counts[side[i]] -= 1
-            counts[was] += 1
-            side[i] = was
-        if not improved:
-            break
-    for i in range(size):
-        local[piece[i]] = -1
-
-
-@part
-def _count_pull(pointers, neighbours, piece, side, local, i, pull):
-    """Count i's neighbours on either side."""
-    v = piece[i]
-    pull[i, 0] = 0
-    pull[i, 1] = 0
-    for e in range(pointers[v], pointers[v + 1]):
-        j = local[neighbours[e]]
-        if j >= 0 and side[j] < 2:
-            pull[i, 1 - side[j]] += 1

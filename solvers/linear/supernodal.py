@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers.linear.ordering import nested_dissection
-from solvers.linear.supernodal_factor import factorise, keep_sums
+from solvers.linear.supernodal_factor import Matrix, Panels, factorise, keep_sums
 from solvers.linear.supernodal_solve import solve
 from solvers.linear.supernodes import LANES, WIDTH
 from solvers.linear.symbolic import Symbolic, analyse
@@ -156,10 +156,8 @@ class Supernodal:
         s = symbolic or analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
         layout = Layout.of(s)
         squares, panels = aligned(layout.squares), aligned(layout.panels)
-        v = factorise(
-            pointers, neighbours, Q.data, s.slot, s.vertex, s.parent, s.first, s.row_start, s.rows,
-            s.sequence, layout.chunk_of, layout.chunks, squares, panels,
-        )  # fmt: skip
+        into = Panels(layout.chunk_of, layout.chunks, squares, panels)
+        v = factorise(Matrix(pointers, neighbours, Q.data), s, into)
         if v >= 0:
             raise NotPositiveDefinite(
                 f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point at vertex {v}: nothing "

@@ -11,7 +11,7 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import kept, part
+from solvers.compiling import inner, kept, part
 
 WIDTH = 16
 """The most columns that a panel has."""
@@ -30,7 +30,7 @@ _WORTH_GROUPS = 3e4
 second one eats up most of what it gains: 1.1 times as fast at 16 x 16, 1.3 at 20 x 20, 1.6 at 32 x 32."""
 
 
-@part
+@inner
 def _cost(width, rows):
     """What a supernode costs a solve, in the cost of an entry."""
     total = 0.0
@@ -45,10 +45,35 @@ def _cost(width, rows):
 @kept()
 def amalgamate(parent, count):
     """The tree of supernodes after amalgamation, the supernode of each column, and the cost of each supernode."""
+    tree, of_column, width, rows = _fundamental(parent, count)
+    into = _absorb(tree, width, rows)
+    name = np.full(len(tree), -1, np.int32)
+    kept = 0
+    for s in range(len(tree)):
+        if into[s] == s:
+            name[s] = kept
+            kept += 1
+    for s in range(len(tree) - 1, -1, -1):  # a node's name is that of the one it went into
+        name[s] = name[into[s]]
+    merged = np.full(kept, -1, np.int32)
+    cost = np.empty(kept)
+    for s in range(len(tree)):
+        if into[s] == s:
+            cost[name[s]] = _cost(width[s], rows[s])
+            if tree[s] >= 0:
+                merged[name[s]] = name[tree[s]]
+    for j in range(len(of_column)):
+        of_column[j] = name[of_column[j]]
+    return merged, of_column, cost
+
+
+@part
+def _fundamental(parent, count):
+    """Columns of one structure as nodes: their tree, each column's node, and each node's columns and rows below."""
     n = len(parent)
     of_column = np.empty(n, np.int32)
     nodes = 0
-    for j in range(n):  # columns with one structure
+    for j in range(n):
         if j > 0 and parent[j - 1] == j and count[j - 1] == count[j] + 1:
             of_column[j] = nodes - 1
         else:
@@ -62,7 +87,13 @@ def amalgamate(parent, count):
         width[s] += 1
         rows[s] = count[j] - 1
         tree[s] = of_column[parent[j]] if parent[j] >= 0 else -1
+    return tree, of_column, width, rows
 
+
+@part
+def _absorb(tree, width, rows):
+    """The node that each goes into, itself where it stays; `width` grows by what a node takes in."""
+    nodes = len(tree)
     child = np.full(nodes, -1, np.int32)
     sibling = np.full(nodes, -1, np.int32)
     for s in range(nodes - 1, -1, -1):
@@ -72,21 +103,13 @@ def amalgamate(parent, count):
     into = np.arange(nodes)
     for s in range(nodes):  # children come first, so theirs are settled
         while True:
-            best, best_gain, before_best, before = -1, 0.0, -1, -1
-            c = child[s]
-            while c >= 0:
-                apart = _cost(width[c], rows[c]) + _cost(width[s], rows[s])
-                gain = apart - _cost(width[c] + width[s], rows[s])
-                if gain >= best_gain:
-                    best, best_gain, before_best = c, gain, before
-                before = c
-                c = sibling[c]
+            best, before = _gain_most(s, child, sibling, width, rows)
             if best < 0:
                 break
             into[best] = s
             width[s] += width[best]
-            if before_best >= 0:  # out of the list of children,
-                sibling[before_best] = sibling[best]
+            if before >= 0:  # out of the list of children,
+                sibling[before] = sibling[best]
             else:
                 child[s] = sibling[best]
             c = child[best]
@@ -95,24 +118,22 @@ def amalgamate(parent, count):
                 sibling[c] = child[s]
                 child[s] = c
                 c = following
-    name = np.full(nodes, -1, np.int32)
-    kept = 0
-    for s in range(nodes):
-        if into[s] == s:
-            name[s] = kept
-            kept += 1
-    for s in range(nodes - 1, -1, -1):  # a node's name is that of the one it went into
-        name[s] = name[into[s]]
-    merged = np.full(kept, -1, np.int32)
-    cost = np.empty(kept)
-    for s in range(nodes):
-        if into[s] == s:
-            cost[name[s]] = _cost(width[s], rows[s])
-            if tree[s] >= 0:
-                merged[name[s]] = name[tree[s]]
-    for j in range(n):
-        of_column[j] = name[of_column[j]]
-    return merged, of_column, cost
+    return into
+
+
+@inner
+def _gain_most(s, child, sibling, width, rows):
+    """The child that a node had best take in, -1 for none, and the one before it in the list of children."""
+    best, best_gain, before_best, before = -1, 0.0, -1, -1
+    c = child[s]
+    while c >= 0:
+        apart = _cost(width[c], rows[c]) + _cost(width[s], rows[s])
+        gain = apart - _cost(width[c] + width[s], rows[s])
+        if gain >= best_gain:
+            best, best_gain, before_best = c, gain, before
+        before = c
+        c = sibling[c]
+    return best, before_best
 
 
 def groups(parent: NDArray[np.int32], cost: NDArray[np.float64]) -> NDArray[np.int32]:

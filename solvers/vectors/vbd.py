@@ -123,8 +123,10 @@ def _bundle(
     """A bundle's code: moves its vertices in x, and returns whether a spring is too short, when it moves none."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        x, own, bundle, *given, right, majorant, near = unpacked(context, builder, signature, args)
-        v, springs = Eights(context, builder), _Springs(*given, near)
+        x, own, bundle, neighbour, kind, weights, begin, end, right, majorant, near = unpacked(
+            context, builder, signature, args
+        )
+        v, springs = Eights(context, builder), _Springs(neighbour, kind, weights, begin, end, near)
         places = v.places(own, bundle)
         centre = v.gather(x, places)
         *constants, weight = v.right(right, bundle)

@@ -26,11 +26,11 @@ def energy(x, own, bundle, neighbour, kinds, weights, begin, end, right, out):
     total = 0.0
     for lane in range(LANES):
         i = own[LANES * bundle + lane]
-        for c in range(3):
-            total += right[LANES * bundle + lane] * x[i + c] ** 2
-            for entry in range(begin, end):
-                v = x[i + c] - x[neighbour[LANES * entry + lane] + c]
-                total += 0.5 * weights[kinds[entry] + LANES + lane] * v * v
+        total += right[LANES * bundle + lane] * (x[i] ** 2 + x[i + 1] ** 2 + x[i + 2] ** 2)
+        for entry in range(begin, end):
+            j = neighbour[LANES * entry + lane]
+            v0, v1, v2 = x[i] - x[j], x[i + 1] - x[j + 1], x[i + 2] - x[j + 2]
+            total += 0.5 * weights[kinds[entry] + LANES + lane] * (v0 * v0 + v1 * v1 + v2 * v2)
     return total
 
 

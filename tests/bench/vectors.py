@@ -72,7 +72,8 @@ def recompiled(kernel: Any, plain: dict[str, Callable[..., Any]]) -> Any:
 
 
 def _compiled(function: Callable[..., Any]) -> Any:
-    return njit(nogil=True, _nrt=False)(function)
+    options: Any = {"nogil": True, "_nrt": False}
+    return njit(**options)(function)
 
 
 def _reaches(kernel: Any, names: set[str], seen: frozenset[Any] = frozenset()) -> bool:

@@ -112,7 +112,7 @@ def inverse_roots(estimates: bool):
     return numba.njit(lambda s, out: root(s, out))  # noqa: TID251
 
 
-ESTIMATES = Eights(cpu_target.target_context, None).estimates
+ESTIMATES = Eights(cpu_target.target_context, None).wide
 
 
 @pytest.mark.parametrize("estimates", [False, True] if ESTIMATES else [False])

@@ -1,0 +1,171 @@
+"""A vertex separator, refined by moves of single vertices.
+
+Fiduccia and Mattheyses 1982; for separators: Ashcraft and Liu 1996.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.compiling import inner, part
+from solvers.linear.separator import SMALLEST_SIDE
+
+_PASSES = 4
+_PATIENCE = 60
+"""How many moves in a row may leave the separator no better before a pass of refinement ends."""
+
+
+class _Cut(NamedTuple):
+    """A piece, cut in two, that is being refined; its vertices go by their places in it.
+
+    graph: pointers and neighbours; piece: vertices by place; local: places by vertex, -1 for none; side: of each;
+    counts (3,): how many are on each side; pull (size, 2): how many neighbours on the other side a move of a separator
+    vertex to this side pulls in; moved: whether a vertex was in this pass; separator: places, those that may move
+    first; trail: (place, side that it had) of each change.
+    """
+
+    pointers: NDArray[np.int64]
+    neighbours: NDArray[np.int32]
+    piece: NDArray[np.int32]
+    local: NDArray[np.int32]
+    side: NDArray[np.int8]
+    counts: NDArray[np.int64]
+    pull: NDArray[np.int64]
+    moved: NDArray[np.bool_]
+    separator: NDArray[np.int64]
+    trail: NDArray[np.int64]
+
+
+@part
+def refine(pointers, neighbours, piece, side, local):
+    """Shrink the separator in `side` by moving its vertices to a side, which pulls their neighbours there in.
+
+    A pass moves each vertex once at most, always the one that shrinks the separator most (ties to the smaller side),
+    and then goes back to the best state it saw. `local` (n,) is -1 on entry and on return.
+    """
+    size = len(piece)
+    counts = np.zeros(3, np.int64)
+    for i in range(size):
+        local[piece[i]] = i
+        counts[side[i]] += 1
+    cut = _Cut(
+        pointers,
+        neighbours,
+        piece,
+        local,
+        side,
+        counts,
+        np.zeros((size, 2), np.int64),
+        np.zeros(size, np.bool_),
+        np.empty(size, np.int64),
+        np.empty((2 * size, 2), np.int64),
+    )
+    for _ in range(_PASSES):
+        if not _improve(cut):
+            break
+    for i in range(size):
+        local[piece[i]] = -1
+
+
+@inner
+def _improve(cut):
+    """A pass; whether it shrank the separator, or left the sides more alike."""
+    counts, side, piece, moved, pointers = cut.counts, cut.side, cut.piece, cut.moved, cut.pointers
+    moved[:] = False
+    listed = 0
+    for i in range(len(piece)):
+        if side[i] == 2:
+            cut.separator[listed] = i
+            listed += 1
+            _count_pull(cut, i)
+    best, best_gap, best_at, at, since = counts[2], abs(counts[0] - counts[1]), 0, 0, 0
+    while since < _PATIENCE:
+        choice, to = _choose(cut, listed)
+        if choice < 0:
+            break
+        i = cut.separator[choice]
+        if at + 1 + pointers[piece[i] + 1] - pointers[piece[i]] > len(cut.trail):
+            break
+        listed -= 1
+        cut.separator[choice] = cut.separator[listed]
+        moved[i] = True
+        at, listed = _move(cut, i, to, at, listed)
+        gap = abs(counts[0] - counts[1])
+        if counts[2] < best or (counts[2] == best and gap < best_gap):
+            best, best_gap, best_at, since = counts[2], gap, at, 0
+        else:
+            since += 1
+    while at > best_at:
+        at -= 1
+        i, was = cut.trail[at, 0], cut.trail[at, 1]
+        counts[side[i]] -= 1
+        counts[was] += 1
+        side[i] = was
+    return best_at > 0
+
+
+@inner
+def _choose(cut, listed):
+    """Which of the listed vertices shrinks the separator most, -1 for none that may move, and to which side."""
+    counts, pull, limit = cut.counts, cut.pull, (1.0 - SMALLEST_SIDE) * len(cut.piece)
+    choice, best, to = -1, -(1 << 60), 0
+    for k in range(listed):
+        i = cut.separator[k]
+        for s in range(2):
+            if counts[s] + 1 <= limit:
+                key = (1 - pull[i, s]) * 2 + (1 if counts[s] < counts[1 - s] else 0)
+                if key > best:
+                    choice, best, to = k, key, s
+    return choice, to
+
+
+@inner
+def _move(cut, i, to, at, listed):
+    """Move i out of the separator, and its neighbours on the other side into it; where trail and list end then."""
+    side, pull, local = cut.side, cut.pull, cut.local
+    at = _put(cut, i, to, at)
+    v = cut.piece[i]
+    for e in range(cut.pointers[v], cut.pointers[v + 1]):
+        j = local[cut.neighbours[e]]
+        if j < 0 or j == i:
+            continue
+        if side[j] == 2:
+            pull[j, 1 - to] += 1
+        elif side[j] == 1 - to:
+            at = _put(cut, j, 2, at)
+            _count_pull(cut, j)
+            if not cut.moved[j]:
+                cut.separator[listed] = j
+                listed += 1
+            w = cut.piece[j]
+            for f in range(cut.pointers[w], cut.pointers[w + 1]):
+                k = local[cut.neighbours[f]]
+                if k >= 0 and side[k] == 2:
+                    pull[k, to] -= 1
+    return at, listed
+
+
+@inner
+def _put(cut, i, side, at):
+    """Put a vertex on a side, and note it; where the trail ends then."""
+    was = cut.side[i]
+    cut.trail[at, 0], cut.trail[at, 1] = i, was
+    cut.counts[was] -= 1
+    cut.counts[side] += 1
+    cut.side[i] = side
+    return at + 1
+
+
+@inner
+def _count_pull(cut, i):
+    """Count i's neighbours on either side."""
+    v = cut.piece[i]
+    cut.pull[i, 0] = 0
+    cut.pull[i, 1] = 0
+    for e in range(cut.pointers[v], cut.pointers[v + 1]):
+        j = cut.local[cut.neighbours[e]]
+        if j >= 0 and cut.side[j] < 2:
+            cut.pull[i, 1 - cut.side[j]] += 1
