@@ -22,8 +22,8 @@ from solvers.kernels.step_ends import Rows, fetch, place, state
 from solvers.linear.supernodal_solve import backwards, forwards
 
 NOISE = 4.0 * np.finfo(np.float64).eps
-"""The relative rounding error of one term of a sum. Errors of many terms partly cancel, so the sum of all bounds is
-above what is measured, by about the root of their number."""
+"""A bound on the relative rounding error of one term of a sum. The bound on the whole sum adds up those of its terms;
+their true errors partly cancel, so that for n terms it is about sqrt(n) times too large."""
 
 
 class Step(NamedTuple):

@@ -94,17 +94,18 @@ def add_blocks(form, diagonal, across, values):
     """Add L [N/m] to the blocks `values` (b, 3, 3): to those on the diagonal (n,) and to those of pairs, both ways,
     (k, 2); -1 stands for none."""
     for i in range(len(form.held)):
-        _hold(values, diagonal[i], form.held[i])
+        hold(values, diagonal[i], form.held[i])
     for k in range(len(form.weight)):
         w = form.weight[k]
-        _hold(values, diagonal[form.pairs[k, 0]], w)
-        _hold(values, diagonal[form.pairs[k, 1]], w)
-        _hold(values, across[k, 0], -w)
-        _hold(values, across[k, 1], -w)
+        hold(values, diagonal[form.pairs[k, 0]], w)
+        hold(values, diagonal[form.pairs[k, 1]], w)
+        hold(values, across[k, 0], -w)
+        hold(values, across[k, 1], -w)
 
 
 @inner
-def _hold(values, block, w):
+def hold(values, block, w):
+    """Add w [N/m] to the diagonal of a block, -1 for none."""
     if block >= 0:
         values[block, 0, 0] += w
         values[block, 1, 1] += w

@@ -18,6 +18,7 @@ from scipy.sparse import csr_array
 from solvers.compiling import inner, kernel
 from solvers.energies.elements import add_products
 from solvers.kernels.forms import add_product
+from solvers.kernels.forms import hold as hold_block
 from solvers.kernels.objective import along
 from solvers.problem import System
 
@@ -95,11 +96,9 @@ def hold(terms, places, values):
 def _hold(terms, places, values):
     values[:] = 0.0
     for v in places.free:
-        h = terms.inertia[v]
-        _add(values, places.diagonal[v], 1.0, h, 0.0, 0.0, h, 0.0, h)
+        hold_block(values, places.diagonal[v], terms.inertia[v])
     for q in range(len(terms.pinned)):
-        v, w = terms.pinned[q], terms.weight[q]
-        _add(values, places.diagonal[v], 1.0, w, 0.0, 0.0, w, 0.0, w)
+        hold_block(values, places.diagonal[terms.pinned[q]], terms.weight[q])
 
 
 @kernel

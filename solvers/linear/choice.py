@@ -50,7 +50,7 @@ _LEFT, _POWERS = 0.9, 4
 corrections look for it."""
 
 _ROUNDING: dict[Precision, float] = {"float64": 0.0, "float32": 0.5, "float16": 1.25}
-"""What rounding a factor needs beside its float64 panels, in their size; the fronts are gone by then."""
+"""Memory for the rounded copy of a factor, in units of its panels in float64, which are there beside it."""
 
 _BYTES_PER_VERTEX = 200
 """Of the structure of a factor: 180 on a sheet of 512 vertices a side."""

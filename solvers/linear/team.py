@@ -22,8 +22,8 @@ _PHASE, _DONE, _CLAIMS = 0, 8, 16
 
 _OVER = -1
 _SPINS = 2000
-"""How often a waiting thread looks at the phase before it offers its core to others. So many looks take about as long
-as one iteration on the smallest mesh for which two threads are faster than one."""
+"""A waiting thread asks so often whether the next phase has begun; after that it lets other programs have its core
+between two questions. They take about as long as an iteration on the smallest mesh on which a second thread pays."""
 
 _offer_core: Any = types.ExternalFunction("sched_yield", types.intc())
 

@@ -15,18 +15,15 @@ from typing import ClassVar
 
 from solvers.about import About, Reference
 from solvers.core.acceleration import Scheme
-from solvers.kernels.accelerate_coefficients import ANDERSON, require_pairs
-from solvers.linear.choice import Linear, Precision
-from solvers.methods.quasi_newton import PreparedAccelerated, prepare
+from solvers.kernels.accelerate_coefficients import ANDERSON
+from solvers.methods.quasi_newton import PreparedAccelerated, Windowed, prepare
 from solvers.problem import System
 
 
 @dataclass(frozen=True)
-class Anderson:
+class Anderson(Windowed):
     """pairs: differences kept of the latest iterations; linear, precision: the solver of Q x = b and of its entries."""
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
     about: ClassVar[About] = About(
         "accelerated local-global",
         Reference(
@@ -36,14 +33,6 @@ class Anderson:
             "10.1145/3197517.3201290",
         ),
     )
-
-    pairs: int = 5
-    linear: Linear = "auto"
-    precision: Precision = "float64"
-
-    def __post_init__(self) -> None:
-        """Raises ValueError."""
-        require_pairs(self.pairs)
 
     def prepare(self, system: System) -> PreparedAccelerated:
         """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""

@@ -49,10 +49,11 @@ _SLOW = 0.8
 """What a round brings beside the one before it where L-BFGS gets slow."""
 
 _KEPT = 0.25
-"""Of the decrease that the slope promises, what shows that the quadratic model holds; one that is right keeps .5."""
+"""The quadratic model counts as right where a full step lowers the objective by this part of what the slope alone
+promises; of a quadratic function it is one half."""
 
 _QUADRATIC = 0.1
-"""What a step leaves of the slope near a minimum, at most."""
+"""Near a minimum a step of Newton's method leaves at most this part of the slope."""
 
 _LEVELS = ((1.0, 0.0), (1.0, 0.1), (1.0, 1.0), (1.0, 10.0), (0.0, 0.0))
 """What is kept of negative lateral parts, and what multiple of inertia is added. The last one is positive definite."""

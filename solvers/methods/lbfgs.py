@@ -17,18 +17,15 @@ from typing import ClassVar
 
 from solvers.about import About, Reference
 from solvers.core.acceleration import Scheme
-from solvers.kernels.accelerate_coefficients import LBFGS, require_pairs
-from solvers.linear.choice import Linear, Precision
-from solvers.methods.quasi_newton import PreparedAccelerated, prepare
+from solvers.kernels.accelerate_coefficients import LBFGS
+from solvers.methods.quasi_newton import PreparedAccelerated, Windowed, prepare
 from solvers.problem import System
 
 
 @dataclass(frozen=True)
-class Lbfgs:
+class Lbfgs(Windowed):
     """pairs: kept of the latest iterations; linear, precision: the solver of Q x = b and of its stored entries."""
 
-    minimises: ClassVar[bool] = True
-    descends: ClassVar[bool] = True
     about: ClassVar[About] = About(
         "quasi-Newton",
         Reference(
@@ -39,14 +36,6 @@ class Lbfgs:
         ),
         first=True,
     )
-
-    pairs: int = 5
-    linear: Linear = "auto"
-    precision: Precision = "float64"
-
-    def __post_init__(self) -> None:
-        """Raises ValueError."""
-        require_pairs(self.pairs)
 
     def prepare(self, system: System) -> PreparedAccelerated:
         """Raises NotPositiveDefinite, and Unsupported where Q fits nowhere."""

@@ -13,6 +13,7 @@ tells, the solve has "stalled", and its iterates stay where they are.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from solvers.core.parts import Parts
 from solvers.core.prefactored import PreparedLocalGlobal, prepared, projective
 from solvers.kernels import accelerate_step, step_ends
 from solvers.kernels.accelerate import Window
+from solvers.kernels.accelerate_coefficients import require_pairs
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.edges import Edges
 from solvers.kernels.loop import ONE, Limits, at_most
@@ -52,6 +54,25 @@ def prepare(system: System, scheme: Scheme, linear: Linear, precision: Precision
 
         engine = Touching(scheme, system, base, engine)
     return PreparedAccelerated(base, engine)
+
+
+@dataclass(frozen=True)
+class Windowed:
+    """A method that keeps differences of its latest iterations.
+
+    pairs: how many; linear, precision: the solver of Q x = b and of its stored entries.
+    """
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+
+    pairs: int = 5
+    linear: Linear = "auto"
+    precision: Precision = "float64"
+
+    def __post_init__(self) -> None:
+        """Raises ValueError."""
+        require_pairs(self.pairs)
 
 
 @dataclass(frozen=True, eq=False)
