@@ -134,7 +134,7 @@ def _write_panel(front, width, start, own, below, vertex, panels, begin):
 @inner
 def _subtract(front, size, start, width):
     """The front less L21 L21', strip by strip: the product of a pass forwards of the solve."""
-    tiles, index, entries = front.tiles, front.index, front.entries
+    tiles, index, entries = front.tiles, front.numbers, front.entries
     flat = front.block
     for strip in range((start + width) // 4, size // 4):
         r = 4 * strip - start

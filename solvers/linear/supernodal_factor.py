@@ -40,7 +40,7 @@ class _Front(NamedTuple):
 
     entries: strips of four columns; place: of a slot in the front; panel (., WIDTH): the chunk's columns, then their
     Cholesky factor; inverse (WIDTH, WIDTH): L11^-1; tiles: L21, by tiles of four rows; row (WIDTH,), block (4 WIDTH,):
-    a row and four of them; index: 0, 1, 2, ...
+    a row and four of them; numbers: 0, 1, 2, ...
     """
 
     entries: NDArray[np.float64]
@@ -50,7 +50,7 @@ class _Front(NamedTuple):
     tiles: NDArray[np.float64]
     row: NDArray[np.float64]
     block: NDArray[np.float64]
-    index: NDArray[np.int32]
+    numbers: NDArray[np.int32]
 
 
 @kept()

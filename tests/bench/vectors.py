@@ -119,8 +119,13 @@ def of_springs() -> Iterator[Case]:
     yield Case("gradient", springs.add_descent, (parts, *whole, p, state.right, out, 0), short, (5,))
     norm = state.form, 0, len(state.form.start) - 1, window.direction.copy(), state.plan.measure
     yield Case("norm of Q", springs.squared_norm, norm, {"energy": plain.energy}, ())
+
+
+def of_descent() -> Iterator[Case]:
+    """Over the same bundles, with the objective."""
+    state, _, window, _, _ = given(accelerate_step, "run", solving("lbfgs"))
+    descent = state.bundles, state.shares, window.trial, state.right, window.descent_there.copy()
     none = {"descend": plain.refuse_energy}
-    descent = parts, state.shares, p, state.right, out
     yield Case("objective and gradient", accelerate_springs.descend, descent, none, (4,))
 
 
@@ -173,6 +178,7 @@ def system() -> tuple[csr_array, Positions]:
 
 CASES = {
     "springs": of_springs,
+    "descent": of_descent,
     "dots": of_dots,
     "vbd": of_vbd,
     "supernodal": of_supernodal,

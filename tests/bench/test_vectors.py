@@ -1,0 +1,11 @@
+"""What is written for vector registers is measured beside plain Numba: `python -m tests.bench.vectors`."""
+
+from pathlib import Path
+
+from solvers.vectors import intrinsics
+from tests.bench.vectors import CASES
+
+
+def test_every_file_of_vectors_is_measured_but_what_they_share():
+    files = {path.stem for path in Path(intrinsics.__file__).parent.glob("*.py")}
+    assert files - {"__init__", "intrinsics"} == CASES.keys()
