@@ -24,6 +24,7 @@ from harness.experiments.ablation.command import ablate
 from harness.experiments.archive.command import compact, merge, publish, verify
 from harness.experiments.gallery import gallery
 from harness.experiments.gates.command import gate
+from harness.experiments.gates.history_command import history
 from harness.experiments.gates.study_command import study
 
 app = typer.Typer(
@@ -190,6 +191,7 @@ app.command()(publish)
 app.command()(verify)
 app.command()(gallery)
 app.command()(gate)
+app.command()(history)
 app.add_typer(study, name="gate-study")
 
 

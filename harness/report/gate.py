@@ -70,9 +70,20 @@ class Benchmark(BaseModel):
     stats: Stats
 
 
-class Stored(BaseModel):
-    """A file that pytest-benchmark stored, as far as it is compared; unknown keys are passed over."""
+class Commit(BaseModel):
+    """The state of the code that was measured. time: of the commit, ISO 8601."""
 
+    id: str = "unknown"
+    time: str | None = None
+    dirty: bool = False
+
+
+class Stored(BaseModel):
+    """A file that pytest-benchmark stored, as far as it is compared; unknown keys are passed over. datetime: when it
+    was measured, ISO 8601."""
+
+    datetime: str = ""
+    commit_info: Commit = Commit()
     machine_info: Mapping[str, Any]
     benchmarks: list[Benchmark] = Field(min_length=1)
 
@@ -94,7 +105,7 @@ def compare(base: Path, new: Path, console: Console) -> int:
 
     Raises InputError for a file that pytest-benchmark did not store.
     """
-    old, now = _read(base), _read(new)
+    old, now = read_stored(base), read_stored(new)
     same = old.machine == now.machine
     table = Table("benchmark", "old", "new", "change", "verdict", box=SIMPLE_HEAD)
     verdicts: list[str] = []
@@ -140,7 +151,7 @@ def _figure(benchmark: Benchmark | None) -> str:
     return f"{ratio.median:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]"
 
 
-def _read(path: Path) -> Stored:
+def read_stored(path: Path) -> Stored:
     """The stored benchmarks of a file; raises InputError."""
     wanted = "wanted a file that pytest-benchmark stored; `pytest tests/bench --benchmark-only` makes one"
     try:

@@ -1,0 +1,46 @@
+"""The command `springbench history`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from harness.base.console import out, say
+from harness.base.errors import InputError, Mistake
+
+PLACES = (Path("results/bench"), Path(".benchmarks"))
+"""Where our own gates leave their results, and those of others do."""
+
+
+def history(
+    places: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Folders and files of pytest-benchmark; results/bench and .benchmarks if left out."),
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="The picture (.png, .svg or .pdf).")] = Path(
+        "results/history.png"
+    ),
+) -> None:
+    """Find where gates became slower or faster, in their stored results by commit. Exit code 3: there are too few."""
+    from harness.report.history import FEWEST, history_table, stored_files
+    from harness.report.history import history as tell
+    from harness.report.history_plot import draw_history
+
+    if output.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise InputError(Mistake("wanted a name that ends in .png, .svg or .pdf", output, key="--output"))
+    files = stored_files(places or [place for place in PLACES if place.exists()])
+    hint = "`pytest tests/bench --benchmark-only` stores one, at each commit that you run it at"
+    if not files:
+        where = ", ".join(map(str, places or PLACES))
+        raise InputError(f"history: no stored results in {where}; {hint}")
+    found = tell(files)
+    out.print(history_table(found))
+    if not any(len(series.points) >= FEWEST for series in found):
+        most = max((len(series.points) for series in found), default=0)
+        say(f"too little to tell changes from noise: at most {most} results of a gate, wanted {FEWEST}; {hint}")
+        raise typer.Exit(3)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    drawn = draw_history(found, output)
+    say(f"the picture of {drawn} gates is {output}")

@@ -1,0 +1,102 @@
+"""`springbench history`: changes are found where they are, noise is none, and too little is said to be so."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from typer.testing import CliRunner
+
+from harness.cli import app
+from harness.report.history import Point, changes, history, stored_files
+
+NOISE = 0.01
+
+
+def points(values: Any) -> list[Point]:
+    return [Point(f"{k:07x}", float(v), float(v) * 0.985, float(v) * 1.015) for k, v in enumerate(values)]
+
+
+def series(seed: int, count: int, *steps: tuple[int, float]) -> Any:
+    """Ratios with noise of 1 %, which from some result on are larger by a factor."""
+    values = np.exp(NOISE * np.random.default_rng(seed).standard_normal(count))
+    for at, factor in steps:
+        values[at:] *= factor
+    return values
+
+
+def write(folder: Path, gates: dict[str, Any], *, ratio: bool = True) -> Path:
+    """Results as pytest-benchmark stores them, a file a commit; in the names' order they are shuffled."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(len(next(iter(gates.values())))):
+        told = [
+            {
+                "fullname": f"tests/bench/test_gates.py::{gate}",
+                "extra_info": {"ratio": {"median": v[k], "low": 0.98 * v[k], "high": 1.02 * v[k]}} if ratio else {},
+                "stats": {"min": 1e-3 * v[k]},
+            }
+            for gate, v in gates.items()
+        ]
+        commit = {"id": f"{k:07x}" * 5, "time": f"2026-01-{k + 1:02}T12:00:00+00:00", "dirty": False}
+        stored = {"machine_info": {"cpu": {"brand_raw": "a processor", "count": 2}, "affinity": 2}}
+        stored |= {"commit_info": commit, "datetime": "2026-03-01T00:00:00", "benchmarks": told}
+        (folder / f"{k * 7 % 31:04}_gates.json").write_text(json.dumps(stored))
+    return folder
+
+
+def test_a_step_of_five_percent_in_noise_of_one_is_found_within_a_commit_of_where_it_is():
+    found = [changes(points(series(seed, 30, (18, 1.05)))) for seed in range(100)]
+    hits = [starts for starts in found if len(starts) == 2 and abs(starts[1] - 18) <= 1]
+    assert len(hits) >= 95
+
+
+def test_noise_alone_seldom_looks_like_a_change_and_an_outlier_never_does_where_there_is_none():
+    alarms = sum(len(changes(points(series(seed, 30)))) > 1 for seed in range(200))
+    assert alarms <= 4
+    lone = np.ones(30)
+    lone[12] = 1.03
+    assert changes(points(lone)) == (0,)
+
+
+def test_changes_are_told_by_commit_with_their_size_the_largest_first(tmp_path: Path):
+    gates = {"test_same": series(1, 24), "test_slower": series(2, 24, (8, 1.1), (16, 0.8))}
+    found = history(stored_files([write(tmp_path / "bench", gates)]))
+    assert [one.gate for one in found] == ["test_slower", "test_same"]
+    assert [point.commit for point in found[0].points] == [f"{k:07x}" for k in range(24)]
+    (first, up), (second, down) = found[0].changes
+    assert (first, second) == (8, 16)
+    assert (up, down) == pytest.approx((1.1, 0.8), abs=0.02)  # the means of eight results each, with noise of 1 %
+    assert found[1].changes == []
+
+
+@pytest.mark.parametrize("ratio", [True, False], ids=["ratios", "least times"])
+def test_the_command_tells_them_and_draws_a_picture(tmp_path: Path, ratio: bool):
+    folder = write(
+        tmp_path / "bench", {"test_slower": series(2, 12, (6, 1.2)), "test_same": series(3, 12)}, ratio=ratio
+    )
+    told = CliRunner().invoke(app, ["history", str(folder), "-o", str(tmp_path / "history.png")])
+    assert told.exit_code == 0, told.output
+    assert "% at 0000006" in told.output
+    assert imread(tmp_path / "history.png").std() > 0
+
+
+def test_too_little_is_said_to_be_so_and_is_no_answer(tmp_path: Path):
+    folder = write(tmp_path / "bench", {"test_slower": series(2, 5, (3, 2.0))})
+    told = CliRunner().invoke(app, ["history", str(folder), "-o", str(tmp_path / "history.png")])
+    assert told.exit_code == 3
+    assert "at most 5 results of a gate, wanted 6; `pytest tests/bench" in " ".join(told.output.split())
+    assert not (tmp_path / "history.png").exists()
+
+
+def test_what_is_no_stored_result_is_named(tmp_path: Path):
+    (tmp_path / "x.json").write_text("{}")
+    (tmp_path / "empty").mkdir()
+    for place, said in (
+        (tmp_path, "x.json"),
+        (tmp_path / "empty", "no stored results"),
+        (tmp_path / "no", "not there"),
+    ):
+        told = CliRunner().invoke(app, ["history", str(place)])
+        assert (told.exit_code, said in told.output) == (2, True), told.output
