@@ -6,8 +6,8 @@ some commits. The changes are those of the least penalised negative log-likeliho
 
     sum over results of (y - mean of its stretch)^2 / sigma^2 + 5 log(n) for each change,
 
-found exactly by PELT (Killick, Fearnhead and Eckley 2012; the library ruptures). Sigma comes from the differences of neighbours, which a change hardly moves,
-and is no less than the results' own intervals say.
+found exactly by PELT (Killick, Fearnhead and Eckley 2012; the library ruptures). Sigma comes from the differences of
+neighbours, which a change hardly moves, and is no less than the results' own intervals say.
 """
 
 from __future__ import annotations
@@ -32,8 +32,10 @@ FEWEST = 6
 SHORTEST = 2
 """Results of a stretch: a single one that lies apart is an outlier."""
 PENALTY = 5.0
-"""Of a change, in log(n). The modified BIC (Zhang and Siegmund 2007) has about 3; then 28 of 400 series of 30 results of
-noise alone show a change, with this 1, and 99 of 100 steps of five times the noise are still placed within a commit."""
+"""Of a change, in log(n). The modified BIC (Zhang and Siegmund 2007) has about 3; then 14 of 200 series of 30 results
+of noise alone show a change, with this 1 of 400, and 99 of 100 steps of five times the noise are placed within a
+commit.
+"""
 FLOOR = 0.005
 """The least noise that is believed, of the logarithm: results are rounded, and repeat by chance."""
 
