@@ -14,8 +14,8 @@ from typer.main import get_command
 
 
 def taking(*names: str) -> type[TyperCommand]:
-    """A command that takes these options of a run too, all without names. It finds what was given, as text, in
-    `obj` of its context."""
+    """A command that takes these options of a run too, all without names. It finds what was given in `obj` of its
+    context: numbers, and as text what is none."""
 
     class Taking(TyperCommand):
         _added: tuple[str, ...] = ()
@@ -29,10 +29,20 @@ def taking(*names: str) -> type[TyperCommand]:
 
         def invoke(self, ctx: Any) -> Any:
             given = {name: ctx.params.pop(name) for name in self._added}
-            ctx.obj = {name: value for name, value in given.items() if value is not None}
+            ctx.obj = {name: _read(value) for name, value in given.items() if value is not None}
             return super().invoke(ctx)
 
     return Taking
+
+
+def _read(given: str) -> int | float | str:
+    """A number where the text is one, as in YAML."""
+    for kind in (int, float):
+        try:
+            return kind(given)
+        except ValueError:
+            continue
+    return given
 
 
 def _options(names: tuple[str, ...]) -> list[Any]:

@@ -21,6 +21,10 @@ Row = Mapping[str, Any]
 
 CAPTION = "CPU time: mean over frames of medians over rounds; displacements in mean rest lengths, energy of the largest"
 
+PRICES = (
+    "CPU time, medians over rounds; ≥ the least that reading the effect's numbers once allows; intervals in the rows"
+)
+
 
 def read(path: Path) -> list[dict[str, Any]]:
     """The rows of an ablation."""
@@ -113,6 +117,23 @@ def ablation_table(rows: Sequence[Row]) -> Table:
             f"error of the {row['name']}", row["status"]
         )
     return table
+
+
+def price_table(rows: Sequence[Row]) -> Table:
+    """A row an effect, a column a solver: the price, and its bound."""
+    found = {(row["name"], row["solver"]): row for row in of_kind(rows, "price")}
+    effects, solvers = (list(dict.fromkeys(key[k] for key in found)) for k in (0, 1))
+    table = Table(box=SIMPLE_HEAD, title="an iteration with the effect over one without", caption=PRICES)
+    for i, heading in enumerate(("effect", *solvers)):
+        table.add_column(heading, justify="right" if i else "left")
+    for effect in effects:
+        cells = [found[effect, solver] for solver in solvers]
+        table.add_row(escape(effect), *(_priced(row) if row["status"] == "ok" else row["status"] for row in cells))
+    return table
+
+
+def _priced(row: Row) -> str:
+    return f"{row['price']:.2f} ≥{row['price_bound']:.2f}"
 
 
 def sentences(rows: Sequence[Row]) -> list[str]:

@@ -271,6 +271,12 @@ def test_mistakes_of_two_scenes_are_reported_together(folder: Path) -> None:
     assert [mistake.file for mistake in caught.value.mistakes] == [folder / "one.yaml", folder / "two.yaml"]
 
 
+def test_the_command_line_gives_numbers_as_numbers(folder: Path) -> None:
+    given = ["run", str(folder / "cloth.yaml"), "--frames", "1", "--tolerance", "1e-2", "--threads", "auto"]
+    done = CliRunner().invoke(app, [*given, "--size", "4", "--here", "--results", str(folder / "results")])
+    assert done.exit_code == 0, done.output
+
+
 def test_each_option_that_a_sweep_varies_is_one_of_a_run_of_the_command_line_and_of_rows() -> None:
     assert set(OPTIONS) == set(Varied.model_fields), "what it is called for short, and its column"
     assert set(OPTIONS) <= set(RunSpec.model_fields)

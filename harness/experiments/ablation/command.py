@@ -13,6 +13,9 @@ from harness.base.console import err, out, say
 SOLVER, TOLERANCE = "hybrid", 1e-4
 """It takes all effects, and converges: what an effect changes is not to drown in the solver's own error."""
 
+PRICED = 1e-6
+"""The tolerance of --all-solvers, if the command line does not say: iterations far from the minimum and near to it."""
+
 ROUNDS = 5
 """How often each step is timed, if the command line does not say."""
 
@@ -24,6 +27,9 @@ def ablate(
     solver: Annotated[str | None, typer.Option(help=f"{SOLVER}, to {TOLERANCE:g}, if left out.")] = None,
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
     pairs: Annotated[bool, typer.Option("--pairs", help="Leave out each pair of effects too.")] = False,
+    all_solvers: Annotated[
+        bool, typer.Option("--all-solvers", help="What each effect alone adds to an iteration, by every solver.")
+    ] = False,
     again: Again = False,
     changed: Changed = False,
     here: InThisProcess = False,
@@ -36,6 +42,9 @@ def ablate(
     from harness.report.ablation import ablation_table, read, sentences
     from harness.report.ablation_plot import draw_ablation
 
+    if all_solvers:
+        _prices(given, scene, results, solver, size, pairs, again, changed, here)
+        return
     usual = {"rounds": ROUNDS, "threads": 1} | ({} if solver else {"tolerance": TOLERANCE})
     sweep = load_any(scene, solvers=[solver or SOLVER], sizes=[size] if size else [], **usual | given.obj)
     folder = claimed(results / sweep.name, scene)
@@ -51,3 +60,34 @@ def ablate(
     picture.parent.mkdir(parents=True, exist_ok=True)
     draw_ablation(rows, picture)
     say(f"rows are in {path}, the picture is {picture}")
+
+
+def _prices(
+    given: typer.Context,
+    scene: Path,
+    results: Path,
+    solver: str | None,
+    size: int | None,
+    pairs: bool,
+    again: bool,
+    changed: bool,
+    here: bool,
+) -> None:
+    """`--all-solvers`."""
+    from harness.base.claim import claimed
+    from harness.base.errors import InputError
+    from harness.base.progress import display
+    from harness.config.load import load_any
+    from harness.experiments.ablation.price_unit import price_all
+    from harness.report.ablation import price_table, read
+    from solvers.registry import SOLVERS, load
+
+    if solver is not None or pairs:
+        raise InputError("--all-solvers: takes neither --solver nor --pairs; leave them out, or do without it")
+    minimising = [name for name, target in SOLVERS.items() if load(target).minimises]
+    usual = {"rounds": ROUNDS, "threads": 1, "tolerance": PRICED}
+    sweep = load_any(scene, solvers=minimising, sizes=[size] if size else [], **usual | given.obj)
+    folder = claimed(results / sweep.name, scene)
+    paths = price_all(sweep, folder, display(err), say, again=again, changed=changed, isolated=not here)
+    out.print(price_table([row for path in paths for row in read(path)]))
+    say(f"rows are in {paths[0].parent}")

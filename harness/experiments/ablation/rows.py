@@ -6,6 +6,7 @@ One table holds all kinds of rows, which `kind` tells apart:
     without      the scene without some of its effects: what they cost, and what leaving them out changes
     error        how far the whole scene is from a better answer: of its solver, or of its time step
     suggestion   an effect that the scene does not list and its motion calls for, with the evidence
+    price        an effect beside springs, gravity, drag and pins alone, or all of them: what an iteration takes more
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ def _as_in_runs(*names: str) -> tuple[Column, ...]:
 
 
 COLUMNS = (
-    Column("kind", _TEXT, "", "whole, without, error or suggestion"),
-    Column("name", _TEXT, "", "the effects left out, joined by +; of an error `solver` or `time-step`"),
+    Column("kind", _TEXT, "", "whole, without, error, suggestion or price"),
+    Column("name", _TEXT, "", "the effects left out, joined by +; `solver` or `time-step`; a price's effect, or `all`"),
     *_as_in_runs("scene", "size", "vertices", "springs", "solver", "parameters", "own", "time_step", "integrator"),
     *_as_in_runs("family", "reference", "minimises", "own_steps"),
     *_as_in_runs("first_guess", "max_iterations", "tolerance", "threads"),
@@ -35,13 +36,24 @@ COLUMNS = (
         "status",
         _TEXT,
         "",
-        "ok, impossible (the scene has no answer without them), unknown (an error); of the whole scene as in runs",
+        "ok, impossible (the scene has no answer without them), unknown (an error); of whole and price as in runs",
     ),
     Column("reason", _TEXT, "", "why the status is not ok; of a suggestion the evidence"),
-    Column("seconds", _REAL, "s", "CPU time of a step, the mean over the frames of the median over the rounds"),
+    Column(
+        "seconds",
+        _REAL,
+        "s",
+        "CPU time of a step, the mean over frames of the median over rounds; of a price, of an iteration",
+    ),
     Column("cost", _REAL, "s", "what the effects cost a step: the same of the differences from the whole scene"),
     Column("cost_low", _REAL, "s", "lower end of its 95 % interval"),
     Column("cost_high", _REAL, "s", "upper end of its 95 % interval"),
+    Column("price", _REAL, "", "CPU time of an iteration with the effect over one without, the median over the rounds"),
+    Column("price_low", _REAL, "", "lower end of its 95 % interval"),
+    Column("price_high", _REAL, "", "upper end of its 95 % interval"),
+    Column(
+        "price_bound", _REAL, "", "the least that it can be: the effect's own numbers are read once, by a dot product"
+    ),
     Column("bytes", _INT, "B", "memory of the bound scene and the prepared solver, as Python's allocators see it"),
     Column("nnz_system", _INT, "", "stored entries of the system matrix Q"),
     Column("nnz_factor", _INT, "", "stored entries of the triangular factor L: of the Hessian's where one is made"),

@@ -1,0 +1,140 @@
+"""What an iteration takes with an effect, over one without: each effect by each solver.
+
+    price = median over rounds of (CPU time an iteration of plain + effect) / (the same of plain)
+
+The plain scene has springs, gravity, drag by velocity filters, and pins. Both scenes go step by step in turns, each to
+the tolerance that is asked for, so that a drift of the machine meets both alike. Rounds end once the price is known to
+CLOSE, or after as many as are allowed. No iteration reads the effect's own numbers sooner than a dot product does: that
+is the bound beside each price.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from time import perf_counter, thread_time
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from harness.base.errors import InputError
+from harness.base.statistics import Interval, ratio
+from harness.scenes.bind import Scene, build
+from harness.scenes.spec import SceneSpec
+from harness.simulation.step import Step, prepare, simulate
+from solvers.energies.springs import Springs
+from solvers.problem import NotPositiveDefinite, ProjectiveEnergy, Solver, StopRule, Unsupported
+
+PLAIN = {"springs", "gravity", "ether-drag", "pins"}
+ALL = "all"
+"""The name of all effects together."""
+CLOSE, LEAST = 0.03, 3
+"""Of a price, the width of its interval at which rounds end; and rounds that an interval needs."""
+WARM = 2
+"""Steps before those that count."""
+_READS = 20
+
+
+class Price(NamedTuple):
+    """Of an effect: the ratio, and seconds of CPU time an iteration with the effect; bound: the least
+    ratio that reading the effect's numbers once allows; refused: why there is none of these, in words."""
+
+    effect: str
+    price: Interval = Interval(np.nan, np.nan, np.nan)
+    seconds: float = np.nan
+    bound: float = np.nan
+    rounds: int = 0
+    refused: str = ""
+
+
+@dataclass(eq=False)
+class _Run:
+    """A scene on its way by one solver: seconds of its steps, and its iterations."""
+
+    steps: Iterator[Step]
+    seconds: float = 0.0
+    iterations: int = 0
+
+    def step(self, *, counts: bool) -> None:
+        """One step more."""
+        began = thread_time()
+        done = next(self.steps)
+        if counts:
+            self.seconds += thread_time() - began
+            self.iterations += done.solution.iterations
+
+    @property
+    def each(self) -> float:
+        """Seconds an iteration."""
+        return self.seconds / max(1, self.iterations)
+
+
+def priced(scene: SceneSpec) -> list[str]:
+    """The kinds of effects that have a price, and all of them together; raises InputError where there is none."""
+    kinds = list(dict.fromkeys(effect.kind for effect in scene.effects if effect.kind not in PLAIN))
+    if not kinds:
+        raise InputError(f"{scene.path}: has no effect beside {', '.join(sorted(PLAIN))}, which have no price here")
+    return [*kinds, ALL]
+
+
+def only(scene: SceneSpec, *kinds: str) -> SceneSpec:
+    """The scene with these effects alone, and the plain ones; with all of them where they are ALL."""
+    if ALL in kinds:
+        return scene
+    return scene.model_copy(update={"effects": tuple(e for e in scene.effects if e.kind in PLAIN.union(kinds))})
+
+
+def prices(scene: SceneSpec, size: int, solver: Solver, stop: StopRule, *, frames: int, rounds: int) -> Iterator[Price]:
+    """The price of each effect by a solver; one that it refuses has none. frames: that count in a round."""
+    for effect in priced(scene):
+        try:
+            yield price(scene, size, effect, solver, stop, frames=frames, rounds=rounds)
+        except (InputError, NotPositiveDefinite, Unsupported) as error:
+            yield Price(effect, refused=str(error))
+
+
+def price(
+    scene: SceneSpec, size: int, effect: str, solver: Solver, stop: StopRule, *, frames: int, rounds: int
+) -> Price:
+    """The price of one effect by one solver; raises InputError, NotPositiveDefinite and Unsupported."""
+    made = [build(only(scene, *kinds), size) for kinds in ((effect,), ())]
+    ready = [prepare(one, solver) for one in made]
+    pairs: list[tuple[float, float]] = []
+    found = Interval(np.nan, np.nan, np.nan)
+    while len(pairs) < rounds:
+        runs = [
+            _Run(iter(simulate(one, prepared, stop, first_guess="current", frames=WARM + frames)))
+            for one, prepared in zip(made, ready, strict=True)
+        ]
+        for k in range(WARM + frames):
+            for run in runs[:: 1 if len(pairs) % 2 else -1]:
+                run.step(counts=k >= WARM)
+        pairs.append((runs[0].each, runs[1].each))
+        found = ratio(*np.array(pairs).T)
+        if len(pairs) >= LEAST and found.high - found.low <= CLOSE * found.middle:
+            break
+    each, plain = np.array(pairs).min(axis=0)
+    return Price(effect, found, float(each), 1.0 + _reading(made[0]) / plain, len(pairs))
+
+
+def _reading(scene: Scene) -> float:
+    """The least time [s] in which the numbers of all energies that are not springs are read, once each."""
+    n = scene.system.vertices
+    size = sum(_bytes(energy, n) for energy in scene.system.energies if not isinstance(energy, Springs))
+    x, best = np.ones(size // 8), np.inf
+    for _ in range(_READS if size else 0):
+        began = perf_counter()
+        x.dot(x)
+        best = min(best, perf_counter() - began)
+    return best if size else 0.0
+
+
+def _bytes(energy: Any, n: int) -> int:
+    """What an energy's own numbers take: its elements, or its entries of Q; 0 of what is known in steps alone."""
+    if hasattr(energy, "elements"):
+        return sum(x.nbytes for x in energy.elements)
+    if isinstance(energy, ProjectiveEnergy):
+        share = csr_array(energy.stiffness_matrix(n))
+        return share.data.nbytes + share.indices.nbytes
+    return 0

@@ -1,0 +1,71 @@
+"""`springbench ablate --all-solvers`: what an iteration takes with an effect, by every solver."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from harness.base.console import err, say
+from harness.base.errors import InputError
+from harness.base.progress import display
+from harness.cli import app
+from harness.config.load import load_any, load_scene
+from harness.experiments.ablation.price_unit import price_all
+from harness.experiments.ablation.prices import only, priced
+from harness.report.ablation import price_table, read
+
+CLOTH = """
+mesh: {kind: grid}
+mass: 0.3
+time_step: 1/30
+frames: 2
+default_size: 5
+effects:
+  - {kind: springs, stretch: 300, shear: 60}
+  - {kind: gravity}
+  - {kind: pins, at: [top_corners]}
+  - {kind: bending, stiffness: 1.0e-3}
+  - {kind: air-drag, coefficient: 0}
+"""
+"""Drag of no coefficient has no energy at all."""
+
+
+@pytest.fixture
+def cloth(tmp_path: Path) -> Path:
+    path = tmp_path / "cloth.yaml"
+    path.write_text(CLOTH)
+    return path
+
+
+def test_every_solver_has_a_price_of_each_effect_or_says_why_not(cloth: Path, tmp_path: Path):
+    sweep = load_any(cloth, solvers=["newton", "dense"], rounds=4, tolerance=1e-6, threads=1)
+    paths = price_all(sweep, tmp_path, display(err), say, isolated=False)
+    told = {(row["name"], row["solver"]): row for path in paths for row in read(path)}
+    assert set(told) == {(e, s) for e in ("bending", "air-drag", "all") for s in ("newton", "dense")}
+    for (effect, solver), row in told.items():
+        if solver == "dense" and effect != "air-drag":
+            assert row["status"] == "unsupported"
+            assert row["price"] is None
+            assert "Quadratic" in row["reason"] or "Bending" in row["reason"]
+            continue
+        assert row["price_low"] <= row["price"] <= row["price_high"]
+        assert row["price_bound"] == 1.0 if effect == "air-drag" else 1.0 < row["price_bound"] < 2.0  # some kilobytes
+        assert 3 <= row["rounds"] <= 4
+        assert row["seconds"] > 0.0
+    table = price_table(list(told.values()))
+    assert [str(column.header) for column in table.columns] == ["effect", "newton", "dense"]
+    assert next(iter(table.columns[2].cells)) == "unsupported"
+
+
+@pytest.mark.parametrize("also", [["--pairs"], ["--solver", "newton"]], ids=" ".join)
+def test_what_is_of_one_solver_is_refused(cloth: Path, also: list[str]):
+    refused = CliRunner().invoke(app, ["ablate", str(cloth), "--all-solvers", *also])
+    assert refused.exit_code == 2
+    assert "neither --solver nor --pairs" in refused.output
+
+
+def test_what_has_no_effect_beside_the_plain_ones_has_no_price(cloth: Path):
+    with pytest.raises(InputError, match="which have no price"):
+        priced(only(load_scene(cloth)))
