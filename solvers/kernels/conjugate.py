@@ -14,32 +14,18 @@ from solvers.compiling import inner, kernel
 from solvers.kernels.hessian import multiply
 from solvers.linear.krylov import CURVED, compiled_over
 from solvers.linear.supernodal import Supernodal
-from solvers.linear.supernodal_solve import solve
+from solvers.linear.supernodal_solve import Factor, solve
 from solvers.linear.team import Team
 
 
-class Factor(NamedTuple):
-    """A factor of Q's free part, its solves from and to vectors of all vertices; see `solvers.linear.supernodal`."""
-
-    squares: NDArray[Any]
-    panels: NDArray[Any]
-    places: NDArray[np.int32]
-    chunks: NDArray[np.int64]
-    spans: NDArray[np.int64]
-    by_slot: NDArray[np.uint32]
-    by_vertex: NDArray[np.uint32]
-    work: NDArray[np.float64]
-    team: Team
-
-    @classmethod
-    def of(cls, factor: Supernodal, free: NDArray[np.int64]) -> Factor:
-        """A float64 factor, whose unknowns are the vertices free (f,)."""
-        at = factor.layout
-        by_slot, by_vertex = (
-            np.stack([free[order[:, 0]], order[:, 1]], axis=1).astype(np.uint32) for order in (at.by_slot, at.by_vertex)
-        )
-        work, team = np.zeros(4 * at.rows), Team.of(len(at.spans) - 1)
-        return cls(factor.squares, factor.panels, at.places, at.chunks, at.spans, by_slot, by_vertex, work, team)
+def among(factor: Supernodal, free: NDArray[np.int64]) -> Factor:
+    """A float64 factor, whose unknowns are the vertices free (f,), with solves from and to vectors of all vertices."""
+    at = factor.layout
+    by_slot, by_vertex = (
+        np.stack([free[order[:, 0]], order[:, 1]], axis=1).astype(np.uint32) for order in (at.by_slot, at.by_vertex)
+    )
+    lists = at.places, at.chunks, at.spans, by_slot, by_vertex
+    return Factor(factor.squares, factor.panels, *lists, np.zeros(4 * at.rows), Team.of(len(at.spans) - 1))
 
 
 class Newton(NamedTuple):
@@ -85,10 +71,8 @@ def _go(state, product, curvature):
         for c in range(3):
             newton.d[i, c] += length * newton.p[i, c]
             newton.r[i, c] -= length * newton.product[i, c]
-    at = newton.factor
     b = _scaled(newton.shrunk, newton.r, newton.product)
-    solve(at.squares, at.panels, at.places, at.chunks, at.spans, at.by_slot, at.by_vertex, at.work, b, newton.z,
-          at.team, newton.threads)  # fmt: skip
+    solve(newton.factor, b, newton.z, newton.threads)
     _shrink(newton.shrunk, newton.z)
     return _dot(newton.r, newton.z)
 

@@ -21,7 +21,7 @@ from scipy.sparse import csr_array
 
 from solvers.linear.ordering import nested_dissection
 from solvers.linear.supernodal_factor import Matrix, Panels, factorise, keep_sums
-from solvers.linear.supernodal_solve import solve
+from solvers.linear.supernodal_solve import Factor, solve_by
 from solvers.linear.supernodes import LANES, WIDTH
 from solvers.linear.symbolic import Symbolic, analyse
 from solvers.linear.team import Team
@@ -176,15 +176,12 @@ class Supernodal:
         self.flops = int(2 * 3 * entries.sum())
         self.shares = [float(entries[a:e].sum() / max(1, entries.sum())) for a, e in layout.spans[:, :2]]
         self.squares, self.panels, self.layout = squares, panels, layout
-        self._work, self._team = work, Team.of(len(self.shares) - 1)
+        lists = layout.places, layout.chunks, layout.spans, layout.by_slot, layout.by_vertex
+        self._factor = Factor(squares, panels, *lists, work, Team.of(len(self.shares) - 1))
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b, shape (n, 3), to `out`; b is left as it is and must not be `out`."""
-        at = self.layout
-        solve(
-            *(self.squares, self.panels, at.places, at.chunks, at.spans, at.by_slot, at.by_vertex),
-            *(self._work, b, out, self._team, self.threads()),
-        )
+        solve_by(*self._factor, b, out, self.threads())
 
     def threads(self) -> int | None:
         """Of a solve, None for one."""

@@ -218,7 +218,7 @@ class _Compiled:
     def __init__(self, objective: Objective, factor: Supernodal) -> None:
         system = objective.system
         self._threads, self._held = factor.threads, system.pins.vertices[system.pins.exact]
-        self._factor = conjugate.Factor.of(factor, system.free)
+        self._factor = conjugate.among(factor, system.free)
         self._scratch = np.zeros((4, system.vertices, 3))
 
     def direction(

@@ -148,8 +148,8 @@ def of_supernodal() -> Iterator[Case]:
     panel = {"add_forward": plain.add_forward, "set_backward": plain.set_backward}
     for precision in ("float64", "float32"):
         factor = Supernodal(Q, precision=precision)
-        solve = given(supernodal, "solve", lambda factor=factor: factor.solve(b, np.empty_like(b)))
-        yield Case(f"solve, {precision}", supernodal_solve.solve, solve, panel, (9,))
+        solve = given(supernodal, "solve_by", lambda factor=factor: factor.solve(b, np.empty_like(b)))
+        yield Case(f"solve, {precision}", supernodal_solve.solve_by, solve, panel, (10,))
 
 
 def of_block() -> Iterator[Case]:
