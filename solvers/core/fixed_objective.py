@@ -57,6 +57,13 @@ class Objective:
         self.own = [k for k in rest if k not in self.stated]
         self.projective = {k for k, e in others.items() if isinstance(e, ProjectiveEnergy)}
 
+    @property
+    def interpreted(self) -> str:
+        """Which energies state no law, so that each iteration evaluates them through Python, as words that follow a
+        choice; empty for none."""
+        names = sorted({type(self.system.energies[k]).__name__ for k in self.own})
+        return f"; each iteration goes through Python for {', '.join(names)}" if names else ""
+
     @cached_property
     def matrix(self) -> Matrix:
         """The Hessian's matrix for the pattern of springs, projective energies and elements."""

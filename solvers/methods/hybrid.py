@@ -88,6 +88,7 @@ class Hybrid:
         factor = objective.matrix.factor
         facts = metric.facts | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {lbfgs.choice}"
+        choice += objective.interpreted
         return PreparedDescent(objective, metric, method, choice, facts)
 
 

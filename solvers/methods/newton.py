@@ -55,6 +55,7 @@ class Newton:
         factor = objective.matrix.factor
         facts = metric.facts | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; residuals by {metric.choice}"
+        choice += objective.interpreted
         return PreparedDescent(objective, metric, NewtonMethod(metric), choice, facts)
 
 

@@ -61,7 +61,8 @@ class NewtonCG:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
         metric = Metric(system)
         objective = Objective(system)
-        return PreparedDescent(objective, metric, Method(metric, objective), metric.choice, metric.facts)
+        choice = metric.choice + objective.interpreted
+        return PreparedDescent(objective, metric, Method(metric, objective), choice, metric.facts)
 
 
 Preconditioner = Callable[[Positions], Positions]

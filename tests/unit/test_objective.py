@@ -12,6 +12,7 @@ from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
 from solvers.energies.springs import Springs
 from solvers.problem import Positions, StepProblem
+from solvers.registry import SOLVERS, load
 from tests.scenes import cloth, first_problem, random_problem
 
 SUMS = 1e-12
@@ -56,6 +57,15 @@ class Links:
 def with_links(problem: StepProblem, reach: float) -> StepProblem:
     system = replace(problem.system, energies=(*problem.system.energies, Links(reach)))
     return replace(problem, system=system)
+
+
+@pytest.mark.parametrize("solver", ["newton", "newton-cg", "hybrid", "lbfgs"])
+def test_a_solver_says_which_energies_take_the_slow_path(solver):
+    problem, made = random_problem(2), load(SOLVERS[solver])()
+    assert "Python" not in made.prepare(problem.system).choice
+    choice = made.prepare(with_links(problem, 0.5).system).choice
+    assert "Python" in choice
+    assert "Links" in choice
 
 
 PROBLEMS = {
