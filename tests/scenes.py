@@ -29,6 +29,16 @@ from solvers.problem import Pins, Positions, Solver, Start, StepProblem, StopRul
 BACKENDS: tuple[Solver, ...] = (DenseLocalGlobal(), SparseLocalGlobal(), CompiledLocalGlobal())
 """The three ways to do one and the same local-global iteration."""
 
+CLOTH_FILE = """
+mesh: {kind: grid}
+mass: 0.3
+time_step: 1/30
+frames: 2
+default_size: 4
+effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
+"""
+"""A scene's file: a small cloth held at two corners, for two steps."""
+
 
 def scene(
     mesh: MeshSource,

@@ -29,36 +29,36 @@ _LENGTH = struct.Struct("<Q")
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class Allowance:
     """What a call may take: seconds of processor time, and bytes of memory beyond what the child has already."""
 
     seconds: float
     bytes: int
 
 
-class Lost(Exception):
+class NoAnswer(Exception):
     """The child gave no answer; the message says why, as the end of a sentence."""
 
 
-def call(function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any:
+def call(function: Callable[..., Any], *arguments: Any, limits: Allowance) -> Any:
     """What a function of a module says to these arguments, within limits; all of it must pickle.
 
-    Raises InputError where the function does, and Lost where it raises anything else, takes too much, or crashes.
+    Raises InputError where the function does, and NoAnswer where it raises anything else, takes too much, or crashes.
     """
     child = _Child.running()
     try:
         child.send((os.getcwd(), function, arguments, limits))
         kind, answer = child.receive(_PATIENCE * limits.seconds)
     except (EOFError, OSError):
-        raise Lost(_why(child.end(), limits)) from None
+        raise NoAnswer(_why(child.end(), limits)) from None
     if kind == "mistakes":
         raise InputError(answer)
     if kind == "error":
-        raise Lost(answer)
+        raise NoAnswer(answer)
     return answer
 
 
-def _why(code: int, limits: Limits) -> str:
+def _why(code: int, limits: Allowance) -> str:
     if code in (-signal.SIGXCPU, -signal.SIGKILL):
         return f"reading it takes more than {limits.seconds:.3g} s"
     name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
@@ -151,7 +151,7 @@ def serve() -> None:
         _write(answers, _answer(function, arguments, limits))
 
 
-def _answer(function: Callable[..., Any], arguments: tuple[Any, ...], limits: Limits) -> tuple[str, Any]:
+def _answer(function: Callable[..., Any], arguments: tuple[Any, ...], limits: Allowance) -> tuple[str, Any]:
     used = resource.getrusage(resource.RUSAGE_SELF)
     limit(resource.RLIMIT_CPU, used.ru_utime + used.ru_stime + limits.seconds)
     limit(resource.RLIMIT_DATA, data() + limits.bytes)

@@ -188,3 +188,19 @@ def schema_of(columns: Iterable[Column]) -> pa.Schema:
 
 
 SCHEMA = schema_of(COLUMNS)
+
+_BY_NAME = {column.name: column for column in COLUMNS}
+
+
+def as_in_runs(*names: str) -> tuple[Column, ...]:
+    """Columns of other rows that mean what they mean in those of runs."""
+    return tuple(_BY_NAME[name] for name in names)
+
+
+OF_SOLVER = as_in_runs("family", "reference", "minimises", "own_steps")
+"""What a solver states of itself."""
+
+PROVENANCE = as_in_runs(
+    *("machine", "cpu", "cores", "memory_gib", "system", "versions", "commit", "code", "started"),
+)
+"""Where, when and by which code something was measured."""

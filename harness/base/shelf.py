@@ -63,7 +63,7 @@ def _packed(path: Path, *state: int) -> frozenset[str]:
         names = pq.read_table(path, columns=[FILE])[FILE]
         if names.null_count:
             raise OSError(f"rows without a {FILE}")
-        return frozenset(names.cast(pa.string()).unique().to_pylist())
+        return frozenset(map(str, names.cast(pa.string()).unique().to_pylist()))
     except (pa.ArrowException, OSError, KeyError) as error:
         raise InputError(Mistake(f"holds no packed rows ({error}); take it out of the results", path)) from error
 

@@ -54,9 +54,9 @@ def require_sound(path: Path, read: Callable[[Path], None]) -> None:
     if _state(path) in _sound:
         return
     size = path.stat().st_size
-    limits = child.Limits(_SECONDS + size / _BYTES_PER_SECOND, _MEMORY + _MEMORY_PER_BYTE * size)
+    limits = child.Allowance(_SECONDS + size / _BYTES_PER_SECOND, _MEMORY + _MEMORY_PER_BYTE * size)
     try:
         child.call(read, path, limits=limits)
-    except child.Lost as error:
+    except child.NoAnswer as error:
         raise InputError(Mistake(f"is damaged: {error}; do its run again", file=path)) from None
     trust(path)

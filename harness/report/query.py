@@ -83,10 +83,10 @@ def answer(sql: str, results: Path, *, most: int = SHOWN, seconds: float = 15.0)
     files = sum(len(shelf.own_files(folder)) for folder in every)
     if not files and not any(shelf.packed_file(folder).exists() for folder in every):
         raise InputError(f"{results}: holds no rows; run a sweep first, or name its folder with --results")
-    limits = child.Limits(seconds + _OPENING * files, MEMORY)
+    limits = child.Allowance(seconds + _OPENING * files, MEMORY)
     try:
         return child.call(_answered, sql, folders, most, limits=limits)
-    except child.Lost as error:
+    except child.NoAnswer as error:
         raise InputError(f"query: {error}; ask for less, or give it more with --seconds") from None
 
 

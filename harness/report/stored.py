@@ -51,7 +51,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class StoredRun:
     """What the rows of a run say. seconds: of each frame's step, the least over its rounds; status: ok, or what it is;
     machine, cpu: where it ran; iterations: of all frames; residual, error, digest: of the last frame, where known."""
 
@@ -111,7 +111,7 @@ def compare(old: Path, new: Path, console: Console, yardstick: str | None = None
     return 1 if bad else 0
 
 
-def read(path: Path) -> dict[Key, Run]:
+def read(path: Path) -> dict[Key, StoredRun]:
     """The runs of a folder of results or of an archive of one, by what they were asked to do. Raises InputError."""
     with _folder(path) as folder:
         files = [unit for of_rows in shelf.folders(folder, "rows") for unit in shelf.units(of_rows)]
@@ -159,7 +159,7 @@ def _require_room(path: Path, unpacked: int) -> None:
         raise InputError(Mistake(f"its rows take {unpacked:,} bytes unpacked; wanted {_MOST:,} at most", path))
 
 
-def _run(found: Sequence[Row]) -> Run:
+def _run(found: Sequence[Row]) -> StoredRun:
     steps = [row for row in found if row["phase"] == "step" and row["frame"] is not None]
     seconds: dict[int, float] = {}
     for row in steps:
@@ -167,7 +167,7 @@ def _run(found: Sequence[Row]) -> Run:
     once = {row["frame"]: row for row in steps}
     last: Row = once[max(once)] if once else {}
     counted = [row["iterations"] for row in once.values() if row["iterations"] is not None]
-    return Run(
+    return StoredRun(
         found[0],
         next((row["status"] for row in found if row["status"] != "ok"), "ok"),
         seconds,
@@ -176,7 +176,7 @@ def _run(found: Sequence[Row]) -> Run:
     )
 
 
-def _incomparable(old: Run, new: Run, yardstick: str | None) -> str:
+def _incomparable(old: StoredRun, new: StoredRun, yardstick: str | None) -> str:
     """Why two times do not compare, empty where they do."""
     if old.status != "ok":
         return f"there is no old time: {old.status}"
@@ -186,7 +186,7 @@ def _incomparable(old: Run, new: Run, yardstick: str | None) -> str:
     return ""
 
 
-def _unit(runs: Mapping[Key, Run], key: Key, yardstick: str) -> float | None:
+def _unit(runs: Mapping[Key, StoredRun], key: Key, yardstick: str) -> float | None:
     """One over the seconds of the yardstick's step in the same scene, size and steps; None where it was not run."""
     at = {name: key[ASKED.index(name)] for name in ("scene", "size", "time_step", "integrator", "threads")}
     found = [run for run in runs.values() if run.row["solver"] == yardstick and run.status == "ok" and run.seconds]
@@ -194,7 +194,7 @@ def _unit(runs: Mapping[Key, Run], key: Key, yardstick: str) -> float | None:
     return 1 / float(np.median(list(found[0].seconds.values()))) if found else None
 
 
-def _judged(old: Run, new: Run, units: Sequence[float | None]) -> tuple[tuple[str, str, str], str]:
+def _judged(old: StoredRun, new: StoredRun, units: Sequence[float | None]) -> tuple[tuple[str, str, str], str]:
     """Old and new times, their change with its interval, and a verdict: slower, faster, unchanged or fails now."""
     if new.status != "ok":
         return ("", "", ""), "fails now"
@@ -216,7 +216,7 @@ def _interval(logs: Array) -> tuple[float, float, float]:
     return middle, float(np.exp(found.confidence_interval.low)), float(np.exp(found.confidence_interval.high))
 
 
-def _beside(old: Run, new: Run) -> tuple[str, str, str, str]:
+def _beside(old: StoredRun, new: StoredRun) -> tuple[str, str, str, str]:
     """What changed beside the time: iterations, residual, error, and whether the last positions are the same."""
     told: list[str] = []
     for name in ("iterations", "residual", "error"):

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from harness.base import child
 
-LIMITS = child.Limits(20.0, 2**31)
+LIMITS = child.Allowance(20.0, 2**31)
 """What an answer may take: 20 s of processor time, and 2 GiB of memory beyond that of a bare interpreter."""
 
 
@@ -26,7 +26,7 @@ class Outcome:
 
 
 def attempt(folder: Path, arguments: list[str]) -> Outcome:
-    """What a command line comes to in a folder, of which `results` is the folder of results. Raises child.Lost."""
+    """What a command line comes to in a folder, of which `results` is the folder of results. Raises child.NoAnswer."""
     return child.call(_attempt, folder, arguments, limits=LIMITS)
 
 

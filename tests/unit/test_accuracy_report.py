@@ -14,10 +14,10 @@ import pytest
 from harness.base.errors import InputError
 from harness.report.accuracy.findings import failures, findings, summary
 from harness.report.accuracy.growth import growths
+from harness.report.accuracy.measured import Curve, Measurements, without_short
 from harness.report.accuracy.paper import FAR, FIGURE_2, FIGURE_3, comparisons
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
 from harness.report.accuracy.reading import read
-from harness.report.accuracy.table import Curve, Table, without_short
 from harness.report.accuracy.times import TARGETS, contested, crossings, duration, power, reach, seconds_to
 from harness.report.accuracy.work_plot import default, front
 from tests import accuracy_rows as made
@@ -25,17 +25,17 @@ from tests import accuracy_rows as made
 COST, SETUP = made.METHODS["numba"]["cost"], made.METHODS["numba"]["setup"]
 
 
-def table(folder: Path, rows: Sequence[dict[str, Any]]) -> Table:
+def table(folder: Path, rows: Sequence[dict[str, Any]]) -> Measurements:
     return read(made.write(folder, rows))
 
 
-def net(folder: Path, *solvers: str, size: int = 10, **more: Any) -> Table:
+def net(folder: Path, *solvers: str, size: int = 10, **more: Any) -> Measurements:
     """One step of a net."""
     problem = made.problem("net", size, "early", **more)
     return table(folder, [*problem, *(row for s in solvers for row in made.curve("net", size, "early", s))])
 
 
-def by_solver(found: Table) -> dict[str, Curve]:
+def by_solver(found: Measurements) -> dict[str, Curve]:
     return {curve.solver: curve for curve in found.curves}
 
 

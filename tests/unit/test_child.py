@@ -14,7 +14,7 @@ from harness.base import child
 from harness.base.errors import InputError, Mistake
 from harness.base.files import CannotWrite, replacing, told
 
-LIMITS, SHORT = child.Limits(20.0, 2**27), child.Limits(0.5, 2**27)
+LIMITS, SHORT = child.Allowance(20.0, 2**27), child.Allowance(0.5, 2**27)
 """What ends by itself has time on a slow machine as well; what does not is ended soon."""
 
 
@@ -84,7 +84,7 @@ def test_it_answers_and_prints_nothing(capfd: pytest.CaptureFixture[str]):
     ],
 )
 def test_what_it_does_not_answer_is_said_in_words_and_the_next_call_is_answered(function, why):
-    with pytest.raises(child.Lost) as caught:
+    with pytest.raises(child.NoAnswer) as caught:
         child.call(function, limits=SHORT if function is loop else LIMITS)
     assert why in str(caught.value)
     assert child.call(double, 21, limits=LIMITS) == 42

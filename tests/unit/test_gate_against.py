@@ -11,6 +11,7 @@ from harness.cli import app
 from harness.experiments.gates.against import Request, exit_code, started
 from harness.experiments.gates.pair import Side, changes, workers
 from harness.experiments.gates.sequential import Answer
+from tests.scenes import CLOTH_FILE
 
 GATES = """
 from types import SimpleNamespace
@@ -150,21 +151,11 @@ def test_a_folder_outside_git_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
     assert "is in no git checkout" in said
 
 
-SCENE = """
-mesh: {kind: grid}
-mass: 0.3
-time_step: 1/30
-frames: 2
-default_size: 4
-effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
-"""
-
-
 def test_a_run_of_a_scene_is_held_with_its_exact_facts_and_each_revision_has_its_own_file(repository: Path):
-    (repository / "cloth.yaml").write_text(SCENE)
+    (repository / "cloth.yaml").write_text(CLOTH_FILE)
     other = repository / "elsewhere"
     other.mkdir()
-    (other / "cloth.yaml").write_text(SCENE.replace("300", "600"))
+    (other / "cloth.yaml").write_text(CLOTH_FILE.replace("300", "600"))
     sides = Side("this", repository), Side("that", other, checkout=repository, extra=0.1)
     asked = {"solvers": ["sparse"], "sizes": [], "iterations": 20}
     with workers(*sides) as alive:

@@ -10,15 +10,7 @@ from harness.base import rows
 from harness.cli import app
 from harness.experiments.gates.sequential import Rule
 from harness.experiments.gates.study import OTHERS, SCHEMA, Start, read, replay, replay_other
-
-SCENE = """
-mesh: {kind: grid}
-mass: 0.3
-time_step: 1/30
-frames: 2
-default_size: 4
-effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
-"""
+from tests.scenes import CLOTH_FILE
 
 
 def starts(biases: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 0.02, turns: int = 500) -> list[Start]:
@@ -67,7 +59,7 @@ def test_others_compare_one_session_with_the_next():
 
 
 def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "cloth.yaml").write_text(SCENE)
+    (tmp_path / "cloth.yaml").write_text(CLOTH_FILE)
     (tmp_path / ".git").mkdir()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("harness.experiments.gates.revisions.root", lambda folder: folder)
@@ -99,7 +91,7 @@ def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypa
 def test_a_mistake_is_one_message(
     arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    (tmp_path / "cloth.yaml").write_text(SCENE)
+    (tmp_path / "cloth.yaml").write_text(CLOTH_FILE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("harness.experiments.gates.revisions.root", lambda folder: folder)
     done = CliRunner().invoke(app, ["gate-study", *arguments])

@@ -13,23 +13,16 @@ from __future__ import annotations
 
 import pyarrow as pa
 
-from harness.base.columns import COLUMNS as RUN_COLUMNS
-from harness.base.columns import Column, schema_of
+from harness.base.columns import OF_SOLVER, PROVENANCE, Column, as_in_runs, schema_of
 
 _TEXT, _INT, _REAL = pa.string(), pa.int64(), pa.float64()
-_SHARED = {column.name: column for column in RUN_COLUMNS}
-
-
-def _as_in_runs(*names: str) -> tuple[Column, ...]:
-    return tuple(_SHARED[name] for name in names)
-
 
 COLUMNS = (
     Column("kind", _TEXT, "", "whole, without, error, suggestion or price"),
     Column("name", _TEXT, "", "the effects left out, joined by +; `solver` or `time-step`; a price's effect, or `all`"),
-    *_as_in_runs("scene", "size", "vertices", "springs", "solver", "parameters", "own", "time_step", "integrator"),
-    *_as_in_runs("family", "reference", "minimises", "own_steps"),
-    *_as_in_runs("first_guess", "max_iterations", "tolerance", "threads"),
+    *as_in_runs("scene", "size", "vertices", "springs", "solver", "parameters", "own", "time_step", "integrator"),
+    *OF_SOLVER,
+    *as_in_runs("first_guess", "max_iterations", "tolerance", "threads"),
     Column("frames", _INT, "", "steps simulated"),
     Column("rounds", _INT, "", "how often each of them was timed"),
     Column(
@@ -62,7 +55,7 @@ COLUMNS = (
     Column("energy", _REAL, "", "largest difference of kinetic and elastic energy in any frame, over its largest"),
     Column("centre", _REAL, "", "largest displacement of the centre of mass in any frame, in mean rest lengths"),
     Column("extent", _REAL, "", "the diagonal of the rest shape's bounding box, in mean rest lengths"),
-    *_as_in_runs("machine", "cpu", "cores", "memory_gib", "system", "versions", "commit", "code", "started"),
+    *PROVENANCE,
 )
 
 SCHEMA = schema_of(COLUMNS)

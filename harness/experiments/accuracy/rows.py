@@ -16,30 +16,23 @@ from __future__ import annotations
 
 import pyarrow as pa
 
-from harness.base.columns import COLUMNS as RUN_COLUMNS
-from harness.base.columns import Column, schema_of
+from harness.base.columns import OF_SOLVER, PROVENANCE, Column, as_in_runs, schema_of
 
 _TEXT, _INT, _REAL, _YES = pa.string(), pa.int64(), pa.float64(), pa.bool_()
-_SHARED = {column.name: column for column in RUN_COLUMNS}
-
-
-def _as_in_runs(*names: str) -> tuple[Column, ...]:
-    return tuple(_SHARED[name] for name in names)
-
 
 COLUMNS = (
     Column("kind", _TEXT, "", "problem, minimum, prepare, curve or work"),
     Column("unit", _TEXT, "", "hash of all that determines the unit's result and timing"),
-    *_as_in_runs("sweep", "scene", "size", "vertices", "springs", "solver", "parameters", "integrator", "time_step"),
-    *_as_in_runs("family", "reference", "minimises", "own_steps"),
-    *_as_in_runs("first_guess", "threads"),
+    *as_in_runs("sweep", "scene", "size", "vertices", "springs", "solver", "parameters", "integrator", "time_step"),
+    *OF_SOLVER,
+    *as_in_runs("first_guess", "threads"),
     Column(
         "status",
         _TEXT,
         "",
         "ok, saddle, unsupported, diverged, no-progress, time-limit, failed, killed or uncertified (the reference)",
     ),
-    _SHARED["reason"],
+    *as_in_runs("reason"),
     Column("problem", _TEXT, "", "digest of the frozen step; of work the digest of the reference trajectory"),
     Column("moment", _TEXT, "", "early, middle, violent, or frame-k"),
     Column("frame", _INT, "", "the step that was frozen, from 1"),
@@ -51,7 +44,7 @@ COLUMNS = (
     Column("branch", _INT, "", "number of a minimum by its energy, 0 is the lowest; null where none was reached"),
     Column("minimum", _TEXT, "", "name of a minimum, which stays; of a curve the one that its errors refer to"),
     Column("g", _REAL, "J", "the step's objective, by the oracle"),
-    _SHARED["stationarity"],
+    *as_in_runs("stationarity"),
     Column("smallest_eigenvalue", _REAL, "N/m", "of the Hessian at the minimum, computed there"),
     Column(
         "certified",
@@ -71,13 +64,13 @@ COLUMNS = (
     Column("cold", _REAL, "s", "wall time of the first time that the solver was prepared"),
     Column("recording", _TEXT, "", "the solve as a recording, relative to the results of this config"),
     Column("iterations", _INT, "", "the iteration limit, of a step of work or of a curve"),
-    _SHARED["tolerance"],
+    *as_in_runs("tolerance"),
     Column("horizon", _REAL, "s", "simulated time"),
     Column("seconds_per_simulated", _REAL, "", "median over the rounds of wall seconds per simulated second"),
     Column("error", _REAL, "", "|p(T) - reference(T)| / |reference(T) - p(0)|, Frobenius norms, vertices not pinned"),
     Column("error_rms_m", _REAL, "m", "root mean square distance of a vertex from the reference at the horizon"),
     Column("iterations_done", _INT, "", "iterations done in all steps together"),
-    *_as_in_runs("machine", "cpu", "cores", "memory_gib", "system", "versions", "commit", "code", "started"),
+    *PROVENANCE,
 )
 
 SCHEMA = schema_of(COLUMNS)

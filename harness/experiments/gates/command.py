@@ -72,7 +72,7 @@ def _stored(old: Path, new: Path, yardstick: str | None) -> int:
 
 def _table(path: Path, budget: float) -> int:
     from harness.experiments.gates.against import exit_code
-    from harness.experiments.gates.table import run_table
+    from harness.experiments.gates.listed import run_table
 
     return exit_code([result.answer for _, result in run_table(path, budget, say)])
 

@@ -10,11 +10,11 @@ from harness.report.accuracy.convergence import draw_convergence
 from harness.report.accuracy.findings import failures, findings, write_findings, write_summary
 from harness.report.accuracy.growth import draw_growth
 from harness.report.accuracy.interactive import write_page
+from harness.report.accuracy.measured import without_short
 from harness.report.accuracy.paper import draw_paper
 from harness.report.accuracy.pictures import draw_meshes
 from harness.report.accuracy.profiles import draw_profiles
 from harness.report.accuracy.reading import read
-from harness.report.accuracy.table import without_short
 from harness.report.accuracy.time_plot import draw_times
 from harness.report.accuracy.work_plot import draw_work
 from harness.report.references import write_bibtex

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from harness.report.accuracy.measured import Curve, Measurements, Problem, Values, step_words
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -28,7 +29,6 @@ from harness.report.accuracy.sheet import (
     panel,
     sheet,
 )
-from harness.report.accuracy.table import Curve, Problem, Table, Values, step_words
 from harness.report.page import count, quantity, text
 from harness.report.style import INK, MUTED, PAGE, WARNING, WIDTH, Mark, looks
 
@@ -54,7 +54,7 @@ _ROWS = (
 )
 
 
-def draw_convergence(table: Table, folder: Path) -> list[Path]:
+def draw_convergence(table: Measurements, folder: Path) -> list[Path]:
     """A picture for each problem that solvers were measured on; returns the files."""
     drawn: list[Path] = []
     marked = looks((curve.label, curve.solver) for curve in table.curves)

@@ -12,16 +12,16 @@ import numpy as np
 from harness.report.accuracy import work_plot
 from harness.report.accuracy.convergence import GUESSES, remarks
 from harness.report.accuracy.growth import TARGET, growths
+from harness.report.accuracy.measured import Curve, Measurements, Values, without_short
 from harness.report.accuracy.paper import FAR, FIGURE_2, ITERATIONS, Comparison, comparisons
 from harness.report.accuracy.profiles import least_ratios
-from harness.report.accuracy.table import Curve, Table, Values, without_short
 from harness.report.accuracy.times import STEPS, TARGETS, crossings, power, races, reach, seconds_to
 from harness.report.references import cited
 
 Chapters = dict[str, list[str]]
 
 
-def findings(table: Table) -> Chapters:
+def findings(table: Measurements) -> Chapters:
     """Sentences by the title of their chapter; chapters without any are left out."""
     compared = without_short(table)
     chapters = {
@@ -37,7 +37,7 @@ def findings(table: Table) -> Chapters:
     return {title: sentences for title, sentences in chapters.items() if sentences}
 
 
-def failures(table: Table) -> list[dict[str, str]]:
+def failures(table: Measurements) -> list[dict[str, str]]:
     """Each run with a status other than ok: what it was, its status and the reason."""
     curves = [
         (f"{c.problem.name}, {GUESSES.get(c.first_guess, c.first_guess)}", c.label, c.status, c.reason)
@@ -48,7 +48,7 @@ def failures(table: Table) -> list[dict[str, str]]:
     return [dict(zip(keys, row, strict=True)) for row in dict.fromkeys(curves + works) if row[2] != "ok"]
 
 
-def summary(table: Table) -> list[dict[str, Any]]:
+def summary(table: Measurements) -> list[dict[str, Any]]:
     """One entry a curve: what it was, what it reached, and the seconds to each accuracy, null where not reached."""
     return [_entry(curve) for curve in table.curves]
 
@@ -67,7 +67,7 @@ def write_findings(path: Path, title: str, chapters: Chapters, failed: list[dict
     path.write_text("\n".join(lines), encoding="utf-8")
 
 
-def write_summary(path: Path, table: Table) -> None:
+def write_summary(path: Path, table: Measurements) -> None:
     """Write the summary as JSON."""
     path.write_text(json.dumps(summary(table), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -110,7 +110,7 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _methods(table: Table) -> Iterator[str]:
+def _methods(table: Measurements) -> Iterator[str]:
     """Where each solver comes from."""
     references = {each.solver: each.reference for each in (*table.curves, *table.works)}
     for solver, reference in references.items():
@@ -118,7 +118,7 @@ def _methods(table: Table) -> Iterator[str]:
             yield f"{solver}: {cited(reference)}."
 
 
-def _times(table: Table) -> Iterator[str]:
+def _times(table: Measurements) -> Iterator[str]:
     for (_, guess), race in races(table).items():
         problem = race[0].problem
         sentences = crossings(race)
@@ -127,7 +127,7 @@ def _times(table: Table) -> Iterator[str]:
             yield f"{problem.name}, {GUESSES.get(guess, guess)}{doubt}: {'; '.join(sentences)}."
 
 
-def _profiles(table: Table) -> Iterator[str]:
+def _profiles(table: Measurements) -> Iterator[str]:
     for target in TARGETS:
         found = {label: values for label, values in least_ratios(table, target).items() if len(values)}
         if found:
@@ -147,13 +147,13 @@ def _times_of(values: Values) -> str:
     return f"{worst:.2g} times" if np.isfinite(worst) else "never reaching, against"
 
 
-def _works(table: Table) -> Iterator[str]:
+def _works(table: Measurements) -> Iterator[str]:
     for mesh in dict.fromkeys(work.mesh for work in table.works):
         for sentence in work_plot.findings([work for work in table.works if work.mesh == mesh]):
             yield f"{mesh}: {sentence}."
 
 
-def _growth(table: Table) -> Iterator[str]:
+def _growth(table: Measurements) -> Iterator[str]:
     for g in growths(table):
         if np.isfinite(g.exponent):
             sizes = f"{g.vertices[0]} to {g.vertices[-1]} vertices"
@@ -161,7 +161,7 @@ def _growth(table: Table) -> Iterator[str]:
             yield f"{where}: {g.label} grows as n^{g.exponent:.2f} to {power(TARGET)} ({sizes})."
 
 
-def _paper(table: Table) -> Iterator[str]:
+def _paper(table: Measurements) -> Iterator[str]:
     """Every curve of both figures as a row of one table: our error over the paper's, bold where it is far off."""
     by_curve: dict[str, dict[int, Comparison]] = {}
     for found in comparisons(table):

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.ticker import FixedLocator
 
 from harness.report.accuracy.convergence import GUESSES
+from harness.report.accuracy.measured import Curve, Measurements
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -26,7 +27,6 @@ from harness.report.accuracy.sheet import (
     panel,
     sheet,
 )
-from harness.report.accuracy.table import Curve, Table
 from harness.report.accuracy.time_plot import middle
 from harness.report.accuracy.times import left_out, power
 from harness.report.labels import direct_labels
@@ -53,7 +53,7 @@ class Growth(NamedTuple):
     lost: list[int]
 
 
-def growths(table: Table) -> list[Growth]:
+def growths(table: Measurements) -> list[Growth]:
     """The growth of each solver on each scene with two sizes or more."""
     groups: dict[tuple[str, str, str], dict[int, list[Curve]]] = {}
     for curve in table.curves:
@@ -75,7 +75,7 @@ def _exponent(times: dict[int, float]) -> float:
     return float(np.polyfit(np.log([*times]), np.log([*times.values()]), 1)[0])
 
 
-def draw_growth(table: Table, stem: Path) -> list[Path]:
+def draw_growth(table: Measurements, stem: Path) -> list[Path]:
     """A column for each scene that has several sizes, a row for each first guess; returns the files."""
     found = growths(table)
     scenes = list(dict.fromkeys(growth.scene for growth in found))[:_COLUMNS]

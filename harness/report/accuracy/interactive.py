@@ -18,8 +18,8 @@ from plotly.offline import get_plotlyjs
 from harness.base.files import replacing
 from harness.report.accuracy.convergence import GUESSES
 from harness.report.accuracy.growth import TARGET, growths
+from harness.report.accuracy.measured import Curve, Measurements, WorkPoint, step_words
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
-from harness.report.accuracy.table import Curve, Table, Work, step_words
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
 from harness.report.references import cited
 from harness.report.style import DASH_DOTTED, DASHED, DOTTED, Mark, looks
@@ -40,7 +40,7 @@ _SHARES = {"range": [-0.02, 1.05], "tickformat": ".0%"}
 def write_page(
     path: Path,
     title: str,
-    table: Table,
+    table: Measurements,
     *,
     pictures: Mapping[str, str],
     findings: Sequence[str],
@@ -100,7 +100,7 @@ def _run(curve: Curve, pictures: Mapping[str, str]) -> Item:
     }
 
 
-def _convergence(table: Table, pictures: Mapping[str, str], folder: Path) -> Item:
+def _convergence(table: Measurements, pictures: Mapping[str, str], folder: Path) -> Item:
     items: list[Item] = []
     for curve in table.curves:
         run = _run(curve, pictures)
@@ -138,7 +138,7 @@ def _convergence(table: Table, pictures: Mapping[str, str], folder: Path) -> Ite
     }
 
 
-def _times(table: Table, pictures: Mapping[str, str]) -> Item:
+def _times(table: Measurements, pictures: Mapping[str, str]) -> Item:
     items: list[Item] = []
     for curve in table.curves:
         found = [reach(curve, target) for target in TARGETS]
@@ -168,8 +168,8 @@ def _times(table: Table, pictures: Mapping[str, str]) -> Item:
     }
 
 
-def _work(works: Sequence[Work]) -> Item:
-    chains: dict[tuple[Any, ...], list[Work]] = {}
+def _work(works: Sequence[WorkPoint]) -> Item:
+    chains: dict[tuple[Any, ...], list[WorkPoint]] = {}
     for w in works:
         if w.status == "ok":
             chains.setdefault((w.mesh, w.label, w.integrator, w.tolerance, w.iterations, w.first_guess), []).append(w)
@@ -202,7 +202,7 @@ def _work(works: Sequence[Work]) -> Item:
     }
 
 
-def _profiles(table: Table) -> Item:
+def _profiles(table: Measurements) -> Item:
     kinds = {"performance profile": least_ratios, "data profile": iteration_ratios}
     items: list[Item] = []
     for kind, ratios in kinds.items():
@@ -233,7 +233,7 @@ def _profiles(table: Table) -> Item:
     }
 
 
-def _growth(table: Table) -> Item:
+def _growth(table: Measurements) -> Item:
     items = [
         {
             "label": growth.label,

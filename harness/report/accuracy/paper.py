@@ -17,6 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from harness.report.accuracy.measured import LONG, Curve, Measurements, Problem
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -31,7 +32,6 @@ from harness.report.accuracy.sheet import (
     panel,
     sheet,
 )
-from harness.report.accuracy.table import LONG, Curve, Problem, Table
 from harness.report.style import INK, MUTED, PAGE, Mark, looks
 from solvers.about import LOCAL_GLOBAL
 
@@ -89,7 +89,7 @@ def stiffness(problem: Problem) -> float:
     return problem.stiffness_ratio / (problem.vertices * problem.time_step**2)
 
 
-def comparisons(table: Table) -> list[Comparison]:
+def comparisons(table: Measurements) -> list[Comparison]:
     """All points of the paper that our rows have a counterpart of."""
     found: list[Comparison] = []
     for curve in _long(table)[:1]:
@@ -118,7 +118,7 @@ def at(curve: Curve, iterations: int) -> float:
     return max(float(curve.gap[k]), curve.problem.round_off) if exact else np.nan
 
 
-def _own(table: Table) -> Iterator[Curve]:
+def _own(table: Measurements) -> Iterator[Curve]:
     """The paper's local-global by our fastest backend that was measured, from the paper's first guess."""
     paper = [c for c in table.curves if c.problem.paper and c.first_guess == "inertial"]
     theirs = [c for c in paper if c.family == LOCAL_GLOBAL]
@@ -133,16 +133,16 @@ def _iteration_seconds(curve: Curve) -> float:
     return seconds / done if done and np.isfinite(seconds) else np.inf
 
 
-def _long(table: Table) -> list[Curve]:
+def _long(table: Measurements) -> list[Curve]:
     return [c for c in _own(table) if c.problem.vertices == 81**2 and c.iterations.max(initial=0.0) >= LONG]
 
 
-def _frames(table: Table, side: int, k: float) -> list[Curve]:
+def _frames(table: Measurements, side: int, k: float) -> list[Curve]:
     """The curves of one curtain; a tenth leaves room for how pins are counted, and tells all stiffnesses apart."""
     return [c for c in _own(table) if c.problem.vertices == side**2 and abs(stiffness(c.problem) / k - 1) < 0.1]
 
 
-def draw_paper(table: Table, stem: Path) -> list[Path]:
+def draw_paper(table: Measurements, stem: Path) -> list[Path]:
     """Four panels of ours over the paper's; nothing where no row belongs to the reproduction. Returns the files."""
     found = comparisons(table)
     if not found:

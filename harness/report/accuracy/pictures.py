@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from harness.report import opengl
-from harness.report.accuracy.table import Table
+from harness.report.accuracy.measured import Measurements
 
 
-def draw_meshes(table: Table, results: Path, folder: Path) -> dict[str, Path]:
+def draw_meshes(table: Measurements, results: Path, folder: Path) -> dict[str, Path]:
     """The pictures that could be drawn, by the digest of their problem; of the solve that came nearest the minimum.
 
     Where the system cannot draw, or nothing was recorded, there are none.

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
+from harness.report.accuracy.measured import Curve, Measurements, Values
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -34,27 +35,28 @@ from harness.report.accuracy.sheet import (
     panel,
     sheet,
 )
-from harness.report.accuracy.table import Curve, Table, Values
 from harness.report.accuracy.times import TARGETS, askable, contested, left_out, power, races, seconds_to
 from harness.report.page import text
 from harness.report.style import Mark, looks
 from solvers.about import LOCAL_GLOBAL
 
 
-def least_ratios(table: Table, target: float) -> dict[str, Values]:
+def least_ratios(table: Measurements, target: float) -> dict[str, Values]:
     """By label the times to the target over the least of all solvers, (problems,); infinite where not reached."""
     found = judged(table, target)
     return _ratios(table, found, target, [min(seconds_to(curve, target) for curve in race) for race in found])
 
 
-def iteration_ratios(table: Table, target: float) -> dict[str, Values]:
+def iteration_ratios(table: Measurements, target: float) -> dict[str, Values]:
     """By label the times to the target over that of one iteration of the yardstick, where that was tried."""
     units = [(race, iteration_seconds(race, yardstick(table))) for race in judged(table, target)]
     known = [(race, unit) for race, unit in units if np.isfinite(unit)]
     return _ratios(table, [race for race, _ in known], target, [unit for _, unit in known])
 
 
-def _ratios(table: Table, found: Sequence[list[Curve]], target: float, units: Sequence[float]) -> dict[str, Values]:
+def _ratios(
+    table: Measurements, found: Sequence[list[Curve]], target: float, units: Sequence[float]
+) -> dict[str, Values]:
     times = [{curve.label: seconds_to(curve, target) for curve in race} for race in found]
     missed = partly_tried(table)
     return {
@@ -64,20 +66,20 @@ def _ratios(table: Table, found: Sequence[list[Curve]], target: float, units: Se
     }
 
 
-def partly_tried(table: Table) -> dict[str, int]:
+def partly_tried(table: Measurements) -> dict[str, int]:
     """By label on how many problems the solvers were tried that were tried on fewer than others."""
     tried = Counter(label for race in races(table).values() for label in {curve.label for curve in race})
     return {label: count for label, count in sorted(tried.items()) if count < max(tried.values())}
 
 
-def yardstick(table: Table) -> str:
+def yardstick(table: Measurements) -> str:
     """The backend of the plain local-global iteration that data profiles count in: of those that ran on most problems
     the last by alphabet; "" where none was measured."""
     tried = Counter(curve.solver for curve in table.curves if curve.family == LOCAL_GLOBAL)
     return max(tried, key=lambda name: (tried[name], name), default="")
 
 
-def not_shown(table: Table) -> list[str]:
+def not_shown(table: Measurements) -> list[str]:
     """A sentence about the solvers that profiles leave out, if there are any."""
     count = len(races(table))
     names = ", ".join(f"{label} (on {tried} of {count})" for label, tried in partly_tried(table).items())
@@ -89,7 +91,7 @@ def share(values: Values, at: Values) -> Values:
     return np.searchsorted(np.sort(values), at, side="right") / len(values)
 
 
-def judged(table: Table, target: float) -> list[list[Curve]]:
+def judged(table: Measurements, target: float) -> list[list[Curve]]:
     """The races that this accuracy can be judged on: some solver reaches it, none of them at once."""
     return [r for r in races(table).values() if askable(r[0].problem, target) and contested(r, target)]
 
@@ -109,7 +111,7 @@ _KINDS = (
 )
 
 
-def draw_profiles(table: Table, stem: Path) -> list[Path]:
+def draw_profiles(table: Measurements, stem: Path) -> list[Path]:
     """A row of performance profiles and a row of data profiles, a column for each accuracy; returns the files."""
     if not any(judged(table, target) for target in TARGETS):
         return []

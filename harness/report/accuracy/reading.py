@@ -1,4 +1,4 @@
-"""Reads the rows of an accuracy measurement into `harness.report.accuracy.table`."""
+"""Reads the rows of an accuracy measurement into `harness.report.accuracy.measured`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pyarrow as pa
 from harness.base import shelf
 from harness.base.errors import InputError, Mistake
 from harness.base.rows import read as read_rows
-from harness.report.accuracy.table import Curve, Problem, Table, Values, Work
+from harness.report.accuracy.measured import Curve, Measurements, Problem, Values, WorkPoint
 
 ROUND_OFF = 100 * float(np.finfo(np.float64).eps)
 """An energy this share of its terms' magnitude below g* is a lower minimum and not round-off: sums of up to 1e5
@@ -27,7 +27,7 @@ _Row = dict[str, Any]
 _Label = Callable[[_Row], str]
 
 
-def read(folder: Path, files: Iterable[Path] | None = None) -> Table:
+def read(folder: Path, files: Iterable[Path] | None = None) -> Measurements:
     """The rows in these files, all under `folder`/accuracy if left out. Raises InputError where there are none."""
     units = shelf.units(folder / "accuracy") if files is None else sorted(files)
     if not units:
@@ -40,7 +40,7 @@ def read(folder: Path, files: Iterable[Path] | None = None) -> Table:
         rows.sort(key=lambda row: (row["scene"], row["size"]))
     label = _labels(kinds["curve"] + kinds["work"])
     problems = _problems(kinds)
-    return Table(
+    return Measurements(
         tuple(problems.values()),
         tuple(_curves(kinds, problems, label)),
         tuple(_work(row, label) for row in kinds["work"]),
@@ -144,9 +144,9 @@ def _curve(problem: Problem, rows: Sequence[_Row], prepared: _Row, label: str) -
     )
 
 
-def _work(row: _Row, label: _Label) -> Work:
+def _work(row: _Row, label: _Label) -> WorkPoint:
     names = ("scene", "size", "solver", "parameters", "integrator", "time_step", "tolerance", "iterations")
-    return Work(
+    return WorkPoint(
         **{name: row[name] for name in (*names, "first_guess", "status")},
         family=row["family"] or "",
         reference=row["reference"] or "",

@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
 
 from harness.report.accuracy.convergence import GUESSES
+from harness.report.accuracy.measured import Curve, Measurements, Problem
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -28,7 +29,6 @@ from harness.report.accuracy.sheet import (
     panel,
     sheet,
 )
-from harness.report.accuracy.table import Curve, Problem, Table
 from harness.report.accuracy.times import STEPS, TARGETS, askable, crossings, left_out, power, seconds_to
 from harness.report.page import count, text
 from harness.report.style import INK, Mark, looks
@@ -36,7 +36,7 @@ from harness.report.style import INK, Mark, looks
 _COLUMNS = {None: "the step alone", **{n: f"set-up over {count(n)} step{'s' if n > 1 else ''}" for n in STEPS}}
 
 
-def draw_times(table: Table, folder: Path) -> list[Path]:
+def draw_times(table: Measurements, folder: Path) -> list[Path]:
     """A picture for each mesh; of problems whose minimum is certified alone. Returns the files."""
     drawn: list[Path] = []
     marked = looks((curve.label, curve.solver) for curve in table.curves)

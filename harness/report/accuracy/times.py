@@ -12,7 +12,7 @@ from math import ceil, inf, log
 
 import numpy as np
 
-from harness.report.accuracy.table import Curve, Problem, Table
+from harness.report.accuracy.measured import Curve, Measurements, Problem
 from harness.report.page import quantity
 
 TARGETS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
@@ -81,7 +81,7 @@ def left_out(problems: Iterable[Problem]) -> list[str]:
     return [f"{len(doubtful)} of {len(problems)} steps are left out, as their minimum is not certified{which}"]
 
 
-def races(table: Table) -> dict[tuple[str, str], list[Curve]]:
+def races(table: Measurements) -> dict[tuple[str, str], list[Curve]]:
     """The curves that race from the same start: by problem and first guess, in the order of the rows."""
     found: dict[tuple[str, str], list[Curve]] = {}
     for curve in table.curves:

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from harness.report.accuracy.measured import Measurements, WorkPoint, step_words
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -26,7 +27,6 @@ from harness.report.accuracy.sheet import (
     sheet,
     size,
 )
-from harness.report.accuracy.table import Table, Work, step_words
 from harness.report.accuracy.times import duration, power
 from harness.report.page import quantity, text
 from harness.report.style import INK, MUTED, PAGE, Mark, looks
@@ -38,27 +38,27 @@ ERRORS = (0.1, 0.03, 0.01, 0.003, 0.001)
 """The errors at which the front is told in words."""
 
 
-def is_default(work: Work) -> bool:
+def is_default(work: WorkPoint) -> bool:
     """Whether this is the assignment's default: implicit Euler at 1/30 s with 50 iterations of local-global."""
     same_method = work.family == LOCAL_GLOBAL and work.integrator == "implicit-euler"
     return same_method and work.tolerance is None and work.iterations == 50 and abs(30 * work.time_step - 1) < 1e-9
 
 
-def default(works: Iterable[Work]) -> Work | None:
+def default(works: Iterable[WorkPoint]) -> WorkPoint | None:
     """The assignment's default among these, by the fastest of its backends."""
     return min((w for w in works if is_default(w) and _known(w)), key=lambda w: w.seconds, default=None)
 
 
-def front(works: Iterable[Work]) -> list[Work]:
+def front(works: Iterable[WorkPoint]) -> list[WorkPoint]:
     """Those that no other beats in both time and error, the cheapest first."""
-    kept: list[Work] = []
+    kept: list[WorkPoint] = []
     for work in sorted((w for w in works if _known(w)), key=lambda w: (w.seconds, w.error)):
         if not kept or work.error < kept[-1].error:
             kept.append(work)
     return kept
 
 
-def findings(works: Sequence[Work]) -> list[str]:
+def findings(works: Sequence[WorkPoint]) -> list[str]:
     """The cheapest way to each error that the default does not reach, or reaches for more, in words."""
     base = default(works)
     words: list[str] = []
@@ -82,7 +82,7 @@ def findings(works: Sequence[Work]) -> list[str]:
     return words
 
 
-def same_method(work: Work, base: Work | None) -> bool:
+def same_method(work: WorkPoint, base: WorkPoint | None) -> bool:
     """Whether it differs from the default in the time step alone."""
     return base is not None and (work.label, work.integrator, work.tolerance, work.iterations) == (
         base.label,
@@ -92,7 +92,7 @@ def same_method(work: Work, base: Work | None) -> bool:
     )
 
 
-def draw_work(table: Table, folder: Path) -> list[Path]:
+def draw_work(table: Measurements, folder: Path) -> list[Path]:
     """A picture for each mesh, a panel for each integrator; returns the files."""
     drawn: list[Path] = []
     marked = looks((work.label, work.solver) for work in table.works)
@@ -105,11 +105,11 @@ def draw_work(table: Table, folder: Path) -> list[Path]:
     return drawn
 
 
-def _known(work: Work) -> bool:
+def _known(work: WorkPoint) -> bool:
     return work.status == "ok" and 0.0 < work.error < np.inf and 0.0 < work.seconds < np.inf
 
 
-def _draw(stem: Path, mesh: str, works: list[Work], marked: dict[str, Mark], machine: Sequence[str]) -> None:
+def _draw(stem: Path, mesh: str, works: list[WorkPoint], marked: dict[str, Mark], machine: Sequence[str]) -> None:
     words = _notes(works)
     integrators = [name for name in INTEGRATORS if any(work.integrator == name for work in works)]
     known = [work for work in works if _known(work)]
@@ -138,15 +138,15 @@ def _draw(stem: Path, mesh: str, works: list[Work], marked: dict[str, Mark], mac
         notes(page, words)
 
 
-def _sizes(works: Iterable[Work]) -> dict[float | None, float]:
+def _sizes(works: Iterable[WorkPoint]) -> dict[float | None, float]:
     """Sizes of the marks by tolerance, larger for tighter ones; None: fixed iterations."""
     tolerances = sorted({work.tolerance for work in works if work.tolerance}, reverse=True)
     return {None: 5.0, **{tolerance: 4.0 + 1.6 * k for k, tolerance in enumerate(tolerances)}}
 
 
-def _panel(ax: Axes, works: list[Work], marked: dict[str, Mark], sizes: dict[float | None, float]) -> None:
+def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dict[float | None, float]) -> None:
     """Points of one integrator; those that differ in the time step alone are joined."""
-    chains: dict[tuple[str, float | None, int, str], list[Work]] = {}
+    chains: dict[tuple[str, float | None, int, str], list[WorkPoint]] = {}
     for work in works:
         chains.setdefault((work.label, work.tolerance, work.iterations, work.first_guess), []).append(work)
     for (label, tolerance, *_), members in chains.items():
@@ -167,7 +167,7 @@ def _panel(ax: Axes, works: list[Work], marked: dict[str, Mark], sizes: dict[flo
         )  # fmt: skip
 
 
-def _front(ax: Axes, works: list[Work]) -> None:
+def _front(ax: Axes, works: list[WorkPoint]) -> None:
     """The front of all integrators, the same in each panel: the least error that a budget buys."""
     best = front(works)
     if best:
@@ -191,7 +191,7 @@ def _stop(tolerance: float | None) -> str:
     return "fixed iterations" if tolerance is None else f"tolerance {power(tolerance)}"
 
 
-def _notes(works: Sequence[Work]) -> list[str]:
+def _notes(works: Sequence[WorkPoint]) -> list[str]:
     words = ["Joined points differ in the time step alone: " + ", ".join(map(step_words, _steps(works)))]
     if not all(work.minimises for work in works):
         words.append("† does not minimise the step's objective: its limit is not the integrator's own solution")
@@ -199,5 +199,5 @@ def _notes(works: Sequence[Work]) -> list[str]:
     return words + [f"× {work.setting}: {work.status}{': ' if work.reason else ''}{work.reason}" for work in failed]
 
 
-def _steps(works: Sequence[Work]) -> list[float]:
+def _steps(works: Sequence[WorkPoint]) -> list[float]:
     return sorted({work.time_step for work in works}, reverse=True)

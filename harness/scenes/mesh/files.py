@@ -74,10 +74,10 @@ def _read_meshio(path: Path) -> Cells:
 @lru_cache(maxsize=2)  # a scene builds its mesh several times, and a child takes a while to start
 def _read(path: Path, changed: int, size: int) -> tuple[NDArray[np.float64], list[Block]]:
     """What meshio finds in a file of so many bytes, changed last at a time [ns]."""
-    limits = child.Limits(SECONDS + size / BYTES_PER_SECOND, MEMORY + MEMORY_PER_BYTE * size)
+    limits = child.Allowance(SECONDS + size / BYTES_PER_SECOND, MEMORY + MEMORY_PER_BYTE * size)
     try:
         return child.call(read, path, limits=limits)
-    except child.Lost as error:
+    except child.NoAnswer as error:
         raise InputError(Mistake(f"cannot be read as a mesh: {error}", path)) from None
 
 

@@ -64,7 +64,7 @@ class Gate(Model):
         return f"{Path(self.scene).stem}{size}, {_name(self.solver)} against {_name(self.against)}"
 
 
-class Table(Model):
+class ListedGates(Model):
     """A table of gates."""
 
     description: str = Field(default="", max_length=1000)
@@ -80,7 +80,7 @@ def run_table(path: Path, budget: float, say: Callable[[str], None], alpha: floa
     Raises InputError, also for answers that differ.
     """
     document = read_yaml(path)
-    table = document.check(Table, document.data)
+    table = document.check(ListedGates, document.data)
     if table is None:
         raise document.error()
     for i, gate in enumerate(table.gates):

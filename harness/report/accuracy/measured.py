@@ -102,7 +102,7 @@ class Curve:
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
+class WorkPoint:
     """One simulation of a horizon [s]: its relative error, and wall seconds a simulated second (nan if it failed).
 
     family, reference, minimises, own_steps: what the solver states of itself.
@@ -143,12 +143,12 @@ class Work:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class Measurements:
     """All that the rows say, in their order; machine: processor, threads and commit, in words."""
 
     problems: tuple[Problem, ...]
     curves: tuple[Curve, ...]
-    works: tuple[Work, ...]
+    works: tuple[WorkPoint, ...]
     machine: tuple[str, ...]
 
 
@@ -162,7 +162,7 @@ LONG = 500
 """Iterations from which on a curve of the paper's reproduction is worth a picture of its own: Figure 2 has 1000."""
 
 
-def without_short(table: Table) -> Table:
+def without_short(table: Measurements) -> Measurements:
     """The table less the many short curves from which the paper's Figure 3 takes means."""
     long = {c.problem.digest for c in table.curves if not c.problem.paper or c.iterations.max(initial=0.0) >= LONG}
     problems = tuple(p for p in table.problems if p.digest in long)
