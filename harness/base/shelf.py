@@ -50,7 +50,7 @@ def packed_units(folder: Path) -> frozenset[str]:
     path = packed_file(folder)
     try:
         there = path.stat()
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return frozenset()
     return _packed(path, there.st_ino, there.st_mtime_ns, there.st_size)
 

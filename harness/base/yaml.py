@@ -96,6 +96,15 @@ def _number(text: str) -> float | int:
     return int(value) if "." not in text and abs(value) < 2**53 and value.is_integer() else value
 
 
+def scalar(text: str) -> Any:
+    """What a text means as a plain value of a file: a number, null, a boolean; else it is text."""
+    tag = YAML(typ="safe", pure=True).resolver.resolve(ScalarNode, text, (True, False))
+    try:
+        return _SCALARS[str(tag).removeprefix(_CORE)](text)
+    except (KeyError, ValueError):
+        return text
+
+
 class _Converter:
     """Turns composed nodes into plain data; the nodes are counted each time an alias repeats them."""
 

@@ -15,7 +15,7 @@ from typer.main import get_command
 
 def taking(*names: str) -> type[TyperCommand]:
     """A command that takes these options of a run too, all without names. It finds what was given in `obj` of its
-    context: numbers, and as text what is none."""
+    context; a value means there what it means in a file."""
 
     class Taking(TyperCommand):
         _added: tuple[str, ...] = ()
@@ -28,21 +28,13 @@ def taking(*names: str) -> type[TyperCommand]:
             return super().get_params(ctx)
 
         def invoke(self, ctx: Any) -> Any:
+            from harness.base.yaml import scalar
+
             given = {name: ctx.params.pop(name) for name in self._added}
-            ctx.obj = {name: _read(value) for name, value in given.items() if value is not None}
+            ctx.obj = {name: scalar(text) for name, text in given.items() if text is not None}
             return super().invoke(ctx)
 
     return Taking
-
-
-def _read(given: str) -> int | float | str:
-    """A number where the text is one, as in YAML."""
-    for kind in (int, float):
-        try:
-            return kind(given)
-        except ValueError:
-            continue
-    return given
 
 
 def _options(names: tuple[str, ...]) -> list[Any]:

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from harness.base.columns import SCHEMA
 from harness.base.errors import InputError
 from harness.cli import app
+from harness.config import load
 from harness.config.load import Sweep, load_any, load_scene, load_sweep
 from harness.config.options import OPTIONS
 from harness.config.schema import schema
@@ -283,6 +284,28 @@ def test_each_option_that_a_sweep_varies_is_one_of_a_run_of_the_command_line_and
     told = CliRunner().invoke(app, ["run", "--help"]).output
     assert {name for name in OPTIONS if f"--{name.replace('_', '-')} VALUE" in told} == set(OPTIONS)
     assert {option.column for option in OPTIONS.values()} - {""} <= set(SCHEMA.names)
+
+
+def test_a_value_on_the_command_line_means_what_it_means_in_a_file(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, Any] = {}
+
+    def loaded(path: Path, *, solvers: Any, sizes: Any, **options: Any) -> Sweep:
+        asked.update(options)
+        asked["runs"] = load_any(path, sizes=[4], **options).runs()
+        raise InputError("enough")
+
+    monkeypatch.setattr(load, "load_any", loaded)
+    values = {"iterations": "7", "tolerance": "1e-3", "integrator": "bdf2", "time_step": "1/60", "frames": "0x3"}
+    values |= {"first_guess": "inertial", "threads": "auto", "rounds": "1"}
+    assert set(values) == set(OPTIONS)
+    given = [part for name, text in values.items() for part in (f"--{name.replace('_', '-')}", text)]
+    assert CliRunner().invoke(app, ["run", str(folder / "cloth.yaml"), *given]).exit_code == 2
+    (run,) = asked.pop("runs")
+    assert asked == {**values, "iterations": 7, "tolerance": 1e-3, "frames": 3, "rounds": 1}
+    assert (run.iterations, run.tolerance, run.time_step, run.frames, run.rounds) == (7, 1e-3, 1 / 60, 3, 1)
+    assert (run.integrator, run.first_guess, run.threads) == ("bdf2", "inertial", "auto")
 
 
 @pytest.mark.parametrize(("key", "value"), [("tolerance", None), ("threads", 2), ("size", [4, 8])])
