@@ -84,7 +84,8 @@ class System:
 
     mass: (n,) [kg], zero is allowed where springs or pins hold the vertex; time_step: dt [s];
     energies: potentials of the positions; pins: which vertices are pinned, and how; factor: c of the time integrator
-    (see `solvers.integrators`), 1 for implicit Euler.
+    (see `solvers.integrators`), 1 for implicit Euler; speed: by how much the unknown's velocity grows with it, in 1/dt,
+    None for sqrt(c).
     """
 
     mass: NDArray[np.float64]
@@ -92,11 +93,12 @@ class System:
     energies: tuple[Energy, ...] = ()
     pins: Pins = field(default_factory=Pins)
     factor: float = 1.0
+    speed: float | None = None
 
     @property
     def rate(self) -> float:
-        """sqrt(c)/dt [1/s], as `Start` has it."""
-        return self.factor**0.5 / self.time_step
+        """sqrt(c)/dt, or speed/dt [1/s], as `Start` has it."""
+        return (self.factor**0.5 if self.speed is None else self.speed) / self.time_step
 
     @cached_property
     def inertia(self) -> NDArray[np.float64]:
@@ -133,7 +135,9 @@ class Start:
 
     positions: p^t (n, 3) [m]; velocity: v^t, filters included, (n, 3) [m/s]; time: t [s]; origin (n, 3) [m] and rate
     [1/s]: the unknown x moves with the velocity rate (x - origin); until: the time of x [s], for what moves by itself
-    (nan, which spoils all that depends on it, where it is not told); ahead: how far [s] to extrapolate what is lagged.
+    (nan, which spoils all that depends on it, where it is not told); ahead: how far [s] to extrapolate what is lagged;
+    lagged: where it is taken instead, (n, 3) [m]; acceleration: what the motion so far leads to expect at x, (n, 3)
+    [m/s^2].
     """
 
     positions: Positions
@@ -143,10 +147,14 @@ class Start:
     rate: float
     until: float = float("nan")
     ahead: float = 0.0
+    lagged: Positions | None = None
+    acceleration: Positions | None = None
 
     @property
     def expected(self) -> Positions:
-        """The positions that an energy is lagged at, (n, 3) [m]: p^t, or extrapolated by `ahead`."""
+        """The positions that an energy is lagged at, (n, 3) [m]: p^t, or extrapolated by `ahead`, or `lagged`."""
+        if self.lagged is not None:
+            return self.lagged
         return self.positions + self.ahead * self.velocity if self.ahead else self.positions
 
     def velocity_at(self, x: Positions) -> Positions:

@@ -100,7 +100,8 @@ def moment_frames(violence: NDArray[np.float64], length: int) -> dict[str, int]:
 
 
 _ARRAYS = ("target", "force", "pin_targets", "current")
-_START = tuple(field.name for field in fields(Start))
+_MAYBE = ("lagged", "acceleration")
+_START = tuple(field.name for field in fields(Start) if field.name not in _MAYBE)
 
 
 def freeze(step: Step, origin: str) -> tuple[Frozen, Arrays]:
@@ -109,6 +110,7 @@ def freeze(step: Step, origin: str) -> tuple[Frozen, Arrays]:
     system, start = problem.system, problem.start
     arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
     arrays |= {f"start_{name}": getattr(start, name) for name in _START}
+    arrays |= {f"start_{name}": known for name in _MAYBE if (known := getattr(start, name)) is not None}
     arrays |= {"mass": system.mass, "pins": system.pins.vertices, "gradient": problem.gradient(problem.current)}
     arrays |= {"time_step": system.time_step, "factor": system.factor, "frame": step.index}
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
@@ -125,7 +127,7 @@ def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
     if any(f"start_{name}" not in arrays for name in _START):
         return None
     system = replace(scene.system, factor=float(arrays["factor"]))
-    begun: dict[str, Any] = {name: arrays[f"start_{name}"] for name in _START}
+    begun: dict[str, Any] = {name: arrays[f"start_{name}"] for name in (*_START, *_MAYBE) if f"start_{name}" in arrays}
     begun |= {name: float(value) for name, value in begun.items() if not value.ndim}
     given = {name: arrays[name] for name in _ARRAYS}
     problem = StepProblem(system, **given, first_guess=given["current"], start=Start(**begun))

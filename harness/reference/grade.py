@@ -36,6 +36,7 @@ class Graded(Passing):
         """frames: counted from 1."""
         super().__init__(prepared)
         self._frames, self._done = frames if minimises(solver) else (), 0
+        self._begun = -np.inf
         self._name = type(solver).__name__
         self._oracles: dict[float, Oracle] = {}
         self.found: dict[int, dict[str, Any]] = {}
@@ -44,9 +45,11 @@ class Graded(Passing):
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """The solver's answer; raises RunFailed where it claims what is not so."""
         found = self._prepared.solve(problem, stop)
-        self._done += 1
+        if problem.start.time > self._begun:  # the first unknown of the next frame
+            self._done, self._begun = self._done + 1, problem.start.time
         if self._done in self._frames and np.isfinite(found.positions).all() and len(problem.target) <= LARGEST:
-            self.found[self._done] = self._graded(problem, found, stop)
+            graded = self._graded(problem, found, stop)
+            self.found[self._done] = max(graded, self.found.get(self._done, graded), key=lambda row: row["graded"])
         return found
 
     def _graded(self, problem: StepProblem, found: Solution, stop: StopRule) -> dict[str, Any]:

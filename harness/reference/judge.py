@@ -36,16 +36,17 @@ class Judge:
 
     def __call__(self, step: Step) -> dict[str, Any]:
         """The columns `stationarity`, `attainable`, `beyond`, `minimum` and `flat` (null for a method that does not
-        minimise) and `distance` of the step's row."""
+        minimise) and `distance` of the step's row. Of a step of several unknowns all are judged, and the first three
+        are those of the worst."""
         row: dict[str, Any] = {}
         if self._reference is not None:
             away = np.linalg.norm(step.positions - self._reference[step.index - 1], axis=1) / self._sizes
             row["distance"] = float(away.max()) if np.isfinite(away).all() else None
         if self._minimises:
-            p, stated = step.solution.positions, step.problem
-            row["stationarity"], row["attainable"], row["beyond"] = self.stationarity(stated, p)
-            found = curvature(stated, p)
-            row["minimum"], row["flat"] = found.convex, found.flat
+            readings = [self.stationarity(stated, solution.positions) for stated, solution in step.stages]
+            row["stationarity"], row["attainable"], row["beyond"] = max(readings, key=_worse)
+            found = [curvature(stated, solution.positions) for stated, solution in step.stages]
+            row["minimum"], row["flat"] = all(one.convex for one in found), any(one.flat for one in found)
         return row
 
     def stationarity(self, problem: StepProblem, p: Positions) -> Reading:
@@ -61,10 +62,15 @@ def reference(scene: Scene, solver: Solver, *, first_guess: str, frames: int) ->
     that does not end at a stationary point."""
     judge, found = Judge(scene, None, minimises=True), np.full((frames, len(scene.mesh.rest), 3), np.nan)
     for step in simulate(scene, prepare(scene, solver), TO_THE_END, first_guess=first_guess, frames=frames):
-        if not judge.stationarity(step.problem, step.solution.positions).beyond <= LOST:
+        if not all(judge.stationarity(stated, s.positions).beyond <= LOST for stated, s in step.stages):
             break
         found[step.index - 1] = step.positions
     return found
+
+
+def _worse(reading: Reading) -> float:
+    """What a reading is ranked by, one that is no number first."""
+    return reading.beyond if np.isfinite(reading.beyond) else np.inf
 
 
 def is_minimum(problem: StepProblem, p: Positions) -> bool:

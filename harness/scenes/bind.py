@@ -16,7 +16,8 @@ from harness.scenes.motion import Motion
 from harness.scenes.spec import SceneSpec
 from harness.scenes.start import Rest
 from solvers.energies.springs import Springs
-from solvers.integrators import IMPLICIT_EULER, Integrator, find
+from solvers import integrators
+from solvers.integrators import IMPLICIT_EULER, find
 from solvers.matrices import assemble
 from solvers.problem import NotPositiveDefinite, Pins, Positions, ProjectiveEnergy, System
 
@@ -33,7 +34,8 @@ class Scene:
     mesh: at rest; start: how the start differs from that; system: what is factorised; load: the sum of the forces
     that never change, (n, 3) [N], read-only; forces: those that change; filters: of the velocity;
     pin_targets: (q, 3) [m], in the order of `system.pins`; moving: which of them move, and how;
-    velocity: of every vertex at the start [m/s], less the start's spin; integrator: its factor is the system's;
+    velocity: of every vertex at the start [m/s], less the start's spin; integrator: its factor and speed are the
+    system's;
     alternate: the same in every second step, where that is of another length.
     """
 
@@ -44,7 +46,7 @@ class Scene:
     filters: tuple[VelocityFilter, ...]
     pin_targets: Positions
     velocity: tuple[float, float, float]
-    integrator: Integrator = IMPLICIT_EULER
+    integrator: integrators.Any = IMPLICIT_EULER
     moving: tuple[tuple[NDArray[np.int64], Motion], ...] = ()
     start: Rest = AT_REST
     alternate: Scene | None = None
@@ -68,6 +70,13 @@ class Scene:
             targets[rows] = motion.moved(self.pin_targets[rows], time)
         return targets
 
+    def pins_moving(self, time: float) -> Positions:
+        """How fast the pins' targets move at a time [s], (q, 3) [m/s]."""
+        velocity = np.zeros_like(self.pin_targets)
+        for rows, motion in self.moving:
+            velocity[rows] = motion.velocity(self.pin_targets[rows], time)
+        return velocity
+
     @cached_property
     def springs(self) -> Springs:
         """All springs that have stiffness: effect by effect, each in the mesh's order."""
@@ -79,9 +88,9 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
 
     Raises InputError where the scene's parts do not fit together.
     """
-    mesh = spec.mesh.build(size)
+    mesh, method = spec.mesh.build(size), find(integrator)
     mass = _mass(spec, mesh)
-    parts = [_bound(spec, i, mesh, mass) for i in range(len(spec.effects))]
+    parts = [_bound(spec, i, mesh, mass).by(method) for i in range(len(spec.effects))]
     _single(spec, parts)
     pins, targets, moving = _pins(parts)
     energies = tuple(energy for part in parts for energy in part.energies)
@@ -92,7 +101,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
         if isinstance(force, Steady):
             load += force.force
     load.flags.writeable = False
-    system = System(mass, spec.time_step, energies, pins, find(integrator).factor)
+    system = System(mass, spec.time_step, energies, pins, method.factor, method.speed)
     _require_determined(system)
     start = spec.start or AT_REST
     _check(parts, start.positions(mesh.rest))
@@ -106,7 +115,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
         filters=tuple(one for part in parts for one in part.filters),
         pin_targets=targets,
         velocity=spec.velocity,
-        integrator=find(integrator),
+        integrator=method,
         moving=moving,
         start=start,
         alternate=None if other in (None, spec.time_step) else build(spec.stepped(other), size, integrator),

@@ -63,6 +63,13 @@ class Motion(Model):
         arm = points - self.about
         return points + offset + arm @ (_rotation(self.axis, np.deg2rad(turn)) - np.eye(3)).T
 
+    def velocity(self, points: Positions, time: float) -> Positions:
+        """How fast points declared at (q, 3) [m] move at a time [s], and right after it at a key, (q, 3) [m/s]."""
+        (*offset, rise), (*_, turn) = self._slope(time), self._at(time)
+        arm = (points - self.about) @ _rotation(self.axis, np.deg2rad(turn)).T
+        axis = np.array(self.axis) / np.linalg.norm(self.axis)
+        return offset + np.deg2rad(rise) * np.cross(axis, arm)
+
     @property
     def straight(self) -> bool:
         """Whether points go along straight lines from key to key, each at one speed."""
@@ -89,6 +96,18 @@ class Motion(Model):
         times, values = self.table
         t = float(np.clip(time, times[0], times[-1]))
         return values[0] if len(times) == 1 else _BETWEEN[self.between](times, values, t)
+
+    def _slope(self, time: float) -> NDArray[np.float64]:
+        """What offset [m/s] and turn [degrees/s] change by at a time [s], (4,)."""
+        times, values = self.table
+        if not times[0] <= time < times[-1]:
+            return np.zeros(4)
+        if self.between == "linear":
+            k = int(np.searchsorted(times, time, side="right"))
+            return (values[k] - values[k - 1]) / (times[k] - times[k - 1])
+        from scipy.interpolate import PchipInterpolator
+
+        return np.asarray(PchipInterpolator(times, values)(time, 1))
 
 
 def _linear(times: NDArray[np.float64], values: NDArray[np.float64], t: float) -> NDArray[np.float64]:

@@ -25,6 +25,9 @@ from solvers.problem import Positions, Prepared
 _OWN = ("springs", "inertia", "force", "pins")
 """Terms of the objective that have a column of their own."""
 
+_WORST = ("iterations", "stalled", "tolerance", "floor")
+"""What may end a solve, the least welcome first."""
+
 
 def observe(
     scene: Scene,
@@ -54,8 +57,9 @@ def observe(
             "objective": sum(terms.values()),
             "largest_strain": largest_strain(scene, p),
             "penetration": penetration(scene, p, scene.time(step.index)),
-            "iterations": s.iterations,
-            "stopped": s.stopped,
+            "iterations": step.iterations,
+            "stages": len(step.stages),
+            "stopped": stopped(step),
             "residual": residual,
             "last_residual": s.residual,
             "residual_of": s.residual_of,
@@ -66,7 +70,7 @@ def observe(
         if stored is not None:
             stored[step.index - 1] = p
         if recorder:
-            recorder.frame(Frame(step.index, scene.time(step.index), p, terms, residual, s.iterations))
+            recorder.frame(Frame(step.index, scene.time(step.index), p, terms, residual, step.iterations))
 
     with ThreadPoolExecutor(1) as beside:
         looked: Future[None] | None = None
@@ -102,6 +106,11 @@ def returned_residual(prepared: Prepared, step: Step) -> float:
     if solution.residual_of == "previous":
         return prepared.residual_at(step.problem, solution.positions)
     return solution.residual
+
+
+def stopped(step: Step) -> str:
+    """What ended the iterations of the unknown that was left farthest from what was asked."""
+    return min((solution.stopped for _, solution in step.stages), key=_WORST.index)
 
 
 def largest_strain(scene: Scene, p: Positions) -> float:

@@ -8,28 +8,35 @@ from functools import reduce
 from time import perf_counter
 
 from harness.scenes.bind import Scene
-from solvers.integrators import IMPLICIT_EULER, Motion
+from harness.simulation.stages import Stages, require_mass
+from solvers.integrators import IMPLICIT_EULER, Integrator, Motion
 from solvers.problem import Positions, Prepared, Solution, Solver, Start, StepProblem, StopRule, System, Unsupported
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
     """now, the motion at the start of the next step; before, one step earlier and filtered, None where there is none;
-    index of the last step, 0 at the start."""
+    index of the last step, 0 at the start; acceleration (n, 3) [m/s^2] now, None where it is not known."""
 
     now: Motion
     before: Motion | None
     index: int
+    acceleration: Positions | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """One step that was done: its problem, its solution, the state after it, its wall seconds."""
+    """One step that was done: its problem, its solution, the state after it, its wall seconds, and all of its iterations.
+
+    A step of several unknowns has the problem and the solution of the last one; stages: those of all, in their order.
+    """
 
     problem: StepProblem
     solution: Solution
     state: State
     seconds: float
+    iterations: int
+    stages: tuple[tuple[StepProblem, Solution], ...]
 
     @property
     def index(self) -> int:
@@ -49,7 +56,9 @@ def start(scene: Scene) -> State:
 
 
 def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
-    """The next step's problem from a state; `first_guess` is a key of `FIRST_GUESSES`."""
+    """The next step's problem from a state, that of its first unknown; `first_guess` is a key of `FIRST_GUESSES`."""
+    if not isinstance(scene.integrator, Integrator):
+        return FIRST_GUESSES[first_guess](_stages(scene, state).first())
     scene, time = scene.at(state.index), scene.time(state.index)
     dt = scene.system.time_step
     # `before` was filtered when it was `now`. Filtered once more it has decayed as long as `now` has (an integrating
@@ -59,7 +68,8 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
     method, system = (IMPLICIT_EULER, _first(scene)) if starts else (scene.integrator, scene.system)
     target, origin = method.predict(now, before, dt)
     when, ahead = time + method.when * dt, method.ahead * dt
-    begun = Start(now.positions, now.velocity, time, origin, system.rate, when, ahead)
+    led = (now.velocity - before.velocity) / dt if first_guess == "motion" and state.before else None
+    begun = Start(now.positions, now.velocity, time, origin, system.rate, when, ahead, acceleration=led)
     force = scene.load
     if scene.forces:
         a = method.ahead
@@ -75,8 +85,9 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
 
 def prepare(scene: Scene, solver: Solver) -> Prepared:
     """The solver, ready for all of the scene's steps; raises what `solver.prepare` raises, and Unsupported where steps
-    differ in length and the integrator goes by two of them."""
-    history, alternate = scene.integrator.history, scene.alternate
+    differ in length and the integrator goes by two of them, or where it needs masses that are not there."""
+    require_mass(scene)
+    history, alternate = isinstance(scene.integrator, Integrator) and scene.integrator.history, scene.alternate
     if history and alternate:
         raise Unsupported("the integrator's formula holds for steps of one length, and the scene alternates two")
     prepared, other = solver.prepare(scene.system), alternate.system if alternate else _first(scene)
@@ -91,13 +102,35 @@ def simulate(
     state = state or start(scene)
     while state.index < frames:
         began = perf_counter()
-        stated = problem(scene, state, first_guess)
-        solution = prepared.solve(stated, stop)
-        method = IMPLICIT_EULER if stated.system.factor == IMPLICIT_EULER.factor else scene.integrator
-        before = Motion(stated.start.positions, stated.start.velocity)
-        state = State(method.advance(stated.start, solution), before, state.index + 1)
+        step = _single if isinstance(scene.integrator, Integrator) else _staged
+        done = step(scene, prepared, stop, first_guess, state)
         seconds = perf_counter() - began
-        yield Step(stated, solution, state, seconds)
+        state = done.state
+        yield replace(done, seconds=seconds)
+
+
+def _single(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, state: State) -> Step:
+    """The step of an integrator of one unknown; its seconds are not known."""
+    stated = problem(scene, state, first_guess)
+    solution = prepared.solve(stated, stop)
+    method = IMPLICIT_EULER if stated.system.factor == IMPLICIT_EULER.factor else scene.integrator
+    assert isinstance(method, Integrator)
+    before = Motion(stated.start.positions, stated.start.velocity)
+    after = State(method.advance(stated.start, solution), before, state.index + 1)
+    return Step(stated, solution, after, 0.0, solution.iterations, ((stated, solution),))
+
+
+def _staged(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, state: State) -> Step:
+    """The step of an integrator of several unknowns; its seconds are not known."""
+    begun = _stages(scene, state)
+    done = begun.done(prepared, stop, FIRST_GUESSES[first_guess])
+    after = State(done.end.motion, begun.now, state.index + 1, done.end.acceleration)
+    return Step(*done.stages[-1], after, 0.0, done.iterations, done.stages)
+
+
+def _stages(scene: Scene, state: State) -> Stages:
+    of = scene.at(state.index)
+    return Stages(of, _filtered(of, state.now), state.acceleration, scene.time(state.index))
 
 
 class _Turns:
@@ -154,8 +187,17 @@ def _inertial(stated: StepProblem) -> StepProblem:
     return replace(stated, first_guess=_pinned(stated.system, stated.target, stated.pin_targets))
 
 
+def _motion(stated: StepProblem) -> StepProblem:
+    """Where the motion so far leads: by inertia, and by the acceleration that it had last."""
+    if stated.start.acceleration is None:
+        return _inertial(stated)
+    led = stated.target + stated.system.time_step**2 / stated.system.factor * stated.start.acceleration
+    return replace(stated, first_guess=_pinned(stated.system, led, stated.pin_targets))
+
+
 FIRST_GUESSES: dict[str, Callable[[StepProblem], StepProblem]] = {
     "assignment": _assignment,
     "current": _current,
     "inertial": _inertial,
+    "motion": _motion,
 }

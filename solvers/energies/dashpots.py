@@ -64,6 +64,7 @@ class Dashpots(Edges):
     direction: Positions
     offset: NDArray[np.float64]
 
+    lagged: ClassVar[bool] = True
     law: ClassVar[Law] = Law.of(_value, _gradient, _curvature, _rise, constant=True)
 
     @cached_property

@@ -87,5 +87,9 @@ class AirDrag(Viscous):
     """Drag of each vertex, in proportion to its velocity."""
 
 
+class EtherDrag(Viscous):
+    """Drag of each vertex, in proportion to its mass and its velocity."""
+
+
 class RayleighDamping(Viscous):
     """The part of Rayleigh damping that is in proportion to masses, or to the matrix of a quadratic energy."""

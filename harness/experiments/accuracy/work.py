@@ -86,7 +86,7 @@ def _run(spec: WorkSpec, scene: Scene, prepared: Prepared, frames: int) -> tuple
             step = next(run)
         p = step.positions
         seconds += step.seconds
-        iterations += step.solution.iterations
+        iterations += step.iterations
         if not np.isfinite(p).all():
             raise Diverged(f"positions are not finite from frame {step.index} on")
         if seconds > spec.how.time_limit and step.index < frames:

@@ -62,7 +62,7 @@ class Worker:
             done.clear()
             step = None
             for step in simulate(scene, prepared, stop, first_guess=run.first_guess, frames=frames):
-                done.append(step.solution.iterations)
+                done.append(step.iterations)
             assert step is not None
             if extra:
                 prepared.solve(step.problem, StopRule(max(1, round(extra * sum(done)))))

@@ -2,7 +2,8 @@
 
 The linear one is an energy (see `solvers.energies.quadratic`): unconditionally stable, and in Q. The quadratic one acts
 on the velocity before each step, by the exact solution of m dv/dt = -c |v| v over it: v <- m v / (m + c dt |v|),
-unconditionally stable too. Wind on triangles drags as well, by their area and how they face the air.
+unconditionally stable too, and of order 1. Integrators that take forces at their unknowns have it as a force, up to
+what stops a vertex in one step, and keep their order. Wind on triangles drags as well, by their area and how they face the air.
 """
 
 from typing import ClassVar, Literal
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeFloat
 
 from harness.base.model import Model
-from harness.scenes.effects.base import Contribution, Seen, VelocityFilter
+from harness.scenes.effects.base import Contribution, Force, Seen, VelocityFilter
 from harness.scenes.mesh.base import Mesh
 from solvers.energies.quadratic import AirDrag as Energy
 from solvers.problem import Positions
@@ -40,7 +41,8 @@ class AirDrag(Model):
             return Contribution()
         if self.law == "linear":
             return Contribution(energies=(Energy.of_vertices(c),))
-        return Contribution(filters=(_quadratic(mass, c * time_step),))
+        force = _force(c, mass / time_step)
+        return Contribution(filters=(_quadratic(mass, c * time_step),), continuous=Contribution(forces=(force,)))
 
     @classmethod
     def called_for(cls, seen: Seen) -> str:
@@ -69,6 +71,15 @@ def _quadratic(mass: NDArray[np.float64], c: NDArray[np.float64]) -> VelocityFil
         return v * np.divide(mass, mass + drag, out=np.ones_like(mass), where=drag > 0.0)[:, None]
 
     return slow
+
+
+def _force(c: NDArray[np.float64], limit: NDArray[np.float64]) -> Force:
+    """The force for c (n,) [kg/m], at most `limit` (n,) [kg/s] times the velocity."""
+
+    def drag(p: Positions, v: Positions, t: float) -> Positions:
+        return -np.minimum(c * np.linalg.norm(v, axis=1), limit)[:, None] * v
+
+    return drag
 
 
 def _kinetic(mass: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:

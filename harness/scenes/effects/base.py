@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.motion import Motion
+from solvers import integrators
 from solvers.energies.springs import Springs
+from solvers.integrators import Integrator
 from solvers.problem import Energy, Positions
 
 
@@ -75,6 +77,12 @@ class Contribution:
     checks: tuple[Check, ...] = field(default=())
     once: tuple[str, ...] = field(default=())
     """What a scene can have but once, in words; a second one would be added to the first."""
+    continuous: Contribution | None = None
+    """What does the same as a force or an energy, with no filter: for integrators that take forces at their unknowns."""
+
+    def by(self, method: integrators.Any) -> Contribution:
+        """What an integrator takes of it."""
+        return self if self.continuous is None or isinstance(method, Integrator) else self.continuous
 
     @property
     def empty(self) -> bool:

@@ -1,4 +1,8 @@
-"""Ether drag (Liu et al. 2013, section 5): before each step the velocity decays, v <- exp(-c dt) v."""
+"""Ether drag (Liu et al. 2013, section 5): before each step the velocity decays, v <- exp(-c dt) v.
+
+So a step is split, at order 1. Integrators that take forces at their unknowns have it as what it is, a linear force
+f = -c M v, and keep their order.
+"""
 
 from math import exp
 from typing import ClassVar, Literal
@@ -10,6 +14,7 @@ from pydantic import NonNegativeFloat
 from harness.base.model import Model
 from harness.scenes.effects.base import Contribution
 from harness.scenes.mesh.base import Mesh
+from solvers.energies.quadratic import EtherDrag as Energy
 from solvers.problem import Positions
 
 
@@ -31,4 +36,5 @@ class EtherDrag(Model):
         def decay(v: Positions) -> Positions:
             return kept * v
 
-        return Contribution(filters=(decay,))
+        drag = Energy.of_vertices(self.rate * mass)
+        return Contribution(filters=(decay,), continuous=Contribution(energies=(drag,)))

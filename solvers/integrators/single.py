@@ -1,4 +1,4 @@
-"""Time integrators, each a step problem of the same form: minimise over the unknown x
+"""Time integrators of one unknown a step, each a step problem of the same form: minimise over the unknown x
 
     energies(x) + c/(2 dt^2) |x - target|_M^2 - tr(x' f),       Q = A'KA + c M/dt^2
 
@@ -20,31 +20,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar
 
-from solvers.plugins import Table, load
+from solvers.integrators.base import Motion
 from solvers.problem import Positions, Solution, Start
-
-
-class Motion(NamedTuple):
-    """positions (n, 3) [m] and velocity (n, 3) [m/s] at one time."""
-
-    positions: Positions
-    velocity: Positions
 
 
 @dataclass(frozen=True, slots=True)
 class Integrator:
     """factor: c; when: the time of x within the step, 1 at its end; ahead: that of the external forces;
     history: whether it needs the motion one step before, so that implicit Euler makes the first step;
-    predict: from the motions now and one step before, and dt [s], to target and origin, each (n, 3) [m].
+    predict: from the motions now and one step before, and dt [s], to target and origin, each (n, 3) [m]; order: of its
+    error.
     """
+
+    speed: ClassVar[None] = None
+    """The unknown's velocity follows from c."""
+    unknowns: ClassVar[int] = 1
 
     factor: float
     when: float
     ahead: float
     history: bool
     predict: Callable[[Motion, Motion, float], tuple[Positions, Positions]]
+    order: int = 1
 
     def advance(self, start: Start, solution: Solution) -> Motion:
         """The motion at the step's end; a method that has a velocity of its own brings it in the solution."""
@@ -71,17 +70,5 @@ def _midpoint(now: Motion, before: Motion, dt: float) -> tuple[Positions, Positi
 
 
 IMPLICIT_EULER = Integrator(1.0, 1.0, 0.0, False, _euler)
-INTEGRATORS = {
-    "implicit-euler": IMPLICIT_EULER,
-    "bdf2": Integrator(2.25, 1.0, 1.0, True, _bdf2),
-    "midpoint": Integrator(4.0, 0.5, 0.5, False, _midpoint),
-}
-"""The shipped integrators by name."""
-
-EVERY = Table("springbench.integrators", INTEGRATORS)
-"""All that a config can name."""
-
-
-def find(name: str) -> Integrator:
-    """The integrator of a name, which may be somebody's own."""
-    return INTEGRATORS[name] if name in INTEGRATORS else load(EVERY[name])
+BDF2 = Integrator(2.25, 1.0, 1.0, True, _bdf2, order=2)
+MIDPOINT = Integrator(4.0, 0.5, 0.5, False, _midpoint, order=2)

@@ -1,0 +1,135 @@
+"""A step of several unknowns: the integrator asks for one after the other, a prepared solver answers each.
+
+All forces, pins and energies are those of the time of the unknown. What the step formula takes as given - forces that
+depend on the motion, directions of dashpots - is taken where the unknown is expected first; the unknown is solved for
+again with it where that led, `order - 2` times: each time it is right to one order more. Exact pins have the very
+velocity of their motion. Filters of the velocity, and contact, belong to the whole step and have order 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+
+from harness.scenes.bind import Scene
+from solvers.integrators import End, Motion, Solved, Staged, Unknown
+from solvers.problem import Positions, Prepared, Solution, Start, StepProblem, StopRule, Unsupported
+
+Guess = Callable[[StepProblem], StepProblem]
+
+
+class Done(NamedTuple):
+    """Each unknown's problem and solution; how the step ends; all iterations."""
+
+    stages: tuple[tuple[StepProblem, Solution], ...]
+    end: End
+    iterations: int
+
+
+class Stages:
+    """One step of a scene from a motion at a time, which is filtered already."""
+
+    def __init__(self, scene: Scene, now: Motion, acceleration: Positions | None, time: float) -> None:
+        """acceleration: at the start, (n, 3) [m/s^2], None where it is not known."""
+        method = scene.integrator
+        assert isinstance(method, Staged)
+        self.scene, self.time, pins = scene, time, scene.system.pins
+        self._exact, self._held = pins.exact, pins.vertices[pins.exact]
+        self.now = self._carried(now, time)
+        if acceleration is None and method.starts:
+            acceleration = self._acceleration()
+        self._unknowns = method.step(self.now, acceleration, scene.system.time_step)
+        self._again = method.order - 2 if scene.forces or any(map(_lags, scene.system.energies)) else 0
+
+    def done(self, prepared: Prepared, stop: StopRule, guess: Guess) -> Done:
+        """The step; prepared: for the scene's system."""
+        found, count, unknown = [], 0, next(self._unknowns)
+        while True:
+            stated = guess(self.stated(unknown))
+            solution = prepared.solve(stated, stop)
+            count += solution.iterations
+            for _ in range(self._again):
+                x = solution.positions
+                stated = replace(self.stated(unknown, x), first_guess=x)
+                solution = prepared.solve(stated, stop)
+                count += solution.iterations
+            found.append((stated, solution))
+            try:
+                unknown = self._unknowns.send(self._solved(stated, solution))
+            except StopIteration as ended:
+                return Done(tuple(found), self._ended(ended.value), count)
+
+    def first(self) -> StepProblem:
+        """The problem of the first unknown."""
+        return self.stated(next(self._unknowns))
+
+    def stated(self, unknown: Unknown, expected: Positions | None = None) -> StepProblem:
+        """An unknown's problem, its first guess the current positions; expected: where it is thought to be, (n, 3) [m],
+        by the motion so far if left out."""
+        scene, system = self.scene, self.scene.system
+        until = self.time + unknown.when * system.time_step
+        held, moving = scene.pins_at(until), scene.pins_moving(until)
+        unknown.origin[self._held] = held[self._exact] - moving[self._exact] / system.rate
+        if expected is None:
+            expected = unknown.target.copy()
+            if unknown.acceleration is not None:
+                expected += (system.time_step**2 / system.factor) * unknown.acceleration
+            expected[system.pins.vertices] = held
+        current = self.now.positions.copy()
+        current[system.pins.vertices] = held
+        begun = Start(
+            *(self.now.positions, self.now.velocity, self.time, unknown.origin, system.rate, until),
+            lagged=expected,
+            acceleration=unknown.acceleration,
+        )
+        v = begun.velocity_at(expected) if scene.forces else expected
+        force = reduce(lambda total, effect: total + effect(expected, v, until), scene.forces, scene.load)
+        return StepProblem(system, unknown.target, force, held, current, current, begun)
+
+    def _solved(self, stated: StepProblem, solution: Solution) -> Solved:
+        system, x = self.scene.system, solution.positions
+        acceleration = (system.factor / system.time_step**2) * (x - stated.target)
+        acceleration[self._held] = 0.0
+        return Solved(x, stated.start.velocity_at(x), acceleration)
+
+    def _ended(self, end: End) -> End:
+        """Exact pins are where their motion has them, and move as it does."""
+        return end._replace(motion=self._carried(end.motion, self.time + self.scene.system.time_step))
+
+    def _carried(self, motion: Motion, time: float) -> Motion:
+        if not len(self._held):
+            return motion
+        p, v = (part.copy() for part in motion)
+        p[self._held] = self.scene.pins_at(time)[self._exact]
+        v[self._held] = self.scene.pins_moving(time)[self._exact]
+        return Motion(p, v)
+
+    def _acceleration(self) -> Positions:
+        """M^-1 of all forces at the start, (n, 3) [m/s^2], zero at exact pins. Raises Unsupported."""
+        (p, v), system = self.now, self.scene.system
+        require_mass(self.scene)
+        begun = Start(p, v, self.time, p - v / system.rate, system.rate, self.time)
+        force = reduce(lambda total, effect: total + effect(p, v, self.time), self.scene.forces, self.scene.load)
+        held = self.scene.pins_at(self.time)
+        pull = StepProblem(system, p, force, held, p, p, begun).gradient(p)
+        mass = system.mass[:, None]
+        return np.divide(pull, -mass, out=np.zeros_like(p), where=mass > 0.0)
+
+
+def require_mass(scene: Scene) -> None:
+    """Raise Unsupported where an integrator needs the acceleration of a vertex without mass."""
+    method, system = scene.integrator, scene.system
+    if isinstance(method, Staged) and method.starts and not system.mass[system.free].all():
+        raise Unsupported(
+            "the integrator starts from the acceleration, and vertices without mass have none; give them mass, or take "
+            "one that does not need it: sdirk-2, sdirk-3, sdirk-4, implicit-euler, bdf2, midpoint"
+        )
+
+
+def _lags(energy: object) -> bool:
+    """Whether an energy takes something where the unknown is expected."""
+    return getattr(energy, "lagged", False)
