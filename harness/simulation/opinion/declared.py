@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,12 +34,14 @@ class Moment:
 
 @dataclass(frozen=True, eq=False)
 class Declared:
-    """A mesh, its masses (n,) [kg], dt [s], the models of all effects."""
+    """A mesh, its masses (n,) [kg], dt [s], the models of all effects; staged: whether the integrator takes forces at
+    its unknowns, so that drag is a force."""
 
     mesh: Mesh
     mass: Array
     time_step: float
     effects: tuple[Any, ...]
+    staged: bool = False
 
     @property
     def rest(self) -> Wide:
@@ -57,8 +59,12 @@ Force = Callable[[Array, Array, float], tuple[Array, float]]
 round-off."""
 
 
-Pinned = tuple[float, Callable[[float], Wide]]
-"""The weight [N/m] of a pin, and its target (3,) [m] at a time [s]."""
+class Held(NamedTuple):
+    """A pin: its weight [N/m], where it is (3,) [m] and how fast (3,) [m/s] at a time [s]."""
+
+    weight: float
+    place: Callable[[float], Wide]
+    speed: Callable[[float], Wide]
 
 
 @dataclass(frozen=True)
@@ -76,9 +82,7 @@ class Opinion:
     needs: Callable[[Array], Begin] | None = None
     force: Force | None = None
     decay: Callable[[Array], Array] | None = None
-    pins: dict[int, tuple[float, Callable[[float], Wide]]] = field(
-        default_factory=dict[int, tuple[float, Callable[[float], Wide]]]
-    )
+    pins: dict[int, Held] = field(default_factory=dict[int, Held])
     shortest: float = np.inf
     reach: float = 0.0
 

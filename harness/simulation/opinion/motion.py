@@ -50,6 +50,24 @@ def place(motion: Any, time: float) -> Place:
     return Place(np.stack(columns, axis=1), wide(motion.about), wide(offset))
 
 
+def speed(motion: Any, q: Wide, time: float) -> Wide:
+    """How fast a point declared at q (3,) [m] moves at a time [s], right after it at a key, (3,) [m/s]."""
+    times = wide([key.time for key in motion.keys]) if motion else wide([0])
+    if len(times) == 1 or not times[0] <= time < times[-1]:
+        return wide([0, 0, 0])
+    values, t = wide([(*key.offset, key.turn) for key in motion.keys]), wide(time)
+    k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
+    h = times[k + 1] - times[k]
+    steep = (values[k + 1] - values[k]) / h
+    if motion.between == "smooth":
+        s = (t - times[k]) / h
+        a, b = (np.array([_slope(times, column, j) for column in values.T]) for j in (k, k + 1))
+        steep = 6 * s * (1 - s) * steep + a * (1 - s) * (1 - 3 * s) + b * s * (3 * s - 2)
+    axis = wide(motion.axis)
+    arm = place(motion, time).turn @ (q - wide(motion.about))
+    return steep[:3] + steep[3] * _PI / 180 * np.cross(axis / np.sqrt(axis @ axis), arm)
+
+
 def blur(motion: Any, size: float, time: float) -> float:
     """How far [m] round-off may take points that lie within `size` [m] of zero, at a time [s]."""
     if motion is None:

@@ -14,7 +14,7 @@ import numpy as np
 from harness.scenes.effects.base import Contribution, Pin
 from harness.simulation.opinion.declared import Array, Opinion
 from harness.simulation.opinion.derivatives import EPS, ROUNDINGS, Told, wide
-from harness.simulation.opinion.vertices import moved
+from harness.simulation.opinion import vertices
 from solvers.problem import Energy, LaggedEnergy, ProjectiveEnergy, Start
 
 _TINY = 1e-100
@@ -32,7 +32,7 @@ def from_outside(bound: Contribution) -> Opinion:
             v = one(v)
         return v
 
-    held = {i: (pin.weight, moved(pin.motion, q)) for pin in bound.pins for i, q in _each(pin)}
+    held = {i: vertices.pin(pin.weight, pin.motion, q) for pin in bound.pins for i, q in _each(pin)}
     return Opinion(force=force if bound.forces else None, decay=decay if bound.filters else None, pins=held)
 
 

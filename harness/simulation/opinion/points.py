@@ -55,10 +55,15 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[Point]:
         far = np.linalg.norm(shift, axis=1).max()
         shift *= min(1.0, limit / far) if far else 1.0
         yield Point(
-            State(type(begun)(p, v), type(begun)(*before) if index else None, index),
+            State(type(begun)(p, v), type(begun)(*before) if index else None, index, led(k, some / dt**2, rest)),
             shift,
             rng.normal(size=rest.shape),
         )
+
+
+def led(k: int, size: float, rest: Array) -> Array:
+    """A random acceleration (n, 3) [m/s^2] of a size, that of point k."""
+    return size * np.random.default_rng(k).normal(size=rest.shape)
 
 
 def _brought(effect: Any, one: Any, p: Array, time: float, rng: np.random.Generator) -> Array:

@@ -8,7 +8,7 @@ opinion: its energies' gradients are held against their own values; its forces, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from harness.simulation.opinion.compare import Finding, Place, differ, energies,
 from harness.simulation.opinion.declared import Array
 from harness.simulation.opinion.points import Point, points
 from harness.simulation.opinion.sides import Side, side
+from harness.simulation.opinion.stages import STAGED, stages
 from harness.simulation.opinion.steps import state
 from harness.simulation.step import simulate
 from solvers.problem import Solution, StepProblem, StopRule
@@ -47,14 +48,14 @@ def second_opinion(spec: SceneSpec, scene: Scene, integrator: str) -> str:
 
 
 class _Answer:
-    """Stands for a prepared solver: what it answers to any step is x (n, 3) [m]."""
+    """Stands for a prepared solver: what it answers is x (n, 3) [m], by the time of the unknown [s]."""
 
-    def __init__(self, x: Array) -> None:
+    def __init__(self, x: Callable[[float], Array]) -> None:
         self.x = x
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """The one answer."""
-        return Solution(self.x, 0, float("nan"), float("nan"), "iterations")
+        """The answer to any step."""
+        return Solution(self.x(problem.start.until), 0, float("nan"), float("nan"), "iterations")
 
 
 def _compared(sides: list[Side], scene: Scene, integrator: str, point: Point) -> Iterator[Finding]:
@@ -63,10 +64,13 @@ def _compared(sides: list[Side], scene: Scene, integrator: str, point: Point) ->
     own = sides[index % len(sides)]
     time = sum(sides[k % len(sides)].declared.time_step for k in range(len(sides))) * (index // len(sides))
     time += sides[0].declared.time_step * (index % len(sides))
+    if integrator in STAGED:
+        yield from _staged(own, scene, integrator, point, time)
+        return
     stated = state(integrator, own.declared, own.opinions, now, before, time)
     m = stated.moment
     x = np.asarray(m.p + m.when * m.time_step * m.v, float) + point.shift
-    answer: Any = _Answer(x)
+    answer: Any = _Answer(lambda until: x)
     run = simulate(scene, answer, StopRule(), first_guess="current", frames=index + 1, state=point.state)
     done = next(run)
     at = Place(own, stated, done.problem, x, point.direction)
@@ -81,3 +85,35 @@ def _compared(sides: list[Side], scene: Scene, integrator: str, point: Point) ->
         yield from differ("positions before", after.before.positions, m.p, at.reach)
         yield from differ("velocities before", after.before.velocity, m.v, at.reach / m.time_step)
     yield from energies(at)
+
+
+def _staged(own: Side, scene: Scene, integrator: str, point: Point, time: float) -> Iterator[Finding]:
+    """The same for an integrator of several unknowns, each of which is answered by where the velocity leads."""
+    now, dt = point.state.now, own.declared.time_step
+
+    def x(until: float) -> Array:
+        return np.asarray(now.positions + (until - time) * now.velocity + (until - time) / dt * point.shift, float)
+
+    a = point.state.acceleration
+    assert a is not None
+    wanted = stages(integrator, own.declared, own.opinions, now, a, time, x)
+    answer: Any = _Answer(x)
+    index = point.state.index
+    done = next(simulate(scene, answer, StopRule(), first_guess="current", frames=index + 1, state=point.state))
+    if len(done.stages) != len(wanted.stated):
+        yield Finding("unknowns of the step (number)", 1.0)
+        return
+    reach = 0.0
+    for (problem, _), stated, answered in zip(done.stages, wanted.stated, wanted.answers, strict=True):
+        at = Place(own, stated, problem, answered, point.direction)
+        reach = max(reach, at.reach)
+        yield from steps(at)
+        yield from energies(at)
+    rate = wanted.stated[0].moment.rate
+    assert done.state.acceleration is not None
+    for name, ours, theirs, size in (
+        ("positions after the step", done.state.now.positions, wanted.end[0], reach),
+        ("velocities after the step", done.state.now.velocity, wanted.end[1], rate * reach),
+        ("acceleration after the step", done.state.acceleration, wanted.acceleration, rate**2 * reach),
+    ):
+        yield from differ(name, ours, theirs, size)

@@ -51,7 +51,7 @@ def state(
 ) -> Stated:
     """The step from a motion now and one step before it (None: there is none), at a time [s]."""
     dt = declared.time_step
-    now, earlier = _decayed(now, opinions), _decayed(before or now, opinions)
+    now, earlier = decayed(now, opinions), decayed(before or now, opinions)
     (p, v), (p0, v0) = ((wide(a), wide(b)) for a, b in (now, earlier))
     method = "implicit-euler" if integrator == "bdf2" and before is None else integrator
     if method == "implicit-euler":
@@ -63,20 +63,27 @@ def state(
         c, target, origin, when, ahead = 4.0, p + dt * v / 2, p, 0.5, 0.5
     far = ahead if before else 0.0
     at = [np.asarray(x + far * (x - y), float) for x, y in zip(now, earlier, strict=True)]
-    force, size = np.zeros_like(now[0]), 0.0
-    for opinion in opinions:
-        if opinion.force:
-            more, its = opinion.force(at[0], at[1], time + ahead * dt)
-            force, size = force + more, size + its
+    force, size = pushed(opinions, at[0], at[1], time + ahead * dt)
     pinned = {i: pin for opinion in opinions for i, pin in opinion.pins.items()}
     vertices = sorted(pinned)
-    held = wide([pinned[i][1](time + dt) for i in vertices]).reshape(-1, 3)
+    held = wide([pinned[i].place(time + dt) for i in vertices]).reshape(-1, 3)
     held = p[vertices] + when * (held - p[vertices]) if when < 1.0 else held
     moment = Moment(dt, c**0.5 / dt, when, time, time + when * dt, p, v, p + ahead * dt * v, origin)
-    return Stated(c, target, force, size, vertices, [pinned[i][0] for i in vertices], held, moment, now)
+    return Stated(c, target, force, size, vertices, [pinned[i].weight for i in vertices], held, moment, now)
 
 
-def _decayed(motion: Motion, opinions: Sequence[Opinion]) -> Motion:
+def pushed(opinions: Sequence[Opinion], p: Array, v: Array, time: float) -> tuple[Array, float]:
+    """All forces (n, 3) [N] at a motion and a time [s], and the size [N] of their round-off."""
+    force, size = np.zeros_like(p), 0.0
+    for opinion in opinions:
+        if opinion.force:
+            more, its = opinion.force(p, v, time)
+            force, size = force + more, size + its
+    return force, size
+
+
+def decayed(motion: Motion, opinions: Sequence[Opinion]) -> Motion:
+    """The motion at a step's start, its velocity as filters leave it."""
     p, v = motion
     for opinion in opinions:
         v = opinion.decay(v) if opinion.decay else v

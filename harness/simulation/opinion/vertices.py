@@ -11,15 +11,14 @@ pins          w/2 |x_i - q_i(t)|^2, or exactly, at the rest position moved by ke
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion, chosen
+from harness.simulation.opinion.declared import Array, Begin, Declared, Held, Moment, Opinion, chosen
 from harness.simulation.opinion.derivatives import Values, Wide, wide
 from harness.simulation.opinion.edges import along_edges, of_springs
-from harness.simulation.opinion.motion import place
+from harness.simulation.opinion.motion import place, speed
 from harness.simulation.opinion.surfaces import damped_bending
 
 
@@ -50,6 +49,15 @@ def air_drag(effect: Any, declared: Declared) -> Opinion:
         return Opinion(_drag(c), c / declared.time_step)
     dt, mass = declared.time_step, declared.mass
 
+    def force(p: Array, v: Array, t: float) -> tuple[Array, float]:
+        speed = np.sqrt((v**2).sum(axis=1))
+        drag = np.minimum(c * speed, mass / dt)
+        # A speed is known to the round-off of positions, times the rate.
+        return -drag[:, None] * v, float((drag + c * speed).max()) * (float(speed.max()) + declared.mesh.size / dt)
+
+    if declared.staged:
+        return Opinion(force=force)
+
     def slowed(v: Array) -> Array:
         speed = np.sqrt((v**2).sum(axis=1))
         drag = dt * c * speed
@@ -66,7 +74,10 @@ def _drag(c: Array) -> Begin:
 
 
 def ether_drag(effect: Any, declared: Declared) -> Opinion:
-    """Decay of all velocity."""
+    """Decay of all velocity, or drag in proportion to mass."""
+    if declared.staged:
+        c = effect.rate * declared.mass
+        return Opinion(_drag(c), c / declared.time_step)
     return Opinion(decay=lambda v: math.exp(-effect.rate * declared.time_step) * v)
 
 
@@ -91,10 +102,10 @@ def rayleigh(effect: Any, declared: Declared) -> Opinion:
 def pins(effect: Any, declared: Declared) -> Opinion:
     """Vertices that are held."""
     weight = math.inf if effect.weight == "exact" else float(effect.weight)
-    held = {i: (weight, moved(effect.motion, declared.rest[i])) for i in chosen(declared, effect)}
+    held = {i: pin(weight, effect.motion, declared.rest[i]) for i in chosen(declared, effect)}
     return Opinion(pins=held, reach=_reach(effect.motion))
 
 
-def moved(motion: Any, q: Wide) -> Callable[[float], Wide]:
-    """Where a point declared at q (3,) [m] is at a time [s]."""
-    return lambda time: place(motion, time).there(q[None])[0]
+def pin(weight: float, motion: Any, q: Wide) -> Held:
+    """A pin of a point declared at q (3,) [m]."""
+    return Held(weight, lambda time: place(motion, time).there(q[None])[0], lambda time: speed(motion, q, time))

@@ -1,0 +1,210 @@
+"""Steps of several unknowns once more: Butcher's tableaux, and generalised alpha as Newmark's formulas have it.
+
+Runge-Kutta, a stage with the weights a_ij and the time c_i (Alexander 1977; Hairer and Wanner, table IV.6.5; Hosea and
+Shampine 1996; Kennedy and Carpenter 2003):
+
+    x = p + dt sum_j a_ij V_j,     V_i = v + dt sum_j a_ij A_j,     the last stage ends the step
+
+Generalised alpha (Chung and Hulbert 1993):
+
+    x = (1 - af) d' + af d,   a' = (d' - d - dt v) / (beta dt^2) - (1/(2 beta) - 1) a,   v' = v + dt ((1 - g) a + g a')
+
+Where an unknown is expected is told by the known acceleration nearest in time; from order 3 on, and where forces or
+dashpots go by it, it is the answer itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harness.simulation.opinion.declared import Array, Declared, Moment, Opinion
+from harness.simulation.opinion.derivatives import Wide, wide
+from harness.simulation.opinion.steps import Motion, Stated, decayed, pushed
+
+Answer = Callable[[float], Array]
+"""The unknown (n, 3) [m] at a time [s] that the solver answers."""
+
+_HALF = np.sqrt(wide(0.5))
+
+
+def _alexander() -> list[Any]:
+    g = wide(0.4358665215)
+    for _ in range(5):  # Newton's method
+        g -= (g**3 - 3 * g**2 + 1.5 * g - wide(1) / 6) / (3 * g**2 - 6 * g + 1.5)
+    c = (1 + g) / 2
+    two = (0.5 - g - g * (1 - g)) / (c - g)  # b_1 + b_2 = 1 - g and b_1 g + b_2 c = 1/2 - g
+    return [[g], [c - g, g], [1 - g - two, two, g]]
+
+
+def _tr_bdf2() -> list[Any]:
+    d = 1 - _HALF
+    return [[0], [d, d], [(1 - d) / 2, (1 - d) / 2, d]]
+
+
+def _esdirk3() -> list[Any]:
+    g = wide(1767732205903) / 4055673282236
+    third = [wide(2746238789719) / 10658868560708, -wide(640167445237) / 6845629431997, g]
+    last = [wide(1471266399579) / 7840856788654, -wide(4482444167858) / 7529755066697]
+    return [[0], [g, g], third, [*last, wide(11266239266428) / 11593286722821, g]]
+
+
+def _quarters(*rows: list[Any]) -> list[Any]:
+    """Rows that end in a quarter."""
+    return [[*row, wide(1) / 4] for row in rows]
+
+
+_W = wide
+_TABLEAUX: dict[str, list[Any]] = {
+    "sdirk-2": [[1 - _HALF], [_HALF, 1 - _HALF]],
+    "sdirk-3": _alexander(),
+    "sdirk-4": _quarters(
+        [],
+        [_W(1) / 2],
+        [_W(17) / 50, -_W(1) / 25],
+        [_W(371) / 1360, -_W(137) / 2720, _W(15) / 544],
+        [_W(25) / 24, -_W(49) / 48, _W(125) / 16, -_W(85) / 12],
+    ),
+    "tr-bdf2": _tr_bdf2(),
+    "esdirk-3": _esdirk3(),
+    "esdirk-4": [
+        [0],
+        *_quarters(
+            [_W(1) / 4],
+            [_W(8611) / 62500, -_W(1743) / 31250],
+            [_W(5012029) / 34652500, -_W(654441) / 2922500, _W(174375) / 388108],
+            [
+                *(_W(15267082809) / 155376265600, -_W(71443401) / 120774400),
+                *(_W(730878875) / 902184768, _W(2285395) / 8070912),
+            ],
+            [_W(82889) / 524892, 0, _W(15625) / 83664, _W(69875) / 102672, -_W(2260) / 8211],
+        ),
+    ],
+}
+_ALPHAS = {"generalised-alpha": (wide(0), wide(1) / 3), "hht": (wide(0), wide(0.1)), "newmark": (wide(0), wide(0))}
+"""am and af; a spectral radius of 1/2 has (2/2 - 1)/(3/2) and (1/2)/(3/2)."""
+_ORDERS = {"sdirk-3": 3, "esdirk-3": 3, "sdirk-4": 4, "esdirk-4": 4}
+STAGED = (*_TABLEAUX, *_ALPHAS)
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The unknowns of a step as they should be stated, the answers (n, 3) [m], and how the step ends."""
+
+    stated: list[Stated]
+    answers: list[Array]
+    end: Motion
+    acceleration: Wide
+
+
+class _Step:
+    """One step from a motion and its acceleration (n, 3) [m/s^2] at a time [s]."""
+
+    def __init__(
+        self, name: str, declared: Declared, opinions: Sequence[Opinion], now: Motion, time: float, answer: Answer
+    ) -> None:
+        self.declared, self.opinions, self.answer, self.time = declared, opinions, answer, time
+        self.dt = wide(declared.time_step)
+        pinned = {i: pin for opinion in opinions for i, pin in opinion.pins.items()}
+        self.pins = sorted(pinned.items())
+        self.exact = [(i, pin) for i, pin in self.pins if np.isinf(pin.weight)]
+        self.now = self.carried(decayed(now, opinions), time)
+        self.lags = _ORDERS.get(name, 2) > 2
+        self.stated: list[Stated] = []
+        self.answers: list[Array] = []
+
+    def carried(self, motion: Motion, time: float) -> list[Wide]:
+        """The motion with exact pins where they are at a time [s], and as fast."""
+        p, v = (wide(part).copy() for part in motion)
+        for i, pin in self.exact:
+            p[i], v[i] = pin.place(time), pin.speed(time)
+        return [p, v]
+
+    def state(self, c: Any, rate: Any, when: Any, target: Wide, origin: Wide, expected: Wide) -> tuple[Wide, Wide]:
+        """Note an unknown; returns the answer and its velocity."""
+        until = self.time + float(when) * self.declared.time_step
+        origin, led = origin.copy(), target + self.dt**2 / c * expected
+        held = wide([pin.place(until) for _, pin in self.pins]).reshape(-1, 3)
+        for k, (i, pin) in enumerate(self.pins):
+            led[i] = held[k]
+            if np.isinf(pin.weight):
+                origin[i] = held[k] - wide(pin.speed(until)) / rate
+        x = self.answer(until)
+        there = wide(x) if self.lags else led
+        p, v = (np.asarray(part, float) for part in (there, rate * (there - origin)))
+        force, size = pushed(self.opinions, p, v, until)
+        q, u = self.now
+        moment = Moment(self.declared.time_step, float(rate), float(when), self.time, until, q, u, there, origin)
+        weights = [pin.weight for _, pin in self.pins]
+        vertices = [i for i, _ in self.pins]
+        now = [np.asarray(part, float) for part in self.now]
+        self.stated.append(Stated(float(c), target, force, size, vertices, weights, held, moment, now))
+        self.answers.append(x)
+        return wide(x), rate * (wide(x) - origin)
+
+    def free(self, a: Wide) -> Wide:
+        """An acceleration, none at exact pins."""
+        a[[i for i, _ in self.exact]] = 0
+        return a
+
+    def done(self, end: Motion, a: Wide) -> Steps:
+        """The whole step."""
+        return Steps(self.stated, self.answers, self.carried(end, self.time + self.declared.time_step), a)
+
+
+def stages(
+    name: str,
+    declared: Declared,
+    opinions: Sequence[Opinion],
+    now: Motion,
+    acceleration: Array,
+    time: float,
+    answer: Answer,
+) -> Steps:
+    """The step of an integrator from a motion and its acceleration (n, 3) [m/s^2]."""
+    step = _Step(name, declared, opinions, now, time, answer)
+    run = _alpha if name in _ALPHAS else _runge_kutta
+    return run(name, step, wide(acceleration))
+
+
+def _runge_kutta(name: str, step: _Step, a0: Wide) -> Steps:
+    rows, dt, (p, v) = _TABLEAUX[name], step.dt, step.now
+    known, V, A = [(wide(0), a0)], list[Wide](), list[Wide]()
+    if rows[0] == [0]:
+        V, A, rows = [v], [a0], rows[1:]
+    x = p
+    for *row, g in rows:
+        origin, base = (y + dt * sum((w * k for w, k in zip(row, ks, strict=True)), 0 * y) for y, ks in ((p, V), (v, A)))
+        when = sum(row) + g
+        distance = [abs(when - t) for t, _ in known]
+        expected = known[distance.index(min(distance))][1]
+        target = origin + g * dt * base
+        x, u = step.state(1 / g**2, 1 / (g * dt), when, target, origin, expected)
+        V.append(u)
+        A.append(step.free((x - target) / (g * dt) ** 2))
+        known.append((when, A[-1]))
+    return step.done([x, V[-1]], A[-1])
+
+
+def _alpha(name: str, step: _Step, a: Wide) -> Steps:
+    (am, af), dt, (d, v) = _ALPHAS[name], step.dt, step.now
+    gamma, beta = wide(0.5) - am + af, (1 - am + af) ** 2 / 4
+
+    def after(x: Wide) -> list[Wide]:
+        """d', v' and a' of an unknown."""
+        end = (x - af * d) / (1 - af)
+        b = (end - d - dt * v) / (beta * dt**2) - (1 / (2 * beta) - 1) * a
+        return [end, v + dt * ((1 - gamma) * a + gamma * b), b]
+
+    c, rate = (1 - am) / ((1 - af) * beta), gamma / (beta * dt)
+    _, u, b = after(d)  # the formulas are linear in x, and so may be read off anywhere
+    target = d - dt**2 / c * ((1 - am) * b + am * a)
+    origin = d - ((1 - af) * u + af * v) / rate
+    x, _ = step.state(c, rate, 1 - af, target, origin, a)
+    mean = step.free(c / dt**2 * (x - target))
+    b = (mean - am * a) / (1 - am)
+    end = d + dt * v + dt**2 * ((wide(0.5) - beta) * a + beta * b)
+    return step.done([end, v + dt * ((1 - gamma) * a + gamma * b)], b)
