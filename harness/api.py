@@ -87,7 +87,7 @@ class Simulation:
         if isinstance(solver, str):
             solver = _solver(solver, parameters or {}, scene.path)
         self._prepared = prepare(self._scene, solver)
-        self._stop, self._guess = StopRule(iterations, tolerance), first_guess or scene.first_guess
+        self._stop, self._guess = StopRule(iterations, tolerance), first_guess or scene.guess(integrator)
         self._state = start(self._scene)
         self.mesh: Mesh = self._scene.mesh
         self.last: Step | None = None

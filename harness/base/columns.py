@@ -36,8 +36,8 @@ COLUMNS = (
     Column("vertices", _INT, "", "vertices of the mesh"),
     Column("springs", _INT, "", "springs of the mesh"),
     Column("time_step", _REAL, "s", "the time step dt"),
-    Column("integrator", _TEXT, "", "how time is integrated: implicit-euler, bdf2 or midpoint"),
-    Column("first_guess", _TEXT, "", "where each step's iteration starts: assignment, current or inertial"),
+    Column("integrator", _TEXT, "", "how time is integrated, by name: implicit-euler, bdf2, midpoint, sdirk-4, ..."),
+    Column("first_guess", _TEXT, "", "where each step's iteration starts: assignment, current, inertial or motion"),
     Column("max_iterations", _INT, "", "the iteration limit of a step"),
     Column("tolerance", _REAL, "", "relative tolerance of the stop rule; null: all iterations are done"),
     Column("threads", _INT, "", "threads of Numba and of BLAS"),
@@ -74,8 +74,16 @@ COLUMNS = (
         "",
         "of the parts of an iteration: whether they add up to one within 15 %, by the medians over the frames",
     ),
-    Column("iterations", _INT, "", "iterations done in the step"),
-    Column("stopped", _TEXT, "", "what ended the step's iterations: iterations, tolerance, floor or stalled"),
+    Column("iterations", _INT, "", "iterations done in the step, for all of its unknowns"),
+    Column(
+        "stages", _INT, "", "unknowns of the step that were solved for, one after the other; energies are the last's"
+    ),
+    Column(
+        "stopped",
+        _TEXT,
+        "",
+        "what ended the step's iterations: iterations, tolerance, floor or stalled; the least welcome of its unknowns",
+    ),
     Column(
         "residual",
         _REAL,
@@ -96,7 +104,7 @@ COLUMNS = (
         _REAL,
         "",
         "where judged, and the solver minimises: |Q^-1 grad g|_Q at the answer, by the oracle, over the larger of "
-        "its value at the current positions and round-off",
+        "its value at the current positions and round-off; of a step of several unknowns that of the worst",
     ),
     Column("attainable", _REAL, "", "where judged: of the stationarity, what round-off may make at the answer"),
     Column(

@@ -49,7 +49,7 @@ class CurveStudy(Study):
 
     moment: Many[Moment] = ("early", "middle", "violent")
     """Which steps are frozen: moments found from the scene's run, or numbers of frames."""
-    first_guess: Many[FirstGuess] = ("current", "inertial")
+    first_guess: Many[Literal["assignment", "current", "inertial"]] = ("current", "inertial")
     """Where a solve starts: at the current positions (the assignment), at the inertial target (Liu et al. 2013)."""
     iterations: Iterations = 2000
     """Iteration limit; a curve ends before it where it has converged."""
@@ -57,7 +57,7 @@ class CurveStudy(Study):
     """Whether the solve from the first of the guesses is recorded, to scrub through its iterates beside the mesh."""
 
 
-class WorkStudy(Study, lists("iterations", "tolerance", first_guess=("current",))):
+class WorkStudy(Study, lists("first_guess", "iterations", "tolerance")):
     """Error and wall time of whole trajectories."""
 
     horizon: Annotated[float, Field(gt=0, le=1e4)] = 1.0

@@ -105,8 +105,9 @@ class _Expansion:
                 problem = f"{study.horizon:g} s is no multiple of the time step {dt:.6g} s of {case.scene_name}"
                 self.document.report(problem, (*at, "horizon"))
             lists: Any = study.first_guess, study.iterations, study.tolerance
-            for solver, options in product(self._solvers(study, at), product(*lists)):
-                yield WorkSpec(case, study.horizon, solver, *options, how=how)
+            for solver, (guess, *options) in product(self._solvers(study, at), product(*lists)):
+                first_guess = guess or case.scene.guess(case.integrator)
+                yield WorkSpec(case, study.horizon, solver, first_guess, *options, how=how)
 
     def _cases(self, study: Study, at: Key) -> list[Case]:
         found = []

@@ -63,6 +63,7 @@ class Expansion:
         kept = {name: getattr(self.fields.options, name) for name in Kept.model_fields}
         for size, solver, values in product(sizes, solvers, product(*options.values())):
             chosen: dict[str, Any] = dict(zip(options, values, strict=True))
+            chosen["first_guess"] = chosen["first_guess"] or scene.guess(chosen["integrator"])
             chosen |= {name: getattr(scene, name) for name in OF_SCENE if chosen[name] is None}
             yield RunSpec.model_construct(
                 sweep=self.name,

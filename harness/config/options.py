@@ -48,7 +48,13 @@ class Chosen(Model):
     time_step: Annotated[TimeStep, Option("dt {:.3g}", "time_step", _OF_SCENE)]
     """Time step [s]."""
     first_guess: Annotated[
-        FirstGuess, Option("{}", "first_guess", "null is `assignment` for JSON scenes, else `current`")
+        FirstGuess,
+        Option(
+            "{}",
+            "first_guess",
+            "null is `assignment` for JSON scenes, `motion` (where the motion so far leads) for integrators that take "
+            "forces at their unknowns, else `current`",
+        ),
     ]
     """Where a step's iteration starts."""
     threads: Annotated[Threads | Literal["auto"], Option("{} thr.", "threads")] = 1

@@ -24,7 +24,7 @@ from harness.scenes.bind import Scene, build
 from harness.scenes.spec import SceneSpec
 from harness.simulation.step import FIRST_GUESSES, State, Step, prepare, simulate
 from solvers.integrators import Motion
-from solvers.problem import Pins, Solver, Start, StepProblem, StopRule
+from solvers.problem import Pins, Positions, Solver, Start, StepProblem, StopRule
 
 MOMENTS = ("early", "middle", "violent")
 CONVERGED = StopRule(500, 1e-12)
@@ -39,19 +39,20 @@ class Frozen:
 
     frame: the step, from 1; problem: exact pins, its first guess the current positions; after: the motion at the
     step's end; digest: 12 hex digits of the problem's arrays, of the gradient at the current positions, which stands
-    for the energies, and of where it is from.
+    for the energies, and of where it is from; acceleration: at the step's end, None where the integrator tells none.
     """
 
     frame: int
     problem: StepProblem
     after: Motion
     digest: str
+    acceleration: Positions | None = None
 
     @property
     def state(self) -> State:
         """From which the reference run goes on."""
         begun = self.problem.start
-        return State(self.after, Motion(begun.positions, begun.velocity), self.frame)
+        return State(self.after, Motion(begun.positions, begun.velocity), self.frame, self.acceleration)
 
     def stated(self, first_guess: str) -> StepProblem:
         """The problem with a first guess by name (`harness.simulation.step.FIRST_GUESSES`)."""
@@ -119,7 +120,9 @@ def freeze(step: Step, origin: str) -> tuple[Frozen, Arrays]:
         content.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
     digest = content.hexdigest()[:12]
     ends = {"after_positions": now.positions, "after_velocity": now.velocity, "digest": np.asarray(digest)}
-    return Frozen(step.index, problem, now, digest), arrays | ends
+    if (acceleration := step.state.acceleration) is not None:
+        ends["after_acceleration"] = acceleration
+    return Frozen(step.index, problem, now, digest, acceleration), arrays | ends
 
 
 def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
@@ -138,7 +141,8 @@ def thaw(arrays: Arrays, scene: Scene) -> Frozen | None:
         and agree(problem.gradient(problem.current), arrays["gradient"])
     )
     after = Motion(arrays["after_positions"], arrays["after_velocity"])
-    return Frozen(int(arrays["frame"]), problem, after, str(arrays["digest"])) if same else None
+    told = str(arrays["digest"]), arrays.get("after_acceleration")
+    return Frozen(int(arrays["frame"]), problem, after, *told) if same else None
 
 
 def agree(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:

@@ -15,8 +15,8 @@ from harness.scenes.mesh.base import Mesh
 from harness.scenes.motion import Motion
 from harness.scenes.spec import SceneSpec
 from harness.scenes.start import Rest
-from solvers.energies.springs import Springs
 from solvers import integrators
+from solvers.energies.springs import Springs
 from solvers.integrators import IMPLICIT_EULER, find
 from solvers.matrices import assemble
 from solvers.problem import NotPositiveDefinite, Pins, Positions, ProjectiveEnergy, System

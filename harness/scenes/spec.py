@@ -138,13 +138,20 @@ class SceneSpec(SceneFields):
     effects: SkipValidation[tuple[Effect, ...]] = ()
     """What acts on the mesh; only what is listed is simulated."""
     first_guess: FirstGuess = "current"
-    """Where a step's iteration starts if a sweep does not say."""
+    """Where a step's iteration starts if a sweep does not say; see `guess`."""
     path: Path
     """The file that the scene was read from, for messages."""
     own: SkipValidation[Mapping[str, tuple[Plugin, Mapping[str, Any]]]] = Field(default_factory=dict)
     """Which of `mesh`, `effects[0]`, ... is somebody's own code, and the parameters that its file gives."""
     lines: SkipValidation[Mapping[str, int]] = Field(default_factory=dict)
     """The lines of the keys in that file, for messages."""
+
+    def guess(self, integrator: str) -> FirstGuess:
+        """Where iterations start by an integrator of this name if nobody says: where the motion so far leads, for those
+        of several unknowns a step."""
+        method = integrators.INTEGRATORS.get(integrator, integrators.IMPLICIT_EULER)
+        says = self.first_guess != "current" or isinstance(method, integrators.Integrator)
+        return self.first_guess if says else "motion"
 
     def stepped(self, time_step: float) -> SceneSpec:
         """The same scene with another time step [s], the same in all steps."""

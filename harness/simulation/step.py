@@ -26,7 +26,7 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """One step that was done: its problem, its solution, the state after it, its wall seconds, and all of its iterations.
+    """A step that was done: its problem, its solution, the state after it, its wall seconds and all of its iterations.
 
     A step of several unknowns has the problem and the solution of the last one; stages: those of all, in their order.
     """

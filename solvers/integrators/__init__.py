@@ -27,8 +27,9 @@ __all__ = [
 Staged = RungeKutta | GeneralisedAlpha
 """Those of one step and one unknown or more, with all forces where the unknown is.
 
-order: of the error; unknowns: in a step; factor: c; speed: rate dt; starts: whether the acceleration at the step's start
-is needed; embedded: the order of the method that the error is told by, 0 for none; step: the unknowns, one by one.
+order: of the error; unknowns: in a step; factor: c; speed: rate dt; starts: whether the acceleration at the
+step's start is needed; embedded: the order of the method that the error is told by, 0 for none; step: the unknowns,
+one by one.
 """
 
 Any = Integrator | Staged

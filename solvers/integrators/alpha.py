@@ -7,9 +7,10 @@ for the motion d, v, a at the step's start and d', v', a' at its end. The mean a
 
     c = (1 - am) / ((1 - af) beta),     target = d + (1 - af) (dt v + (1/2 - beta/(1 - am)) dt^2 a)
 
-Of order 2 where gamma = 1/2 - am + af. A spectral radius r in the limit of high frequencies gives am = (2 r - 1)/(r + 1),
-af = r/(r + 1); Hilber, Hughes and Taylor (1977) have am = 0, Newmark's mean acceleration (1959) am = af = 0. All of them
-are stable without condition for linear problems, and beta = (1 - am + af)^2/4 damps high frequencies most.
+Of order 2 where gamma = 1/2 - am + af. A spectral radius r in the limit of high frequencies gives am =
+(2 r - 1)/(r + 1) and af = r/(r + 1); Hilber, Hughes and Taylor (1977) have am = 0, Newmark's mean acceleration (1959)
+am = af = 0. All are stable without condition for linear problems; beta = (1 - am + af)^2/4 damps high frequencies
+most.
 """
 
 from __future__ import annotations

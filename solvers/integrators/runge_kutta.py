@@ -72,7 +72,8 @@ class RungeKutta:
         return self.speed**2
 
     def step(self, now: Motion, acceleration: Positions | None, dt: float) -> Unknowns:
-        """The unknowns of a step of dt [s] from a motion and its acceleration (n, 3) [m/s^2]; the acceleration that is expected of a stage is that of the known one nearest in time."""
+        """The unknowns of a step of dt [s] from a motion and its acceleration (n, 3) [m/s^2]; what is expected of a
+        stage is the known acceleration nearest in time."""
         v: list[Positions] = [now.velocity] if self.starts else []
         a: list[Positions] = [acceleration] if self.starts and acceleration is not None else []
         h = dt * self.a[-1][-1]
@@ -165,8 +166,6 @@ ESDIRK4 = RungeKutta(
         "15267082809/155376265600 -71443401/120774400 730878875/902184768 2285395/8070912 1/4",
         "82889/524892 0 15625/83664 69875/102672 -2260/8211 1/4",
     ),
-    *_rows(
-        "4586570599/29645900160 0 178811875/945068544 814220225/1159782912 -3700637/11593932 61727/225920"
-    ),
+    *_rows("4586570599/29645900160 0 178811875/945068544 814220225/1159782912 -3700637/11593932 61727/225920"),
     embedded=3,
 )

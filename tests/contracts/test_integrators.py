@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from harness.reference.trajectory import integrate
+from harness.reference.trajectory import Trajectory, integrate
 from harness.scenes.bind import Scene, build
 from harness.scenes.effects.air_drag import AirDrag
 from harness.scenes.effects.base import Effect
@@ -80,6 +81,7 @@ PROBLEMS: dict[str, tuple[tuple[Effect, ...], tuple, tuple[float, float, float]]
     "swinging": ((SOFT, Gravity(), HELD), (), (0.5, 1.0, 2.0)),
     "under a force of time, place and speed": ((SOFT, HELD), (gusts,), (1.0, 0.0, 0.5)),
     "slowed by ether drag": ((SOFT, Gravity(), EtherDrag(rate=3.0), HELD), (), (0.0, 0.0, 0.0)),
+    "slowed by quadratic drag": ((SOFT, AirDrag(law="quadratic", coefficient=3.0), HELD), (), (1.0, 0.0, 2.0)),
     "slowed by air": ((SOFT, Gravity(), AirDrag(coefficient=2.0), HELD), (), (1.0, 0.0, 2.0)),
     "slowed by dashpots": ((SOFT, Gravity(), Dashpots(stretch=0.4), HELD), (), (1.0, 0.0, 2.0)),
     "slowed by Rayleigh's damping": ((SOFT, Gravity(), Rayleigh(mass=0.5, stiffness=0.02), HELD), (), (1.0, 0.0, 2.0)),
@@ -87,18 +89,33 @@ PROBLEMS: dict[str, tuple[tuple[Effect, ...], tuple, tuple[float, float, float]]
 }  # fmt: skip
 
 
+SPLIT = {("slowed by quadratic drag", "midpoint"): 1}
+"""The order where filters of the velocity act half a step early."""
+
+END = 0.3
+
+
+@cache
+def truth(problem: str) -> Trajectory:
+    """The motion at the end, which no integrator has a share in; forces take the place of filters."""
+    effects, forces, velocity = PROBLEMS[problem]
+    scene = made("esdirk-4", Chain(), *effects, size=4, time_step=0.1, velocity=velocity)
+    return integrate(replace(scene, forces=(*scene.forces, *forces)), [END])
+
+
 @integrators
 @pytest.mark.parametrize("problem", PROBLEMS)
 def test_the_error_falls_with_the_methods_order(name, problem):
     effects, forces, velocity = PROBLEMS[problem]
-    end, errors = 0.3, []
-    for steps in (24, 48, 96):
-        scene = made(name, Chain(), *effects, size=4, time_step=end / steps, velocity=velocity)
+    errors, order = [], INTEGRATORS[name].order
+    for steps in (24, 48) if order > 2 else (24, 48, 96):
+        scene = made(name, Chain(), *effects, size=4, time_step=END / steps, velocity=velocity)
         scene = replace(scene, forces=(*scene.forces, *forces))
-        errors.append(integrate(scene, [end]).error(0, run(scene, steps)[-1].positions))
+        errors.append(truth(problem).error(0, run(scene, steps)[-1].positions))
     orders = [np.log2(a / b) for a, b in pairwise(errors)]
+    order = SPLIT.get((problem, name), order)
     # The next term of the error is smaller by a time step times the fastest frequency or rate of decay, at most 0.2.
-    np.testing.assert_allclose(orders, INTEGRATORS[name].order, rtol=0, atol=0.2)
+    np.testing.assert_allclose(orders, order, rtol=0, atol=0.2)
 
 
 FREE = (Grid(), Springs(stretch=300.0))
@@ -185,7 +202,7 @@ def test_the_others_damp_a_quadratic_energy(name):
 MINIMISERS = [name for name, target in SOLVERS.items() if load(target).minimises]
 
 
-@integrators
+@pytest.mark.parametrize("name", ["implicit-euler", "bdf2", "midpoint", "generalised-alpha", "sdirk-3"])
 @pytest.mark.parametrize("solver", MINIMISERS)
 def test_every_minimiser_takes_the_steps_of_every_integrator(name, solver):
     scene = made(name, Grid(), Springs(stretch=30.0), Gravity(), Pins(at=("top_corners",)), size=4, time_step=1 / 60)

@@ -8,20 +8,32 @@ _K, _M, _U = "solvers/kernels", "solvers/methods", "tests/unit"
 _STEPS, _ORDER = (f"{_U}/test_{name}.py" for name in ("simulate", "integrator_recursions"))
 
 _TABLE = (
-    ("bdf2-target", "solvers/integrators.py", "2.0 * dt / 9.0", "2.0 * dt / 3.0", _ORDER),
-    ("bdf2-factor", "solvers/integrators.py", "Integrator(2.25,", "Integrator(2.0,", _ORDER),
+    ("bdf2-target", "solvers/integrators/single.py", "2.0 * dt / 9.0", "2.0 * dt / 3.0", _ORDER),
+    ("bdf2-factor", "solvers/integrators/single.py", "Integrator(2.25,", "Integrator(2.0,", _ORDER),
     (
         "midpoint-target",
-        "solvers/integrators.py",
+        "solvers/integrators/single.py",
         "now.positions + 0.5 * dt * now.velocity",
         "now.positions + dt * now.velocity",
         _ORDER,
     ),
-    ("midpoint-velocity", "solvers/integrators.py", "2.0 * v - start.velocity", "1.9 * v - start.velocity", _ORDER),
-    ("midpoint-forces", "solvers/integrators.py", "Integrator(4.0, 0.5, 0.5,", "Integrator(4.0, 0.5, 0.0,", _ORDER),
+    (
+        "midpoint-velocity",
+        "solvers/integrators/single.py",
+        "2.0 * v - start.velocity",
+        "1.9 * v - start.velocity",
+        _ORDER,
+    ),
+    (
+        "midpoint-forces",
+        "solvers/integrators/single.py",
+        "Integrator(4.0, 0.5, 0.5,",
+        "Integrator(4.0, 0.5, 0.0,",
+        _ORDER,
+    ),
     (
         "euler-target",
-        "solvers/integrators.py",
+        "solvers/integrators/single.py",
         "now.positions + dt * now.velocity, now",
         "now.positions + 0.9 * dt * now.velocity, now",
         _STEPS,

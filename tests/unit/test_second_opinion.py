@@ -4,6 +4,7 @@ disputes the runs of steps that it finds wrong."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,6 +24,7 @@ from harness.scenes.mesh.base import Mesh
 from harness.simulation.opinion.second import second_opinion
 from solvers.energies.bending import Bending
 from solvers.energies.quadratic import Quadratic
+from solvers.integrators import INTEGRATORS
 from solvers.problem import Energy, Positions
 from tests.lies import (
     BALL,
@@ -78,7 +80,7 @@ def test_both_opinions_agree_with_every_integrator_at_full_size(name: str, integ
     assert opinion(spec, spec.default_size or 0, integrator) == "agrees"
 
 
-@pytest.mark.parametrize("integrator", METHODS)
+@pytest.mark.parametrize("integrator", [*METHODS, "sdirk-2"])
 def test_both_opinions_agree_where_all_effects_are(integrator: str):
     every = [SKIP_ONE, PINS, TIED, LIMITS, GUSTS, BEND, DASHPOTS, RAYLEIGH, DRAG, FLOOR, *FORCES, *SLOWED]
     assert opinion(declared(*every, velocity=(0.1, 0.2, 0.3)), 5, integrator) == "agrees"
@@ -140,6 +142,23 @@ def scaled_sum(true: Callable[[Positions, Positions], None], p: Positions, out: 
     added = np.zeros_like(out)
     true(p, added)
     out += by * added
+
+
+STAGED = [name for name in INTEGRATORS if name not in METHODS]
+
+
+@pytest.mark.parametrize("integrator", STAGED)
+def test_both_opinions_agree_with_every_integrator_of_several_unknowns(integrator: str):
+    assert opinion(declared(SPRINGS, PINS, GUSTS, *SLOWED), 3, integrator) == "agrees"
+
+
+@pytest.mark.parametrize("integrator", [name for name in STAGED if hasattr(INTEGRATORS[name], "a")])
+def test_a_weight_that_is_wrong_by_a_millionth_is_told(integrator: str, monkeypatch: pytest.MonkeyPatch):
+    method: Any = INTEGRATORS[integrator]
+    rows = [list(row) for row in method.a]
+    rows[-1][0] += 1e-6
+    monkeypatch.setitem(INTEGRATORS, integrator, replace(method, a=tuple(map(tuple, rows))))
+    assert "target" in opinion(declared(SPRINGS), 3, integrator)
 
 
 @pytest.mark.parametrize("integrator", METHODS)

@@ -31,11 +31,13 @@ from harness.reference.store import Store
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
 from solvers.about import LOCAL_GLOBAL
-from solvers.integrators import INTEGRATORS
 from solvers.registry import SOLVERS, about, load
 
 REFINEMENTS = (0.5, 1, 2, 4, 8)
 """Steps in the horizon, relative to those of the scene's own time step."""
+
+TRIED = ["implicit-euler", "bdf2", "midpoint", "sdirk-4"]
+"""Integrators: one of each order and kind."""
 
 
 def candidates() -> list[dict[str, Any]]:
@@ -45,7 +47,7 @@ def candidates() -> list[dict[str, Any]]:
     implicit = [name for name, told in first.items() if not told.own_steps]
     fixed = [name for name, told in first.items() if told.own_steps or told.family == LOCAL_GLOBAL]
     return [
-        {"solver": implicit, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": list(INTEGRATORS)},
+        {"solver": implicit, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": TRIED},
         {"solver": fixed, "iterations": 50},
     ]
 

@@ -31,8 +31,10 @@ from harness.report.accuracy.times import duration, power
 from harness.report.page import quantity, text
 from harness.report.style import INK, MUTED, PAGE, Mark, looks
 from solvers.about import LOCAL_GLOBAL
+from solvers.integrators import INTEGRATORS
 
-INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
+ACROSS = 4
+"""Panels in a row."""
 
 ERRORS = (0.1, 0.03, 0.01, 0.003, 0.001)
 """The errors at which the front is told in words."""
@@ -111,18 +113,21 @@ def _known(work: WorkPoint) -> bool:
 
 def _draw(stem: Path, mesh: str, works: list[WorkPoint], marked: dict[str, Mark], machine: Sequence[str]) -> None:
     words = _notes(works)
-    integrators = [name for name in INTEGRATORS if any(work.integrator == name for work in works)]
+    there = {work.integrator for work in works}
+    integrators = [*(name for name in INTEGRATORS if name in there), *sorted(there - set(INTEGRATORS))]
     known = [work for work in works if _known(work)]
     sizes = _sizes(works)
     across, down = limits([w.seconds for w in known], margin=1.6), limits([w.error for w in known], margin=1.6)
     facts = [f"{quantity(works[0].horizon)} s simulated", "time stepping and solver together", *machine]
     with sheet(stem, f"Work and precision: {mesh}", facts) as page:
-        width = (RIGHT - LEFT - 62) / len(integrators) - 20
-        top = TOP + 46
+        across_page, down_page = min(ACROSS, len(integrators)), -(-len(integrators) // ACROSS)
+        width = (RIGHT - LEFT - 62) / across_page - 20
+        height = (foot(words) - TOP - 46) / down_page
         text(page, LEFT + 62, TOP + 4, "error of the positions, relative to the way from the start", size=10.5)
-        for column, integrator in enumerate(integrators):
-            left = LEFT + 62 + column * (width + 20)
-            ax = panel(page, left, top, width, foot(words) - top - 46, integrator)
+        for k, integrator in enumerate(integrators):
+            row, column = divmod(k, ACROSS)
+            left, top = LEFT + 62 + column * (width + 20), TOP + 46 + row * height
+            ax = panel(page, left, top, width, height - 46, integrator)
             _panel(ax, [work for work in known if work.integrator == integrator], marked, sizes)
             _front(ax, known)
             log_axis(ax.xaxis, *across, unit="time")

@@ -3,7 +3,8 @@
 The linear one is an energy (see `solvers.energies.quadratic`): unconditionally stable, and in Q. The quadratic one acts
 on the velocity before each step, by the exact solution of m dv/dt = -c |v| v over it: v <- m v / (m + c dt |v|),
 unconditionally stable too, and of order 1. Integrators that take forces at their unknowns have it as a force, up to
-what stops a vertex in one step, and keep their order. Wind on triangles drags as well, by their area and how they face the air.
+what stops a vertex in one step, and keep their order. Wind on triangles drags as well, by their area and how they face
+the air.
 """
 
 from typing import ClassVar, Literal
@@ -42,7 +43,7 @@ class AirDrag(Model):
         if self.law == "linear":
             return Contribution(energies=(Energy.of_vertices(c),))
         force = _force(c, mass / time_step)
-        return Contribution(filters=(_quadratic(mass, c * time_step),), continuous=Contribution(forces=(force,)))
+        return Contribution(filters=(_quadratic(mass, c * time_step),), continuous=(Contribution(forces=(force,)),))
 
     @classmethod
     def called_for(cls, seen: Seen) -> str:

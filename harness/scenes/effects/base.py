@@ -77,12 +77,12 @@ class Contribution:
     checks: tuple[Check, ...] = field(default=())
     once: tuple[str, ...] = field(default=())
     """What a scene can have but once, in words; a second one would be added to the first."""
-    continuous: Contribution | None = None
-    """What does the same as a force or an energy, with no filter: for integrators that take forces at their unknowns."""
+    continuous: tuple[Contribution, ...] = field(default=())
+    """What does the same by forces and energies alone: for integrators that take forces at their unknowns."""
 
     def by(self, method: integrators.Any) -> Contribution:
         """What an integrator takes of it."""
-        return self if self.continuous is None or isinstance(method, Integrator) else self.continuous
+        return self if not self.continuous or isinstance(method, Integrator) else self.continuous[0]
 
     @property
     def empty(self) -> bool:

@@ -37,4 +37,4 @@ class EtherDrag(Model):
             return kept * v
 
         drag = Energy.of_vertices(self.rate * mass)
-        return Contribution(filters=(decay,), continuous=Contribution(energies=(drag,)))
+        return Contribution(filters=(decay,), continuous=(Contribution(energies=(drag,)),))

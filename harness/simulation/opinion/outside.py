@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from harness.scenes.effects.base import Contribution, Pin
+from harness.simulation.opinion import vertices
 from harness.simulation.opinion.declared import Array, Opinion
 from harness.simulation.opinion.derivatives import EPS, ROUNDINGS, Told, wide
-from harness.simulation.opinion import vertices
 from solvers.problem import Energy, LaggedEnergy, ProjectiveEnergy, Start
 
 _TINY = 1e-100

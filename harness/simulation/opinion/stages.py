@@ -177,7 +177,9 @@ def _runge_kutta(name: str, step: _Step, a0: Wide) -> Steps:
         V, A, rows = [v], [a0], rows[1:]
     x = p
     for *row, g in rows:
-        origin, base = (y + dt * sum((w * k for w, k in zip(row, ks, strict=True)), 0 * y) for y, ks in ((p, V), (v, A)))
+        origin, base = (
+            y + dt * sum((w * k for w, k in zip(row, ks, strict=True)), 0 * y) for y, ks in ((p, V), (v, A))
+        )
         when = sum(row) + g
         distance = [abs(when - t) for t, _ in known]
         expected = known[distance.index(min(distance))][1]
