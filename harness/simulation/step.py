@@ -57,15 +57,16 @@ def start(scene: Scene) -> State:
 
 def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
     """The next step's problem from a state, that of its first unknown; `first_guess` is a key of `FIRST_GUESSES`."""
-    if not isinstance(scene.integrator, Integrator):
+    usual = scene.integrator
+    if not isinstance(usual, Integrator):
         return FIRST_GUESSES[first_guess](_stages(scene, state).first())
     scene, time = scene.at(state.index), scene.time(state.index)
     dt = scene.system.time_step
     # `before` was filtered when it was `now`. Filtered once more it has decayed as long as `now` has (an integrating
     # factor); without that, BDF2 would decay at twice the rate.
     now, before = (_filtered(scene, motion) for motion in (state.now, state.before or state.now))
-    starts = scene.integrator.history and state.before is None
-    method, system = (IMPLICIT_EULER, _first(scene)) if starts else (scene.integrator, scene.system)
+    starts = usual.history and state.before is None
+    method, system = (IMPLICIT_EULER, _first(scene)) if starts else (usual, scene.system)
     target, origin = method.predict(now, before, dt)
     when, ahead = time + method.when * dt, method.ahead * dt
     led = (now.velocity - before.velocity) / dt if first_guess == "motion" and state.before else None

@@ -91,7 +91,7 @@ class RungeKutta:
     def _error(self, dt: float, v: Sequence[Positions], a: Sequence[Positions]) -> Motion | None:
         if not self.lower:
             return None
-        weights = np.subtract(self.a[-1], self.lower)
+        weights = [b - lower for b, lower in zip(self.a[-1], self.lower, strict=True)]
         return Motion(*(_combined(np.zeros_like(v[0]), dt, weights, part) for part in (v, a)))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import islice, pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,7 +69,8 @@ def powers(name: str, z: complex) -> np.ndarray:
     if name == "implicit-euler":
         return (1.0 - z) ** -n
     if name in TABLEAUX:
-        rows = INTEGRATORS[name].a
+        method: Any = INTEGRATORS[name]
+        rows = method.a
         A = np.array([[*row, *[0.0] * (len(rows) - len(row))] for row in rows])
         once = np.linalg.solve(np.eye(len(A)) - z * A, np.ones(len(A)))[-1]  # the last stage is the step's end
         return once**n
@@ -136,7 +138,8 @@ def test_bdf2_starts_with_a_step_of_implicit_euler():
 @pytest.mark.parametrize("name", ["implicit-euler", "bdf2", "midpoint"])
 def test_the_unknown_moves_with_the_velocity_of_the_start(name):
     """rate (target - origin) is the velocity that inertia alone leads to; for a steady flight it is that flight's."""
-    method, v = INTEGRATORS[name], np.array([[1.0, -2.0, 0.5]])
+    method: Any = INTEGRATORS[name]
+    v = np.array([[1.0, -2.0, 0.5]])
     now, before = Motion(DT * v, v), Motion(0.0 * v, v)
     target, origin = method.predict(now, before, DT)
     np.testing.assert_allclose(target, (1.0 + method.when) * DT * v, rtol=1e-14)
@@ -156,7 +159,8 @@ def test_a_spring_far_too_stiff_for_the_step_is_at_rest_after_one(name):
 @pytest.mark.parametrize(("name", "radius"), [("newmark", 1.0), ("hht", 0.9 / 1.1), ("generalised-alpha", 0.5)])
 def test_generalised_alpha_damps_the_highest_frequencies_by_its_spectral_radius(name, radius):
     """That of d, v dt and a dt^2 in a step, z = omega dt without limit; af of HHT has (1 - af)/(1 + af)."""
-    method, size = INTEGRATORS[name], 1e8
+    method: Any = INTEGRATORS[name]
+    size = 1e8
     columns = []
     for d, v, a in np.eye(3):
         one = [np.full((1, 3), x) for x in (d, v, a)]
@@ -175,7 +179,7 @@ def test_generalised_alpha_damps_the_highest_frequencies_by_its_spectral_radius(
 @pytest.mark.parametrize("name", TABLEAUX)
 def test_a_tableau_meets_the_conditions_of_its_order(name):
     """Butcher's, one a rooted tree; those of the embedded method up to its own order, and not the next."""
-    method = INTEGRATORS[name]
+    method: Any = INTEGRATORS[name]
     A = np.array([[*row, *[0.0] * (len(method.a) - len(row))] for row in method.a])
     c, one = A.sum(axis=1), np.ones(len(A))
     trees = [
