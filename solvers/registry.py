@@ -23,6 +23,12 @@ SOLVERS = {
     "xpbd-small-steps": "solvers.methods.xpbd:XpbdSmallSteps",
     "vbd": "solvers.methods.vbd:VertexBlockDescent",
     "symplectic-euler": "solvers.methods.symplectic_euler:SymplecticEuler",
+    "velocity-verlet": "solvers.methods.explicit:VelocityVerlet",
+    "blanes-moan-4": "solvers.methods.explicit:BlanesMoan4",
+    "blanes-moan-6": "solvers.methods.explicit:BlanesMoan6",
+    "runge-kutta-4": "solvers.methods.explicit:RungeKutta4",
+    "tsitouras-5": "solvers.methods.explicit:Tsitouras5",
+    "dormand-prince-8": "solvers.methods.explicit:DormandPrince8",
 }
 
 OPTIONAL = {"eigen": "solvers.methods.eigen:EigenLocalGlobal"}

@@ -114,8 +114,9 @@ def _single(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, 
     """The step of an integrator of one unknown; its seconds are not known."""
     stated = problem(scene, state, first_guess)
     solution = prepared.solve(stated, stop)
-    method = IMPLICIT_EULER if stated.system.factor == IMPLICIT_EULER.factor else scene.integrator
-    assert isinstance(method, Integrator)
+    usual = scene.integrator
+    assert isinstance(usual, Integrator)
+    method = IMPLICIT_EULER if usual.history and state.before is None else usual
     before = Motion(stated.start.positions, stated.start.velocity)
     after = State(method.advance(stated.start, solution), before, state.index + 1)
     return Step(stated, solution, after, 0.0, solution.iterations, ((stated, solution),))

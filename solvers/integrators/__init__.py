@@ -5,13 +5,14 @@ from __future__ import annotations
 from solvers.integrators.alpha import GENERALISED_ALPHA, HHT, NEWMARK, GeneralisedAlpha
 from solvers.integrators.base import End, Motion, Solved, Unknown
 from solvers.integrators.runge_kutta import ESDIRK3, ESDIRK4, SDIRK2, SDIRK3, SDIRK4, TR_BDF2, RungeKutta
-from solvers.integrators.single import BDF2, IMPLICIT_EULER, MIDPOINT, Integrator
+from solvers.integrators.single import BDF2, IMPLICIT_EULER, MIDPOINT, OWN, Integrator
 from solvers.plugins import Table, load
 
 __all__ = [
     "EVERY",
     "IMPLICIT_EULER",
     "INTEGRATORS",
+    "OWN",
     "Any",
     "End",
     "GeneralisedAlpha",
@@ -22,6 +23,7 @@ __all__ = [
     "Staged",
     "Unknown",
     "find",
+    "splits",
 ]
 
 Staged = RungeKutta | GeneralisedAlpha
@@ -47,11 +49,17 @@ INTEGRATORS: dict[str, Any] = {
     "esdirk-3": ESDIRK3,
     "sdirk-4": SDIRK4,
     "esdirk-4": ESDIRK4,
+    "own": OWN,
 }
 """The shipped integrators by name."""
 
 EVERY = Table("springbench.integrators", INTEGRATORS)
 """All that a config can name."""
+
+
+def splits(method: Any) -> bool:
+    """Whether filters of the velocity act before a step; an integrator that takes forces where they act has none."""
+    return isinstance(method, Integrator) and method.splits
 
 
 def find(name: str) -> Any:

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from solvers.integrators.base import Motion
-from solvers.problem import Positions, Solution, Start
+from solvers.problem import Positions, Solution, Start, Unsupported
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +37,8 @@ class Integrator:
     speed: ClassVar[None] = None
     """The unknown's velocity follows from c."""
     unknowns: ClassVar[int] = 1
+    splits: ClassVar[bool] = True
+    """Whether filters of the velocity act before a step."""
 
     factor: float
     when: float
@@ -69,6 +71,23 @@ def _midpoint(now: Motion, before: Motion, dt: float) -> tuple[Positions, Positi
     return now.positions + 0.5 * dt * now.velocity, now.positions
 
 
+@dataclass(frozen=True, slots=True)
+class Own(Integrator):
+    """For solvers that integrate a step by themselves, and tell the velocity at its end: drag is a force to them."""
+
+    splits: ClassVar[bool] = False
+
+    def advance(self, start: Start, solution: Solution) -> Motion:
+        """The solver's motion. Raises Unsupported for one that has no velocity."""
+        if solution.velocity is None:
+            raise Unsupported(
+                "the integrator `own` leaves it to the solver to integrate a step, and this one minimises what another "
+                "integrator states: take that one, or a solver such as dormand-prince-8"
+            )
+        return Motion(solution.positions, solution.velocity)
+
+
 IMPLICIT_EULER = Integrator(1.0, 1.0, 0.0, False, _euler)
 BDF2 = Integrator(2.25, 1.0, 1.0, True, _bdf2, order=2)
 MIDPOINT = Integrator(4.0, 0.5, 0.5, False, _midpoint, order=2)
+OWN = Own(1.0, 1.0, 0.0, False, _euler)

@@ -16,7 +16,7 @@ from harness.scenes.mesh.base import Mesh
 from harness.scenes.motion import Motion
 from solvers import integrators
 from solvers.energies.springs import Springs
-from solvers.integrators import Integrator
+from solvers.integrators import splits
 from solvers.problem import Energy, Positions
 
 
@@ -82,7 +82,7 @@ class Contribution:
 
     def by(self, method: integrators.Any) -> Contribution:
         """What an integrator takes of it."""
-        return self if not self.continuous or isinstance(method, Integrator) else self.continuous[0]
+        return self.continuous[0] if self.continuous and not splits(method) else self
 
     @property
     def empty(self) -> bool:

@@ -59,7 +59,7 @@ def side(spec: SceneSpec, scene: Scene) -> Side:
     """What is thought of a scene that was built of the spec."""
     mesh, dt = scene.mesh, spec.time_step
     mass = np.asarray(mesh.mass if spec.mass is None else spec.mass * mesh.shares)
-    declared = Declared(mesh, mass, dt, tuple(spec.effects), not hasattr(scene.integrator, "predict"))
+    declared = Declared(mesh, mass, dt, tuple(spec.effects), not getattr(scene.integrator, "splits", False))
     bound = [effect.bind(mesh, mass, dt).by(scene.integrator) for effect in declared.effects]
     # In the order in which a scene lines them up: each effect's, then what follows from all of those.
     first = [energy for part in bound for energy in part.energies]

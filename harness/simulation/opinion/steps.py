@@ -53,7 +53,8 @@ def state(
     dt = declared.time_step
     now, earlier = decayed(now, opinions), decayed(before or now, opinions)
     (p, v), (p0, v0) = ((wide(a), wide(b)) for a, b in (now, earlier))
-    method = "implicit-euler" if integrator == "bdf2" and before is None else integrator
+    starts = integrator == "own" or (integrator == "bdf2" and before is None)
+    method = "implicit-euler" if starts else integrator
     if method == "implicit-euler":
         c, target, origin, when, ahead = 1.0, p + dt * v, p, 1.0, 0.0
     elif method == "bdf2":

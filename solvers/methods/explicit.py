@@ -1,0 +1,349 @@
+"""Explicit integrators: forces and no matrix, in as many substeps as stability or an error asks for.
+
+    v' = M^-1 (f - grad E(p)) - c v,    p' = v
+
+Compositions of kicks and drifts are symplectic: without drag their energy stays near where it was for as long as one
+likes. Runge-Kutta methods of Tsitouras and of Dormand and Prince choose their substeps by an estimate of their error.
+Substeps of the others are stable while omega h is below a limit of the method, omega^2 the largest eigenvalue of
+M^-1 A'KA, which is that of the springs at their stiffest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from math import ceil
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import ArpackError, eigsh
+
+from solvers import matrices
+from solvers.about import About, Reference
+from solvers.core import vertex_terms
+from solvers.core.driver import Iterating, Iterative
+from solvers.energies.quadratic import Quadratic, Viscous
+from solvers.energies.springs import Springs
+from solvers.kernels.explicit_steps import Forces, compose, integrate
+from solvers.kernels.forms import Form
+from solvers.kernels.loop import ITERATIONS, Limits
+from solvers.kernels.springs import Bundles
+from solvers.memory import aligned
+from solvers.methods.explicit_tables import (
+    BLANES_MOAN_4,
+    BLANES_MOAN_6,
+    RUNGE_KUTTA_4,
+    TSITOURAS_5,
+    VERLET,
+    Composition,
+    Tableau,
+    dormand_prince_8,
+)
+from solvers.problem import LaggedEnergy, Positions, ResidualOf, StepProblem, System, Unsupported
+
+_SAFETY = 0.95
+"""Of the limit: at the limit itself a vibration neither grows nor keeps its size, and springs are not linear."""
+
+_ABOVE = 1.02
+"""Of the largest eigenvalue as it is found, which is from below: to one percent."""
+
+_MOST = 1e10
+"""Springs that a step may go through, some tens of seconds: compiled code cannot be interrupted meanwhile."""
+
+_FAR = 1e100
+"""Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
+
+
+@dataclass(frozen=True)
+class _Explicit:
+    minimises: ClassVar[bool] = False
+    descends: ClassVar[bool] = False
+    name: ClassVar[str]
+    method: ClassVar[Callable[[], Composition | Tableau]]
+
+    def _prepared(self, system: System, substeps: int, error: float) -> PreparedExplicit:
+        """substeps: times the fewest that are stable; error: of the springs' mean length, 0 for none."""
+        vertex_terms.require_implicit_euler(system, self.name)
+        vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), self.name)
+        method, parts = type(self).method(), _Parts.of(system, self.name)
+        omega = frequency(system)
+        rate = omega + float(parts.drag.max(initial=0.0))
+        needed = substeps * max(1.0, ceil(system.time_step * rate / (_SAFETY * method.limit))) if not error else 1.0
+        if needed * max(1, len(parts.springs.edges)) > _MOST:
+            raise Unsupported(
+                f"{self.name}: is stable with {needed:.3g} substeps a step, which for {len(parts.springs.edges)} "
+                f"springs are more than the {_MOST:.0e} evaluations that are allowed; take a shorter time step"
+            )
+        soft = int((~system.pins.exact).sum())
+        taken = f"; {soft} pins by penalty taken as exact" if soft else ""
+        told = f"steps to an error of {error:.3g}" if error else f"{needed:.0f} substeps"
+        lengths = parts.springs.rest_length
+        tolerance = error * (float(lengths.mean()) if len(lengths) else 1.0)
+        choice = f"{told}, for vibrations of at most {omega:.3g} rad/s{taken}"
+        return PreparedExplicit(system, method, parts, int(needed), tolerance, rate, choice)
+
+
+@dataclass(frozen=True)
+class _Fixed(_Explicit):
+    """Substeps of one length. refine: by how much more of them than stability asks for."""
+
+    refine: int = 1
+
+    def prepare(self, system: System) -> PreparedExplicit:
+        """Raises Unsupported for energies that are neither springs, constant quadratic forms nor drag on vertices, for
+        integrators other than `own` and implicit Euler, vertices without mass that are not pinned, and too many
+        substeps."""
+        if not self.refine >= 1:
+            raise Unsupported(f"{self.name}: refine came as {self.refine}; wanted 1 or more")
+        return self._prepared(system, self.refine, 0.0)
+
+
+@dataclass(frozen=True)
+class _Controlled(_Explicit):
+    """Substeps by their error. error: of each, root mean square over the vertices, in parts of the springs' mean
+    length; an error of velocity counts by what it moves in a frame."""
+
+    error: float = 1e-6
+
+    def prepare(self, system: System) -> PreparedExplicit:
+        """Raises Unsupported as `_Fixed` does, and for an error that is no number from 1e-14 to 1."""
+        if not 1e-14 <= self.error <= 1.0:
+            raise Unsupported(f"{self.name}: error came as {self.error}; wanted a number from 1e-14 to 1")
+        return self._prepared(system, 1, self.error)
+
+
+def _about(authors: str, year: int, title: str, doi: str = "", *, first: bool = False) -> About:
+    return About("explicit", Reference(authors, year, title, doi), own_steps=True, first=first)
+
+
+_BLANES_MOAN = _about(
+    "Blanes, Sergio and Moan, Per Christian",
+    2002,
+    "Practical symplectic partitioned Runge-Kutta and Runge-Kutta-Nyström methods",
+    "10.1016/S0377-0427(01)00492-7",
+)
+
+
+@dataclass(frozen=True)
+class VelocityVerlet(_Fixed):
+    """Kick, drift, kick: symplectic, of order 2, one evaluation of the forces a substep."""
+
+    name: ClassVar[str] = "velocity-verlet"
+    method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(lambda: VERLET)
+    about: ClassVar[About] = _about(
+        "Swope, William C. and Andersen, Hans C. and Berens, Peter H. and Wilson, Kent R.",
+        1982,
+        "A computer simulation method for the calculation of equilibrium constants",
+        "10.1063/1.442716",
+    )
+
+
+@dataclass(frozen=True)
+class BlanesMoan4(_Fixed):
+    """A symplectic composition of order 4, six evaluations a substep."""
+
+    name: ClassVar[str] = "blanes-moan-4"
+    method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(lambda: BLANES_MOAN_4)
+    about: ClassVar[About] = _BLANES_MOAN
+
+
+@dataclass(frozen=True)
+class BlanesMoan6(_Fixed):
+    """A symplectic composition of order 6, ten evaluations a substep."""
+
+    name: ClassVar[str] = "blanes-moan-6"
+    method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(lambda: BLANES_MOAN_6)
+    about: ClassVar[About] = _BLANES_MOAN
+
+
+@dataclass(frozen=True)
+class RungeKutta4(_Fixed):
+    """Kutta's method of order 4, four evaluations a substep."""
+
+    name: ClassVar[str] = "runge-kutta-4"
+    method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(lambda: RUNGE_KUTTA_4)
+    about: ClassVar[About] = _about(
+        "Kutta, Wilhelm", 1901, "Beitrag zur näherungsweisen Integration totaler Differentialgleichungen"
+    )
+
+
+@dataclass(frozen=True)
+class Tsitouras5(_Controlled):
+    """Tsitouras's pair of orders 5 and 4, six evaluations a substep."""
+
+    name: ClassVar[str] = "tsitouras-5"
+    method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(lambda: TSITOURAS_5)
+    about: ClassVar[About] = _about(
+        "Tsitouras, Charalampos",
+        2011,
+        "Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying assumption",
+        "10.1016/j.camwa.2011.06.002",
+    )
+
+
+@dataclass(frozen=True)
+class DormandPrince8(_Controlled):
+    """Dormand and Prince's method of order 8 with errors of orders 5 and 3, twelve evaluations a substep."""
+
+    name: ClassVar[str] = "dormand-prince-8"
+    method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(dormand_prince_8)
+    about: ClassVar[About] = _about(
+        "Hairer, Ernst and Norsett, Syvert Paul and Wanner, Gerhard",
+        1993,
+        "Solving Ordinary Differential Equations I",
+        "10.1007/978-3-540-78862-1",
+    )
+
+
+def frequency(system: System) -> float:
+    """A bound of the largest angular frequency [rad/s] of springs and constant quadratic forms, all pins held."""
+    free = np.flatnonzero(system.unpinned)
+    constant = [e for e in system.energies if isinstance(e, (Springs, Quadratic)) and not isinstance(e, LaggedEnergy)]
+    if not len(free) or not constant:
+        return 0.0
+    n = system.vertices
+    K = sum((e.stiffness_matrix(n) for e in constant), csr_array((n, n)))
+    slow = matrices.diagonal(1.0 / np.sqrt(system.mass[free]))
+    inner = csr_array(slow @ csr_array(csr_array(K[free])[:, free]) @ slow)
+    rows = float(abs(inner).sum(axis=1).max(initial=0.0))  # Gershgorin
+    if len(free) < 20 or not rows:
+        most = float(np.linalg.eigvalsh(inner.toarray()).max(initial=0.0))
+        return _ABOVE * max(most, 0.0) ** 0.5
+    try:
+        given = np.random.default_rng(0).normal(size=len(free))
+        most = float(eigsh(inner, 1, which="LA", tol=1e-2, v0=given, return_eigenvectors=False)[0])
+    except ArpackError:
+        return rows**0.5
+    return min(_ABOVE * most**0.5, rows**0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """The forces of a system: springs, their bundles; a form, as in `Forces`; drag (n,) [1/s]; load (n, 3) [N], that of
+    the form at the origin."""
+
+    springs: Springs
+    bundles: Bundles
+    pairs: NDArray[np.int64]
+    weight: NDArray[np.float64]
+    held: NDArray[np.float64]
+    drag: NDArray[np.float64]
+    load: Positions
+
+    @classmethod
+    def of(cls, system: System, solver: str) -> _Parts:
+        """Raises Unsupported for what it does not know."""
+        n = system.vertices
+        springs = Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
+        drag, load, L = np.zeros(n), np.zeros((n, 3)), csr_array((n, n))
+        for energy in system.energies:
+            if isinstance(energy, Viscous) and (np.diff(energy.A.indptr) == 1).all():
+                drag += energy.A.power(2).T @ energy.weight
+            elif isinstance(energy, Quadratic) and not isinstance(energy, LaggedEnergy):
+                L = csr_array(L + energy.stiffness_matrix(n))
+                energy.add_projection(load, load)
+            elif not isinstance(energy, Springs):
+                raise Unsupported(
+                    f"{solver}: knows springs, bending and drag on vertices; the scene has {type(energy).__name__} "
+                    "as well"
+                )
+        form = Form.of(L)
+        part = np.where(system.unpinned, 0, -1)
+        bundles, _ = Bundles.of(springs, np.arange(n), part, 1, n, n + 1)
+        drag = np.divide(drag, system.mass, out=np.zeros(n), where=system.unpinned)
+        return cls(
+            springs, bundles, form.pairs, form.weight, form.held if form.held.any() else form.held[:0], drag, load
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedExplicit(Iterative):
+    """substeps: of a step, where they have one length; tolerance [m]: of each where they have not, else 0; rate: of the
+    fastest motion [1/s]."""
+
+    residual_of: ClassVar[ResidualOf] = "none"
+
+    system: System
+    method: Composition | Tableau
+    parts: _Parts
+    substeps: int
+    tolerance: float
+    rate: float
+    choice: str
+    facts: dict[str, float] = field(default_factory=dict[str, float])
+
+    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+        """See Iterative; the whole step."""
+        return _Done(*self.step(problem)[:2])
+
+    def refined(self, times: int) -> PreparedExplicit:
+        """The same with so many times the substeps."""
+        return replace(self, substeps=times * self.substeps)
+
+    def step(self, problem: StepProblem) -> tuple[Positions, Positions, NDArray[np.float64]]:
+        """Positions and velocities (n, 3) at the step's end, and what `integrate` tells."""
+        s, pins, start, frame = self.system, self.system.pins.vertices, problem.start, self.system.time_step
+        begin, end = np.ascontiguousarray(start.positions[pins]), problem.pin_targets.copy()
+        p, v = self._rows(start.positions), self._rows(start.velocity)
+        v.reshape(-1, 4)[pins] = 0.0
+        p[4 * (s.vertices + 1)] = _FAR
+        force = self._rows(problem.force + self.parts.load)
+        inverse = np.divide(1.0, s.mass, out=np.zeros(s.vertices), where=s.unpinned)
+        right, x = self.parts.bundles.right(np.zeros(s.vertices + 2), force), self.parts
+        forces = Forces(x.bundles, right, x.pairs, x.weight, x.held, inverse, x.drag, pins.copy(), begin, end)
+        told = np.array([self.substeps, 0.0, frame / self.substeps, frame])
+        if isinstance(self.method, Composition):
+            self._compose(forces, self.method, p, v)
+        else:
+            self._integrate(forces, self.method, p, v, told)
+        velocity = v.reshape(-1, 4)[: s.vertices, :3].copy()
+        velocity[pins] = (end - begin) / frame
+        return p.reshape(-1, 4)[: s.vertices, :3].copy(), velocity, told
+
+    def _compose(self, forces: Forces, method: Composition, p: NDArray[np.float64], v: NDArray[np.float64]) -> None:
+        h = self.system.time_step / self.substeps
+        gone = h * method.kicks[:, None] * forces.drag
+        gained = np.divide(
+            -np.expm1(-gone), forces.drag, out=h * method.kicks[:, None] + 0.0 * gone, where=forces.drag > 0
+        )
+        compose(forces, method.drifts, np.exp(-gone), gained, self.substeps, h, p, v, np.zeros_like(v))
+
+    def _integrate(
+        self, forces: Forces, method: Tableau, p: NDArray[np.float64], v: NDArray[np.float64], told: NDArray[np.float64]
+    ) -> None:
+        frame, rows = self.system.time_step, np.zeros((2, len(method.a), len(p)))
+        fixed = not self.tolerance
+        h = frame / self.substeps if fixed else min(frame, 1.0 / self.rate if self.rate else frame)
+        errors = np.zeros((1, len(method.a))) if fixed else method.errors
+        whole = (self.tolerance or 1.0, frame, frame, h)
+        q, w = aligned(len(p)), aligned(len(p))
+        integrate(forces, method.a, method.times, errors, method.power, *whole, p, v, q, w, *rows, told)
+        if told[3] < frame:
+            raise RuntimeError(
+                f"the error of {self.tolerance:.3g} m was not kept by any step down to {told[2]:.3g} s: after "
+                f"{told[3]:.6g} of {frame:.6g} s of the frame the forces are too sudden, or round-off is larger; ask "
+                "for a larger error"
+            )
+
+    def _rows(self, x: Positions) -> NDArray[np.float64]:
+        """x (n, 3) in rows of four, and the two rows that fill up bundles."""
+        out = aligned(4 * (self.system.vertices + 2))
+        out.reshape(-1, 4)[: self.system.vertices, :3] = x
+        return out
+
+
+class _Done(Iterating):
+    """The only iterate, again and again."""
+
+    def __init__(self, p: Positions, v: Positions) -> None:
+        self.positions, self.velocity = p, v
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        return True
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating."""
+        return 1, float("nan"), ITERATIONS

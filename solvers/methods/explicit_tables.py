@@ -1,0 +1,136 @@
+"""Coefficients of explicit methods.
+
+Compositions: drifts a and kicks b in turns, a_0 b_0 a_1 ... b_(k-1) a_k, the same backwards as forwards (Blanes and
+Moan 2002, "Practical symplectic partitioned Runge-Kutta and Runge-Kutta-Nystrom methods", S6 of order 4 and S10 of
+order 6). Runge-Kutta methods: Kutta's of order 4; Tsitouras 2011, "Runge-Kutta pairs of order 5(4) satisfying only the
+first column simplifying assumption"; Dormand and Prince's of order 8, with errors of order 5 and 3 (Hairer, Norsett and
+Wanner, Solving Ordinary Differential Equations I, section II.5), whose coefficients SciPy has.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Composition:
+    """order; drifts (k + 1,) and kicks (k,), parts of a step."""
+
+    order: int
+    drifts: Array
+    kicks: Array
+
+    @classmethod
+    def symmetric(cls, order: int, drifts: list[float], kicks: list[float]) -> Composition:
+        """By the first of both; what is left of a step lies in the middle."""
+        middle = 1.0 - 2.0 * sum(drifts)
+        kicks = [*kicks, 0.5 - sum(kicks)]
+        return cls(order, np.array([*drifts, middle, *drifts[::-1]]), np.array([*kicks, *kicks[::-1]]))
+
+    def power(self, y: float) -> complex:
+        """The eigenvalue of a step's matrix that is largest, for an oscillator with omega h = y."""
+        step = np.eye(2)
+        for k, drift in enumerate(self.drifts):
+            step = np.array([[1.0, drift * y], [0.0, 1.0]]) @ step
+            if k < len(self.kicks):
+                step = np.array([[1.0, 0.0], [-self.kicks[k] * y, 1.0]]) @ step
+        return max(np.linalg.eigvals(step), key=abs)
+
+    @cached_property
+    def limit(self) -> float:
+        """omega h up to which steps are stable."""
+        return _limit(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Tableau:
+    """order; a (s, s): rows, the last of which ends the step; errors (0 to 2, s): weights of its error, and power:
+    by which power of the step that falls."""
+
+    order: int
+    a: Array
+    errors: Array
+    power: float = 0.0
+
+    def power_of(self, y: float) -> complex:
+        """R(i y)."""
+        s = len(self.a)
+        stages = np.linalg.solve(np.eye(s) - 1j * y * self.a, np.ones(s))
+        return stages[-1]
+
+    @cached_property
+    def times(self) -> Array:
+        """c (s,)."""
+        return self.a.sum(axis=1)
+
+    @cached_property
+    def limit(self) -> float:
+        """omega h up to which steps are stable."""
+        return _limit(self)
+
+
+def _limit(method: Composition | Tableau) -> float:
+    grows = method.power if isinstance(method, Composition) else method.power_of
+    found = next(y for y in np.arange(0.01, 40.0, 0.01) if abs(grows(float(y))) > 1.0 + 1e-6)
+    return float(found) - 0.01
+
+
+def _lower(*rows: list[float]) -> Array:
+    """A square array of rows that fill up with zeros."""
+    out = np.zeros((len(rows), len(rows)))
+    for k, row in enumerate(rows):
+        out[k, : len(row)] = row
+    return out
+
+
+VERLET = Composition(2, np.array([0.0, 1.0, 0.0]), np.array([0.5, 0.5]))
+BLANES_MOAN_4 = Composition.symmetric(
+    4, [0.0792036964311957, 0.353172906049774, -0.0420650803577195], [0.209515106613362, -0.143851773179818]
+)
+BLANES_MOAN_6 = Composition.symmetric(
+    6,
+    [0.0502627644003922, 0.413514300428344, 0.0450798897943977, -0.188054853819569, 0.541960678450780],
+    [0.148816447901042, -0.132385865767784, 0.067307604692185, 0.432666402578175],
+)
+RUNGE_KUTTA_4 = Tableau(
+    4, _lower([], [0.5], [0.0, 0.5], [0.0, 0.0, 1.0], [1 / 6, 1 / 3, 1 / 3, 1 / 6]), np.zeros((0, 5))
+)
+TSITOURAS_5 = Tableau(
+    5,
+    _lower(
+        [],
+        [0.161],
+        [-0.008480655492356989, 0.335480655492357],
+        [2.8971530571054935, -6.359448489975075, 4.3622954328695815],
+        [5.325864828439257, -11.748883564062828, 7.4955393428898365, -0.09249506636175525],
+        [5.86145544294642, -12.92096931784711, 8.159367898576159, -0.071584973281401, -0.028269050394068383],
+        [
+            *(0.09646076681806523, 0.01, 0.4798896504144996),
+            *(1.379008574103742, -3.290069515436081, 2.324710524099774),
+        ],
+    ),
+    np.array(
+        [
+            [
+                *(-0.00178001105222577714, -0.0008164344596567469, 0.007880878010261995),
+                *(-0.1447110071732629, 0.5823571654525552, -0.45808210592918697, 1.0 / 66.0),
+            ]
+        ]
+    ),
+    5.0,
+)
+
+
+def dormand_prince_8() -> Tableau:
+    """The method of order 8."""
+    from scipy.integrate import DOP853  # for those who ask for it
+
+    a = np.zeros((13, 13))
+    a[:12, :12], a[12, :12] = DOP853.A, DOP853.B
+    return Tableau(8, a, np.array([DOP853.E5, DOP853.E3]), 8.0)
