@@ -136,13 +136,13 @@ def _size(forces, weights, span, speeds, pulls):
 
 
 @kernel
-def integrate(forces, a, times, errors, power, tolerance, span, frame, h, p, v, q, w, speeds, pulls, told):
+def integrate(forces, a, times, errors, power, tolerance, most, span, frame, h, p, v, q, w, speeds, pulls, told):
     """A frame [s] by a Runge-Kutta method whose steps keep an error at most `tolerance` [m], root mean square.
 
     a (s, s): rows of the tableau, the last of which ends the step; times (s,): c; errors (1 or 2, s): weights of the
-    error, the second one that of a lower order which tempers it; power: the error falls by h^power, 0 keeps h; span
-    [s]: by what velocities count; h: to begin with; q, w: scratch; speeds, pulls: scratch (s, rows); told: takes the
-    steps accepted, those rejected, the last step [s] and the time reached [s].
+    error, the second one that of a lower order which tempers it; power: the error falls by h^power, 0 keeps h; most:
+    how many steps may be tried; span [s]: by what velocities count; h: to begin with; q, w: scratch; speeds, pulls:
+    scratch (s, rows); told: takes the steps accepted, those rejected, the last step [s] and the time reached [s].
     """
     free = 0
     for i in range(len(forces.inverse)):
@@ -176,6 +176,6 @@ def integrate(forces, a, times, errors, power, tolerance, span, frame, h, p, v, 
             told[1] += 1.0
             known = power > 0.0 and error < np.inf
             h = step * (max(FEWEST, CAUTION * error ** (-1.0 / power)) if known else FEWEST)
-            if h < FLOOR * frame:
-                break
+        if h < FLOOR * frame or told[0] + told[1] >= most:
+            break
     told[2], told[3] = h, t

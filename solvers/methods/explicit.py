@@ -49,15 +49,20 @@ _SAFETY = 0.95
 _ABOVE = 1.02
 """Of the largest eigenvalue as it is found, which is from below: to one percent."""
 
-_MOST = 1e10
-"""Springs that a step may go through, some tens of seconds: compiled code cannot be interrupted meanwhile."""
+_MOST = 1e9
+"""Springs that a step may go through, some seconds: compiled code cannot be interrupted meanwhile."""
+
+_TRIED = 20
+"""Steps that may be tried to keep to an error, for each that is stable."""
 
 _FAR = 1e100
 """Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
 
 
 @dataclass(frozen=True)
-class _Explicit:
+class Explicit:
+    """What they share."""
+
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
     name: ClassVar[str]
@@ -70,15 +75,16 @@ class _Explicit:
         method, parts = type(self).method(), _Parts.of(system, self.name)
         omega = frequency(system)
         rate = omega + float(parts.drag.max(initial=0.0))
-        needed = substeps * max(1.0, ceil(system.time_step * rate / (_SAFETY * method.limit))) if not error else 1.0
-        if needed * max(1, len(parts.springs.edges)) > _MOST:
+        needed = substeps * max(1.0, ceil(system.time_step * rate / (_SAFETY * method.limit)))
+        if needed * method.evaluations * max(1, len(parts.springs.edges)) > _MOST:
             raise Unsupported(
-                f"{self.name}: is stable with {needed:.3g} substeps a step, which for {len(parts.springs.edges)} "
-                f"springs are more than the {_MOST:.0e} evaluations that are allowed; take a shorter time step"
+                f"{self.name}: is stable with {needed:.3g} substeps a step of {method.evaluations} evaluations, which "
+                f"for {len(parts.springs.edges)} springs are more than the {_MOST:.0e} allowed; take a shorter "
+                "time step"
             )
         soft = int((~system.pins.exact).sum())
         taken = f"; {soft} pins by penalty taken as exact" if soft else ""
-        told = f"steps to an error of {error:.3g}" if error else f"{needed:.0f} substeps"
+        told = f"steps by an error of {error:.3g}" if error else f"{needed:.0f} substeps"
         lengths = parts.springs.rest_length
         tolerance = error * (float(lengths.mean()) if len(lengths) else 1.0)
         choice = f"{told}, for vibrations of at most {omega:.3g} rad/s{taken}"
@@ -86,7 +92,7 @@ class _Explicit:
 
 
 @dataclass(frozen=True)
-class _Fixed(_Explicit):
+class _Fixed(Explicit):
     """Substeps of one length. refine: by how much more of them than stability asks for."""
 
     refine: int = 1
@@ -101,7 +107,7 @@ class _Fixed(_Explicit):
 
 
 @dataclass(frozen=True)
-class _Controlled(_Explicit):
+class _Controlled(Explicit):
     """Substeps by their error. error: of each, root mean square over the vertices, in parts of the springs' mean
     length; an error of velocity counts by what it moves in a frame."""
 
@@ -165,7 +171,10 @@ class RungeKutta4(_Fixed):
     name: ClassVar[str] = "runge-kutta-4"
     method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(lambda: RUNGE_KUTTA_4)
     about: ClassVar[About] = _about(
-        "Kutta, Wilhelm", 1901, "Beitrag zur näherungsweisen Integration totaler Differentialgleichungen"
+        "Hairer, Ernst and Norsett, Syvert Paul and Wanner, Gerhard",
+        1993,
+        "Solving Ordinary Differential Equations I",
+        "10.1007/978-3-540-78862-1",
     )
 
 
@@ -317,14 +326,15 @@ class PreparedExplicit(Iterative):
         fixed = not self.tolerance
         h = frame / self.substeps if fixed else min(frame, 1.0 / self.rate if self.rate else frame)
         errors = np.zeros((1, len(method.a))) if fixed else method.errors
-        whole = (self.tolerance or 1.0, frame, frame, h)
+        most = self.substeps if fixed else _TRIED * self.substeps + 10_000
+        whole = (self.tolerance or 1.0, float(most), frame, frame, h)
         q, w = aligned(len(p)), aligned(len(p))
         integrate(forces, method.a, method.times, errors, method.power, *whole, p, v, q, w, *rows, told)
         if told[3] < frame:
             raise RuntimeError(
-                f"the error of {self.tolerance:.3g} m was not kept by any step down to {told[2]:.3g} s: after "
-                f"{told[3]:.6g} of {frame:.6g} s of the frame the forces are too sudden, or round-off is larger; ask "
-                "for a larger error"
+                f"the error of {self.tolerance:.3g} m was not kept within {told[0] + told[1]:.0f} steps, the last of "
+                f"{told[2]:.3g} s: after {told[3]:.6g} of {frame:.6g} s of the frame the forces are too sudden, or "
+                "round-off is larger; ask for a larger error"
             )
 
     def _rows(self, x: Positions) -> NDArray[np.float64]:

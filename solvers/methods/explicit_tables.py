@@ -33,6 +33,11 @@ class Composition:
         kicks = [*kicks, 0.5 - sum(kicks)]
         return cls(order, np.array([*drifts, middle, *drifts[::-1]]), np.array([*kicks, *kicks[::-1]]))
 
+    @property
+    def evaluations(self) -> int:
+        """Of the forces, in a step: a first drift of no length needs none anew."""
+        return len(self.kicks) - (self.drifts[0] == 0.0)
+
     def power(self, y: float) -> complex:
         """The eigenvalue of a step's matrix that is largest, for an oscillator with omega h = y."""
         step = np.eye(2)
@@ -57,6 +62,11 @@ class Tableau:
     a: Array
     errors: Array
     power: float = 0.0
+
+    @property
+    def evaluations(self) -> int:
+        """Of the forces, in a step."""
+        return len(self.a) - 1
 
     def power_of(self, y: float) -> complex:
         """R(i y)."""
