@@ -10,7 +10,6 @@ M^-1 A'KA, which is that of the springs at their stiffest.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from math import ceil
 from typing import ClassVar
@@ -66,13 +65,16 @@ class Explicit:
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
     name: ClassVar[str]
-    method: ClassVar[Callable[[], Composition | Tableau]]
+
+    def method(self) -> Composition | Tableau:
+        """The coefficients."""
+        raise NotImplementedError
 
     def _prepared(self, system: System, substeps: int, error: float) -> PreparedExplicit:
         """substeps: times the fewest that are stable; error: of the springs' mean length, 0 for none."""
         vertex_terms.require_implicit_euler(system, self.name)
         vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), self.name)
-        method, parts = type(self).method(), _Parts.of(system, self.name)
+        method, parts = self.method(), _Parts.of(system, self.name)
         omega = frequency(system)
         rate = omega + float(parts.drag.max(initial=0.0))
         needed = substeps * max(1.0, ceil(system.time_step * rate / (_SAFETY * method.limit)))
@@ -137,7 +139,6 @@ class VelocityVerlet(_Fixed):
     """Kick, drift, kick: symplectic, of order 2, one evaluation of the forces a substep."""
 
     name: ClassVar[str] = "velocity-verlet"
-    method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(lambda: VERLET)
     about: ClassVar[About] = _about(
         "Swope, William C. and Andersen, Hans C. and Berens, Peter H. and Wilson, Kent R.",
         1982,
@@ -145,14 +146,21 @@ class VelocityVerlet(_Fixed):
         "10.1063/1.442716",
     )
 
+    def method(self) -> Composition | Tableau:
+        """The coefficients."""
+        return VERLET
+
 
 @dataclass(frozen=True)
 class BlanesMoan4(_Fixed):
     """A symplectic composition of order 4, six evaluations a substep."""
 
     name: ClassVar[str] = "blanes-moan-4"
-    method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(lambda: BLANES_MOAN_4)
     about: ClassVar[About] = _BLANES_MOAN
+
+    def method(self) -> Composition | Tableau:
+        """The coefficients."""
+        return BLANES_MOAN_4
 
 
 @dataclass(frozen=True)
@@ -160,8 +168,11 @@ class BlanesMoan6(_Fixed):
     """A symplectic composition of order 6, ten evaluations a substep."""
 
     name: ClassVar[str] = "blanes-moan-6"
-    method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(lambda: BLANES_MOAN_6)
     about: ClassVar[About] = _BLANES_MOAN
+
+    def method(self) -> Composition | Tableau:
+        """The coefficients."""
+        return BLANES_MOAN_6
 
 
 @dataclass(frozen=True)
@@ -169,13 +180,16 @@ class RungeKutta4(_Fixed):
     """Kutta's method of order 4, four evaluations a substep."""
 
     name: ClassVar[str] = "runge-kutta-4"
-    method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(lambda: RUNGE_KUTTA_4)
     about: ClassVar[About] = _about(
         "Hairer, Ernst and Norsett, Syvert Paul and Wanner, Gerhard",
         1993,
         "Solving Ordinary Differential Equations I",
         "10.1007/978-3-540-78862-1",
     )
+
+    def method(self) -> Composition | Tableau:
+        """The coefficients."""
+        return RUNGE_KUTTA_4
 
 
 @dataclass(frozen=True)
@@ -183,7 +197,6 @@ class Tsitouras5(_Controlled):
     """Tsitouras's pair of orders 5 and 4, six evaluations a substep."""
 
     name: ClassVar[str] = "tsitouras-5"
-    method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(lambda: TSITOURAS_5)
     about: ClassVar[About] = _about(
         "Tsitouras, Charalampos",
         2011,
@@ -191,19 +204,26 @@ class Tsitouras5(_Controlled):
         "10.1016/j.camwa.2011.06.002",
     )
 
+    def method(self) -> Composition | Tableau:
+        """The coefficients."""
+        return TSITOURAS_5
+
 
 @dataclass(frozen=True)
 class DormandPrince8(_Controlled):
     """Dormand and Prince's method of order 8 with errors of orders 5 and 3, twelve evaluations a substep."""
 
     name: ClassVar[str] = "dormand-prince-8"
-    method: ClassVar[Callable[[], Composition | Tableau]] = staticmethod(dormand_prince_8)
     about: ClassVar[About] = _about(
         "Hairer, Ernst and Norsett, Syvert Paul and Wanner, Gerhard",
         1993,
         "Solving Ordinary Differential Equations I",
         "10.1007/978-3-540-78862-1",
     )
+
+    def method(self) -> Composition | Tableau:
+        """The coefficients."""
+        return dormand_prince_8()
 
 
 def frequency(system: System) -> float:

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from harness.reference.minimiser import free_hessian
 from harness.scenes.bind import Scene
 from harness.simulation.step import State, prepare, simulate
-from solvers.integrators import INTEGRATORS, Motion
+from solvers.integrators import Motion
 from solvers.methods.newton import Newton
 from solvers.problem import Positions, StepProblem, StopRule
 from tests.contracts.test_integrators import LAWS, energies
@@ -139,7 +139,7 @@ def test_what_flies_freely_at_rest_length_goes_on(name: str, case: Case):
 
 
 STEPS = 4
-integrators = pytest.mark.parametrize("integrator", INTEGRATORS)
+integrators = pytest.mark.parametrize("integrator", LAWS)
 LAWFUL = examples(20)
 
 

@@ -48,14 +48,17 @@ def second_opinion(spec: SceneSpec, scene: Scene, integrator: str) -> str:
 
 
 class _Answer:
-    """Stands for a prepared solver: what it answers is x (n, 3) [m], by the time of the unknown [s]."""
+    """Stands for a prepared solver: what it answers is x (n, 3) [m], by the time of the unknown [s]; moves: whether it
+    tells the velocity at the step's end."""
 
-    def __init__(self, x: Callable[[float], Array]) -> None:
-        self.x = x
+    def __init__(self, x: Callable[[float], Array], *, moves: bool = False) -> None:
+        self.x, self._moves = x, moves
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """The answer to any step."""
-        return Solution(self.x(problem.start.until), 0, float("nan"), float("nan"), "iterations")
+        x = self.x(problem.start.until)
+        v = problem.start.velocity_at(x) if self._moves else None
+        return Solution(x, 0, float("nan"), float("nan"), "iterations", v)
 
 
 def _compared(sides: list[Side], scene: Scene, integrator: str, point: Point) -> Iterator[Finding]:
@@ -70,7 +73,7 @@ def _compared(sides: list[Side], scene: Scene, integrator: str, point: Point) ->
     stated = state(integrator, own.declared, own.opinions, now, before, time)
     m = stated.moment
     x = np.asarray(m.p + m.when * m.time_step * m.v, float) + point.shift
-    answer: Any = _Answer(lambda until: x)
+    answer: Any = _Answer(lambda until: x, moves=integrator == "own")
     run = simulate(scene, answer, StopRule(), first_guess="current", frames=index + 1, state=point.state)
     done = next(run)
     at = Place(own, stated, done.problem, x, point.direction)
