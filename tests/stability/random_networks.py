@@ -67,16 +67,8 @@ class Case:
         mesh = Network(positions=tuple(map(tuple, rest.tolist()))).build()
         by = INTEGRATORS[integrator]
         none = np.empty((0, 3))
-        scene = Scene(
-            mesh,
-            replace(system, factor=by.factor, speed=by.speed),
-            np.zeros_like(rest),
-            (),
-            (),
-            none,
-            (0.0, 0.0, 0.0),
-            integrator=by,
-        )
+        system = replace(system, factor=by.factor, speed=by.speed)
+        scene = Scene(mesh, system, np.zeros_like(rest), (), (), none, (0.0, 0.0, 0.0), integrator=by)
         p, v = rest + 0.3 * rng.normal(size=rest.shape), rng.normal(size=rest.shape)
         return scene, State(Motion(p, v), None, 0)
 
