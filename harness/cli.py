@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from harness.base.commands import Again, Changed, Commands, InThisProcess, Results
+from harness.base.commands import Again, Changed, Commands, InThisProcess, Results, Rows
 from harness.base.console import err, out
 from harness.base.console import say as _say
 from harness.base.errors import InputError, Mistake
@@ -223,7 +223,7 @@ def list_runs(config: Config, results: Results = Path("results")) -> None:
 @app.command()
 def query(
     sql: Annotated[str, typer.Argument(help="A query over the tables `rows`, `accuracy`, `ablation`.")],
-    results: Results = Path("results"),
+    results: Rows = Path("results"),
     csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
     seconds: Annotated[float, typer.Option(help="Processor time that the answer may take.")] = 15.0,
 ) -> None:

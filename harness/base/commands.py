@@ -10,11 +10,18 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from harness.base import places
 from harness.base.console import say, show_log
 from harness.base.errors import SpringbenchError
 from harness.base.files import MISTAKES, told
 
-Results = Annotated[Path, typer.Option(help="The folder that holds a folder for each config.")]
+_RESULTS: Any = {
+    "parser": places.parse,
+    "metavar": "PATH|URL",
+    "help": "The folder that holds a folder for each sweep.",
+}
+Results = Annotated[Path, typer.Option(callback=places.everything, **_RESULTS)]
+Rows = Annotated[Path, typer.Option(callback=places.rows_alone, **_RESULTS)]
 Again = Annotated[bool, typer.Option("--again", help="Do all, also what is there.")]
 Changed = Annotated[bool, typer.Option("--changed", help="Do also what is there by other code than today's.")]
 InThisProcess = Annotated[

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from harness.base import places
 from harness.base.console import say
 from harness.base.errors import InputError, Mistake
 
-Folder = Annotated[Path, typer.Argument(help="A folder of results, or that of one sweep.")]
+_FOLDER: Any = {"parser": places.parse, "metavar": "PATH|URL", "help": "A folder of results, or that of one sweep."}
+Folder = Annotated[Path, typer.Argument(callback=places.everything, **_FOLDER)]
 
 
 def compact(

@@ -1,0 +1,184 @@
+"""Results on another file system, by URL (fsspec): `s3://bucket/results`, `sftp://host/results`, `memory://...`
+
+Commands work on a folder in the user's cache, one for each URL. What is new there is fetched before, and what is new
+here is sent when the command ends, however it does; what a kill keeps from being sent, the next command sends. An index
+remembers both sides as they were when they last agreed: where one of them changed since, the other follows; where both
+did, this one's is sent.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import typer
+
+from harness.base.errors import InputError, Mistake, RunFailed
+from harness.base.files import replacing
+
+_BATCH = 500
+"""So many files travel at once."""
+INDEX = ".place.json"
+"""The index, in the folder."""
+
+ROWS = ("rows", "accuracy", "ablation")
+"""What holds rows: folders of these names, and packed files."""
+
+
+def parse(value: str) -> Path | str:
+    """A path, or a URL as it stands."""
+    return value if "://" in value else Path(value)
+
+
+def everything(context: typer.Context, value: Path | str) -> Path:
+    """The folder of a command that reads and writes results."""
+    if isinstance(value, Path):
+        return value
+    place = Place.of(value)
+    place.fetch()
+    context.call_on_close(place.send)
+    return place.folder
+
+
+def rows_alone(value: Path | str) -> Path:
+    """The folder of a command that reads rows and writes nothing."""
+    if isinstance(value, Path):
+        return value
+    place = Place.of(value)
+    place.fetch(rows_alone=True)
+    return place.folder
+
+
+@dataclass(slots=True)
+class Place:
+    """A URL and its folder here. index: of each file what it was there and here when the two last agreed."""
+
+    url: str
+    folder: Path
+    system: Any
+    root: str
+    index: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+
+    @classmethod
+    def of(cls, url: str) -> Place:
+        """The place of a URL. Raises InputError where its kind is not known, or takes a package that is missing."""
+        from fsspec.core import url_to_fs
+
+        try:
+            system, root = url_to_fs(url)
+        except (ValueError, ImportError, TypeError) as error:
+            hint = "; pip install 'springbench[s3]'" if url.startswith("s3:") else ""
+            raise InputError(Mistake(f"{error}{hint}", key=url)) from error
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "springbench" / "places"
+        folder = cache / hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
+        folder.mkdir(parents=True, exist_ok=True)
+        place = cls(url, folder, system, str(root).rstrip("/"))
+        with suppress(OSError, ValueError):
+            place.index = json.loads((folder / INDEX).read_text())
+        return place
+
+    def fetch(self, *, rows_alone: bool = False) -> None:
+        """Fetch what is new there, and take away what went there and was not touched here. Raises InputError."""
+        try:
+            self.system.invalidate_cache()
+            there = self._there()
+            wanted = {n: token for n, token in there.items() if not rows_alone or _holds_rows(n)}
+            new = [n for n, token in wanted.items() if self.index.get(n, [""])[0] != token]
+            new = [n for n in new if self._here(n) in ("", self.index.get(n, ["", ""])[1])]
+            for start in range(0, len(new), _BATCH):
+                self._get(new[start : start + _BATCH], there)
+        except Exception as error:  # of whatever library speaks to it
+            raise InputError(Mistake(f"cannot be read: {_words(error)}", key=self.url)) from error
+        for name in [name for name in self.index if name not in there]:
+            if self._here(name) == self.index.pop(name)[1]:
+                (self.folder / name).unlink(missing_ok=True)
+        self._remember()
+
+    def _get(self, names: Sequence[str], there: Mapping[str, str]) -> None:
+        """Fetch some files, many at once; what a kill leaves is fetched again."""
+        with TemporaryDirectory(dir=self.folder, prefix=".partial") as scratch:
+            fetched = [Path(scratch) / str(number) for number in range(len(names))]
+            self.system.get([f"{self.root}/{name}" for name in names], [str(path) for path in fetched])
+            for name, path in zip(names, fetched, strict=True):
+                (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(path, self.folder / name)
+                self.index[name] = [there[name], self._here(name)]
+        self._remember()
+
+    def send(self) -> None:
+        """Send what is new here, then take away there what went here. Raises RunFailed: it is kept, and sent later."""
+        names = {path.relative_to(self.folder).as_posix() for path in self.folder.rglob("*") if _is_result(path)}
+        new = [name for name in sorted(names) if self.index.get(name, ["", ""])[1] != self._here(name)]
+        gone = [name for name in self.index if not (self.folder / name).exists()]
+        if not new and not gone:
+            return
+        try:
+            for start in range(0, len(new), _BATCH):
+                batch = new[start : start + _BATCH]
+                for above in {str(PurePosixPath(f"{self.root}/{name}").parent) for name in batch}:
+                    self.system.makedirs(above, exist_ok=True)
+                self.index |= {name: ["", self._here(name)] for name in batch}
+                self.system.put([str(self.folder / n) for n in batch], [f"{self.root}/{n}" for n in batch])
+            for name in gone:
+                self.system.rm_file(f"{self.root}/{name}")
+                del self.index[name]
+            self.system.invalidate_cache()
+            there = self._there()
+        except Exception as error:  # of whatever library speaks to it
+            raise RunFailed(
+                f"{self.url}: cannot be written: {_words(error)}; all is kept in {self.folder}, and the next command "
+                "with this URL sends it"
+            ) from error
+        for name in new:
+            self.index[name][0] = there[name]
+        self._remember()
+
+    def _there(self) -> dict[str, str]:
+        """The files there, and what changes when they do."""
+        found: Mapping[str, Mapping[str, Any]] = self.system.find(self.root, detail=True)
+        start = len(self.root.strip("/")) + 1
+        files = {name.strip("/")[start:]: about for name, about in found.items()}
+        return {name: _token(about) for name, about in files.items() if _is_safe(name)}
+
+    def _here(self, name: str) -> str:
+        """What changes when a file here does; empty where there is none."""
+        try:
+            about = (self.folder / name).stat()
+        except FileNotFoundError:
+            return ""
+        return f"{about.st_size} {about.st_mtime_ns}"
+
+    def _remember(self) -> None:
+        with replacing(self.folder / INDEX) as partial:
+            partial.write_text(json.dumps(self.index))
+
+
+def _token(about: Mapping[str, Any]) -> str:
+    version = next((about[key] for key in ("ETag", "etag", "LastModified", "mtime", "created") if about.get(key)), "")
+    return f"{about.get('size')} {version}"
+
+
+def _is_safe(name: str) -> bool:
+    """Whether a name leads into the folder, and to no file of ours."""
+    parts = PurePosixPath(name).parts
+    return bool(parts) and ".." not in parts and not name.startswith("/") and name != INDEX
+
+
+def _is_result(path: Path) -> bool:
+    return path.is_file() and path.name not in (INDEX, ".lock") and not any("partial" in part for part in path.parts)
+
+
+def _holds_rows(name: str) -> bool:
+    path = PurePosixPath(name)
+    return path.suffix == ".parquet" and (path.parent.name in ROWS or path.stem in ROWS)
+
+
+def _words(error: Exception) -> str:
+    return " ".join(str(error).split())[:300] or type(error).__name__

@@ -1,0 +1,125 @@
+"""Results on another file system: what is there is read, what is new is sent, and what was killed is made up for."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from harness.base.places import Place
+from harness.cli import app
+from tests.contracts.hostile import scene
+from tests.dummies import write_dummies
+
+SWEEP = "{scenes: [cloth.yaml], sizes: [4], solvers: [sparse], options: {rounds: 1, record: false, pictures: false}}"
+
+
+def command(*arguments: object) -> Result:
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    (tmp_path / "cloth.yaml").write_text(scene())
+    (tmp_path / "sweep.yaml").write_text(SWEEP)
+    return tmp_path / "sweep.yaml"
+
+
+def test_files_travel_both_ways_and_what_is_there_already_does_not(tmp_path: Path):
+    there = tmp_path / "there"
+    units = write_dummies(there / "sweep", 3)
+    (there / "sweep" / "recordings").mkdir()
+    (there / "sweep" / "recordings" / "a.rrd").write_text("a recording")
+    place = Place.of(f"file://{there}")
+    place.fetch(rows_alone=True)
+    assert len([path for path in place.folder.rglob("*.*") if path.suffix in (".parquet", ".rrd")]) == 3
+    (here,) = place.folder.rglob(units[0].name)
+    fetched = here.stat().st_ino
+    (place.folder / "sweep" / "rows.parquet").write_text("packed")
+    (place.folder / "sweep" / "rows" / units[1].name).unlink()
+    os.unlink(units[2])
+    again = Place.of(f"file://{there}/")
+    again.fetch()
+    assert here.stat().st_ino == fetched
+    assert (again.folder / "sweep" / "recordings" / "a.rrd").read_text() == "a recording"
+    again.send()
+    left = {path.relative_to(there).as_posix() for path in there.rglob("*") if path.is_file()}
+    assert left == {f"sweep/rows/{units[0].name}", "sweep/rows.parquet", "sweep/recordings/a.rrd"}
+
+
+def test_what_was_changed_on_both_sides_is_taken_from_here(tmp_path: Path):
+    (tmp_path / "there").mkdir()
+    file = tmp_path / "there" / "a.txt"
+    file.write_text("old")
+    place = Place.of(f"file://{tmp_path / 'there'}")
+    place.fetch()
+    (place.folder / "a.txt").write_text("changed here")
+    file.write_text("changed there as well")
+    again = Place.of(f"file://{tmp_path / 'there'}")
+    again.fetch()
+    again.send()
+    assert file.read_text() == "changed here"
+
+
+def a_sweep_lives_at(url: str, config: Path, cache: Path) -> None:
+    """Run, list, query, pack and query again, as from three machines."""
+    for machine in range(3):
+        os.environ["XDG_CACHE_HOME"] = str(cache / str(machine))
+        told = command("run", config, "--results", url)
+        assert told.exit_code == 0, told.output
+        assert ("1 of 1 runs are there already" in told.output) == (machine > 0)
+    asked = command("query", "SELECT DISTINCT scene, solver FROM rows", "--results", url, "--csv")
+    assert asked.output.split() == ["scene,solver", "cloth,sparse"]
+    packed = command("compact", url)
+    assert packed.exit_code == 0, packed.output
+    os.environ["XDG_CACHE_HOME"] = str(cache / "4")
+    assert command("query", "SELECT DISTINCT scene, solver FROM rows", "--results", url, "--csv").output == asked.output
+    assert "done" in command("list", config, "--results", url).output
+
+
+def test_a_sweep_lives_at_a_url(config: Path, cache: Path, tmp_path: Path):
+    (tmp_path / "there").mkdir()
+    a_sweep_lives_at(f"file://{tmp_path / 'there'}", config, cache)
+    assert [path.name for path in (tmp_path / "there").rglob("*.parquet")] == ["rows.parquet"]
+
+
+@pytest.fixture
+def storage(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """An S3-compatible server on the loopback, with a bucket."""
+    import boto3
+    from moto.server import ThreadedMotoServer
+
+    server = ThreadedMotoServer("127.0.0.1", 0)
+    server.start()
+    host, port = server.get_host_and_port()
+    settings = {"AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x", "AWS_DEFAULT_REGION": "us-east-1"}
+    for name, value in {**settings, "AWS_ENDPOINT_URL": f"http://{host}:{port}"}.items():
+        monkeypatch.setenv(name, value)
+    boto3.client("s3").create_bucket(Bucket="bucket")
+    yield "s3://bucket/results"
+    server.stop()
+
+
+@pytest.mark.long
+def test_a_sweep_lives_in_storage_of_the_kind_of_s3(storage: str, config: Path, cache: Path):
+    a_sweep_lives_at(storage, config, cache)
+
+
+def test_a_place_that_cannot_be_read_or_written_is_named_and_nothing_is_lost(config: Path, cache: Path, tmp_path: Path):
+    told = command("query", "SELECT 1", "--results", "nothing://there")
+    assert (told.exit_code, "nothing://there" in told.output) == (2, True)
+    (tmp_path / "there").write_text("a file")
+    url = f"file://{tmp_path / 'there'}"
+    told = command("run", config, "--results", url)
+    assert (told.exit_code, "all is kept in" in told.output) == (1, True), told.output
+    (tmp_path / "there").unlink()
+    told = command("run", config, "--results", url)
+    assert (told.exit_code, "1 of 1 runs are there already" in told.output) == (0, True), told.output
+    assert len(list((tmp_path / "there").rglob("*.parquet"))) == 1
