@@ -11,6 +11,8 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -172,18 +174,9 @@ def rows(folder: str | Path) -> Any:
 
 
 def _frame(table: Any) -> Any:
-    try:
-        import polars  # pyright: ignore[reportMissingImports]
-
-        return polars.from_arrow(table)
-    except ImportError:
-        pass
-    try:
-        import pandas  # noqa: F401  # pyright: ignore[reportMissingImports]
-
-        return table.to_pandas()
-    except ImportError:
-        return table
+    if find_spec("polars"):
+        return import_module("polars").from_arrow(table)
+    return table.to_pandas() if find_spec("pandas") else table
 
 
 def open_recording(path: str | Path) -> Replay:

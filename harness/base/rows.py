@@ -1,5 +1,5 @@
-# pyright: reportUnknownMemberType=false
-# pyarrow's stubs say nothing of the kinds of files that Parquet is written to.
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyarrow's stubs say little of columns, and of files that Parquet is read from.
 """The rows that a run leaves: one flat Parquet file a run, under `results/<sweep>/rows/`, written and read.
 
 `harness.base.shelf` says where the rows of a unit lie once many were packed.
@@ -126,7 +126,8 @@ def _rows(unit: Path) -> pa.Table:
             return _file(unit)
     if unit.stem not in shelf.packed_units(unit.parent):
         raise OSError("it is no plain file")
-    only = pq.read_table(shelf.packed_file(unit.parent), filters=[(shelf.FILE, "==", unit.stem)])
+    named: Any = [(shelf.FILE, "==", unit.stem)]
+    only = pq.read_table(shelf.packed_file(unit.parent), filters=named)
     return only.drop_columns([shelf.FILE])
 
 

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# pyarrow's stubs say little of columns, and of files that Parquet is read from.
 """Where rows are kept: a unit's in a file of its own, `rows/<unit>.parquet`, or those of many in one file beside the
 folder, `rows.parquet`, whose column `file` names the unit (`springbench compact`).
 

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# pyarrow's stubs say little of columns, and of files that Parquet is read from.
 """The rows of many units at once, by DuckDB on their Parquet files; those of one schema are read together.
 
 `union_by_name` would do as much for files of any schema, and takes 140 kB of memory a file. What does not fit together
@@ -6,7 +8,7 @@ raises `Unfit`: whoever reads then looks unit by unit, and can say which.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,11 +59,11 @@ class Union:
 
 
 @contextmanager
-def connected(memory: int = MEMORY) -> Iterator[DuckDBPyConnection]:
+def connected(memory: int = MEMORY) -> Generator[DuckDBPyConnection]:
     """A DuckDB that reads Parquet files and nothing else, on one thread: others may be timed."""
     import duckdb
 
-    settings = {"memory_limit": f"{memory}B", "threads": 1, "temp_directory": ""}
+    settings: Any = {"memory_limit": f"{memory}B", "threads": 1, "temp_directory": ""}
     try:
         with duckdb.connect(config=settings) as connection:
             connection.execute("SET enable_external_file_cache = false; SET disable_parquet_prefetching = true")
@@ -137,8 +139,8 @@ def table(
         raise Unfit(f"no {lacking[0]}" if lacking else "not all have rows")
     if named:
         names = pa.array([path.stem for path in asked], pa.string())
-        found = found.append_column(FILE, names.take(pa.array(number)))
-    return found if np.all(np.diff(number) >= 0) else found.take(pa.array(np.argsort(number, kind="stable")))
+        found = found.append_column(FILE, names.take(number))
+    return found if np.all(np.diff(number) >= 0) else found.take(np.argsort(number, kind="stable"))
 
 
 def _check_claims(parts: Sequence[Part], most: int) -> None:
@@ -172,7 +174,7 @@ _AT, _ROW = "unit_asked_for", "row_of_the_unit"
 """Names that no column has."""
 
 
-def _numbers(part: Part, at: pa.ChunkedArray) -> np.ndarray[Any, np.dtype[np.int64]]:
+def _numbers(part: Part, at: Any) -> np.ndarray[Any, np.dtype[np.int64]]:
     """The number of each row's unit."""
     if part.packed is None:
         return np.asarray(part.numbers, np.int64)[at.to_numpy()]

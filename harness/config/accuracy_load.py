@@ -110,7 +110,7 @@ class _Expansion:
                 yield WorkSpec(case, study.horizon, solver, first_guess, *options, how=how)
 
     def _cases(self, study: Study, at: Key) -> list[Case]:
-        found = []
+        found: list[Case] = []
         for name in self._named("scene", study.scene, list(self.scenes), at):
             scene = self.scenes[name]
             lists: Any = study.integrator, study.time_step

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_type_hints
 
 from pydantic import create_model
 
-from harness.base.document import Document, Key, key_text, quote
+from harness.base.document import Document, Key, is_list, is_mapping, key_text, quote
 from harness.base.errors import InputError, Mistake
 from harness.base.model import Model
 from harness.base.yaml import read_yaml
@@ -102,7 +102,7 @@ def scene_from_assignment(path: Path) -> SceneSpec:
         raise document.error()
     assignment = read_assignment(path)
     k, pins, mesh = assignment.stiffness, assignment.pins.tolist(), AssignmentMesh(path=path)
-    effects = (
+    effects: tuple[dict[str, Any], ...] = (
         {"kind": "springs", "rule": "fixed", "stretch": k, "shear": k, "bend": k},
         {"kind": "constant-force", "force": FORCE},
         *([{"kind": "pins", "indices": pins, "weight": PIN_WEIGHT}] if pins else []),
@@ -127,15 +127,16 @@ def scene_of(document: Document) -> SceneSpec:
     fields = document.check(SceneFile, data)
     own: dict[str, tuple[Plugin, dict[str, Any]]] = {}
     mesh = _part(document, "mesh", data["mesh"], ("mesh",), own) if "mesh" in data else None
-    listed = data.get("effects", [])
-    if not isinstance(listed, list):
+    listed: Any = data.get("effects", [])
+    if not is_list(listed):
         document.report("should be a list of mappings, each with a `kind`", ("effects",))
         listed = []
     effects = tuple(_part(document, "effect", effect, ("effects", i), own) for i, effect in enumerate(listed))
     if fields is None or document.mistakes:
         raise document.error()
+    parts: dict[str, Any] = {"mesh": mesh, "mesh_digest": _digest(mesh), "effects": effects}
     return SceneSpec(
-        **vars(fields) | {"mesh": mesh, "mesh_digest": _digest(mesh), "effects": effects},
+        **vars(fields) | parts,
         path=document.path,
         own=own,
         lines={key_text(key): line for key, line in document.lines.items()},
@@ -196,8 +197,8 @@ def sweep_of(document: Document) -> Sweep:
 def scenes_of(document: Document) -> dict[str, SceneSpec]:
     """The scenes by name, read from the files that the config lists under `scenes`; mistakes are noted."""
     scenes: dict[str, SceneSpec] = {}
-    listed = document.data.get("scenes")
-    for i, entry in enumerate(listed if isinstance(listed, list) else []):
+    listed: Any = document.data.get("scenes")
+    for i, entry in enumerate(listed if is_list(listed) else []):
         if not isinstance(entry, str):
             continue  # the check of the whole sweep reports it
         at, path = ("scenes", i), document.path.parent / entry
@@ -215,11 +216,11 @@ def scenes_of(document: Document) -> dict[str, SceneSpec]:
 
 def solvers_of(document: Document) -> list[SolverSpec]:
     """The solvers that the config lists under `solvers`, with all of their parameters; mistakes are noted."""
-    listed = document.data.get("solvers")
+    listed: Any = document.data.get("solvers")
     found = [
         _solver(document, entry, ("solvers", i))
-        for i, entry in enumerate(listed if isinstance(listed, list) else [])
-        if isinstance(entry, (str, dict))  # the check of the whole config reports others
+        for i, entry in enumerate(listed if is_list(listed) else [])
+        if isinstance(entry, str) or is_mapping(entry)  # the check of the whole config reports others
     ]
     return [solver for solver in found if solver]
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.base.document import Document, Key
+from harness.base.document import Document, Key, is_mapping
 from harness.base.model import Model
 from harness.scenes.effects.base import Contribution
 from harness.scenes.mesh.base import Mesh
@@ -22,7 +22,7 @@ from solvers.plugins import Plugin, Refused, Table, load
 def chosen(document: Document, table: Table, data: Any, tag: str, at: Key) -> tuple[str, dict[str, Any]] | None:
     """Split the mapping `data` into the name under its key `tag`, a Plugin where it is somebody's own code, and its
     other keys; None after a mistake was noted."""
-    if isinstance(data, dict) and isinstance(data.get(tag), str):
+    if is_mapping(data) and isinstance(data.get(tag), str):
         try:
             name = table.named(data[tag], document.path.parent)
         except Refused as error:

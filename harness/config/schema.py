@@ -4,7 +4,6 @@ them."""
 from __future__ import annotations
 
 from functools import reduce
-from operator import or_
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, create_model
@@ -55,14 +54,15 @@ def schema() -> dict[str, Any]:
 
 def _one_of(models: dict[str, type[Model]], tag: str) -> Any:
     """The union of models, told apart by the key `tag`, which is required and holds the model's name."""
-    tagged = [
-        create_model(name, __base__=model, __doc__=model.__doc__, **{tag: (Literal[name], ...)})  # pyright: ignore[reportCallIssue, reportArgumentType]
+    make: Any = create_model  # the name of a field is known at run time alone
+    tagged: list[Any] = [
+        make(name, __base__=model, __doc__=model.__doc__, **{tag: (Literal[name], ...)})
         for name, model in models.items()
     ]
-    own = create_model(  # its keys are known to its code alone, which nobody runs for a schema
+    own: Any = make(  # its keys are known to its code alone, which nobody runs for a schema
         f"Own {tag}",
         __config__=ConfigDict(extra="allow"),
         __doc__="Your own: `module:Name`, or `./file.py:Name` beside the config.",
-        **{tag: (Annotated[str, Field(pattern=PATTERN)], ...)},  # pyright: ignore[reportCallIssue, reportArgumentType]
+        **{tag: (Annotated[str, Field(pattern=PATTERN)], ...)},
     )
-    return Annotated[reduce(or_, tagged), Field(discriminator=tag)] | own
+    return Annotated[reduce(lambda one, other: one | other, tagged), Field(discriminator=tag)] | own

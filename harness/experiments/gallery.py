@@ -20,7 +20,7 @@ def gallery(
 
     if output.suffix != ".png" or not output.parent.is_dir() or output.is_dir():
         raise InputError(f"--output: came {output}; wanted a file that ends in .png, in a folder that exists")
-    tiles = []
+    tiles: list[Any] = []
     for path in scenes:
         tiles.append(_tile(path))
         say(f"[{len(tiles)}/{len(scenes)}] {tiles[-1].name}")

@@ -16,7 +16,7 @@ from collections.abc import Collection, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -282,7 +282,7 @@ def _times(batch: pa.RecordBatch, timeline: str) -> NDArray[Any]:
 
 def _column(batch: pa.RecordBatch, name: str) -> Any:
     """A column; pyarrow's stubs know no kind of array that is told by its schema alone."""
-    return batch[name]
+    return cast(Any, batch[name])
 
 
 def _scalar(batch: pa.RecordBatch, name: str, row: int) -> Any:

@@ -10,7 +10,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -162,8 +161,7 @@ def _export(replay: Replay, recording: Path, export: Path) -> None:
         mesh = pv.PolyData(points, lines=np.insert(replay.springs, 0, 2, axis=1).ravel())
         mesh.cell_data["strain"] = spring_strain(replay, 0)
     mesh.point_data["strain"] = vertex_strain(replay, 0)
-    save: Callable[[Path], Any] = mesh.save
-    _write(export, save)
+    _write(export, lambda path: mesh.save(path))
 
 
 def _write(target: Path, write: Callable[[Path], object]) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, TypeGuard, cast
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +54,7 @@ class Checked(Passing):
         before = {name: array.copy() for name, array in _of_problem(problem).items()}
         found: Any = self._prepared.solve(problem, stop)
         usual: Any = getattr(self._prepared, "usual", self._prepared)
-        line = _line(cast(Any, usual).__class__, "solve")
+        line = _line(usual.__class__, "solve")
         written = _differing(before, _of_problem(problem))
         if written:
             line = self._writes(_restored(problem, before), stop) or line

@@ -41,7 +41,7 @@ class Contender:
     prepared: Prepared | None = None
     bytes: int = 0
     failure: str = ""
-    seconds: list[list[float]] = field(default_factory=list)
+    seconds: list[list[float]] = field(default_factory=list[list[float]])
     positions: Array = field(default_factory=lambda: np.empty(0))
     velocities: Array = field(default_factory=lambda: np.empty(0))
 

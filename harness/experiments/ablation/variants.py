@@ -25,7 +25,7 @@ class Variant:
 def variants(scene: SceneSpec, *, pairs: bool) -> list[Variant]:
     """The whole scene, then without each of its effects in their order; with `pairs` also without each two."""
     names = effect_names(scene)
-    chosen = [(), *((i,) for i in range(len(names)))]
+    chosen: list[tuple[int, ...]] = [(), *((i,) for i in range(len(names)))]
     if pairs:
         chosen += combinations(range(len(names)), 2)
     return [Variant(tuple(names[i] for i in out), _without(scene, out)) for out in chosen]

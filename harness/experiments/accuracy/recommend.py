@@ -139,7 +139,7 @@ def _known(
 ) -> tuple[list[Way], list[dict[str, Any]]]:
     """What was measured of this scene on this machine: the ways that have an error, the cheapest first, and the rows
     of those that have none."""
-    here, ways, without = machine.describe().id, [], []
+    here, ways, without = machine.describe().id, list[Way](), list[dict[str, Any]]()
     units = (unit for folder in shelf.folders(results, "accuracy", "*/") for unit in shelf.units(folder))
     for path in sorted(unit for unit in units if unit.name.startswith(f"{name}-{size}-work-")):
         row = rows.read([path], SCHEMA).to_pylist()[0]

@@ -16,7 +16,7 @@ def round_off(problem: StepProblem) -> float:
 def distances(system: System, p: Positions, other: Positions) -> tuple[float, float]:
     """The largest and the root mean square distance [m] over the vertices that are not exactly pinned."""
     away = np.linalg.norm(p - other, axis=1)[system.free]
-    return float(away.max(initial=0.0)), float(np.sqrt(np.mean(away**2))) if len(away) else 0.0
+    return float(away.max(initial=0.0)), float(np.sqrt((away**2).mean())) if len(away) else 0.0
 
 
 def stiffness_ratio(system: System, stiffness: np.ndarray) -> float:

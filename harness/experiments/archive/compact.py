@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyarrow's stubs say little of columns, and of files that Parquet is read from.
 """Packs the rows of many units into one file beside their folder; whoever reads rows sees the same before and after.
 
 The packed file is written anew under a partial name, with what was packed before; it is read back, and takes its place

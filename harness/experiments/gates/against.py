@@ -6,7 +6,7 @@ bytes, is compared exactly. Then two processes take turns.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -76,7 +76,7 @@ def run_gates(
 ) -> list[tuple[Request, Result]]:
     """Race this checkout, the first side, against the revision; each result is told as it comes. Raises InputError."""
     rule = Rule(options.limit, options.alpha / len(requests))
-    found = []
+    found: list[tuple[Request, Result]] = []
     for request in requests:
         result = confirmed(partial(started, sides, request, options, say), rule, budget=options.budget)
         say(f"{request.title}: {result}")
@@ -92,7 +92,7 @@ def exit_code(answers: Sequence[Answer]) -> int:
 @contextmanager
 def started(
     sides: tuple[Side, Side], request: Request, options: Options, say: Callable[[str], None]
-) -> Iterator[tuple[Timed, Timed]]:
+) -> Generator[tuple[Timed, Timed]]:
     """Both revisions in processes of their own, warm, with the same answer."""
     with workers(*sides) as alive:
         held = _held(alive, request, 1)
@@ -114,7 +114,7 @@ def started(
 
 def _held(alive: Sequence[Worker], request: Request, frames: int) -> list[Held]:
     """The request's work in both, of so many steps where it is a run's."""
-    held = []
+    held: list[Held] = []
     for worker in alive:
         more: dict[str, Any] = {}
         if request.config:

@@ -6,7 +6,7 @@ gates:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -88,7 +88,7 @@ def run_table(path: Path, budget: float, say: Callable[[str], None], alpha: floa
             document.report(f"there is no file {path.parent / gate.scene}", ("gates", i, "scene"))
     if document.mistakes:
         raise document.error()
-    found = []
+    found: list[tuple[Gate, Result]] = []
     for i, gate in enumerate(table.gates):
         rule = Rule(gate.limit, alpha / len(table.gates))
         result = confirmed(partial(_started, document, i, gate), rule, budget=gate.budget or budget)
@@ -98,7 +98,7 @@ def run_table(path: Path, budget: float, say: Callable[[str], None], alpha: floa
 
 
 @contextmanager
-def _started(document: Document, i: int, gate: Gate) -> Iterator[tuple[Timed, Timed]]:
+def _started(document: Document, i: int, gate: Gate) -> Generator[tuple[Timed, Timed]]:
     """Both solvers prepared anew, warm, with the same answer."""
     options = {key: getattr(gate, key) for key in ("iterations", "tolerance", "integrator", "frames")}
     with pinned_threads(1):

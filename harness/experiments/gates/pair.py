@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -132,7 +132,7 @@ def _path(side: Side) -> str:
 
 
 @contextmanager
-def workers(*sides: Side) -> Iterator[list[Worker]]:
+def workers(*sides: Side) -> Generator[list[Worker]]:
     """A live worker for each side; all end with the block."""
     alive: list[Worker] = []
     with TemporaryDirectory(prefix="springbench-") as scratch:

@@ -17,7 +17,7 @@ import os
 from collections.abc import Generator
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import pytest
 
@@ -67,8 +67,8 @@ class Race:
         from harness.experiments.gates.sequential import ALPHA, Answer, Rule
         from harness.experiments.gates.turns import playing
 
-        rule, benchmark = Rule(limit, error or ALPHA), self._benchmark
-        answer = benchmark.pedantic(candidate) if benchmark.disabled else candidate()
+        rule, benchmark = Rule(limit, error or ALPHA), cast(Any, self._benchmark)
+        answer: Any = benchmark.pedantic(candidate) if benchmark.disabled else candidate()
         if agree is not None:
             said = difference(answer, yardstick(), agree)
             if said:

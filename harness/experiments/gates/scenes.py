@@ -33,10 +33,10 @@ class Steps:
 
     run: RunSpec
     frames: int
-    _positions: Callable[[int], Positions]
+    positions: Callable[[int], Positions]
 
     def __call__(self) -> Positions:
-        return self._positions(self.frames)
+        return self.positions(self.frames)
 
 
 def pair(scene: Path, solver: Given, against: Given, *, size: int | None = None, **options: Any) -> tuple[Steps, Steps]:
@@ -47,7 +47,7 @@ def pair(scene: Path, solver: Given, against: Given, *, size: int | None = None,
     both = [_steps(scene, given, size, options) for given in (solver, against)]
     once = min(seconds_of(steps) for steps in both)
     frames = min(both[0].run.frames, ceil(CALL / max(once, 1e-6)))
-    candidate, yardstick = (Steps(s.run, frames, s._positions) for s in both)
+    candidate, yardstick = (Steps(s.run, frames, s.positions) for s in both)
     return candidate, yardstick
 
 
@@ -55,7 +55,8 @@ def _steps(scene: Path, given: Given, size: int | None, options: dict[str, Any])
     asked: list[Any] = [
         dict(given) if isinstance(given, Mapping) else given if isinstance(given, str) else DEFAULT_SOLVER
     ]
-    runs = load_any(scene, solvers=asked, sizes=[size] if size else [], **{"threads": 1, **options}).runs()
+    more: dict[str, Any] = {"threads": 1} | options
+    runs = load_any(scene, solvers=asked, sizes=[size] if size else [], **more).runs()
     if len(runs) != 1:
         raise InputError(f"{scene}: a gate is on one run; came {len(runs)}")
     (run,) = runs

@@ -9,13 +9,14 @@ repeats on another start's turns, as a gate does.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from random import Random
 from time import perf_counter, process_time, sleep
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -81,7 +82,7 @@ def record(
     planted: float = 0.0,
 ) -> None:
     """Record so many seconds of turns of each request, in so many starts, beside what the condition says."""
-    found = []
+    found: list[dict[str, Any]] = []
     with competing(condition):
         for request in requests:
             for start in range(starts):
@@ -101,7 +102,7 @@ def record(
 
 
 @contextmanager
-def competing(condition: str) -> Iterator[None]:
+def competing(condition: str) -> Generator[None]:
     """One process on each core beside what is recorded: always at work (busy), now and then (bursty), or none."""
     if condition not in CONDITIONS:
         raise InputError(f"--condition: came {condition}; wanted one of {', '.join(CONDITIONS)}")
@@ -128,7 +129,7 @@ def _compete(bursts: bool, seed: int) -> None:
 def read(paths: Sequence[Path]) -> dict[tuple[str, str], list[Start]]:
     """The recorded starts by gate and condition. Raises InputError."""
     table = rows.read(paths, SCHEMA).to_pylist()
-    by: dict[tuple[str, str, int], list[dict]] = {}
+    by: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for row in table:
         by.setdefault((row["gate"], row["condition"], row["start"]), []).append(row)
     found: dict[tuple[str, str], list[Start]] = {}
@@ -176,7 +177,7 @@ def _stretches(rng: np.random.Generator, length: int, turns: int) -> NDArray[np.
 
 def _asv(new: Array, old: Array) -> bool:
     """asv continuous with a factor of 1.05: the medians differ by it, and Mann and Whitney's test says p < .002."""
-    return float(np.median(new)) > 1.05 * float(np.median(old)) and mannwhitneyu(new, old).pvalue < 0.002
+    return float(np.median(new)) > 1.05 * float(np.median(old)) and float(mannwhitneyu(new, old).pvalue) < 0.002
 
 
 OTHERS: dict[str, Callable[[Array, Array], bool]] = {

@@ -103,7 +103,7 @@ def playing(
     """The same for a caller that times A itself: each time this yields it wants the seconds of one call of A."""
     began, turns = perf_counter(), list[Turn]()
     for order in orders(coin):
-        seconds = []
+        seconds = list[float]()
         for who in order:
             seconds.append((yield) if who == "A" else b())
         turns.append(Turn(order, tuple(seconds)))

@@ -136,8 +136,8 @@ def _title(run: Any) -> str:
 def _gates() -> dict[str, Any]:
     import tests.bench.test_gates as listed
 
-    tuples = (value for value in vars(listed).values() if isinstance(value, tuple))
-    return {gate.name: gate for found in tuples for gate in found if hasattr(gate, "candidate")}
+    groups: list[tuple[Any, ...]] = [value for value in vars(listed).values() if isinstance(value, tuple)]
+    return {gate.name: gate for group in groups for gate in group if hasattr(gate, "candidate")}
 
 
 def main() -> None:

@@ -1,3 +1,6 @@
+# pyright: reportMissingTypeStubs=false
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# Numba and llvmlite, which generate the code, have no types.
 """What the machine can do at best, measured: bytes a second by working set (after STREAM, McCalpin 1995), and flops.
 
     read     s += a_i                    8 bytes an entry
@@ -19,6 +22,7 @@ from llvmlite import ir
 from numba import prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 from solvers.compiling import kept
 
@@ -63,7 +67,7 @@ def probes(sets: tuple[int, ...] = WORKING_SETS) -> Iterator[Probe]:
 
 
 @kept(parallel=True, fastmath=_FAST)
-def _read(a, threads, repeats):
+def _read(a: NDArray[Any], threads: int, repeats: int) -> float:
     total = 0.0
     for t in prange(threads):
         first, last = len(a) * t // threads, len(a) * (t + 1) // threads
@@ -72,7 +76,7 @@ def _read(a, threads, repeats):
 
 
 @kept(fastmath=_FAST)
-def _sum(a, repeats):
+def _sum(a: NDArray[Any], repeats: int) -> float:
     total = 0.0
     for k in range(repeats):
         part = 0.0
@@ -84,7 +88,7 @@ def _sum(a, repeats):
 
 
 @kept(parallel=True, fastmath=_FAST)
-def _triad(a, b, c, threads, repeats):
+def _triad(a: NDArray[Any], b: NDArray[Any], c: NDArray[Any], threads: int, repeats: int) -> None:
     for t in prange(threads):
         first, last = len(a) * t // threads, len(a) * (t + 1) // threads
         for _ in range(repeats):
@@ -92,23 +96,23 @@ def _triad(a, b, c, threads, repeats):
 
 
 @kept(fastmath=_FAST)
-def _add_scaled(a, b, c):
+def _add_scaled(a: NDArray[Any], b: NDArray[Any], c: NDArray[Any]) -> None:
     for i in range(len(a)):
         a[i] = b[i] + 3.0 * c[i]
 
 
 @kept(parallel=True)
-def _fused(start, threads):
+def _fused(start: NDArray[Any], threads: int) -> float:
     total = 0.0
     for _ in prange(threads):
         total += _chains(start, _REPEATS)
     return total
 
 
-def _multiply_adds(typingctx, start, repeats):
+def _multiply_adds(typingctx: Any, start: Any, repeats: Any) -> tuple[Any, Callable[..., Any]]:
     """The sum of some vectors after `repeats` multiply-adds of each with start[0] and itself, all in registers."""
 
-    def generate(context, builder, signature, args):
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array, count = signature.args[0], args[1]
         element = context.get_value_type(array.dtype)
         lanes = _VECTOR_BYTES * 8 // array.dtype.bitwidth

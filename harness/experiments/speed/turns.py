@@ -8,7 +8,7 @@ predict, is left out with a row that says so.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from math import exp, log
 from typing import Any, NamedTuple
@@ -113,7 +113,7 @@ def predicted(past: Sequence[Past], vertices: int, run: RunSpec) -> float:
 
 
 @contextmanager
-def _guarded(candidate: Candidate, rows: list[Row], alive: list[Candidate]) -> Iterator[None]:
+def _guarded(candidate: Candidate, rows: list[Row], alive: list[Candidate]) -> Generator[None]:
     """With the candidate's threads; what it raises is its only row, and it is out."""
     try:
         with machine.pinned_threads(machine.threads(candidate.run.threads).number):

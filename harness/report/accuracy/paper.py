@@ -193,9 +193,10 @@ def _figure_2(
         "mew": 1.4,
         "zorder": 6,
     }
+    empty: Any = look | {"linestyle": ""}
     by_iterations.plot([*FIGURE_2], errors, marker="o", **look)
     by_time.plot(seconds, errors, marker="o", **look)
-    by_time.plot(*zip(*FIGURE_2_NEWTON, strict=True), marker="D", **(look | {"linestyle": ""}))
+    by_time.plot(*zip(*FIGURE_2_NEWTON, strict=True), marker="D", **empty)
 
 
 def _figure_3(ax: Axes, compared: Sequence[Comparison], keys: Sequence[tuple[int, int]]) -> None:

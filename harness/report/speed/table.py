@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from itertools import groupby
+from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
@@ -114,4 +116,7 @@ def exponents(found: Sequence[Figures], figure: str = "global_", least: int = 10
         if value and f.vertices >= least:
             by_label[f.scene, f.label].append((f.vertices, value))
     logarithms = {label: np.log(np.array(points)).T for label, points in by_label.items() if len(points) > 1}
-    return {label: float(np.polyfit(n, values, 1).item(0)) for label, (n, values) in logarithms.items()}
+    return {
+        label: float(cast(NDArray[np.float64], np.polyfit(n, values, 1))[0])
+        for label, (n, values) in logarithms.items()
+    }

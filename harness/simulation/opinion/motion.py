@@ -8,7 +8,7 @@ Between keys straight, or by monotone cubics (Fritsch and Carlson 1980, with the
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -72,7 +72,8 @@ def blur(motion: Any, size: float, time: float) -> float:
     """How far [m] round-off may take points that lie within `size` [m] of zero, at a time [s]."""
     if motion is None:
         return EPS * size
-    times, turns = ([getattr(key, name) for key in motion.keys] for name in ("time", "turn"))
+    keys: list[Any] = list(motion.keys)
+    times, turns = [float(key.time) for key in keys], [float(key.turn) for key in keys]
     values = np.array([(*key.offset, np.deg2rad(key.turn)) for key in motion.keys])
     arm = size + float(np.abs(motion.about).max())
     steep = np.abs(np.diff(values, axis=0) / np.diff(times)[:, None]).max(axis=0, initial=0.0)
@@ -84,7 +85,7 @@ def _between(times: Wide, values: Wide, t: Any, how: str) -> Wide:
     """Offset [m] and turn [degrees] at t, (4,)."""
     if len(times) == 1:
         return values[0]
-    k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
+    k = min(int(cast(int, np.searchsorted(times, t, side="right"))) - 1, len(times) - 2)
     h = times[k + 1] - times[k]
     s = (t - times[k]) / h
     if how == "linear":
