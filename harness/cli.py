@@ -10,7 +10,7 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
@@ -67,7 +67,7 @@ def run(
     _check_positions(positions)
     folder = claimed(results / sweep.name, config)
     runs = sweep.runs()
-    how = {"again": again, "changed": changed, "positions": positions, "isolated": not here}
+    how: dict[str, Any] = {"again": again, "changed": changed, "positions": positions, "isolated": not here}
     table = run_sweep(sweep.name, runs, folder, display(err), _say, **how)
     out.print(summary_table(table, of_other_code(runs, table)))
     _say(f"rows, recordings and pictures are in {folder}")

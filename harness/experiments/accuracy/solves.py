@@ -147,7 +147,7 @@ def curve_rows(spec: CurveSpec, graded: GradedStep, folder: Path, tick: Callable
 
 
 def _prepared(solver: Solver, graded: GradedStep, rounds: int) -> tuple[Prepared, Row]:
-    system, seconds = graded.frozen.problem.system, []
+    system, seconds = graded.frozen.problem.system, list[float]()
     began = perf_counter()
     prepared = solver.prepare(system)
     cold = perf_counter() - began

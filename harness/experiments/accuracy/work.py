@@ -67,7 +67,7 @@ def _simulated(spec: WorkSpec, trajectory: Trajectory, tick: Callable[[], None])
         tick()
     away = (p - trajectory.positions[-1])[scene.system.free]
     row["error"] = trajectory.error(-1, p)
-    row["error_rms_m"] = float(np.sqrt(np.mean(np.einsum("ij,ij->i", away, away))))
+    row["error_rms_m"] = float(np.sqrt(np.einsum("ij,ij->i", away, away).mean()))
     row["seconds_per_simulated"] = float(np.median(row["seconds"])) / spec.horizon
     trajectory.require(row["error"])
     return row
