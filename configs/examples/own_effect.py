@@ -13,7 +13,6 @@ import harness
 from harness.base.model import Model
 from harness.scenes.effects.base import Contribution
 from harness.scenes.mesh.base import Mesh
-from solvers.problem import Positions
 
 
 class LinearDrag(Model):
@@ -24,18 +23,13 @@ class LinearDrag(Model):
     """The drag coefficient c [N s/m]."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The drag as a force."""
-
-        def drag(p: Positions, v: Positions, t: float) -> Positions:
-            return -self.coefficient * v
-
-        return Contribution(forces=(drag,))
+        """The drag as a force, of positions p [m], velocities v [m/s] and time t [s]."""
+        return Contribution(forces=(lambda p, v, t: -self.coefficient * v,))
 
 
 if __name__ == "__main__":
     fall = {"mesh": {"kind": "chain"}, "mass": 1.0, "time_step": "1/30", "frames": 30, "default_size": 4}
-    for drag in (0.0, 0.5):
-        effects = [{"kind": "springs", "stretch": 300.0}, {"kind": "gravity"}, LinearDrag(coefficient=drag)]
-        print(
-            f"c = {drag}: {harness.Simulation(harness.make_scene(**fall, effects=effects)).steps(30)[-1, 0, 1]:.2f} m"
-        )
+    springs, gravity = {"kind": "springs", "stretch": 300.0}, {"kind": "gravity"}
+    for c in (0.0, 0.5):
+        scene = harness.make_scene(**fall, effects=[springs, gravity, LinearDrag(coefficient=c)])
+        print(f"c = {c}: {harness.Simulation(scene).steps(30)[-1, 0, 1]:.2f} m")

@@ -10,7 +10,7 @@ import numpy as np
 import harness
 from harness.scenes.mesh.base import SHEAR, STRETCH, Mesh
 from harness.scenes.mesh.generator import Generator, Metres
-from harness.scenes.mesh.topology import assemble, by_length
+from harness.scenes.mesh.topology import assemble
 
 
 class Wheel(Generator):
@@ -30,23 +30,11 @@ class Wheel(Generator):
         rest = np.zeros((size + 1, 3))
         rest[1:, :2] = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         springs = {STRETCH: np.stack([i, np.roll(i, -1)], axis=1), SHEAR: np.stack([0 * i, i], axis=1)}
-        weights, spacing = by_length(rest, np.concatenate(list(springs.values()))), self.radius * 2.0 * np.pi / size
-        return assemble(
-            rest=rest,
-            springs=springs,
-            weights=weights,
-            dimension=1,
-            spacing=spacing,
-            resolution=size,
-            parts={"hub": [0]},
-        )
+        return assemble(rest=rest, springs=springs, resolution=size, parts={"hub": [0]})
 
 
 if __name__ == "__main__":
-    effects = [
-        {"kind": "springs", "stretch": 500.0, "shear": 500.0},
-        {"kind": "gravity"},
-        {"kind": "pins", "indices": [0]},
-    ]
+    springs = {"kind": "springs", "stretch": 500.0, "shear": 500.0}
+    effects = [springs, {"kind": "gravity"}, {"kind": "pins", "at": ["hub"]}]
     scene = harness.make_scene(mesh=Wheel(radius=0.5), effects=effects, mass=1.0, time_step=0.02, frames=20)
     print(f"the rim sinks to {harness.Simulation(scene, size=12).steps(20)[:, :, 1].min():.3f} m")

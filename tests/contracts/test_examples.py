@@ -29,6 +29,11 @@ def test_every_example_is_run_here():
     assert {path.stem for path in (ROOT / "configs" / "examples").glob("*.py")} == set(EXAMPLES)
 
 
+def test_every_example_is_short():
+    lengths = {path.name: len(path.read_text().splitlines()) for path in (ROOT / "configs" / "examples").glob("*.py")}
+    assert {name for name, length in lengths.items() if length > 40} == set()
+
+
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_an_example_runs(name: str, tmp_path: Path):
     assert EXAMPLES[name] in python(str(ROOT / "configs" / "examples" / f"{name}.py"), folder=tmp_path)

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# pyarrow's stubs say little of columns, and of files that Parquet is read from.
 """Results of several folders in one: rows are told apart by their content, so that nothing is lost and nothing doubled.
 
 A run on two machines has two ids, so both keep their rows. Where the rows of one unit differ, since it was done twice,
@@ -127,7 +129,7 @@ def _tables(units: Sequence[Path], batch: int = 1_000) -> Iterator[tuple[Path, p
         yield from ((unit, rows.read([unit], _ANY)) for unit in chosen if unit.exists())
         if packed:
             table = rows.read(packed, _ANY, named=True)
-            ends = pa.array(table[shelf.FILE]).to_pylist()
+            ends = table[shelf.FILE].to_pylist()
             at = 0
             for unit in packed:
                 length = ends.count(unit.stem)

@@ -25,6 +25,7 @@ from typing import Any
 
 from harness.base import machine, rows, shelf
 from harness.base.claim import NAME as CLAIM
+from harness.base.document import is_list
 from harness.base.errors import InputError, Mistake
 from harness.base.files import replacing
 from harness.config.load import load_any
@@ -107,7 +108,7 @@ def _needed(config: Path) -> tuple[Path, list[Path]]:
 
 
 def _is_file(value: Any, folder: Path) -> bool:
-    return isinstance(value, list) and len(value) == 2 and isinstance(value[0], str) and (folder / value[0]).is_file()
+    return is_list(value) and len(value) == 2 and isinstance(value[0], str) and (folder / value[0]).is_file()
 
 
 def _is_beside(plugin: Plugin) -> bool:

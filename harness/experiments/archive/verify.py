@@ -226,7 +226,8 @@ _WHERE = {"machine": "machine", "versions": "libraries", "code": "code", "thread
 
 def _ratio(old: tuple[Published, Published], new: tuple[list[Row], list[Row]]) -> Claim:
     was, now = (tuple(map(_seconds, pair)) for pair in ((old[0].rows, old[1].rows), new))
-    frames = sorted(set.intersection(*(set(seconds) for seconds in (*was, *now))))
+    first, *others = (*was, *now)
+    frames = sorted(set(first).intersection(*others))
     ratio = [median(math.log(a[f] / b[f]) for f in frames) for a, b in (was, now)]
     apart = math.exp(median(math.log(now[0][f] / now[1][f] * was[1][f] / was[0][f]) for f in frames))
     what = f"{old[0].title} takes {math.exp(ratio[0]):.3g} times as long as {old[1].run.solver.name}"

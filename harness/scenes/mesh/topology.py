@@ -110,23 +110,31 @@ def assemble(
     rest: Points,
     springs: Mapping[str, Indices],
     triangles: Indices = NO_TRIANGLES,
-    weights: Points,
-    dimension: int,
-    spacing: float,
-    resolution: int,
-    parts: Mapping[str, ArrayLike],
+    weights: Points | None = None,
+    dimension: int = 1,
+    spacing: float | None = None,
+    resolution: int = 0,
+    parts: Mapping[str, ArrayLike] | None = None,
 ) -> Mesh:
-    """A mesh of springs given by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND."""
+    """A mesh of springs given by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND.
+
+    weights: in proportion to the vertices' masses, half the length of its springs for each if left out; spacing: the
+    springs' mean length if left out. The rest as `Mesh` has it.
+    """
     blocks = [springs.get(family, NO_PAIRS) for family in (STRETCH, SHEAR, BEND)]
+    pairs = np.concatenate(blocks)
+    weights = by_length(rest, pairs) if weights is None else weights
+    if spacing is None:
+        spacing = float(np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1).mean())
     ends: list[int] = np.cumsum([0, *map(len, blocks)]).tolist()
     return Mesh(
         rest=np.ascontiguousarray(rest, np.float64),
-        springs=np.concatenate(blocks),
+        springs=pairs,
         families={f: np.arange(ends[k], ends[k + 1]) for k, f in enumerate((STRETCH, SHEAR, BEND))},
         triangles=triangles.copy(),
         shares=weights / weights.sum(),
         dimension=dimension,
         spacing=spacing,
         resolution=resolution,
-        parts={name: np.unique(np.asarray(part, np.int64)) for name, part in parts.items()},
+        parts={name: np.unique(np.asarray(part, np.int64)) for name, part in (parts or {}).items()},
     )

@@ -1,0 +1,59 @@
+"""What scripts and notebooks use of stored results: rows, recordings, pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import harness
+from harness import api
+from harness.base import rows
+from harness.base.errors import InputError
+from tests.recordings import info, record, waving
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """What the functions that draw are given; they write a few bytes instead of a picture."""
+    given: list[object] = []
+
+    def draw(what: object, path: Path) -> None:
+        given.append(what)
+        path.write_bytes(b"a picture")
+
+    monkeypatch.setattr("harness.report.run_picture.draw_run", draw)
+    monkeypatch.setattr("harness.report.comparison.draw_comparison", draw)
+    return given
+
+
+def test_rows_of_a_folder_are_a_table_in_the_order_of_their_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "rows").mkdir()
+    for name in ("b", "a"):
+        rows.write(tmp_path / "rows" / f"{name}.parquet", [{"solver": name, "frame": k} for k in (1, 2)])
+    monkeypatch.setattr(api, "find_spec", lambda name: None)  # neither polars nor pandas
+    found = harness.rows(tmp_path)
+    assert found.select(["solver", "frame"]).to_pylist() == [{"solver": s, "frame": k} for s in "ab" for k in (1, 2)]
+
+
+def test_an_opened_recording_has_every_frame(tmp_path: Path):
+    of = info("chain")
+    replay = harness.open_recording(record(tmp_path / "a.rrd", of, count=3))
+    np.testing.assert_array_equal(replay.positions, [f.positions.astype(np.float32) for f in waving(of, 3)])
+    np.testing.assert_array_equal(replay.springs, of.springs)
+    with pytest.raises(InputError, match="nowhere"):
+        harness.open_recording(tmp_path / "nowhere.rrd")
+
+
+def test_a_recording_is_drawn_alone_and_several_side_by_side(tmp_path: Path, drawn: list[object]):
+    path = record(tmp_path / "a.rrd", info("chain"), count=2)
+    replay = harness.open_recording(path)
+    picture = harness.draw(replay)
+    harness.draw({"one": path, "other": replay})
+    alone, beside = drawn
+    assert alone is replay
+    assert isinstance(beside, dict)
+    assert list(beside) == ["one", "other"]
+    np.testing.assert_array_equal(beside["one"].positions, replay.positions)
+    assert picture._repr_png_() == picture.save(tmp_path / "a.png").read_bytes() == b"a picture"
