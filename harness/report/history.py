@@ -1,3 +1,5 @@
+# pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
+# ruptures has no types.
 """What the gates' stored results say over time: where did a gate become slower or faster, and by how much?
 
 The stored results of a gate, on one kind of machine, in the order of their commits, are logarithms y of its ratio to
@@ -17,6 +19,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,7 +129,8 @@ def changes(points: Sequence[Point]) -> tuple[int, ...]:
 
     y: Array = np.log([p.value for p in points])
     sigma = max(noise(y), float(np.median([math.log(p.high / p.low) for p in points])) / _INTERVAL)
-    found = Pelt(model="l2", min_size=SHORTEST, jump=1).fit(y / sigma).predict(pen=PENALTY * math.log(len(y)))
+    fitted: Any = Pelt(model="l2", min_size=SHORTEST, jump=1).fit(y / sigma)
+    found: list[int] = fitted.predict(pen=PENALTY * math.log(len(y)))
     return (0, *found[:-1])
 
 

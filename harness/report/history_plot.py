@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
 """The picture of `springbench history`: a panel for each gate, results by commit, levels and changes."""
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ def two(tmp_path: Path) -> Path:
 def test_all_runs_are_there_once_with_their_recordings_and_again_changes_nothing(two: Path):
     assert merged(two, "a", "b") == Merged(5, 1, [], [])
     units = shelf.units(two / "all" / "sweep" / "rows")
-    assert sorted(set(rows.read(units)["run_id"].to_pylist())) == [f"{k:012x}" for k in range(5)]
+    assert sorted(set(map(str, rows.read(units)["run_id"].to_pylist()))) == [f"{k:012x}" for k in range(5)]
     for part in ("recordings", "pictures"):
         assert [path.stem for path in sorted((two / "all" / "sweep" / part).iterdir())] == [u.stem for u in units]
     before = {path: path.stat().st_mtime_ns for path in two.rglob("*") if path.is_file()}
