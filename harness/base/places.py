@@ -1,3 +1,5 @@
+# pyright: reportMissingTypeStubs=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# fsspec has no types.
 """Results on another file system, by URL (fsspec): `s3://bucket/results`, `sftp://host/results`, `memory://...`
 
 Commands work on a folder in the user's cache, one for each URL. What is new there is fetched before, and what is new

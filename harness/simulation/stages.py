@@ -47,7 +47,7 @@ class Stages:
 
     def done(self, prepared: Prepared, stop: StopRule, guess: Guess) -> Done:
         """The step; prepared: for the scene's system."""
-        found, count, unknown = [], 0, next(self._unknowns)
+        found, count, unknown = list[tuple[StepProblem, Solution]](), 0, next(self._unknowns)
         while True:
             stated = guess(self.stated(unknown))
             solution = prepared.solve(stated, stop)

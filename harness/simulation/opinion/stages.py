@@ -1,3 +1,5 @@
+# pyright: reportConstantRedefinition=false
+# V and A are the letters of the formulas.
 """Steps of several unknowns once more: Butcher's tableaux, and generalised alpha as Newmark's formulas have it.
 
 Runge-Kutta, a stage with the weights a_ij and the time c_i (Alexander 1977; Hairer and Wanner, table IV.6.5; Hosea and

@@ -108,4 +108,11 @@ def pins(effect: Any, declared: Declared) -> Opinion:
 
 def pin(weight: float, motion: Any, q: Wide) -> Held:
     """A pin of a point declared at q (3,) [m]."""
-    return Held(weight, lambda time: place(motion, time).there(q[None])[0], lambda time: speed(motion, q, time))
+
+    def there(time: float) -> Wide:
+        return place(motion, time).there(q[None])[0]
+
+    def moving(time: float) -> Wide:
+        return speed(motion, q, time)
+
+    return Held(weight, there, moving)
