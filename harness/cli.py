@@ -52,6 +52,12 @@ def run(
     ] = None,
     again: Again = False,
     changed: Changed = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=1024, help="How many processes do runs; one is timed at a time.")
+    ] = None,
+    on: Annotated[
+        str | None, typer.Option(help="Do runs by Dask: a scheduler's address, local:N, or a batch system's file.")
+    ] = None,
     here: InThisProcess = False,
 ) -> None:
     """Do what is missing of a sweep, or of the one scene in a file."""
@@ -68,6 +74,7 @@ def run(
     folder = claimed(results / sweep.name, config)
     runs = sweep.runs()
     how: dict[str, Any] = {"again": again, "changed": changed, "positions": positions, "isolated": not here}
+    how |= {"at_once": workers, "on": on}
     table = run_sweep(sweep.name, runs, folder, display(err), _say, **how)
     out.print(summary_table(table, of_other_code(runs, table)))
     _say(f"rows, recordings and pictures are in {folder}")

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import gc
+import os
+import tempfile
 
 import pytest
 from hypothesis import settings
 
 import harness  # noqa: F401  sets what Numba and OpenMP read when they load
+
+# What commands time in tests waits for no other's.
+_LOCKS = tempfile.TemporaryDirectory(prefix="springbench-locks-")
+os.environ["SPRINGBENCH_LOCKS"] = _LOCKS.name
 
 # derandomize: the same examples in every run; no deadline: a slow machine fails no test.
 settings.register_profile("suite", derandomize=True, deadline=None, max_examples=40, database=None)

@@ -10,11 +10,12 @@ class Quiet:
         self.finished_units, self._stop_after, self._counts = 0, stop_after, True
         self.titles: list[str] = []
 
-    def begin(self, runs: int, work: float) -> None: ...
+    def begin(self, runs: int, work: float, at_once: int = 1) -> None: ...
 
-    def run(self, title: str, ticks: int, work: float) -> None:
+    def run(self, title: str, ticks: int, work: float) -> Quiet:
         self.titles.append(title)
         self._counts = not title.endswith("steps to freeze")
+        return self
 
     def tick(self, phase: str) -> None: ...
 

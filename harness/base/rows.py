@@ -158,7 +158,7 @@ def _same(one: Any, other: Any) -> bool:
 
 @contextmanager
 def alone(folder: Path) -> Generator[None]:
-    """Hold a folder of results for one process; whatever a killed one left half written is removed."""
+    """Hold a folder of results for one process; whatever is left half written is removed."""
     lock = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
     _LOCKS.add(lock)
     try:
@@ -168,12 +168,19 @@ def alone(folder: Path) -> Generator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise InputError(f"{folder}: another springbench is running this sweep; wait for it or stop it") from error
-        for partial in folder.glob("*/.*partial*"):
-            partial.unlink()
-        yield
+        _remove_partial(folder)
+        try:
+            yield
+        finally:
+            _remove_partial(folder)  # of workers that were ended
     finally:
         _LOCKS.discard(lock)
         os.close(lock)
+
+
+def _remove_partial(folder: Path) -> None:
+    for partial in folder.glob("*/.*partial*"):
+        partial.unlink(missing_ok=True)
 
 
 _LOCKS: set[int] = set()

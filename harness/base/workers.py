@@ -12,16 +12,20 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from contextlib import suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from pickle import UnpicklingError
 from time import monotonic
-from typing import Any, Protocol
+from typing import Any
 
+from harness.base.asides import LOOK, WAITING, begun, ended, is_step
 from harness.base.blame import place
 from harness.base.worker import DUMP, Answer, Limits, Piece, Tick, serve
+
+Going = Generator[Connection, None, Any]
+"""A piece that is being done: yields whom to wait for, and returns its value."""
 
 _LOOK = 0.1
 """Seconds between two looks at a worker that is at work."""
@@ -43,43 +47,30 @@ class Lost(Exception):
         self.status, self.reason = status, reason
 
 
-class Executor(Protocol):
-    """Does pieces of work, one after the other."""
-
-    def do(self, piece: Piece, tick: Tick, limits: Limits) -> Any:
-        """What the piece returns. Raises the SpringbenchError that it raises, and Lost where it gives no answer."""
-        ...
-
-    def end(self) -> None:
-        """Let go of everything."""
-        ...
-
-
-class Here:
-    """Does pieces in this process, without limits: for debuggers, and for work that is trusted. It loses none."""
-
-    def do(self, piece: Piece, tick: Tick, limits: Limits) -> Any:
-        """See Executor; whatever the piece raises is raised."""
-        return piece(tick)
-
-    def end(self) -> None:
-        """See Executor."""
-
-
 class Workers:
-    """Does pieces in a worker. ready: called in each before anything else."""
+    """Does pieces in a worker. ready: called in each before anything else; fork: whether that may be a fork of this
+    process, as it may while no other thread runs here."""
 
-    def __init__(self, ready: Callable[[], object] = int) -> None:
-        self._ready = ready
+    def __init__(self, ready: Callable[[], object] = int, *, fork: bool = True) -> None:
+        self._ready, self._fork = ready, fork
         self._worker: _Worker | None = None
 
     def do(self, piece: Piece, tick: Tick, limits: Limits) -> Any:
-        """See Executor."""
+        """What the piece returns. Raises the SpringbenchError that it raises, and Lost where it gives no answer."""
+        going = self.doing(piece, tick, limits)
+        while True:
+            try:
+                wait([next(going)], _LOOK)
+            except StopIteration as done:
+                return done.value
+
+    def doing(self, piece: Piece, tick: Tick, limits: Limits) -> Going:
+        """Do a piece while others are done; see `do`. tick is told LOOK too, whenever this is asked to go on."""
         if self._worker is None or not self._worker.alive:
             self.end()
-            self._worker = _Worker(self._ready)
+            self._worker = _Worker(self._ready, fork=self._fork)
         try:
-            answer = self._worker.ask(piece, tick, limits)
+            answer = yield from self._worker.ask(piece, tick, limits)
         except BaseException:  # it was lost, or somebody wants to leave
             self._worker.kill()
             self.end()
@@ -93,7 +84,7 @@ class Workers:
         return answer.value
 
     def end(self) -> None:
-        """See Executor."""
+        """Let go of everything."""
         if self._worker:
             self._worker.end()
             self._worker = None
@@ -102,8 +93,9 @@ class Workers:
 class _Worker:
     """One worker process, seen from its parent."""
 
-    def __init__(self, ready: Callable[[], object]) -> None:
-        context: Any = get_context("fork" if sys.platform == "linux" and not _threads_run() else "spawn")
+    def __init__(self, ready: Callable[[], object], *, fork: bool) -> None:
+        fork = fork and sys.platform == "linux" and not _threads_run()
+        context: Any = get_context("fork" if fork else "spawn")
         self._calls, calls = context.Pipe()
         (self._ticks, ticks), (self._said, said), (self._dump, dump) = (context.Pipe(duplex=False) for _ in range(3))
         theirs = calls, ticks, said, dump
@@ -117,14 +109,15 @@ class _Worker:
         """Whether it can be asked."""
         return self._process.is_alive()
 
-    def ask(self, piece: Piece, tick: Tick, limits: Limits) -> Answer:
-        """The answer to a piece. Raises Lost."""
+    def ask(self, piece: Piece, tick: Tick, limits: Limits) -> Generator[Connection, None, Answer]:
+        """The answer to a piece, in the end. Raises Lost."""
         heard, began = _Heard(self._ticks, self._said, tick), monotonic()
         try:
             self._calls.send((piece, limits))
-            while not wait([self._calls], _LOOK):
+            while not self._calls.poll():
+                yield self._calls
                 heard.listen()
-                if limits.seconds is not None and monotonic() - began > limits.seconds:
+                if limits.seconds is not None and monotonic() - began - heard.waited > limits.seconds:
                     raise self._late(limits.seconds, heard)
                 if not self.alive and not self._calls.poll():  # processes of its own may hold the pipe open
                     raise EOFError
@@ -183,14 +176,27 @@ class _Heard:
     def __init__(self, ticks: Connection, said: Connection, tick: Tick) -> None:
         self._ticks, self._said, self._tick = ticks, said, tick
         self._phase, self._steps, self._kept = "", 0, b""
+        self._waits_since: float | None = None
+        self._waited = 0.0
+
+    @property
+    def waited(self) -> float:
+        """For how many seconds it has waited for others, by what it told."""
+        return self._waited + (0.0 if self._waits_since is None else monotonic() - self._waits_since)
 
     def listen(self) -> None:
         """Pass on what came meanwhile."""
         with suppress(EOFError):
             while self._ticks.poll():
                 phase = self._ticks.recv_bytes().decode()
-                self._phase, self._steps = phase, 1 + (self._steps if phase == self._phase else 0)
+                if is_step(phase):
+                    self._phase, self._steps = phase, 1 + (self._steps if phase == self._phase else 0)
+                elif begun(phase) == WAITING:
+                    self._waits_since = monotonic()
+                elif ended(phase) == WAITING:
+                    self._waited, self._waits_since = self.waited, None
                 self._tick(phase)
+        self._tick(LOOK)
         if said := _come(self._said):
             sys.stderr.write(said.decode(errors="replace"))
             self._kept = (self._kept + said)[-_KEPT:]

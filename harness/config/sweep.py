@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, SkipValidation
 
@@ -45,6 +45,9 @@ class Kept(Model):
     """Whether pictures are drawn from the recordings."""
     judge: bool = False
     """Whether an oracle judges each step's answer in the rows: for `springbench report`, on small meshes."""
+    timing: Literal["exclusive", "shared"] = "exclusive"
+    """exclusive: while a run is timed, nothing else of springbench's computes on the machine; shared: several are timed
+    at once, each on cores of its own, and their rows say so."""
     time_limit: float | None = Field(default=3600.0, gt=0, le=1e7)
     """Wall time [s] that a run may take, all of it; null is any. One that takes longer is ended, and is a row."""
     memory_limit: float | None = Field(default=None, gt=0, le=1e6)
@@ -147,6 +150,8 @@ class RunSpec(Kept, Chosen):
         settings = {name: value for name, value in self if name not in left_out}
         settings |= {"scene": self.scene.digest, "solver": [identity(self.solver.name), dict(self.solver.parameters)]}
         settings["integrator"] = identity(self.integrator)
+        if self.timing == "exclusive":  # as it always was before there was another
+            del settings["timing"]
         return json.dumps(settings, sort_keys=True, separators=(",", ":"))
 
     def run_id(self, machine: str) -> str:

@@ -1,23 +1,31 @@
 """What experiments have in common: units of work, of which those that are missing are done, each in a worker.
 
 A unit is a file of rows, written when all of it is done. A unit that crashes, hangs or swells costs its worker and is a
-row all the same. A disk that is full ends the experiment, and so do the user's mistakes.
+row all the same. While one is timed the others wait; what is not timed is done side by side. A disk that is full ends
+the experiment, and so do the user's mistakes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
+from contextlib import nullcontext
 from functools import partial
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from harness.base import machine
-from harness.base.progress import Display
-from harness.base.workers import Executor, Here, Limits, Lost, Tick, Workers
+from harness.base.asides import compiling_told
+from harness.base.crew import Task, done_by
+from harness.base.machine_lock import alone
+from harness.base.progress import Display, Run
+from harness.base.workers import Limits, Lost, Tick
 from harness.scenes.effects.table import EFFECTS
 from harness.scenes.mesh.table import MESHES
 from solvers.registry import SOLVERS
 
-_TABLES = (SOLVERS, EFFECTS, MESHES)
+TABLES = (SOLVERS, EFFECTS, MESHES)
+
+MOST, GIB_EACH = 8, 2.0
+"""At most so many workers: they take turns at being timed. And the memory [GiB] that there is to be for each."""
 
 
 class Unit(Protocol):
@@ -52,24 +60,53 @@ class Unit(Protocol):
         ...
 
 
-def do_all(todo: Sequence[Unit], display: Display, *, isolated: bool = True) -> None:
-    """Do units one after the other; isolated: each in a worker, else in this process, without limits.
+@runtime_checkable
+class Sharing(Protocol):
+    """What units have that say themselves when they are timed (`harness.base.machine_lock`); others are as a whole."""
 
-    Raises InputError, CannotWrite.
+    @property
+    def group(self) -> Hashable:
+        """Units of one group share what is found once, and are left to one worker where that can be."""
+        ...
+
+
+def do_all(todo: Sequence[Unit], display: Display, *, isolated: bool = True, at_once: int = 1) -> None:
+    """Do units; isolated: in workers, so many at once, else in this process, one after the other and without limits.
+
+    Nothing else of ours is done on the machine while a unit is timed. Raises InputError, CannotWrite.
     """
-    executor: Executor = Workers(partial(_ready, [dict(table) for table in _TABLES])) if isolated else Here()
-    display.begin(len(todo), sum(unit.work for unit in todo))
+    display.begin(len(todo), sum(unit.work for unit in todo), at_once)
+    runs: dict[int, Run] = {}
+
+    def start(number: int) -> Task:
+        unit = todo[number]
+        run = runs[number] = display.run(unit.title, unit.ticks, unit.work)
+        return Task(partial(watched, unit), run.tick, unit.limits)
+
     try:
-        for unit in todo:
-            display.run(unit.title, unit.ticks, unit.work)
-            try:
-                outcome = executor.do(unit.do, display.tick, unit.limits)
-            except Lost as lost:
-                outcome = unit.lost(lost)
-            display.finished(outcome)
+        if not isolated:
+            for unit in todo:
+                run = display.run(unit.title, unit.ticks, unit.work)
+                run.finished(watched(unit, run.tick))
+            return
+        groups = [unit.group if isinstance(unit, Sharing) else None for unit in todo]
+        tables = [dict(table) for table in TABLES]
+        for number, outcome in done_by(at_once, partial(ready, tables), groups, start):
+            told = todo[number].lost(outcome) if isinstance(outcome, Lost) else outcome
+            runs.pop(number).finished(told)
     finally:
-        executor.end()
         display.end()
+
+
+def workers_at_once() -> int:
+    """As many as there are cores, less what the memory has no room for."""
+    return max(1, min(machine.describe().cores, MOST, int(machine.describe().memory_gib / GIB_EACH)))
+
+
+def watched(unit: Unit, tick: Tick) -> str:
+    """What became of a unit; whoever is told of its steps is told what is compiled too."""
+    with compiling_told(tick), nullcontext() if isinstance(unit, Sharing) else alone(tick):
+        return unit.do(tick)
 
 
 def require_threads(numbers: set[int]) -> None:
@@ -78,7 +115,7 @@ def require_threads(numbers: set[int]) -> None:
         machine.require_threads(number)
 
 
-def _ready(tables: Sequence[Mapping[str, str]]) -> None:
+def ready(tables: Sequence[Mapping[str, str]]) -> None:
     """In a worker: know all names that are known here, those included that were added since."""
-    for table, known in zip(_TABLES, tables, strict=True):
+    for table, known in zip(TABLES, tables, strict=True):
         table.update(known)

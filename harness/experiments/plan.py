@@ -6,7 +6,7 @@ and a picture is drawn from the recording alone, so what a kill leaves undone is
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,9 +38,9 @@ class Files:
     picture: Path
 
     @classmethod
-    def of(cls, run: RunSpec, folder: Path) -> Files:
-        """The files of a run in the folder of its sweep."""
-        label = run.label(machine.describe().id)
+    def of(cls, run: RunSpec, folder: Path, on: str | None = None) -> Files:
+        """The files of a run in the folder of its sweep, done on the machine of an id, this one if left out."""
+        label = run.label(on or machine.describe().id)
         return cls(
             folder / "rows" / f"{label}.parquet",
             folder / "recordings" / f"{label}.rrd",
@@ -62,13 +62,14 @@ class PlannedRun:
         return self.run.title
 
 
-def plan(runs: Iterable[RunSpec], folder: Path) -> list[PlannedRun]:
-    """Each run with its files and what is there already."""
+def plan(runs: Iterable[RunSpec], folder: Path, machines: Sequence[str | None] = (None,)) -> list[PlannedRun]:
+    """Each run with its files and what is there already; machines: the ids of those on which it may have been done."""
     codes: dict[frozenset[type | Plugin], str] = {}
     planned: list[PlannedRun] = []
-    placed = [(run, Files.of(run, folder)) for run in runs]
-    heads = rows.heads((files.rows for _, files in placed), _TOLD, needed=NEEDED)
-    for run, files in placed:
+    placed = [(run, [Files.of(run, folder, on) for on in machines]) for run in runs]
+    heads = rows.heads((files.rows for _, some in placed for files in some), _TOLD, needed=NEEDED)
+    for run, some in placed:
+        files = next((files for files in some if files.rows in heads), some[0])
         state, older, damage = MISSING, False, ""
         there = heads.get(files.rows)
         if isinstance(there, str):

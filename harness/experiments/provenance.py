@@ -14,7 +14,7 @@ from harness.config.sweep import RunSpec
 
 def common(run: RunSpec) -> dict[str, Any]:
     """The columns that are the same in all rows of a run."""
-    limits = {"time_limit": run.time_limit, "memory_limit": run.memory_limit}
+    limits = {"time_limit": run.time_limit, "memory_limit": run.memory_limit, "timing": run.timing}
     return {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep} | asked(run) | limits | provenance()
 
 
@@ -37,6 +37,7 @@ def provenance() -> dict[str, Any]:
     here = machine.describe()
     return {
         "machine": here.id,
+        "node": machine.node(),
         "cpu": here.cpu,
         "cores": here.cores,
         "memory_gib": here.memory_gib,

@@ -6,8 +6,8 @@ final positions must equal the timed ones to the last bit. The rows are written 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from harness.base import machine, rows
 from harness.base.errors import InputError, RunFailed
 from harness.base.files import replacing
+from harness.base.machine_lock import alone, beside, own_cores
 from harness.base.worker import Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts, solver_class
@@ -42,13 +43,16 @@ from solvers.problem import Solver, StopRule
 from solvers.registry import SOLVERS, load, minimises
 
 
-def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = None) -> list[dict[str, Any]]:
+def execute(
+    run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = None, at_once: int = 1
+) -> list[dict[str, Any]]:
     """Do one run and write its files; a failure is a row with a status and a reason.
 
     tick: told the name of the pass after each step; positions: where to store the positions after every step
-    (frames, n, 3) [m], float64. Returns the rows. Raises InputError, and CannotWrite without rows.
+    (frames, n, 3) [m], float64; at_once: how many runs may be timed at once. Returns the rows. Raises InputError, and
+    CannotWrite without rows.
     """
-    shared, threads = common(run) | {"code": code(parts(run))}, machine.threads(run.threads)
+    shared, threads = common(run) | {"code": code(parts(run)), "at_once": at_once}, machine.threads(run.threads)
     with machine.pinned_threads(threads.number):
         try:
             found = _passes(run, files, tick, positions)
@@ -59,7 +63,8 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
             for earlier in (files.recording, files.picture):  # of a time when it did not fail; they would hide this
                 earlier.unlink(missing_ok=True)
             if run.record and "frame" in found[0]:
-                _record_until(run, files, found[0])
+                with beside(tick):
+                    _record_until(run, files, found[0])
     if threads.why:
         for row in found:
             row["choice"] = "; ".join(filter(None, [row.get("choice"), threads.why]))
@@ -69,15 +74,29 @@ def execute(run: RunSpec, files: Files, tick: Tick, *, positions: Path | None = 
 
 
 def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
-    scene = build(run.scene, run.size, run.integrator)
+    with beside(tick):
+        scene = build(run.scene, run.size, run.integrator)
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
     settings = _settings(run)
-    told = times.rows(measured := measure(scene, _solver(run), settings, tick))
-    by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
+    with _timed(run, tick) as how:
+        told = times.rows(measured := measure(scene, _solver(run), settings, tick))
+    with beside(tick):
+        by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
     require_numbers(by_frame, minimises=minimises(_solver(run)), yardstick=run.tolerance is not None)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
-    facts |= {"choice": measured.prepared.choice} | standing(run)
+    facts |= {"choice": measured.prepared.choice} | standing(run) | how
     return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
+
+
+@contextmanager
+def _timed(run: RunSpec, tick: Tick) -> Iterator[dict[str, Any]]:
+    """How the run is timed, as columns: alone on the machine, or on cores of its own."""
+    if run.timing == "exclusive":
+        with alone(tick):
+            yield {}
+    else:
+        with own_cores(machine.threads(run.threads).number, tick) as cores:
+            yield {"pinned": " ".join(map(str, cores))}
 
 
 def _second_pass(

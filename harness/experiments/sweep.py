@@ -2,35 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
 from harness.base import machine, rows
-from harness.base.errors import InputError
+from harness.base.errors import InputError, Mistake
 from harness.base.progress import Display
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts
-from harness.experiments.core import do_all, require_threads
+from harness.experiments.core import do_all, require_threads, workers_at_once
 from harness.experiments.plan import NEEDED, Files, plan
 from harness.experiments.provenance import common
 from harness.experiments.resume import wanted
 from harness.experiments.run import execute
-from harness.report.sweep import Pictured, draw_sweep
+
+if TYPE_CHECKING:
+    from harness.experiments.cluster import Cluster
 
 
 @dataclass(frozen=True, slots=True)
 class RunUnit:
-    """A run as a unit of a sweep (`harness.experiments.core.Unit`). positions: where to store those of its steps."""
+    """A run as a unit of a sweep (`harness.experiments.core.Unit`). positions: where to store those of its steps;
+    at_once: so many may be timed at once."""
 
     run: RunSpec
     files: Files
     positions: Path | None = None
+    at_once: int = 1
 
     @property
     def title(self) -> str:
@@ -52,9 +57,14 @@ class RunUnit:
         """What the sweep says."""
         return Limits(self.run.time_limit, self.run.memory_limit)
 
+    @property
+    def group(self) -> Hashable:
+        """Runs that are judged by one reference."""
+        return (self.run.scene.digest, self.run.size, self.run.integrator) if self.run.judge else None
+
     def do(self, tick: Tick) -> str:
         """See Unit."""
-        return _outcome(execute(self.run, self.files, tick, positions=self.positions))
+        return _outcome(execute(self.run, self.files, tick, positions=self.positions, at_once=self.at_once))
 
     def lost(self, lost: Lost) -> str:
         """See Unit."""
@@ -72,6 +82,14 @@ def _abandoned(run: RunSpec, files: Files, status: str, reason: str) -> list[dic
     return found
 
 
+def _away(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> AbstractContextManager[Cluster]:
+    try:
+        from harness.experiments.cluster import cluster
+    except ModuleNotFoundError as error:
+        raise InputError(Mistake(f"needs {error.name}: pip install 'springbench[cluster]'", key="--on")) from None
+    return cluster(on, runs, say)
+
+
 def run_sweep(
     name: str,
     runs: Sequence[RunSpec],
@@ -83,25 +101,42 @@ def run_sweep(
     changed: bool = False,
     positions: Path | None = None,
     isolated: bool = True,
+    at_once: int | None = None,
+    on: str | None = None,
 ) -> pa.Table:
     """Do what is missing of a sweep, all of it with `again` or `positions`, with `changed` also what was done by other
     code than today's, and return all its rows.
 
     say: prints a remark; positions: where to store the positions of the sweep's only run; isolated: whether runs are
-    done in a process that may die, within their limits, or in this one. Raises InputError.
+    done in processes that may die, within their limits, or in this one; at_once: in how many, by the cores if left out;
+    on: where else to do them (`harness.experiments.cluster`). Raises InputError.
     """
+    if on and (positions or not isolated):
+        raise InputError("--positions and --here are of this machine; leave --on out")
     if positions and len(runs) != 1:
         raise InputError(f"--positions stores the positions of one run; this is {len(runs)} runs")
-    require_threads({machine.threads(run.threads).number for run in runs})
+    if not on:
+        require_threads({machine.threads(run.threads).number for run in runs})
     for part in ("rows", "recordings", "pictures"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    with rows.alone(folder):
-        planned = plan(runs, folder)
+    with ExitStack() as held:
+        held.enter_context(rows.alone(folder))
+        away = held.enter_context(_away(on, runs, say)) if on else None
+        machines = away.machines if away else (None,)
+        planned = plan(runs, folder, machines)
         todo = wanted(planned, "runs", say, again=again or positions is not None, changed=changed)
-        do_all([RunUnit(p.run, p.files, positions) for p in todo], display, isolated=isolated)
+        many = min(at_once or workers_at_once(), max(1, len(todo)))
+        units = [RunUnit(p.run, p.files, positions, many if p.run.timing == "shared" else 1) for p in todo]
+        if away:
+            away.do_all(units, folder, display)
+            planned = plan(runs, folder, machines)
+        else:
+            do_all(units, display, isolated=isolated, at_once=many)
+        from harness.report.sweep import Pictured, draw_sweep  # takes a second, in which runs can be done already
+
         table = rows.read((p.files.rows for p in planned), needed=NEEDED)
         pictured = [Pictured(p.run, p.files.recording, p.files.picture) for p in planned]
-        draw_sweep(name, pictured, folder, table, say)
+        draw_sweep(name, pictured, folder, table, say, at_once=many)
     return table
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
 
+from harness.base.crew import Task, done_by
+from harness.base.machine_lock import beside
+from harness.base.workers import Limits, Lost, Tick
 from harness.config.options import OPTIONS
 from harness.config.sweep import RunSpec
 from harness.record.compare import Look, side_by_side
@@ -29,11 +33,17 @@ class Pictured(NamedTuple):
 
 
 def draw_sweep(
-    name: str, pictured: Sequence[Pictured], folder: Path, table: pa.Table, say: Callable[[str], None]
+    name: str,
+    pictured: Sequence[Pictured],
+    folder: Path,
+    table: pa.Table,
+    say: Callable[[str], None],
+    *,
+    at_once: int = 1,
 ) -> None:
     """Pictures of runs, and what compares runs, where it is missing or older than a recording that it shows.
 
-    table: the rows of all of them; say: prints a remark.
+    table: the rows of all of them; say: prints a remark; at_once: how many processes draw.
     """
     write_bibtex(folder / "references.bib", table["reference"].to_pylist())
     drawn = [p for p in pictured if p.run.record and p.recording.exists()]
@@ -43,10 +53,8 @@ def draw_sweep(
     wanting = [p for p in drawn if p.run.pictures and _stale(p.picture, [p.recording])]
     if wanting and not missing:
         say(f"drawing the pictures of {len(wanting)} runs")
-        for p in wanting:
-            camera = p.run.scene.camera
-            angles = (camera.azimuth, camera.elevation) if camera else None
-            draw_run(read_replay(p.recording), p.picture, camera=angles)
+        for lost in _drawn(wanting, at_once):
+            say(lost)
     for label, group in _groups(drawn).items():
         recordings = {_distinct(p, group): p.recording for p in group}
         recording = folder / "recordings" / f"{label}-solvers.rrd"
@@ -63,6 +71,24 @@ def draw_sweep(
             draw_comparison({key: read_replay(path) for key, path in recordings.items()}, picture)
     if any(p.run.pictures for p in pictured):
         draw_timing(table, folder / "pictures" / "timing.png", name)
+
+
+def _drawn(wanting: Sequence[Pictured], at_once: int) -> Iterator[str]:
+    """Draw pictures of runs, and say of those that are lost why they are."""
+    tasks = [Task(partial(_draw, p), _silent, Limits()) for p in wanting]
+    for number, outcome in done_by(at_once, int, [None] * len(tasks), tasks.__getitem__):
+        if isinstance(outcome, Lost):
+            yield f"{wanting[number].picture} is not drawn: its process {outcome}"
+
+
+def _draw(p: Pictured, tick: Tick) -> None:
+    camera = p.run.scene.camera
+    with beside(tick):
+        draw_run(read_replay(p.recording), p.picture, camera=(camera.azimuth, camera.elevation) if camera else None)
+
+
+def _silent(said: str) -> None:
+    pass
 
 
 def _stale(made: Path, sources: Iterable[Path]) -> bool:

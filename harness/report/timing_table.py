@@ -116,6 +116,7 @@ _NUMBERS = (
 INTERRUPTED = "! the process was interrupted while steps were timed: its least time is nearest to the truth"
 APART = "~ local and global, timed alone, do not add up to an iteration within 15 %"
 """What the marks in the table mean."""
+SHARED = "timed beside others, up to {} at once, each on cores of its own: slower than alone by what they share"
 
 
 def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
@@ -156,6 +157,10 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
             _number(run.largest_strain, lambda strain: f"{100 * strain:.3g} %"),
         )
     marks = {INTERRUPTED: any(run.interrupted for run in found), APART: any(_apart(run, run.local) for run in found)}
+    shared = [
+        n for how, n in zip(*(table[c].to_pylist() for c in ("timing", "at_once")), strict=True) if how == "shared"
+    ]
+    marks[SHARED.format(max(shared, default=0))] = bool(shared)
     out.caption = "\n".join([*(words for words, there in marks.items() if there), *_methods(table)]) or None
     # Lines longer than a narrow terminal keep their numbers; Rich would cut them to ellipses.
     out.width = Measurement.get(wide := Console(width=1000), wide.options, out).maximum

@@ -136,12 +136,11 @@ def busy(process: psutil.Process) -> bool:
         return False
 
 
-def test_all_runs_of_a_sweep_are_done_in_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """One worker does all runs of a sweep: its process is the same in all."""
+def test_a_worker_stays_from_run_to_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     note = tmp_path / "note"
     does = f"import os; open({str(note)!r}, 'a').write(str(os.getpid()) + ' ')"
     made = own(tmp_path, monkeypatch, solving=does, options=OPTIONS + ", tolerance: [1e-2, 1e-3, 1e-4]")
-    assert (told := ran(made)).exit_code == 0, told.output
+    assert (told := ran(made, "--workers", "1")).exit_code == 0, told.output
     workers = set(note.read_text().split())
     assert len(workers) == 1
     assert str(os.getpid()) not in workers

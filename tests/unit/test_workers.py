@@ -114,5 +114,5 @@ def test_errors_that_end_an_experiment_come_back_as_they_were(error: Exception, 
 def test_all_ticks_arrive_and_what_is_said_is_passed_on(workers: Workers, capsys: pytest.CaptureFixture[str]):
     heard: list[str] = []
     assert workers.do(does.chat, heard.append, NONE) == "said"
-    assert heard == ["chatting"] * 5000
+    assert [said for said in heard if said] == ["chatting"] * 5000
     assert capsys.readouterr().err.count("x" * 99) == 5000

@@ -1,0 +1,128 @@
+"""Who computes on this machine at a time: one that is timed, alone, or any number of those that are not.
+
+    alone    waits until nobody computes, and keeps all others waiting
+    beside   waits while somebody is timed alone, or waits for it
+    own_cores   as `beside`, on cores that nobody else has
+
+Whoever wants to be timed goes first, so that those who were timed look at what they found side by side and not each
+before the next is timed. The locks are files, which the system lets go of where a process dies; they are the same for
+all commands and workers of a machine: in the folder `SPRINGBENCH_LOCKS`, else in that for temporary files.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from time import sleep
+
+from harness.base.asides import WAITING, Tick, aside
+
+_PAUSE = 0.02
+"""Seconds between two looks for a free core."""
+
+
+@contextmanager
+def alone(tick: Tick) -> Iterator[None]:
+    """Be the only one on the machine. tick: is told while this waits."""
+    with _held("wanted", fcntl.LOCK_SH, tick), _held("used", fcntl.LOCK_EX, tick):
+        yield
+
+
+@contextmanager
+def beside(tick: Tick) -> Iterator[None]:
+    """Compute while nobody is timed. tick: is told while this waits."""
+    with _held("wanted", fcntl.LOCK_EX, tick):  # nobody who would be timed waits
+        used = _locked("used", fcntl.LOCK_SH, tick)
+    try:
+        yield
+    finally:
+        _let_go(used)
+
+
+@contextmanager
+def own_cores(number: int, tick: Tick) -> Iterator[list[int]]:
+    """Compute beside others, kept to so many cores that are nobody else's, by number. Raises ValueError where this
+    process may not use as many."""
+    mine = sorted(os.sched_getaffinity(0))
+    if number > len(mine):
+        raise ValueError(f"{number} cores of {len(mine)}")
+    with beside(tick):
+        claimed: dict[int, int] = {}
+        try:
+            claimed = _free(mine, number)
+            if len(claimed) < number:
+                with aside(tick, WAITING):
+                    while len(claimed) < number:
+                        _let_go(*claimed.values())  # or two that have half of what they want wait for each other
+                        claimed = {}
+                        sleep(_PAUSE)
+                        claimed = _free(mine, number)
+            _keep_to(set(claimed))
+            yield sorted(claimed)
+        finally:
+            _keep_to(set(mine))
+            _let_go(*claimed.values())
+
+
+def _free(cores: list[int], most: int) -> dict[int, int]:
+    """Locks of cores that nobody has, at most so many."""
+    found: dict[int, int] = {}
+    for core in cores:
+        if len(found) == most:
+            break
+        lock = os.open(_file(f"core-{core}"), os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            found[core] = lock
+        except BlockingIOError:
+            os.close(lock)
+    return found
+
+
+def _keep_to(cores: set[int]) -> None:
+    """Let all threads of this process run on these cores alone."""
+    for thread in os.listdir("/proc/self/task"):
+        with suppress(OSError):  # it has ended
+            os.sched_setaffinity(int(thread), cores)
+
+
+@contextmanager
+def _held(name: str, how: int, tick: Tick) -> Iterator[None]:
+    lock = _locked(name, how, tick)
+    try:
+        yield
+    finally:
+        _let_go(lock)
+
+
+def _locked(name: str, how: int, tick: Tick) -> int:
+    lock = os.open(_file(name), os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(lock, how | fcntl.LOCK_NB)
+        except BlockingIOError:
+            with aside(tick, WAITING):
+                fcntl.flock(lock, how)
+    except BaseException:
+        os.close(lock)
+        raise
+    return lock
+
+
+def _let_go(*locks: int) -> None:
+    for lock in locks:
+        fcntl.flock(lock, fcntl.LOCK_UN)  # copies that this process has made of itself have it open too
+        os.close(lock)
+
+
+def _file(name: str) -> Path:
+    """A lock's file, which all users of the machine may lock."""
+    path = Path(os.environ.get("SPRINGBENCH_LOCKS") or tempfile.gettempdir()) / f"springbench-{name}.lock"
+    if not path.exists():
+        with suppress(FileExistsError):
+            os.close(os.open(path, os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o644))
+    return path

@@ -1,0 +1,308 @@
+"""Runs on many machines, by Dask: each is a task, done in a process of its own on whichever worker is free.
+
+A worker does one run after the other; workers of one machine wait for each other while one is timed
+(`harness.base.machine_lock`). A run that crashes ends its process and not Dask's worker, so no number of bad runs uses
+up the workers. What a run leaves comes back with its outcome, but where the worker sees the client's folder. A worker
+that is lost costs its run at hand, which is done again elsewhere; one that cannot write, or has other code, gets no
+more.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from socket import create_connection
+from tempfile import TemporaryDirectory
+from time import time
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+from uuid import uuid4
+
+import distributed
+from distributed import Client, Future, KilledWorker, LocalCluster
+from ruamel.yaml import YAML
+
+from harness.base import machine
+from harness.base.errors import InputError, Mistake, RunFailed
+from harness.base.files import CannotWrite, replacing
+from harness.base.progress import Display
+from harness.base.workers import Lost, Workers
+from harness.config.sweep import RunSpec
+from harness.experiments.core import TABLES, ready, watched
+from harness.experiments.plan import Files
+from harness.experiments.sweep import RunUnit
+from solvers.plugins import Plugin, load
+
+PATIENCE = 10.0
+"""Seconds in which a scheduler has to answer, and to have a worker."""
+
+CLOCKS = 60.0
+"""Seconds by which a worker's clock may differ from the client's before that is said."""
+
+_SILENCE = logging.CRITICAL
+"""What Dask says of workers that end is not for the user, who is told what became of runs."""
+
+_TRIES = 4
+"""How often a run is handed out whose worker is lost."""
+
+_AHEAD = 4
+"""Tasks that wait at the scheduler for each thread of the workers: more would be kept there for nothing."""
+
+
+class About(NamedTuple):
+    """What a worker says of itself: its machine, its versions, its clock."""
+
+    machine: str
+    node: str
+    code: str
+    python: str
+    distributed: str
+    clock: float
+
+    @classmethod
+    def this(cls) -> About:
+        """Of this process."""
+        python = ".".join(map(str, sys.version_info[:2]))
+        return cls(machine.describe().id, machine.node(), machine.code_hash(), python, version("distributed"), time())
+
+
+class Done(NamedTuple):
+    """What became of a run on a worker: in words, and what it left, by name; or why this worker is of no use."""
+
+    worker: str
+    told: str = ""
+    left: Mapping[str, bytes] = {}
+    useless: str = ""
+
+
+class Cluster(NamedTuple):
+    """A client of workers that can do the runs, and the ids of their machines."""
+
+    client: Client
+    machines: Sequence[str]
+
+    def do_all(self, units: Sequence[RunUnit], folder: Path, display: Display) -> None:
+        """See `do_on`."""
+        do_on(self.client, units, folder, display)
+
+
+@contextmanager
+def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Iterator[Cluster]:
+    """The workers of the scheduler at an address, so many on this machine (`local:4`), or those that a file asks of a
+    batch system. Raises InputError where there is none, or none that can do the runs."""
+    with _scheduler(on) as address:
+        try:
+            if isinstance(address, str):
+                _reach(address)
+            client = Client(address, timeout=PATIENCE, set_as_default=False)
+        except (OSError, ValueError) as error:
+            why = f"no scheduler answers within {PATIENCE:g} s ({' '.join(str(error).split())[:200]})"
+            raise InputError(Mistake(f"{on}: {why}; start one with `dask scheduler`", key="--on")) from None
+        with client, client.as_current():
+            try:
+                client.wait_for_workers(1, timeout=PATIENCE if address is on else 60 * PATIENCE)
+            except TimeoutError:
+                why = f"the scheduler has no worker; start some with `dask worker {on} --nthreads 1`"
+                raise InputError(Mistake(f"{on}: {why}", key="--on")) from None
+            yield Cluster(client, machines(client, runs, say))
+
+
+@contextmanager
+def _scheduler(on: str) -> Iterator[Any]:
+    kind, _, many = on.partition(":")
+    if kind == "local":
+        if not many.isdecimal() or not 1 <= int(many) <= 1024:
+            raise InputError(Mistake(f"came {on}; wanted local:N with a number of workers", key="--on"))
+        quiet: Any = {"dashboard_address": None, "silence_logs": _SILENCE}
+        with LocalCluster(n_workers=int(many), threads_per_worker=1, **quiet) as found:
+            yield found
+    elif on.endswith((".yaml", ".yml")):
+        with _batch(Path(on)) as found:
+            yield found
+    else:
+        yield on
+
+
+def _reach(address: str) -> None:
+    """Raise OSError or ValueError where nobody listens at an address: Dask's client would go on trying."""
+    place = urlsplit(address)
+    if not place.hostname or not place.port:
+        raise ValueError("an address is like tcp://host:8786")
+    create_connection((place.hostname, place.port), timeout=PATIENCE).close()
+
+
+def _batch(path: Path) -> Any:
+    """The cluster that a file describes: `kind`, a class of dask-jobqueue less its Cluster, `jobs`, and its options."""
+    try:
+        options = dict(YAML(typ="safe").load(path.read_text()) or {})
+        kind, jobs = str(options.pop("kind")), int(options.pop("jobs"))
+    except (OSError, TypeError, ValueError, KeyError) as error:
+        wanted = (
+            "wanted a mapping with `kind` (SLURM, PBS, ...), `jobs` and the options of that cluster of dask-jobqueue"
+        )
+        raise InputError(Mistake(f"cannot be read ({error}); {wanted}", path)) from None
+    try:
+        dask_jobqueue = import_module("dask_jobqueue")
+    except ModuleNotFoundError:
+        raise InputError(Mistake("needs dask-jobqueue: pip install 'springbench[cluster]'", path)) from None
+    made = getattr(dask_jobqueue, f"{kind}Cluster", None)
+    if made is None:
+        raise InputError(Mistake(f"{kind}: dask-jobqueue has no {kind}Cluster", path, key="kind"))
+    try:
+        found = made(**options)
+    except (TypeError, ValueError) as error:
+        raise InputError(Mistake(f"{kind}Cluster refuses: {error}", path)) from None
+    found.scale(jobs=jobs)
+    return found
+
+
+def machines(client: Client, runs: Sequence[RunSpec], say: Callable[[str], None]) -> list[str]:
+    """The ids of the workers' machines. Raises InputError for workers of other versions, or without the code that a run
+    names; says which clocks differ."""
+    here = About.this()
+    before = time()
+    plugins = list({plugin for run in runs for plugin in run.own()})
+    answered: Any = client.run(_about, plugins, on_error="return")
+    found: dict[str, Any] = answered
+    problems = []
+    for worker, said in found.items():
+        if isinstance(said, OSError):
+            say(f"the worker {worker} was lost: {said}")
+            continue
+        if isinstance(said, BaseException):
+            problems.append(f"the worker {worker} cannot do runs: {type(said).__name__}: {said}")
+            continue
+        about, missing = said
+        for what in ("code", "python", "distributed"):
+            theirs, ours = getattr(about, what), getattr(here, what)
+            if theirs != ours:
+                problems.append(f"the worker {worker} has another version: {what} {theirs}, here {ours}")
+        problems += [f"the worker {worker} has no {name}: {why}" for name, why in missing.items()]
+        off = about.clock - min(max(about.clock, before), time())
+        if abs(off) > CLOCKS:
+            say(f"the clock of {worker} is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}; its rows tell by it")
+    if problems:
+        raise InputError([Mistake(problem, key="--on") for problem in problems])
+    answers = [said for said in found.values() if not isinstance(said, OSError)]
+    if not answers:
+        raise InputError(Mistake("all workers were lost; start others", key="--on"))
+    return sorted({about.machine for about, _ in answers})
+
+
+def _about(plugins: Sequence[Plugin]) -> tuple[About, dict[str, str]]:
+    """On a worker: what it is, and which plug-ins it has not, and why."""
+    missing = {}
+    for plugin in plugins:
+        try:
+            load(plugin.target)
+        except Exception as error:
+            missing[str(plugin)] = f"{type(error).__name__}: {error}"
+    return About.this(), missing
+
+
+def do_on(client: Client, units: Sequence[RunUnit], folder: Path, display: Display) -> None:
+    """Do the runs of units on a client's workers; their files come to `folder`. Raises InputError, CannotWrite,
+    RunFailed where the scheduler is gone."""
+    token = (
+        folder / f".{uuid4().hex}.partial"
+    )  # who sees it shares the folder; a killed client's goes as partial files do
+    left, tries, excluded = list(enumerate(units))[::-1], dict[int, int](), set[str]()
+    going: dict[Future, tuple[int, RunUnit]] = {}
+    fixed = folder.resolve(), token.name, machine.code_hash(), [dict(table) for table in TABLES]
+    display.begin(len(units), 0.0)
+    looks = display.run(f"{len(units)} runs on {client.scheduler.address if client.scheduler else 'a cluster'}", 1, 0.0)
+    try:
+        token.touch()
+        while left or going:
+            workers = {name: threads for name, threads in _threads(client).items() if name not in excluded}
+            while left and len(going) < _AHEAD * max(1, sum(workers.values())):
+                number, unit = left.pop()
+                key = f"springbench-{unit.run.title.replace(' ', '-')}-{uuid4().hex}"
+                only = list(workers) if excluded and workers else None
+                task = client.submit(_do, unit, *fixed, key=key, pure=False, workers=only)
+                going[task] = number, unit
+            with suppress(TimeoutError, distributed.TimeoutError):
+                distributed.wait(list(going), timeout=1.0, return_when="FIRST_COMPLETED")
+            looks.tick("")
+            for task in [task for task in going if task.done()]:
+                number, unit = going.pop(task)
+                again = _ended(task, unit, folder, display, excluded, last=tries.get(number, 1) >= _TRIES)
+                if again:
+                    tries[number] = tries.get(number, 1) + 1
+                    left.append((number, unit))
+            if excluded and not set(_threads(client)) - excluded:
+                raise CannotWrite(f"no worker is of use any more: {', '.join(sorted(excluded))}")
+    finally:
+        token.unlink(missing_ok=True)
+        display.end()
+
+
+def _ended(task: Future, unit: RunUnit, folder: Path, display: Display, excluded: set[str], *, last: bool) -> bool:
+    """Keep what a task left; whether its run is to be done again. last: no more."""
+    if task.status in ("cancelled", "lost"):
+        raise RunFailed("the scheduler is gone; what was done is kept, and the same command does the rest")
+    run = display.run(unit.title, 1, 0.0)
+    try:
+        done: Done = task.result()
+    except KilledWorker as error:
+        if last:
+            run.finished(unit.lost(Lost("killed", f"its worker was lost again and again: {error}")))
+        return not last
+    if done.useless:
+        excluded.add(done.worker)
+        run.finished(f"is done elsewhere, for {done.worker} {done.useless}")
+        return True
+    for name, content in sorted(done.left.items(), key=lambda item: item[0].endswith(".parquet")):  # rows last
+        with replacing(folder / name) as partial_name:
+            partial_name.write_bytes(content)
+    run.finished(done.told)
+    return False
+
+
+def _threads(client: Client) -> dict[str, int]:
+    """How many tasks each worker does at a time."""
+    found: Any = client.nthreads()
+    return found
+
+
+_PROCESSES: list[Workers] = []
+"""Of this worker, those that wait for their next run."""
+
+
+def _do(unit: RunUnit, folder: Path, token: str, code: str, tables: Sequence[Mapping[str, str]]) -> Done:
+    """On a worker: one run, in a process of its own."""
+    me = distributed.get_worker().address
+    if machine.code_hash() != code:
+        return Done(me, useless=f"has other code, {machine.code_hash()} and not {code}")
+    # Dask's nannies make their workers daemons, which may have no children; these end with their parent by themselves.
+    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
+    process = _PROCESSES.pop() if _PROCESSES else Workers(partial(ready, tables), fork=False)
+    try:
+        with TemporaryDirectory(prefix="springbench-") as temporary:
+            shared = (folder / token).exists()
+            place = folder if shared else Path(temporary)
+            for part in ("rows", "recordings", "pictures"):
+                (place / part).mkdir(exist_ok=True)
+            here = RunUnit(unit.run, Files.of(unit.run, place), None, unit.at_once)
+            try:
+                told = process.do(partial(watched, here), _quiet, here.limits)
+            except Lost as lost:
+                told = here.lost(lost)
+            made = [] if shared else [here.files.rows, here.files.recording]
+            return Done(me, told, {os.path.relpath(path, place): path.read_bytes() for path in made if path.exists()})
+    except (CannotWrite, OSError) as error:
+        return Done(me, useless=f"cannot write: {error}")
+    finally:
+        _PROCESSES.append(process)
+
+
+def _quiet(said: str) -> None:
+    pass

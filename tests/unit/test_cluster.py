@@ -1,0 +1,99 @@
+"""Who can do runs elsewhere is told before any is handed out, and why another cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from time import time
+from typing import Any, NamedTuple
+
+import pytest
+
+from harness.base.errors import InputError
+from harness.config.sweep import RunSpec
+from harness.experiments import cluster
+from harness.experiments.cluster import About
+from solvers.plugins import Plugin
+
+
+class Workers:
+    """A client whose workers say this."""
+
+    def __init__(self, *said: object) -> None:
+        self._said = {f"tcp://worker-{number}:1": what for number, what in enumerate(said)}
+
+    def run(self, function: Callable[..., Any], *arguments: object, on_error: str) -> dict[str, object]:
+        return {name: function(*arguments) if what is None else what for name, what in self._said.items()}
+
+
+class Own(NamedTuple):
+    """A run with somebody's own code."""
+
+    plugins: tuple[Plugin, ...]
+
+    def own(self) -> list[Plugin]:
+        return list(self.plugins)
+
+
+def machines(client: Workers, *plugins: Plugin, say: Callable[[str], None] = print) -> list[str]:
+    runs: Any = [Own(plugins)]
+    asked: Any = client
+    return cluster.machines(asked, list[RunSpec](runs), say)
+
+
+def test_workers_like_this_one_can_do_runs():
+    assert machines(Workers(None, None)) == [About.this().machine]
+
+
+@pytest.mark.parametrize("what", ["code", "python", "distributed"])
+def test_a_worker_of_another_version_is_refused_with_both(what: str):
+    other = About.this()._replace(**{what: "0.0.1"})
+    with pytest.raises(InputError) as refused:
+        machines(Workers(None, (other, {})))
+    for part in ("tcp://worker-1:1", f"{what} 0.0.1", str(getattr(About.this(), what))):
+        assert part in str(refused.value)
+    assert "worker-0" not in str(refused.value)
+
+
+def test_a_worker_without_a_plug_in_is_named_with_it(tmp_path: Path):
+    mine = Plugin("./mine.py:Mine", f"{tmp_path}/mine.py:Mine", "mine", "1", "")
+    with pytest.raises(InputError) as refused:
+        machines(Workers(None), mine)
+    assert "worker-0" in str(refused.value)
+    assert "./mine.py:Mine" in str(refused.value)
+
+
+def test_a_worker_that_cannot_be_asked_is_told():
+    with pytest.raises(InputError, match=r"worker-0.*ModuleNotFoundError.*harness"):
+        machines(Workers(ModuleNotFoundError("No module named 'harness'")))
+
+
+def test_a_worker_that_is_lost_meanwhile_is_no_mistake():
+    told: list[str] = []
+    assert machines(Workers(None, OSError("Stream is closed")), say=told.append) == [About.this().machine]
+    assert "worker-1" in told[0]
+    with pytest.raises(InputError, match="all workers were lost"):
+        machines(Workers(OSError("Stream is closed")))
+
+
+@pytest.mark.parametrize(("off", "words"), [(3600.0, "ahead"), (-3600.0, "behind"), (1.0, "")])
+def test_clocks_that_differ_are_said(off: float, words: str):
+    told: list[str] = []
+    machines(Workers((About.this()._replace(clock=time() + off), {})), say=told.append)
+    assert [words in line for line in told] == [True] * bool(words)
+
+
+@pytest.mark.parametrize(
+    ("on", "said"),
+    [
+        ("tcp://127.0.0.1:1", "no scheduler answers"),
+        ("nowhere", "no scheduler answers"),
+        ("local:none", "wanted local:N"),
+        ("absent.yaml", "wanted a mapping"),
+    ],
+)
+def test_where_there_is_no_cluster_that_is_said(on: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr(cluster, "PATIENCE", 0.3)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=said), cluster.cluster(on, [], print):
+        pass

@@ -1,0 +1,70 @@
+"""Several workers do tasks at once: each is done once, a loss costs its task alone, groups stay together."""
+
+from __future__ import annotations
+
+from functools import partial
+from time import sleep
+
+import pytest
+from numba.core import event
+
+from harness.base.asides import COMPILING, WAITING, aside, begun, compiling_told, ended
+from harness.base.crew import Task, done_by
+from harness.base.errors import InputError
+from harness.base.workers import Limits, Lost, Tick, Workers
+from tests import workers as does
+
+
+def quiet(said: str) -> None:
+    pass
+
+
+def refuse(tick: Tick) -> None:
+    raise InputError("no")
+
+
+def patient(tick: Tick) -> str:
+    with aside(tick, WAITING):
+        sleep(0.6)
+    return "done"
+
+
+def test_each_task_is_done_once_and_a_loss_costs_its_own():
+    pieces = [does.crash if n in (1, 4) else partial(does.double, n) for n in range(6)]
+    found = dict(done_by(2, int, [None] * 6, lambda number: Task(pieces[number], quiet, Limits())))
+    assert sorted(found) == list(range(6))
+    for number, outcome in found.items():
+        assert isinstance(outcome, Lost) if number in (1, 4) else outcome == 2 * number
+
+
+def test_what_is_done_already_is_left_out():
+    found = dict(
+        done_by(2, int, [None] * 4, lambda n: Task(partial(does.double, n), quiet, Limits()) if n % 2 else None)
+    )
+    assert found == {1: 2, 3: 6}
+
+
+def test_a_group_is_left_to_one_worker_as_long_as_the_others_have_something_to_do():
+    groups = ["a", "b", "a", "b", "a", "b"]
+    found = dict(done_by(2, int, groups, lambda number: Task(does.name, quiet, Limits())))
+    assert len({(found[number], group) for number, group in enumerate(groups)}) <= 3  # of four that there may be
+
+
+def test_an_error_that_ends_an_experiment_ends_it():
+    with pytest.raises(InputError):
+        list(done_by(2, int, [None] * 4, lambda number: Task(refuse, quiet, Limits())))
+
+
+def test_what_a_piece_waits_for_others_does_not_count_for_its_limit():
+    workers = Workers()
+    assert workers.do(patient, quiet, Limits(seconds=0.4)) == "done"
+    workers.end()
+
+
+def test_compiling_is_told_once_whatever_is_compiled_within():
+    heard: list[str] = []
+    with compiling_told(heard.append), event.trigger_event("numba:compile"), event.trigger_event("numba:compile"):
+        assert len(heard) == 1
+    assert [begun(heard[0]), ended(heard[1])] == [COMPILING] * 2
+    with event.trigger_event("numba:compile"):
+        assert len(heard) == 2

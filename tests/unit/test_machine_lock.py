@@ -1,0 +1,100 @@
+"""One is timed at a time on a machine, and what is not timed waits for it."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import partial
+from pathlib import Path
+from time import monotonic
+
+import pytest
+
+from harness.base.asides import WAITING, begun, ended
+from harness.base.crew import Task, done_by
+from harness.base.machine_lock import alone, beside, own_cores
+from harness.base.workers import Limits, Tick
+
+SOON, PATIENCE = 0.1, 60.0
+
+
+@pytest.fixture(autouse=True)
+def _locks_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPRINGBENCH_LOCKS", str(tmp_path))
+
+
+class Other(threading.Thread):
+    """Somebody else who would compute, and has begun once it is in."""
+
+    def __init__(self, how: Callable[[Tick], AbstractContextManager[object]]) -> None:
+        super().__init__(daemon=True)
+        self.how, self.waits, self.inside, self.leave = how, threading.Event(), threading.Event(), threading.Event()
+        self.heard: list[str] = []
+        self.start()
+
+    def run(self) -> None:
+        def tick(said: str) -> None:
+            self.heard.append(said)
+            self.waits.set()
+
+        with self.how(tick):
+            self.inside.set()
+            self.leave.wait(PATIENCE)
+
+
+def quiet(said: str) -> None:
+    pass
+
+
+@pytest.mark.parametrize(("mine", "others"), [(alone, alone), (alone, beside), (beside, alone)])
+def test_who_is_timed_is_alone(mine: Callable[..., AbstractContextManager[None]], others: Callable[..., object]):
+    with mine(quiet):
+        other = Other(others)  # type: ignore[arg-type]
+        assert other.waits.wait(PATIENCE)
+        assert not other.inside.wait(SOON)
+    assert other.inside.wait(PATIENCE)
+    other.leave.set()
+    other.join(PATIENCE)
+    assert begun(other.heard[0]) == ended(other.heard[-1]) == WAITING
+
+
+def test_what_is_not_timed_is_done_side_by_side():
+    with beside(quiet):
+        other = Other(beside)
+        assert other.inside.wait(PATIENCE)
+        other.leave.set()
+
+
+def test_who_would_be_timed_goes_before_who_would_not():
+    with beside(quiet):
+        timed = Other(alone)
+        assert timed.waits.wait(PATIENCE)
+        untimed = Other(beside)
+        assert untimed.waits.wait(PATIENCE)
+        assert not untimed.inside.wait(SOON)
+    assert timed.inside.wait(PATIENCE)
+    assert not untimed.inside.is_set()
+    timed.leave.set()
+    assert untimed.inside.wait(PATIENCE)
+    untimed.leave.set()
+
+
+def at_core(tick: Tick) -> tuple[list[int], set[int], float, float]:
+    """The cores that this is kept to, as told and as it is, and from when to when."""
+    with own_cores(1, tick) as cores:
+        began, end = monotonic(), monotonic() + SOON
+        while monotonic() < end:
+            pass
+        return cores, os.sched_getaffinity(0), began, monotonic()
+
+
+def test_each_has_cores_of_its_own():
+    task = Task(partial(at_core), quiet, Limits(PATIENCE))
+    found = [value for _, value in done_by(3, int, [None] * 3, lambda number: task)]
+    for cores, kept_to, began, end in found:
+        assert set(cores) == kept_to
+        assert len(kept_to) == 1
+        meanwhile = [other for other, _, a, b in found if a < end and b > began]
+        assert meanwhile.count(cores) == 1
