@@ -1,0 +1,87 @@
+"""What a motion calls for: suggestions with their evidence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from harness.experiments.ablation import suggest
+from harness.experiments.ablation.suggest import Suggestion
+from harness.scenes.bind import Scene
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.grid import Grid
+from tests.effects import cloth
+from tests.scenes import scene
+
+
+def asked(
+    made: Scene, kinds: set[str], positions: np.ndarray, velocities: np.ndarray | float = 0.0
+) -> list[Suggestion]:
+    """What a motion calls for that passes through positions (n, 3) for 12 frames."""
+    places = np.tile(positions, (12, 1, 1))
+    return suggest.suggestions(suggest.seen(made, kinds, places, np.broadcast_to(velocities, places.shape)), kinds)
+
+
+def folded(made: Scene, angle: float) -> np.ndarray:
+    """The level cloth, folded along its middle."""
+    x, y, z = made.mesh.rest.T
+    right = np.maximum(x, 0.0)
+    return np.stack([x - right + right * np.cos(angle), y + right * np.sin(angle), z], axis=1)
+
+
+def still() -> Scene:
+    made = replace(cloth(), forces=(), moving=())
+    assert asked(made, set(), made.mesh.rest) == []
+    return made
+
+
+def test_a_motion_that_asks_for_nothing_gets_no_suggestion():
+    made = still()
+    assert asked(made, set(), folded(made, np.deg2rad(20.0))) == []
+
+
+@pytest.mark.parametrize(
+    ("effect", "listed", "evidence"),
+    [
+        ("strain-limits", "strain-limits", "one by 12 %"),
+        ("bending", "bending", "of the edges"),
+        ("air-drag", "rayleigh", "100 %"),
+    ],
+)
+def test_a_suggestion_comes_with_its_evidence_unless_the_effect_is_listed(effect: str, listed: str, evidence: str):
+    made = still()
+    places = {"strain-limits": 1.12 * made.mesh.rest, "bending": folded(made, 0.8 * np.pi), "air-drag": made.mesh.rest}
+    speed = 1.0 if effect == "air-drag" else 0.0
+    found = {s.effect: s.evidence for s in asked(made, set(), places[effect], speed)}
+    assert evidence in found[effect]
+    assert effect not in {s.effect for s in asked(made, {listed}, places[effect], speed)}
+
+
+def test_a_corner_alone_asks_for_no_effect():
+    made = scene(Grid(), Springs(stretch=300.0, shear=60.0), size=20)
+    p, h = made.mesh.rest.copy(), made.mesh.spacing
+    p[0] += [-h, 2 * h, -h]  # three springs of 1482, and two edges of 1083
+    assert asked(made, set(), p) == []
+    p[made.mesh.parts["left"]] += [0.0, 3 * h, 0.0]
+    assert {s.effect for s in asked(made, set(), p)} == {"strain-limits", "bending"}
+
+
+def test_vertices_that_come_close_are_counted():
+    made = still()
+    found = {s.effect: s.evidence for s in asked(made, set(), folded(made, np.pi * 0.99))}
+    # Of 6 columns the inner two are joined by springs; each outer pair lies on each other in all 6 rows.
+    assert found["self-contact"].startswith("12 pairs of vertices without a spring")
+
+
+def test_a_body_that_flies_as_a_whole_is_not_asked_to_rest():
+    free = scene(Grid(), Springs(stretch=300.0), size=4)
+    assert asked(free, set(), free.mesh.rest, 1.0) == []
+    swelling = asked(free, set(), free.mesh.rest, free.mesh.rest)
+    assert [s.effect for s in swelling] == ["air-drag"]
+
+
+def test_a_driven_motion_is_not_asked_to_rest():
+    made = replace(still(), forces=(lambda p, v, t: p,))
+    assert asked(made, set(), made.mesh.rest, 1.0) == []
