@@ -5,8 +5,7 @@ A step of implicit Euler minimises the incremental potential (Liu et al. 2013, e
     g(p) = sum of energies(p) + c/(2 dt^2) |p - target|_M^2 - tr(p' f) + sum_pins w/2 |p_i - pin_i|^2
 
 over the positions p, with c = 1 and target = 2 p^t - p^(t-dt); other integrators have another c and another target
-(see `solvers.integrators`). `StepProblem` states it in plain NumPy and float64: it is the oracle from which every
-accuracy figure is taken.
+(see `solvers.integrators`). `StepProblem` states it in plain NumPy: every accuracy figure is taken from it.
 """
 
 from __future__ import annotations
@@ -22,10 +21,8 @@ from scipy.sparse import csr_array
 
 Positions = NDArray[np.float64]
 """Positions [m], shape (n, 3), float64, C-contiguous."""
-
 ResidualOf = Literal["returned", "previous", "none"]
-"""The iterate that a residual belongs to: the positions that a solve returns, or those before its last iteration; none
-where there is no residual."""
+"""The iterate that a residual belongs to: what a solve returns, or the one before; none where there is no residual."""
 
 
 class Unsupported(Exception):
@@ -83,9 +80,8 @@ class System:
     """What stays fixed in a run, and so is factorised once.
 
     mass: (n,) [kg], zero is allowed where springs or pins hold the vertex; time_step: dt [s];
-    energies: potentials of the positions; pins: which vertices are pinned, and how; factor: c of the time integrator
-    (see `solvers.integrators`), 1 for implicit Euler; speed: by how much the unknown's velocity grows with it, in 1/dt,
-    None for sqrt(c).
+    energies: potentials of the positions; pins: which vertices are pinned, and how; factor, speed: of the integrator,
+    c and the unknown's velocity over its change in 1/dt, None for sqrt(c).
     """
 
     mass: NDArray[np.float64]
@@ -134,10 +130,9 @@ class Start:
     """Where a step starts, for energies that depend on it and for methods that do not minimise.
 
     positions: p^t (n, 3) [m]; velocity: v^t, filters included, (n, 3) [m/s]; time: t [s]; origin (n, 3) [m] and rate
-    [1/s]: the unknown x moves with the velocity rate (x - origin); until: the time of x [s], for what moves by itself
-    (nan, which spoils all that depends on it, where it is not told); ahead: how far [s] to extrapolate what is lagged;
-    lagged: where it is taken instead, (n, 3) [m]; acceleration: what the motion so far leads to expect at x, (n, 3)
-    [m/s^2].
+    [1/s]: the unknown x moves with the velocity rate (x - origin); until: the time of x [s] (nan, which spoils all that
+    depends on it, where it is not told); ahead: how far [s] to extrapolate what is lagged; lagged: where it is taken
+    instead, (n, 3) [m]; acceleration: what the motion so far leads to expect, (n, 3) [m/s^2].
     """
 
     positions: Positions
@@ -153,9 +148,8 @@ class Start:
     @property
     def expected(self) -> Positions:
         """The positions that an energy is lagged at, (n, 3) [m]: p^t, or extrapolated by `ahead`, or `lagged`."""
-        if self.lagged is not None:
-            return self.lagged
-        return self.positions + self.ahead * self.velocity if self.ahead else self.positions
+        p = self.positions if self.lagged is None else self.lagged
+        return p + self.ahead * self.velocity if self.ahead else p
 
     def velocity_at(self, x: Positions) -> Positions:
         """The velocity [m/s] of the unknown x, both (n, 3)."""
@@ -164,8 +158,8 @@ class Start:
 
 @runtime_checkable
 class LaggedEnergy(Energy, Protocol):
-    """An energy that depends on where the step starts: damping, friction, obstacles that move. The stiffness of a
-    projective one may depend on the start's rate and on nothing else of it, for Q is made once."""
+    """An energy that depends on where the step starts: damping, friction, obstacles that move. Of that, the stiffness
+    of a projective one may depend on the rate alone, for Q is made once."""
 
     def begin_step(self, start: Start) -> Energy:
         """The energy of this one step."""
@@ -231,8 +225,8 @@ class StepProblem:
 
 @dataclass(frozen=True, slots=True)
 class StopRule:
-    """When a solve ends: after `iterations`, or with a `tolerance` before that, once the residual is at most so much of
-    its value at the current positions, or once the gradient is round-off, so that a scene at rest stops at once.
+    """When a solve ends: after `iterations`, or with a `tolerance` once the residual is at most so much of its value at
+    the current positions, or the gradient round-off, so that a scene at rest stops at once.
 
     The residual at p is |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q [J^(1/2)] over the unpinned vertices, the same for every
     method. Round-off is at each of them at most `floor` times its bound (see `solvers.round_off`); 0 looks for none.
@@ -245,13 +239,11 @@ class StopRule:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Where a solve ended.
-
-    positions: (n, 3) [m]; iterations: how many were done; residual: |Q^-1 grad g|_Q [J^(1/2)] over the unpinned
-    vertices, by which the rule judged (nan for a method that does not minimise); yardstick: the same at the current
-    positions (nan when the rule had no tolerance); stopped: "iterations", "tolerance", "floor", or "stalled" where
-    round-off lets nothing descend any more; velocity: (n, 3) [m/s] at the step's end, of a method that keeps its own;
-    residual_of: which iterate the residual belongs to.
+    """Where a solve ended. positions: (n, 3) [m]; iterations: how many were done; residual: |Q^-1 grad g|_Q [J^(1/2)]
+    over the unpinned vertices, by which the rule judged (nan for a method that does not minimise), of the iterate that
+    residual_of names; yardstick: the same at the current positions (nan without a tolerance); stopped: "iterations",
+    "tolerance", "floor", or "stalled" where nothing descends any more; velocity: (n, 3) [m/s] at the end, of a method
+    that keeps its own.
     """
 
     positions: Positions
@@ -296,8 +288,8 @@ class Prepared(Protocol):
 class Solver(Protocol):
     """A frozen dataclass of a method's parameters.
 
-    minimises: whether its iterates tend to a minimum of the step's objective; a method for which they do not is
-    graded on its trajectories. descends: whether the objective rises in no iteration, round-off apart.
+    minimises: whether its iterates tend to a minimum of the step's objective; others are graded on their trajectories.
+    descends: whether the objective rises in no iteration, round-off apart.
     """
 
     minimises: ClassVar[bool]

@@ -16,19 +16,13 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.linalg import ArpackError, eigsh
 
-from solvers import matrices
 from solvers.about import About, Reference
 from solvers.core import vertex_terms
 from solvers.core.driver import Iterating, Iterative
-from solvers.energies.quadratic import Quadratic, Viscous
-from solvers.energies.springs import Springs
+from solvers.core.forces import Parts, frequency
 from solvers.kernels.explicit_steps import Forces, compose, integrate
-from solvers.kernels.forms import Form
 from solvers.kernels.loop import ITERATIONS, Limits
-from solvers.kernels.springs import Bundles
 from solvers.memory import aligned
 from solvers.methods.explicit_tables import (
     BLANES_MOAN_4,
@@ -40,20 +34,15 @@ from solvers.methods.explicit_tables import (
     Tableau,
     dormand_prince_8,
 )
-from solvers.problem import LaggedEnergy, Positions, ResidualOf, StepProblem, System, Unsupported
+from solvers.problem import Positions, ResidualOf, StepProblem, System, Unsupported
 
 _SAFETY = 0.95
 """Of the limit: at the limit itself a vibration neither grows nor keeps its size, and springs are not linear."""
 
-_ABOVE = 1.02
-"""Of the largest eigenvalue as it is found, which is from below: to one percent."""
-
 _MOST = 1e9
 """Springs that a step may go through, some seconds: compiled code cannot be interrupted meanwhile."""
-
 _TRIED = 20
 """Steps that may be tried to keep to an error, for each that is stable."""
-
 _FAR = 1e100
 """Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
 
@@ -74,15 +63,14 @@ class Explicit:
         """substeps: times the fewest that are stable; error: of the springs' mean length, 0 for none."""
         vertex_terms.require_implicit_euler(system, self.name)
         vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), self.name)
-        method, parts = self.method(), _Parts.of(system, self.name)
+        method, parts = self.method(), Parts.of(system, self.name)
         omega = frequency(system)
         rate = omega + float(parts.drag.max(initial=0.0))
         needed = substeps * max(1.0, ceil(system.time_step * rate / (_SAFETY * method.limit)))
         if needed * method.evaluations * max(1, len(parts.springs.edges)) > _MOST:
             raise Unsupported(
                 f"{self.name}: is stable with {needed:.3g} substeps a step of {method.evaluations} evaluations, which "
-                f"for {len(parts.springs.edges)} springs are more than the {_MOST:.0e} allowed; take a shorter "
-                "time step"
+                f"for {len(parts.springs.edges)} springs are beyond the {_MOST:.0e} allowed; take a shorter time step"
             )
         soft = int((~system.pins.exact).sum())
         taken = f"; {soft} pins by penalty taken as exact" if soft else ""
@@ -126,6 +114,12 @@ def _about(authors: str, year: int, title: str, doi: str = "", *, first: bool = 
     return About("explicit", Reference(authors, year, title, doi), own_steps=True, first=first)
 
 
+_HAIRER = _about(
+    "Hairer, Ernst and Norsett, Syvert Paul and Wanner, Gerhard",
+    1993,
+    "Solving Ordinary Differential Equations I",
+    "10.1007/978-3-540-78862-1",
+)
 _BLANES_MOAN = _about(
     "Blanes, Sergio and Moan, Per Christian",
     2002,
@@ -180,12 +174,7 @@ class RungeKutta4(_Fixed):
     """Kutta's method of order 4, four evaluations a substep."""
 
     name: ClassVar[str] = "runge-kutta-4"
-    about: ClassVar[About] = _about(
-        "Hairer, Ernst and Norsett, Syvert Paul and Wanner, Gerhard",
-        1993,
-        "Solving Ordinary Differential Equations I",
-        "10.1007/978-3-540-78862-1",
-    )
+    about: ClassVar[About] = _HAIRER
 
     def method(self) -> Composition | Tableau:
         """The coefficients."""
@@ -214,77 +203,11 @@ class DormandPrince8(_Controlled):
     """Dormand and Prince's method of order 8 with errors of orders 5 and 3, twelve evaluations a substep."""
 
     name: ClassVar[str] = "dormand-prince-8"
-    about: ClassVar[About] = _about(
-        "Hairer, Ernst and Norsett, Syvert Paul and Wanner, Gerhard",
-        1993,
-        "Solving Ordinary Differential Equations I",
-        "10.1007/978-3-540-78862-1",
-    )
+    about: ClassVar[About] = _HAIRER
 
     def method(self) -> Composition | Tableau:
         """The coefficients."""
         return dormand_prince_8()
-
-
-def frequency(system: System) -> float:
-    """A bound of the largest angular frequency [rad/s] of springs and constant quadratic forms, all pins held."""
-    free = np.flatnonzero(system.unpinned)
-    constant = [e for e in system.energies if isinstance(e, (Springs, Quadratic)) and not isinstance(e, LaggedEnergy)]
-    if not len(free) or not constant:
-        return 0.0
-    n = system.vertices
-    K = sum((e.stiffness_matrix(n) for e in constant), csr_array((n, n)))
-    slow = matrices.diagonal(1.0 / np.sqrt(system.mass[free]))
-    inner = csr_array(slow @ csr_array(csr_array(K[free])[:, free]) @ slow)
-    rows = float(abs(inner).sum(axis=1).max(initial=0.0))  # Gershgorin
-    if len(free) < 20 or not rows:
-        most = float(np.linalg.eigvalsh(inner.toarray()).max(initial=0.0))
-        return _ABOVE * max(most, 0.0) ** 0.5
-    try:
-        given = np.random.default_rng(0).normal(size=len(free))
-        most = float(eigsh(inner, 1, which="LA", tol=1e-2, v0=given, return_eigenvectors=False)[0])
-    except ArpackError:
-        return rows**0.5
-    return min(_ABOVE * most**0.5, rows**0.5)
-
-
-@dataclass(frozen=True, eq=False)
-class _Parts:
-    """The forces of a system: springs, their bundles; a form, as in `Forces`; drag (n,) [1/s]; load (n, 3) [N], that of
-    the form at the origin."""
-
-    springs: Springs
-    bundles: Bundles
-    pairs: NDArray[np.int64]
-    weight: NDArray[np.float64]
-    held: NDArray[np.float64]
-    drag: NDArray[np.float64]
-    load: Positions
-
-    @classmethod
-    def of(cls, system: System, solver: str) -> _Parts:
-        """Raises Unsupported for what it does not know."""
-        n = system.vertices
-        springs = Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
-        drag, load, L = np.zeros(n), np.zeros((n, 3)), csr_array((n, n))
-        for energy in system.energies:
-            if isinstance(energy, Viscous) and (np.diff(energy.A.indptr) == 1).all():
-                drag += energy.A.power(2).T @ energy.weight
-            elif isinstance(energy, Quadratic) and not isinstance(energy, LaggedEnergy):
-                L = csr_array(L + energy.stiffness_matrix(n))
-                energy.add_projection(load, load)
-            elif not isinstance(energy, Springs):
-                raise Unsupported(
-                    f"{solver}: knows springs, bending and drag on vertices; the scene has {type(energy).__name__} "
-                    "as well"
-                )
-        form = Form.of(L)
-        part = np.where(system.unpinned, 0, -1)
-        bundles, _ = Bundles.of(springs, np.arange(n), part, 1, n, n + 1)
-        drag = np.divide(drag, system.mass, out=np.zeros(n), where=system.unpinned)
-        return cls(
-            springs, bundles, form.pairs, form.weight, form.held if form.held.any() else form.held[:0], drag, load
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +219,7 @@ class PreparedExplicit(Iterative):
 
     system: System
     method: Composition | Tableau
-    parts: _Parts
+    parts: Parts
     substeps: int
     tolerance: float
     rate: float
@@ -304,7 +227,7 @@ class PreparedExplicit(Iterative):
     facts: dict[str, float] = field(default_factory=dict[str, float])
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
-        """See Iterative; the whole step."""
+        """The whole step."""
         return _Done(*self.step(problem)[:2])
 
     def refined(self, times: int) -> PreparedExplicit:
@@ -371,9 +294,7 @@ class _Done(Iterating):
         self.positions, self.velocity = p, v
 
     def advance(self) -> bool:
-        """See Iterating."""
         return True
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating."""
         return 1, float("nan"), ITERATIONS

@@ -110,7 +110,7 @@ def assignment_scene(name: str) -> Scene:
     return build(scene_from_assignment(ASSIGNMENT / f"{name}.json"), 0)
 
 
-@pytest.mark.skipif(numba.get_num_threads() < 2, reason="Numba was started with one thread")
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="Numba was started with one thread")
 @pytest.mark.parametrize("name", ["chain", "stiff-cloth", "block", "skirt"])
 def test_the_compiled_backend_gives_the_same_bits_with_any_number_of_threads(name):
     problem = first_problem(SCENES[name](1e10))

@@ -127,7 +127,7 @@ LARGE = {"geometry-collapsed": 48, "geometry-random": 48, "motion-pins-shake": 4
 """Cases at sizes that have work for two threads."""
 
 
-@pytest.mark.skipif(numba.get_num_threads() < 2, reason="Numba was started with one thread")
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="Numba was started with one thread")
 @pytest.mark.parametrize("solver", SPLIT.values(), ids=list(SPLIT))
 @pytest.mark.parametrize(
     ("case", "size"),

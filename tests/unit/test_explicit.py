@@ -25,8 +25,9 @@ from harness.scenes.mesh.chain import Chain
 from harness.scenes.mesh.grid import Grid
 from harness.scenes.spec import SceneSpec
 from harness.simulation.step import State, prepare, simulate, start
+from solvers.core.forces import frequency
 from solvers.integrators import Motion
-from solvers.methods.explicit import PreparedExplicit, frequency
+from solvers.methods.explicit import PreparedExplicit
 from solvers.methods.explicit_tables import BLANES_MOAN_4, RUNGE_KUTTA_4, TSITOURAS_5, VERLET
 from solvers.methods.newton import Newton
 from solvers.problem import StopRule, Unsupported

@@ -93,10 +93,10 @@ def test_a_sweep_lives_at_a_url(config: Path, cache: Path, tmp_path: Path):
 @pytest.fixture
 def storage(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """An S3-compatible server on the loopback, with a bucket."""
+    moto = pytest.importorskip("moto.server", reason="a server of this kind: pip install -e '.[s3-server]'")
     import boto3
-    from moto.server import ThreadedMotoServer
 
-    server = ThreadedMotoServer("127.0.0.1", 0)
+    server = moto.ThreadedMotoServer("127.0.0.1", 0)
     server.start()
     host, port = server.get_host_and_port()
     settings = {"AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x", "AWS_DEFAULT_REGION": "us-east-1"}

@@ -1,0 +1,81 @@
+"""What explicit methods evaluate instead of a matrix: the forces of a system, and how fast it can vibrate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import ArpackError, eigsh
+
+from solvers import matrices
+from solvers.energies.quadratic import Quadratic, Viscous
+from solvers.energies.springs import Springs
+from solvers.kernels.forms import Form
+from solvers.kernels.springs import Bundles
+from solvers.problem import LaggedEnergy, Positions, System, Unsupported
+
+_ABOVE = 1.02
+"""Of the largest eigenvalue as it is found, which is from below: to one percent."""
+
+
+def frequency(system: System) -> float:
+    """A bound of the largest angular frequency [rad/s] of springs and constant quadratic forms, all pins held."""
+    free = np.flatnonzero(system.unpinned)
+    constant = [e for e in system.energies if isinstance(e, (Springs, Quadratic)) and not isinstance(e, LaggedEnergy)]
+    if not len(free) or not constant:
+        return 0.0
+    n = system.vertices
+    K = sum((e.stiffness_matrix(n) for e in constant), csr_array((n, n)))
+    slow = matrices.diagonal(1.0 / np.sqrt(system.mass[free]))
+    inner = csr_array(slow @ csr_array(csr_array(K[free])[:, free]) @ slow)
+    rows = float(abs(inner).sum(axis=1).max(initial=0.0))  # Gershgorin
+    if len(free) < 20 or not rows:
+        most = float(np.linalg.eigvalsh(inner.toarray()).max(initial=0.0))
+        return _ABOVE * max(most, 0.0) ** 0.5
+    try:
+        given = np.random.default_rng(0).normal(size=len(free))
+        most = float(eigsh(inner, 1, which="LA", tol=1e-2, v0=given, return_eigenvectors=False)[0])
+    except ArpackError:
+        return rows**0.5
+    return min(_ABOVE * most**0.5, rows**0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """The forces of a system: springs, their bundles; a form, as in `Forces`; drag (n,) [1/s]; load (n, 3) [N], that of
+    the form at the origin."""
+
+    springs: Springs
+    bundles: Bundles
+    pairs: NDArray[np.int64]
+    weight: NDArray[np.float64]
+    held: NDArray[np.float64]
+    drag: NDArray[np.float64]
+    load: Positions
+
+    @classmethod
+    def of(cls, system: System, solver: str) -> Parts:
+        """Raises Unsupported for what it does not know."""
+        n = system.vertices
+        springs = Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
+        drag, load, L = np.zeros(n), np.zeros((n, 3)), csr_array((n, n))
+        for energy in system.energies:
+            if isinstance(energy, Viscous) and (np.diff(energy.A.indptr) == 1).all():
+                drag += energy.A.power(2).T @ energy.weight
+            elif isinstance(energy, Quadratic) and not isinstance(energy, LaggedEnergy):
+                L = csr_array(L + energy.stiffness_matrix(n))
+                energy.add_projection(load, load)
+            elif not isinstance(energy, Springs):
+                raise Unsupported(
+                    f"{solver}: knows springs, bending and drag on vertices; the scene has {type(energy).__name__} "
+                    "as well"
+                )
+        form = Form.of(L)
+        part = np.where(system.unpinned, 0, -1)
+        bundles, _ = Bundles.of(springs, np.arange(n), part, 1, n, n + 1)
+        drag = np.divide(drag, system.mass, out=np.zeros(n), where=system.unpinned)
+        return cls(
+            springs, bundles, form.pairs, form.weight, form.held if form.held.any() else form.held[:0], drag, load
+        )
