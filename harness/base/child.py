@@ -72,13 +72,14 @@ class _Child:
 
     def __init__(self) -> None:
         paths = [path or os.getcwd() for path in sys.path]
-        one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
+        settings = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
+        settings["ARROW_DEFAULT_MEMORY_POOL"] = "system"  # others reserve a GiB at once, which counts as taken
         self._owner = os.getpid()
         self._process = subprocess.Popen(
             [sys.executable, "-c", f"from {__name__} import serve; serve()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env={**os.environ, **one_thread, "PYTHONPATH": os.pathsep.join(paths)},
+            env={**os.environ, **settings, "PYTHONPATH": os.pathsep.join(paths)},
         )
 
     @classmethod

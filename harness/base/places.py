@@ -34,9 +34,9 @@ ROWS = ("rows", "accuracy", "ablation")
 """What holds rows: folders of these names, and packed files."""
 
 
-def parse(value: str) -> Path | str:
-    """A path, or a URL as it stands."""
-    return value if "://" in value else Path(value)
+def parse(value: str | Path) -> Path | str:
+    """A path, which a default is already, or a URL as it stands."""
+    return value if isinstance(value, Path) or "://" in value else Path(value)
 
 
 def everything(context: typer.Context, value: Path | str) -> Path:
