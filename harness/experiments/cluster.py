@@ -9,26 +9,21 @@ more.
 
 from __future__ import annotations
 
-import logging
 import multiprocessing
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from socket import create_connection
 from tempfile import TemporaryDirectory
 from time import time
 from typing import Any, NamedTuple
-from urllib.parse import urlsplit
 from uuid import uuid4
 
 import distributed
-from distributed import Client, Future, KilledWorker, LocalCluster
-from ruamel.yaml import YAML
+from distributed import Client, Future, KilledWorker
 
 from harness.base import machine
 from harness.base.errors import InputError, Mistake, RunFailed
@@ -38,17 +33,12 @@ from harness.base.workers import Lost, Workers
 from harness.config.sweep import RunSpec
 from harness.experiments.core import TABLES, ready, watched
 from harness.experiments.plan import Files
+from harness.experiments.scheduler import PATIENCE, reach, scheduler
 from harness.experiments.sweep import RunUnit
 from solvers.plugins import Plugin, load
 
-PATIENCE = 10.0
-"""Seconds in which a scheduler has to answer, and to have a worker."""
-
 CLOCKS = 60.0
 """Seconds by which a worker's clock may differ from the client's before that is said."""
-
-_SILENCE = logging.CRITICAL
-"""What Dask says of workers that end is not for the user, who is told what became of runs."""
 
 _TRIES = 4
 """How often a run is handed out whose worker is lost."""
@@ -98,10 +88,10 @@ class Cluster(NamedTuple):
 def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Iterator[Cluster]:
     """The workers of the scheduler at an address, so many on this machine (`local:4`), or those that a file asks of a
     batch system. Raises InputError where there is none, or none that can do the runs."""
-    with _scheduler(on) as address:
+    with scheduler(on) as address:
         try:
             if isinstance(address, str):
-                _reach(address)
+                reach(address)
             client = Client(address, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
             why = f"no scheduler answers within {PATIENCE:g} s ({' '.join(str(error).split())[:200]})"
@@ -113,55 +103,6 @@ def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Ite
                 why = f"the scheduler has no worker; start some with `dask worker {on} --nthreads 1`"
                 raise InputError(Mistake(f"{on}: {why}", key="--on")) from None
             yield Cluster(client, machines(client, runs, say))
-
-
-@contextmanager
-def _scheduler(on: str) -> Iterator[Any]:
-    kind, _, many = on.partition(":")
-    if kind == "local":
-        if not many.isdecimal() or not 1 <= int(many) <= 1024:
-            raise InputError(Mistake(f"came {on}; wanted local:N with a number of workers", key="--on"))
-        quiet: Any = {"dashboard_address": None, "silence_logs": _SILENCE}
-        with LocalCluster(n_workers=int(many), threads_per_worker=1, **quiet) as found:
-            yield found
-    elif on.endswith((".yaml", ".yml")):
-        with _batch(Path(on)) as found:
-            yield found
-    else:
-        yield on
-
-
-def _reach(address: str) -> None:
-    """Raise OSError or ValueError where nobody listens at an address: Dask's client would go on trying."""
-    place = urlsplit(address)
-    if not place.hostname or not place.port:
-        raise ValueError("an address is like tcp://host:8786")
-    create_connection((place.hostname, place.port), timeout=PATIENCE).close()
-
-
-def _batch(path: Path) -> Any:
-    """The cluster that a file describes: `kind`, a class of dask-jobqueue less its Cluster, `jobs`, and its options."""
-    try:
-        options = dict(YAML(typ="safe").load(path.read_text()) or {})
-        kind, jobs = str(options.pop("kind")), int(options.pop("jobs"))
-    except (OSError, TypeError, ValueError, KeyError) as error:
-        wanted = (
-            "wanted a mapping with `kind` (SLURM, PBS, ...), `jobs` and the options of that cluster of dask-jobqueue"
-        )
-        raise InputError(Mistake(f"cannot be read ({error}); {wanted}", path)) from None
-    try:
-        dask_jobqueue = import_module("dask_jobqueue")
-    except ModuleNotFoundError:
-        raise InputError(Mistake("needs dask-jobqueue: pip install 'springbench[cluster]'", path)) from None
-    made = getattr(dask_jobqueue, f"{kind}Cluster", None)
-    if made is None:
-        raise InputError(Mistake(f"{kind}: dask-jobqueue has no {kind}Cluster", path, key="kind"))
-    try:
-        found = made(**options)
-    except (TypeError, ValueError) as error:
-        raise InputError(Mistake(f"{kind}Cluster refuses: {error}", path)) from None
-    found.scale(jobs=jobs)
-    return found
 
 
 def machines(client: Client, runs: Sequence[RunSpec], say: Callable[[str], None]) -> list[str]:

@@ -1,0 +1,73 @@
+"""Where a scheduler of Dask is: at an address, on this machine, or started by a batch system that a file describes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from socket import create_connection
+from typing import Any
+from urllib.parse import urlsplit
+
+from distributed import LocalCluster
+from ruamel.yaml import YAML
+
+from harness.base.errors import InputError, Mistake
+
+PATIENCE = 10.0
+"""Seconds in which a scheduler has to answer, and to have a worker."""
+
+_SILENCE = logging.CRITICAL
+"""What Dask says of workers that end is not for the user, who is told what became of runs."""
+
+
+@contextmanager
+def scheduler(on: str) -> Iterator[Any]:
+    """An address as it stands, or the cluster that is started for as long. Raises InputError."""
+    kind, _, many = on.partition(":")
+    if kind == "local":
+        if not many.isdecimal() or not 1 <= int(many) <= 1024:
+            raise InputError(Mistake(f"came {on}; wanted local:N with a number of workers", key="--on"))
+        quiet: Any = {"dashboard_address": None, "silence_logs": _SILENCE}
+        with LocalCluster(n_workers=int(many), threads_per_worker=1, **quiet) as found:
+            yield found
+    elif on.endswith((".yaml", ".yml")):
+        with _batch(Path(on)) as found:
+            yield found
+    else:
+        yield on
+
+
+def reach(address: str) -> None:
+    """Raise OSError or ValueError where nobody listens at an address: Dask's client would go on trying."""
+    place = urlsplit(address)
+    if not place.hostname or not place.port:
+        raise ValueError("an address is like tcp://host:8786")
+    create_connection((place.hostname, place.port), timeout=PATIENCE).close()
+
+
+def _batch(path: Path) -> Any:
+    """The cluster that a file describes: `kind`, a class of dask-jobqueue less its Cluster, `jobs`, and its options."""
+    try:
+        options = dict(YAML(typ="safe").load(path.read_text()) or {})
+        kind, jobs = str(options.pop("kind")), int(options.pop("jobs"))
+    except (OSError, TypeError, ValueError, KeyError) as error:
+        wanted = (
+            "wanted a mapping with `kind` (SLURM, PBS, ...), `jobs` and the options of that cluster of dask-jobqueue"
+        )
+        raise InputError(Mistake(f"cannot be read ({error}); {wanted}", path)) from None
+    try:
+        dask_jobqueue = import_module("dask_jobqueue")
+    except ModuleNotFoundError:
+        raise InputError(Mistake("needs dask-jobqueue: pip install 'springbench[cluster]'", path)) from None
+    made = getattr(dask_jobqueue, f"{kind}Cluster", None)
+    if made is None:
+        raise InputError(Mistake(f"{kind}: dask-jobqueue has no {kind}Cluster", path, key="kind"))
+    try:
+        found = made(**options)
+    except (TypeError, ValueError) as error:
+        raise InputError(Mistake(f"{kind}Cluster refuses: {error}", path)) from None
+    found.scale(jobs=jobs)
+    return found
