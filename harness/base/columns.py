@@ -213,6 +213,6 @@ OF_SOLVER = as_in_runs("family", "reference", "minimises", "own_steps")
 """What a solver states of itself."""
 
 PROVENANCE = as_in_runs(
-    *("machine", "cpu", "cores", "memory_gib", "system", "versions", "commit", "code", "started"),
+    *("machine", "node", "cpu", "cores", "memory_gib", "system", "versions", "commit", "code", "started"),
 )
 """Where, when and by which code something was measured."""

@@ -46,19 +46,26 @@ class Mark(NamedTuple):
     """How one solver is drawn: a colour, a matplotlib marker and a matplotlib line style."""
 
     color: str
-    marker: str
+    marker: Any
     dash: Any = "-"
 
 
 DASHED, DOTTED, DASH_DOTTED = (0, (5, 2)), (0, (1, 1.6)), (0, (6, 2, 1, 2))
 _DASHES = ("-", DASHED, DOTTED, DASH_DOTTED)
 
-_MARKERS = ("s", "o", "D", "^", "v", "P", "X", "p", "*", "<", ">", "h", "d", "H", "8")
+STARS: tuple[Any, ...] = ((4, 1, 0), (6, 1, 0), (3, 1, 0), (8, 1, 0), (3, 1, 180))
+"""Of four, six, three, eight and three points, the last upside down."""
+_MARKERS: tuple[Any, ...] = ("s", "o", "D", "^", "v", "P", "X", "p", "*", "<", ">", "h", "d", "H", "8", *STARS)
 
 # Okabe and Ito's palette, less its yellow and black, and four more: for families in the order of the registry.
 _FAMILIES = ("#0072b2", "#00a878", "#e69f00", "#d55e00", "#9a86e0", "#cc79a7", "#a8326e", "#858585")
 _MEMBERS: tuple[tuple[float, Any], ...] = ((0.0, "-"), (-0.25, DASHED), (0.4, "-"), (0.2, DASH_DOTTED))
 """How much lighter the members of a family are drawn, or darker where negative, and in which line style."""
+_MANY: tuple[tuple[float, Any], ...] = (
+    *((0.0, "-"), (-0.25, DOTTED), (0.3, (0, (10, 3))), (-0.4, (0, (3, 1, 1, 1, 1, 1)))),
+    *((0.15, (0, (8, 2, 2, 2, 2, 2))), (-0.15, (0, (1, 3))), (0.3, (0, (12, 2, 1, 2)))),
+)
+"""The same for a family of more than four, in line styles that no other has."""
 _STRANGERS = ("#8a8a00", "#00a0a0", "#8c564b", "#4c6ef5", "#5a9e2f", "#c9506b")
 
 
@@ -87,7 +94,7 @@ def _shipped() -> dict[str, Mark]:
     return {
         name: Mark(shade(color, by), markers[name], dash)
         for color, members in zip(_FAMILIES, families.values(), strict=False)
-        for name, (by, dash) in zip(members, _MEMBERS, strict=False)
+        for name, (by, dash) in zip(members, _MEMBERS if len(members) <= len(_MEMBERS) else _MANY, strict=False)
         if name in markers
     }
 

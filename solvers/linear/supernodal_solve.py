@@ -164,9 +164,10 @@ def _share(factor, b, out, first):
 
 
 @inner_in_parallel
-def _side_by_side(factor, b, out, threads):
-    for thread in prange(threads):
-        _share(factor, b, out, thread * (len(factor.spans) - 1) // threads)
+def _side_by_side(squares, panels, places, chunks, spans, by_slot, by_vertex, work, team, b, out, threads):
+    for thread in prange(threads):  # which takes no tuple with another in it
+        whole = Factor(squares, panels, places, chunks, spans, by_slot, by_vertex, work, team)
+        _share(whole, b, out, thread * (len(spans) - 1) // threads)
 
 
 @inner
@@ -176,7 +177,8 @@ def solve(factor, b, out, threads):
     if threads is None:
         _share(factor, b, out, 0)
     else:
-        _side_by_side(factor, b, out, threads)
+        f = factor
+        _side_by_side(f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f.team, b, out, threads)
 
 
 @kernel

@@ -9,6 +9,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from numba.core import config
 
 from harness.config.load import scene_from_assignment
 from harness.scenes.bind import Scene, build
@@ -110,7 +111,7 @@ def assignment_scene(name: str) -> Scene:
     return build(scene_from_assignment(ASSIGNMENT / f"{name}.json"), 0)
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="Numba was started with one thread")
+@pytest.mark.skipif(config.NUMBA_NUM_THREADS < 2, reason="Numba was started with one thread")
 @pytest.mark.parametrize("name", ["chain", "stiff-cloth", "block", "skirt"])
 def test_the_compiled_backend_gives_the_same_bits_with_any_number_of_threads(name):
     problem = first_problem(SCENES[name](1e10))

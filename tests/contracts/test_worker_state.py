@@ -55,6 +55,7 @@ def answer(tick: Tick) -> bytes:
     return bytes(2**16)
 
 
+@pytest.mark.long
 def test_the_memory_of_the_process_that_asks_stays_flat():
     """64 KiB an answer: kept, the second thousand would be 64 MiB."""
     sizes = list[int]()

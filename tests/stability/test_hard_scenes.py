@@ -13,6 +13,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from numba.core import config
 
 from harness.config.load import load_scene, load_sweep
 from harness.reference.oracle import Oracle
@@ -127,7 +128,7 @@ LARGE = {"geometry-collapsed": 48, "geometry-random": 48, "motion-pins-shake": 4
 """Cases at sizes that have work for two threads."""
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="Numba was started with one thread")
+@pytest.mark.skipif(config.NUMBA_NUM_THREADS < 2, reason="Numba was started with one thread")
 @pytest.mark.parametrize("solver", SPLIT.values(), ids=list(SPLIT))
 @pytest.mark.parametrize(
     ("case", "size"),
@@ -162,7 +163,7 @@ def test_a_factor_in_single_precision_leaves_the_motion_where_it_was(case: str):
 def test_the_sweep_runs_every_case_by_every_solver():
     sweep = load_sweep(CONFIGS / "hard.yaml")
     asked = {(run.scene_name, run.solver.name) for run in sweep.runs()}
-    assert asked == {(case, name) for case in CASES for name in EVERY}
+    assert asked == {(case, name) for case in CASES for name in EVERY.keys() - ALIKE}
     assert len(CASES) >= 60
     assert {run.solver.parameters["precision"] for run in sweep.runs() if run.solver.name == "numba"} == {
         "float32",

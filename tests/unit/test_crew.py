@@ -25,7 +25,7 @@ def refuse(tick: Tick) -> None:
 
 def patient(tick: Tick) -> str:
     with aside(tick, WAITING):
-        sleep(0.6)
+        sleep(3.0)
     return "done"
 
 
@@ -57,7 +57,7 @@ def test_an_error_that_ends_an_experiment_ends_it():
 
 def test_what_a_piece_waits_for_others_does_not_count_for_its_limit():
     workers = Workers()
-    assert workers.do(patient, quiet, Limits(seconds=0.4)) == "done"
+    assert workers.do(patient, quiet, Limits(seconds=2.5)) == "done"
     workers.end()
 
 

@@ -22,7 +22,7 @@ from harness.report.accuracy.measured import Curve, Measurements, WorkPoint, ste
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
 from harness.report.references import cited
-from harness.report.style import DASH_DOTTED, DASHED, DOTTED, Mark, looks
+from harness.report.style import DASH_DOTTED, DASHED, DOTTED, STARS, Mark, looks
 
 Item = dict[str, Any]
 
@@ -30,6 +30,8 @@ _SYMBOLS = {
     "o": "circle", "s": "square", "^": "triangle-up", "v": "triangle-down", "<": "triangle-left",
     ">": "triangle-right", "D": "diamond", "d": "diamond-tall", "P": "cross", "X": "x", "p": "pentagon",
     "h": "hexagon", "*": "star", "H": "hexagon2", "8": "octagon",
+    STARS[0]: "star-diamond", STARS[1]: "hexagram", STARS[2]: "star-triangle-up", STARS[3]: "star-square",
+    STARS[4]: "star-triangle-down",
 }  # fmt: skip
 _DASHES = {"-": "solid", DASHED: "dash", DOTTED: "dot", DASH_DOTTED: "dashdot"}
 
