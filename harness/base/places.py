@@ -36,6 +36,8 @@ ROWS = ("rows", "accuracy", "ablation")
 
 def parse(value: str | Path) -> Path | str:
     """A path, which a default is already, or a URL as it stands."""
+    if "\0" in str(value):
+        raise typer.BadParameter("holds NUL, which no path and no URL can")
     return value if isinstance(value, Path) or "://" in value else Path(value)
 
 

@@ -29,6 +29,8 @@ _PAGE = 2**16
 
 _broken: list[rr.RecordingStream] = []
 """Streams whose writing thread has died."""
+_LOADED_IN = os.getpid()
+"""The process that loaded this; the streams of its own do not survive in a fork of it."""
 
 
 class PartialFile:
@@ -40,7 +42,7 @@ class PartialFile:
     def __init__(self, path: Path, application: str, recording_id: str, title: str) -> None:
         self._path, self._broken = path, False
         self._partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.rrd")
-        if not _broken:  # else this would wait for ever
+        if not _broken and os.getpid() == _LOADED_IN:  # else this would wait for ever, or refuse
             rerun_bindings.flush_and_cleanup_orphaned_recordings()  # the library keeps two threads of each until then
         rr.set_strict_mode(True)  # without it a wrong shape is swallowed and logged as nothing
         self.stream = rr.RecordingStream(
