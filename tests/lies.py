@@ -17,7 +17,7 @@ from harness.scenes.mesh.table import MESHES
 from harness.scenes.spec import SceneSpec
 from harness.simulation.opinion.second import second_opinion
 from solvers.contact.energy import Contact
-from solvers.integrators import INTEGRATORS
+from solvers.integrators import INTEGRATORS, Integrator
 from solvers.problem import Positions, System
 from solvers.registry import load
 
@@ -172,7 +172,9 @@ def predicted(name: str, target: float = 1.0, origin: float = 1.0) -> Callable[[
     """The target or the origin of an integrator, by how much of the way that it leads from the positions."""
 
     def tell(patch: pytest.MonkeyPatch) -> None:
-        true = INTEGRATORS[name].predict
+        integrator = INTEGRATORS[name]
+        assert isinstance(integrator, Integrator)
+        true = integrator.predict
 
         def lying(now: Any, before: Any, dt: float) -> tuple[Positions, Positions]:
             p, (aim, began) = now.positions, true(now, before, dt)

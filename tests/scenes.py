@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from harness.scenes.spec import MeshSource, SceneSpec
 from harness.simulation.step import problem, simulate, start
 from solvers.energies.springs import Springs
 from solvers.energies.strain_limits import StrainLimits
+from solvers.integrators import Integrator
 from solvers.methods.local_global import DenseLocalGlobal, SparseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Pins, Positions, Solver, Start, StepProblem, StopRule, System
@@ -177,3 +179,13 @@ def moved(problem: StepProblem, by: float, stiffer: float = 1.0) -> StepProblem:
     )
     arrays = {name: getattr(problem, name) + by for name in names}
     return replace(problem, system=replace(problem.system, energies=energies), **arrays)
+
+
+def of_one_unknown(made: Scene) -> Integrator:
+    """A scene's integrator, which solves for the positions at the step's end alone."""
+    assert isinstance(made.integrator, Integrator)
+    return made.integrator
+
+
+THREADS = min(len(os.sched_getaffinity(0)), int(os.environ.get("NUMBA_NUM_THREADS") or 1024))
+"""How many Numba has: to ask it would start them, and a process in which they run is not forked."""

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Numba tells no types.
 """What a piece of work does beside its steps, said on the way that its steps are told: compiling, and waiting.
 
 The time of it is no measure of the work, so whoever foretells an end leaves it out; and whoever limits a piece leaves
@@ -6,7 +8,7 @@ out what it waited.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 
 COMPILING, WAITING, LOOK = "compiling (once)", "waiting for the machine", ""
@@ -18,7 +20,7 @@ Tick = Callable[[str], None]
 
 
 @contextmanager
-def aside(tick: Tick, what: str) -> Iterator[None]:
+def aside(tick: Tick, what: str) -> Generator[None]:
     """Say that something else than a step goes on, as long as it does."""
     tick(_BEGIN + what)
     try:
@@ -43,7 +45,7 @@ def is_step(said: str) -> bool:
 
 
 @contextmanager
-def compiling_told(tick: Tick) -> Iterator[None]:
+def compiling_told(tick: Tick) -> Generator[None]:
     """Say of kernels when they are compiled within this; those that are found on disk are not."""
     from numba.core import event  # where nothing is compiled, nobody waits for it
 

@@ -72,7 +72,7 @@ class _Child:
 
     def __init__(self) -> None:
         paths = [path or os.getcwd() for path in sys.path]
-        settings = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
+        settings: dict[str, str] = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
         settings["ARROW_DEFAULT_MEMORY_POOL"] = "system"  # others reserve a GiB at once, which counts as taken
         self._owner = os.getpid()
         self._process = subprocess.Popen(

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from multiprocessing.connection import wait
+from itertools import chain
+from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
 from harness.base.workers import Going, Limits, Lost, Piece, Tick, Workers
@@ -45,7 +46,9 @@ class _Member:
         self.workers.end()
 
 
-def done_by(members: int, ready: Callable[[], object], groups: Iterable[Hashable], start: Start) -> Iterator[Any]:
+def done_by(
+    members: int, ready: Callable[[], object], groups: Iterable[Hashable], start: Start
+) -> Iterator[tuple[int, Any]]:
     """Do tasks by so many workers; yields (number, value or Lost) of each that is done, in that order.
 
     ready: called in each worker before anything else; groups: of the tasks, by number; start: see there, called when a
@@ -66,7 +69,7 @@ def done_by(members: int, ready: Callable[[], object], groups: Iterable[Hashable
             going = [member for member in crew if member.going]
             if not going:
                 return
-            pipes = []
+            pipes = list[Connection]()
             for member in going:
                 assert member.going
                 try:
@@ -84,8 +87,7 @@ def done_by(members: int, ready: Callable[[], object], groups: Iterable[Hashable
 
 def _next(left: dict[int, Hashable], member: _Member, others: list[Hashable]) -> int:
     """The next task of the worker's own group, else of one that nobody is at, else any."""
-    for wanted in (lambda group: group == member.group, lambda group: group not in others):
-        for number, group in left.items():
-            if group is not None and wanted(group):
-                return number
-    return next(iter(left))
+    grouped = {number: group for number, group in left.items() if group is not None}
+    own = (number for number, group in grouped.items() if group == member.group)
+    new = (number for number, group in grouped.items() if group not in others)
+    return next(chain(own, new, left))

@@ -14,7 +14,7 @@ from __future__ import annotations
 import fcntl
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import sleep
@@ -26,14 +26,14 @@ _PAUSE = 0.02
 
 
 @contextmanager
-def alone(tick: Tick) -> Iterator[None]:
+def alone(tick: Tick) -> Generator[None]:
     """Be the only one on the machine. tick: is told while this waits."""
     with _held("wanted", fcntl.LOCK_SH, tick), _held("used", fcntl.LOCK_EX, tick):
         yield
 
 
 @contextmanager
-def beside(tick: Tick) -> Iterator[None]:
+def beside(tick: Tick) -> Generator[None]:
     """Compute while nobody is timed. tick: is told while this waits."""
     with _held("wanted", fcntl.LOCK_EX, tick):  # nobody who would be timed waits
         used = _locked("used", fcntl.LOCK_SH, tick)
@@ -44,7 +44,7 @@ def beside(tick: Tick) -> Iterator[None]:
 
 
 @contextmanager
-def own_cores(number: int, tick: Tick) -> Iterator[list[int]]:
+def own_cores(number: int, tick: Tick) -> Generator[list[int]]:
     """Compute beside others, kept to so many cores that are nobody else's, by number. Raises ValueError where this
     process may not use as many."""
     mine = sorted(os.sched_getaffinity(0))
@@ -91,7 +91,7 @@ def _keep_to(cores: set[int]) -> None:
 
 
 @contextmanager
-def _held(name: str, how: int, tick: Tick) -> Iterator[None]:
+def _held(name: str, how: int, tick: Tick) -> Generator[None]:
     lock = _locked(name, how, tick)
     try:
         yield

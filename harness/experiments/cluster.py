@@ -1,3 +1,6 @@
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# pyright: reportMissingTypeArgument=false, reportUnknownParameterType=false
+# Dask tells no types.
 """Runs on many machines, by Dask: each is a task, done in a process of its own on whichever worker is free.
 
 A worker does one run after the other; workers of one machine wait for each other while one is timed
@@ -12,7 +15,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.metadata import version
@@ -85,7 +88,7 @@ class Cluster(NamedTuple):
 
 
 @contextmanager
-def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Iterator[Cluster]:
+def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Generator[Cluster]:
     """The workers of the scheduler at an address, so many on this machine (`local:4`), or those that a file asks of a
     batch system. Raises InputError where there is none, or none that can do the runs."""
     with scheduler(on) as address:

@@ -92,7 +92,7 @@ def do_all(todo: Sequence[Unit], display: Display, *, isolated: bool = True, at_
         groups = [unit.group if isinstance(unit, Sharing) else None for unit in todo]
         tables = [dict(table) for table in TABLES]
         for number, outcome in done_by(at_once, partial(ready, tables), groups, start):
-            told = todo[number].lost(outcome) if isinstance(outcome, Lost) else outcome
+            told: str = todo[number].lost(outcome) if isinstance(outcome, Lost) else outcome
             runs.pop(number).finished(told)
     finally:
         display.end()

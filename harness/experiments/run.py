@@ -6,7 +6,7 @@ final positions must equal the timed ones to the last bit. The rows are written 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -89,7 +89,7 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
 
 
 @contextmanager
-def _timed(run: RunSpec, tick: Tick) -> Iterator[dict[str, Any]]:
+def _timed(run: RunSpec, tick: Tick) -> Generator[dict[str, Any]]:
     """How the run is timed, as columns: alone on the machine, or on cores of its own."""
     if run.timing == "exclusive":
         with alone(tick):

@@ -1,9 +1,11 @@
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# Dask and ruamel.yaml tell no types.
 """Where a scheduler of Dask is: at an address, on this machine, or started by a batch system that a file describes."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -24,7 +26,7 @@ _SILENCE = logging.CRITICAL
 
 
 @contextmanager
-def scheduler(on: str) -> Iterator[Any]:
+def scheduler(on: str) -> Generator[Any]:
     """An address as it stands, or the cluster that is started for as long. Raises InputError."""
     kind, _, many = on.partition(":")
     if kind == "local":

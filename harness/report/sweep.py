@@ -76,7 +76,7 @@ def draw_sweep(
 def _drawn(wanting: Sequence[Pictured], at_once: int) -> Iterator[str]:
     """Draw pictures of runs, and say of those that are lost why they are."""
     tasks = [Task(partial(_draw, p), _silent, Limits()) for p in wanting]
-    for number, outcome in done_by(at_once, int, [None] * len(tasks), tasks.__getitem__):
+    for number, outcome in done_by(at_once, int, [None] * len(tasks), lambda number: tasks[number]):
         if isinstance(outcome, Lost):
             yield f"{wanting[number].picture} is not drawn: its process {outcome}"
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-from numba.core import config
 
 from harness.config.load import scene_from_assignment
 from harness.scenes.bind import Scene, build
@@ -19,7 +18,7 @@ from solvers.linear.choice import Linear
 from solvers.methods.local_global import DenseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, Solver
-from tests.scenes import BACKENDS, SCENES, first_problem, random_problem, trajectory
+from tests.scenes import BACKENDS, SCENES, THREADS, first_problem, random_problem, trajectory
 
 FORCED: tuple[Linear, ...] = ("inverse", "cholespy", "supernodal", "cg")
 WAYS: tuple[Solver, ...] = (*BACKENDS, *(CompiledLocalGlobal(linear) for linear in FORCED))
@@ -111,7 +110,7 @@ def assignment_scene(name: str) -> Scene:
     return build(scene_from_assignment(ASSIGNMENT / f"{name}.json"), 0)
 
 
-@pytest.mark.skipif(config.NUMBA_NUM_THREADS < 2, reason="Numba was started with one thread")
+@pytest.mark.skipif(THREADS < 2, reason="Numba was started with one thread")
 @pytest.mark.parametrize("name", ["chain", "stiff-cloth", "block", "skirt"])
 def test_the_compiled_backend_gives_the_same_bits_with_any_number_of_threads(name):
     problem = first_problem(SCENES[name](1e10))

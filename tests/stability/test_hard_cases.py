@@ -14,7 +14,7 @@ from harness.scenes.bind import Scene
 from harness.simulation.step import State, problem
 from solvers.integrators import Motion
 from solvers.problem import Pins, Positions, Solver, StopRule, System
-from tests.scenes import BACKENDS, SCENES, cloth, first_problem, static_shape, trajectory
+from tests.scenes import BACKENDS, SCENES, cloth, first_problem, of_one_unknown, static_shape, trajectory
 
 backends = pytest.mark.parametrize("backend", BACKENDS, ids=lambda b: type(b).__name__)
 
@@ -113,7 +113,7 @@ def test_a_hard_case_descends_stays_finite_and_near(case: Case, backend: Solver)
         assert np.abs(p).max() <= case.reach
         slack = VALUE * stated.magnitude(stated.first_guess)
         assert stated.value(p) <= stated.value(stated.first_guess) + slack
-        state = State(made.integrator.advance(stated.start, solution), state.now, index)
+        state = State(of_one_unknown(made).advance(stated.start, solution), state.now, index)
 
 
 @cases

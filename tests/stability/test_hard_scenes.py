@@ -13,7 +13,6 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-from numba.core import config
 
 from harness.config.load import load_scene, load_sweep
 from harness.reference.oracle import Oracle
@@ -23,7 +22,7 @@ from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, Solver, StepProblem, StopRule, Unsupported
 from solvers.registry import EVERY, SOLVERS, load
 from solvers.round_off import gradient_round_off
-from tests.scenes import far
+from tests.scenes import THREADS, far, of_one_unknown
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 CASES = {path.stem: path for path in sorted((CONFIGS / "hard").glob("*.yaml"))}
@@ -114,7 +113,7 @@ def test_a_hard_scene_is_refused_by_name_or_stays_finite_descends_and_repeats_it
         assert np.isfinite(solution.positions).all()
         if frame == 1:
             np.testing.assert_array_equal(again.solve(stated, StopRule(ITERATIONS)).positions, solution.positions)
-        state = State(made.integrator.advance(stated.start, solution), state.now, frame)
+        state = State(of_one_unknown(made).advance(stated.start, solution), state.now, frame)
 
 
 def steps(made: Scene, solver: Solver, iterations: int) -> list[Step]:
@@ -128,7 +127,7 @@ LARGE = {"geometry-collapsed": 48, "geometry-random": 48, "motion-pins-shake": 4
 """Cases at sizes that have work for two threads."""
 
 
-@pytest.mark.skipif(config.NUMBA_NUM_THREADS < 2, reason="Numba was started with one thread")
+@pytest.mark.skipif(THREADS < 2, reason="Numba was started with one thread")
 @pytest.mark.parametrize("solver", SPLIT.values(), ids=list(SPLIT))
 @pytest.mark.parametrize(
     ("case", "size"),

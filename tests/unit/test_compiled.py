@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numba import types
-from numba.core import config
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
@@ -26,7 +25,7 @@ from solvers.methods.local_global import SparseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, StepProblem, StopRule
 from solvers.vectors.springs import WIDE, Eights
-from tests.scenes import cloth, first_problem, random_network, random_problem
+from tests.scenes import THREADS, cloth, first_problem, random_network, random_problem
 
 LINEAR: tuple[Linear, ...] = ("inverse", "supernodal")
 PRECISIONS: tuple[Precision, ...] = ("float64", "float32", "float16")
@@ -187,7 +186,7 @@ def test_blocks_change_nothing_but_the_order_of_work(solver, size, monkeypatch):
     np.testing.assert_array_equal(found, iterates(cut, problem, 12)[-1])
 
 
-@pytest.mark.skipif(config.NUMBA_NUM_THREADS < 2, reason="Numba was started with one thread")
+@pytest.mark.skipif(THREADS < 2, reason="Numba was started with one thread")
 @pytest.mark.parametrize("solver", DIRECT[3:], ids=named)
 @pytest.mark.parametrize("stop", [StopRule(10), StopRule(200, 0.3)], ids=["count", "tolerance"])
 def test_the_bits_do_not_depend_on_the_number_of_threads(solver, stop):
