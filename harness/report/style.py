@@ -74,7 +74,7 @@ def marks(solvers: Iterable[str] = ()) -> dict[str, Mark]:
 
     What other solvers get follows from their names; where two would get the same, the later by alphabet gets the next.
     """
-    looks = dict(_shipped())
+    looks = dict(_shipped((*SOLVERS, *OPTIONAL)))
     free = [Mark(color, marker, dash) for dash in _DASHES for color in _STRANGERS for marker in _MARKERS]
     taken: set[Mark] = set()
     for name in sorted({*SOLVERS, *OPTIONAL, *solvers} - set(looks)):
@@ -85,12 +85,12 @@ def marks(solvers: Iterable[str] = ()) -> dict[str, Mark]:
 
 
 @cache
-def _shipped() -> dict[str, Mark]:
+def _shipped(names: tuple[str, ...]) -> dict[str, Mark]:
     """The marks of the registry's solvers: the colour of their family, a marker of their own; as many as there are."""
     families: dict[str, list[str]] = {}
-    for name, target in (SOLVERS | OPTIONAL).items():
-        families.setdefault(about(load(target), name).family, []).append(name)
-    markers = dict(zip((*SOLVERS, *OPTIONAL), _MARKERS, strict=False))
+    for name in names:
+        families.setdefault(about(load((SOLVERS | OPTIONAL)[name]), name).family, []).append(name)
+    markers = dict(zip(names, _MARKERS, strict=False))
     return {
         name: Mark(shade(color, by), markers[name], dash)
         for color, members in zip(_FAMILIES, families.values(), strict=False)
