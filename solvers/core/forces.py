@@ -10,10 +10,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import ArpackError, eigsh
 
 from solvers import matrices
+from solvers.core.driver import Iterating
 from solvers.energies.quadratic import Quadratic, Viscous
 from solvers.energies.springs import Springs
 from solvers.kernels.forms import Form
+from solvers.kernels.loop import ITERATIONS, Limits
 from solvers.kernels.springs import Bundles
+from solvers.memory import aligned
 from solvers.problem import LaggedEnergy, Positions, System, Unsupported
 
 _ABOVE = 1.02
@@ -79,3 +82,31 @@ class Parts:
         return cls(
             springs, bundles, form.pairs, form.weight, form.held if form.held.any() else form.held[:0], drag, load
         )
+
+
+_FAR = 1e100
+"""Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
+
+
+def rows_of_four(x: Positions, *, far: bool = False) -> NDArray[np.float64]:
+    """x (n, 3) in rows of four, and the two rows that fill up bundles; far: the last one is where no vertex is."""
+    out = aligned(4 * (len(x) + 2))
+    out.reshape(-1, 4)[: len(x), :3] = x
+    if far:
+        out[4 * (len(x) + 1)] = _FAR
+    return out
+
+
+class Whole(Iterating):
+    """A whole step as the only iterate, again and again."""
+
+    def __init__(self, p: Positions, v: Positions) -> None:
+        self.positions, self.velocity = p, v
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        return True
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating."""
+        return 1, float("nan"), ITERATIONS

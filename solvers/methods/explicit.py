@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from solvers.about import About, Reference
 from solvers.core import vertex_terms
 from solvers.core.driver import Iterating, Iterative
-from solvers.core.forces import Parts, frequency
+from solvers.core.forces import Parts, Whole, frequency, rows_of_four
 from solvers.kernels.explicit_steps import Forces, compose, integrate
-from solvers.kernels.loop import ITERATIONS, Limits
 from solvers.memory import aligned
 from solvers.methods.explicit_tables import (
     BLANES_MOAN_4,
@@ -43,8 +42,6 @@ _MOST = 1e9
 """Springs that a step may go through, some seconds: compiled code cannot be interrupted meanwhile."""
 _TRIED = 20
 """Steps that may be tried to keep to an error, for each that is stable."""
-_FAR = 1e100
-"""Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
 
 
 @dataclass(frozen=True)
@@ -228,7 +225,7 @@ class PreparedExplicit(Iterative):
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """The whole step."""
-        return _Done(*self.step(problem)[:2])
+        return Whole(*self.step(problem)[:2])
 
     def refined(self, times: int) -> PreparedExplicit:
         """The same with so many times the substeps."""
@@ -238,10 +235,9 @@ class PreparedExplicit(Iterative):
         """Positions and velocities (n, 3) at the step's end, and what `integrate` tells."""
         s, pins, start, frame = self.system, self.system.pins.vertices, problem.start, self.system.time_step
         begin, end = np.ascontiguousarray(start.positions[pins]), problem.pin_targets.copy()
-        p, v = self._rows(start.positions), self._rows(start.velocity)
+        p, v = rows_of_four(start.positions, far=True), rows_of_four(start.velocity)
         v.reshape(-1, 4)[pins] = 0.0
-        p[4 * (s.vertices + 1)] = _FAR
-        force = self._rows(problem.force + self.parts.load)
+        force = rows_of_four(problem.force + self.parts.load)
         inverse = np.divide(1.0, s.mass, out=np.zeros(s.vertices), where=s.unpinned)
         right, x = self.parts.bundles.right(np.zeros(s.vertices + 2), force), self.parts
         forces = Forces(x.bundles, right, x.pairs, x.weight, x.held, inverse, x.drag, pins.copy(), begin, end)
@@ -279,22 +275,3 @@ class PreparedExplicit(Iterative):
                 f"{told[2]:.3g} s: after {told[3]:.6g} of {frame:.6g} s of the frame the forces are too sudden, or "
                 "round-off is larger; ask for a larger error"
             )
-
-    def _rows(self, x: Positions) -> NDArray[np.float64]:
-        """x (n, 3) in rows of four, and the two rows that fill up bundles."""
-        out = aligned(4 * (self.system.vertices + 2))
-        out.reshape(-1, 4)[: self.system.vertices, :3] = x
-        return out
-
-
-class _Done(Iterating):
-    """The only iterate, again and again."""
-
-    def __init__(self, p: Positions, v: Positions) -> None:
-        self.positions, self.velocity = p, v
-
-    def advance(self) -> bool:
-        return True
-
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        return 1, float("nan"), ITERATIONS

@@ -19,17 +19,15 @@ from math import ceil
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from solvers.about import About, Reference
 from solvers.core import vertex_terms
 from solvers.core.driver import Iterating, Iterative
+from solvers.core.forces import Whole, rows_of_four
 from solvers.core.prefactored import only_springs
 from solvers.energies.springs import Springs
 from solvers.kernels.explicit import advance
-from solvers.kernels.loop import ITERATIONS, Limits
 from solvers.kernels.springs import Bundles
-from solvers.memory import aligned
 from solvers.problem import Positions, ResidualOf, StepProblem, System, Unsupported
 
 _SAFETY = 0.95
@@ -37,9 +35,6 @@ _SAFETY = 0.95
 
 _MOST = 1e10
 """Springs that a step may go through, some tens of seconds: compiled code cannot be interrupted meanwhile."""
-
-_FAR = 1e100
-"""Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
 
 
 @dataclass(frozen=True)
@@ -106,39 +101,18 @@ class PreparedSymplecticEuler(Iterative):
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """See Iterative; the whole step."""
-        return _Done(*self._step(problem))
+        return Whole(*self._step(problem))
 
     def _step(self, problem: StepProblem) -> tuple[Positions, Positions]:
         s, pins, start = self.system, self.system.pins.vertices, problem.start
         h = s.time_step / self.substeps
         rate = np.divide(h, s.mass, out=np.zeros(s.vertices), where=s.unpinned)
         begin, end = start.positions[pins], problem.pin_targets.copy()
-        p, v, force = (self._rows(x) for x in (start.positions, start.velocity, problem.force))
+        p = rows_of_four(start.positions, far=True)
+        v, force = rows_of_four(start.velocity), rows_of_four(problem.force)
         v.reshape(-1, 4)[pins] = 0.0
-        p[4 * (s.vertices + 1)] = _FAR
         force = self.bundles.right(np.zeros(s.vertices + 2), force)
         advance(self.bundles, pins.copy(), begin, end, force, rate, h, self.substeps, p, v, np.zeros_like(v))
         velocity = v.reshape(-1, 4)[: s.vertices, :3].copy()
         velocity[pins] = (end - begin) / s.time_step
         return p.reshape(-1, 4)[: s.vertices, :3].copy(), velocity
-
-    def _rows(self, x: Positions) -> NDArray[np.float64]:
-        """x (n, 3) in rows of four, and the two rows that fill up bundles."""
-        out = aligned(4 * (self.system.vertices + 2))
-        out.reshape(-1, 4)[: self.system.vertices, :3] = x
-        return out
-
-
-class _Done(Iterating):
-    """The only iterate, again and again."""
-
-    def __init__(self, p: Positions, v: Positions) -> None:
-        self.positions, self.velocity = p, v
-
-    def advance(self) -> bool:
-        """See Iterating."""
-        return True
-
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating."""
-        return 1, float("nan"), ITERATIONS
