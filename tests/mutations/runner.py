@@ -25,6 +25,7 @@ OUTCOMES = Path(__file__).with_name("outcomes.json")
 LONGEST = 600.0
 """Seconds after which tests count as hanging, which is noticed too."""
 WHOLE = 3600.0
+PYTEST = ("-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-n", "0")
 CAUGHT, SURVIVED, BROKEN = "caught", "survived", "broken"
 
 
@@ -128,8 +129,7 @@ def examine(copy: Copy, lie: Mutation, *, whole: bool = False) -> Outcome:
     began = monotonic()
     with copy.planted(lie):
         chosen = ["tests"] if whole else list(lie.tests)
-        plain = ["-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", *chosen]
-        code, told = copy.told(lie, plain, WHOLE if whole else LONGEST)
+        code, told = copy.told(lie, [*PYTEST, *chosen], WHOLE if whole else LONGEST)
         tests = {0: SURVIVED, 1: CAUGHT, -1: CAUGHT}.get(code, BROKEN)
         product = ""
         if lie.product and not whole:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from tests.mutations.base import ROOT, Mutation, Stale
+from tests.mutations.runner import PYTEST
 from tests.mutations.table import TABLE
 
 
@@ -26,6 +29,12 @@ def test_each_can_be_planted_and_names_tests_that_exist(lie: Mutation):
     for test in lie.tests:
         path, _, name = test.partition("::")
         assert f"def {name or 'test_'}" in (ROOT / path).read_text()
+
+
+def test_the_command_that_runs_them_is_one_that_pytest_knows():
+    command = [sys.executable, *PYTEST, "--collect-only", "tests/unit/test_round_off.py"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_what_stands_elsewhere_or_twice_is_refused(tmp_path: Path):
