@@ -22,9 +22,6 @@ from solvers.registry import minimises
 SLACK = 10.0
 """A residual may be measured with a factor of few digits, or with a preconditioner that is like Q."""
 
-LARGEST = 50_000
-"""Vertices up to which the oracle's factor takes seconds at most, on solids too."""
-
 _SAME = 1e-9
 """Of the largest coordinate, what two sums of the same terms may differ by after many iterations."""
 
@@ -47,7 +44,7 @@ class Graded(Passing):
         found = self._prepared.solve(problem, stop)
         if problem.start.time > self._begun:  # the first unknown of the next frame
             self._done, self._begun = self._done + 1, problem.start.time
-        if self._done in self._frames and np.isfinite(found.positions).all() and len(problem.target) <= LARGEST:
+        if self._done in self._frames and np.isfinite(found.positions).all():
             graded = self._graded(problem, found, stop)
             self.found[self._done] = max(graded, self.found.get(self._done, graded), key=lambda row: row["graded"])
         return found

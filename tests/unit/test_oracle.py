@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from harness.config.load import load_scene
+from harness.reference import oracle as oracle_module
 from harness.reference.judge import Judge
 from harness.reference.minimiser import polish
 from harness.reference.oracle import Oracle, component_sizes, sizes, stiffness
@@ -85,6 +86,16 @@ def test_a_scene_at_rest_is_stationary_by_round_off_alone():
     oracle = Oracle(made.system)
     assert oracle.stationarity(at_rest, p).beyond == 0.0
     assert oracle.stationarity(at_rest, p).reached <= 1.0
+
+
+@pytest.mark.parametrize("name", ["geometry-random-stiff-block", "numbers-mass-ratio-1e8", "topology-components"])
+def test_of_large_systems_conjugate_gradients_give_nearly_the_same_and_never_more(
+    name: str, monkeypatch: pytest.MonkeyPatch
+):
+    made, stated = case(name)
+    exact = Oracle(made.system).residual(stated, stated.current)
+    monkeypatch.setattr(oracle_module, "LARGEST", 0)
+    assert 0.9 * exact <= Oracle(made.system).residual(stated, stated.current) <= exact * (1 + 1e-9)
 
 
 def test_what_overflows_is_not_stationary():
