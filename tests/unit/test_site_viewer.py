@@ -1,0 +1,95 @@
+"""Recordings replayed in a page: the viewer's version, what its scripts hold, and both in a real browser."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import os
+import shutil
+from base64 import b64decode
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.report.site import viewer
+from tests.browser import chromium
+from tests.recordings import record
+
+REPLAY = Path(viewer.__file__).parent / "static" / "replay.js"
+PAGE = '<!doctype html><html lang="en"><title>t</title><body><script src="site/replay.js"></script></body></html>'
+
+
+def test_the_viewer_is_the_one_that_the_page_was_written_for():
+    words = "open recordings in it (pytest -m long tests/unit/test_site_viewer.py), then raise VERSION"
+    assert version("rerun-sdk") == viewer.VERSION, words
+
+
+def test_a_script_holds_its_recording_and_is_written_once(tmp_path: Path):
+    recording = record(tmp_path / "a.rrd", count=3)
+    script = viewer.write_recording(recording, tmp_path / "site" / "a.js", 'cloth "6"')
+    name, value = script.read_text().removesuffix(";\n").split(" = ", 1)
+    told = json.loads(value)
+    assert (name, told["title"]) == ("springbench.taken", 'cloth "6"')
+    assert gzip.decompress(b64decode(told["rrd"])) == recording.read_bytes()
+    made = script.stat().st_mtime_ns
+    viewer.write_recording(recording, script, "other")
+    assert script.stat().st_mtime_ns == made
+    os.utime(recording, ns=(made + 1, made + 1))
+    viewer.write_recording(recording, script, "newer")
+    assert '"newer"' in script.read_text()
+
+
+def site(folder: Path) -> Path:
+    """A page that can replay, without the viewer."""
+    (folder / "site").mkdir()
+    shutil.copy(REPLAY, folder / "site")
+    viewer.write_recording(record(folder / "a.rrd"), folder / "site" / "a.js", "cloth 6")
+    (folder / "index.html").write_text(PAGE)
+    return folder / "index.html"
+
+
+def colours(picture: bytes) -> int:
+    """How many different colours are in a PNG."""
+    from PIL import Image
+
+    return len(np.unique(np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).reshape(-1, 3), axis=0))
+
+
+@pytest.mark.long
+def test_a_page_replays_recordings_from_the_file_system_and_says_what_it_lacks(tmp_path: Path):
+    page = site(tmp_path)
+    ask = "([script, file]) => springbench.replay('id', script, {file})"
+    with chromium() as browser:
+        tab, said, asked = browser.new_page(viewport={"width": 1280, "height": 800}), [], []
+        tab.on("console", lambda message: said.append(message.text))
+        tab.on("request", lambda request: asked.append(request.url))
+        tab.goto(page.as_uri())
+        assert asked == [page.as_uri(), (page.parent / "site" / "replay.js").as_uri()], "nothing heavy before a click"
+        assert not tab.evaluate(ask, ["site/a.js", "a.rrd"])
+        for words in ("The viewer is not part of this report", f"springbench view {tmp_path / 'a.rrd'}"):
+            assert tab.get_by_role("dialog").get_by_text(words).is_visible()
+        assert tab.get_by_role("link", name="The recording as a file").get_attribute("href") == "a.rrd"
+        tab.keyboard.press("Escape")
+        said.clear()  # the browser's own word of the file that is missing
+
+        viewer.write_viewer(tmp_path / "site")
+        assert not tab.evaluate(ask, ["site/none.js", "a.rrd"])
+        assert tab.get_by_text("This recording is not part of the report").is_visible()
+        said.clear()
+        for _ in range(2):  # the second time without the first one's viewer in the way
+            assert tab.evaluate(ask, ["site/a.js", "a.rrd"])
+            assert tab.get_by_role("heading", name="cloth 6").is_visible()
+            tab.wait_for_timeout(500)
+            seen = 0
+            for _ in range(60):  # software draws slowly
+                if (seen := colours(tab.screenshot())) > 400:
+                    break
+                tab.wait_for_timeout(500)
+            assert seen > 400, "a lit mesh has many shades; an empty view has few"
+            tab.get_by_role("button", name="Close").click()
+            assert not tab.get_by_role("dialog").is_visible()
+        assert not said
+        assert all(url.startswith("file:") for url in asked)
