@@ -8,7 +8,7 @@ _E, _U, _F = "solvers/energies", "tests/unit", "harness/scenes/effects"
 _SPRINGS, _GAS, _DAMPING, _BENDING = (
     f"{_U}/test_{name}.py" for name in ("springs_energy", "effect_gas", "effect_damping", "effect_bending")
 )
-_STEPS = f"{_U}/test_simulate.py"
+_STEPS, _SLOPES = f"{_U}/test_simulate.py", f"{_U}/test_effect_energies.py"
 
 _TABLE = (
     (
@@ -35,7 +35,7 @@ _TABLE = (
     ("springs-hessian", f"{_E}/springs.py", "1.0, 1.0 - ratio)", "1.0, 1.0 + ratio)", _SPRINGS),
     ("gas-value", f"{_E}/gas.py", "return -self.pressure *", "return -2.0 * self.pressure *", _GAS),
     ("gas-gradient", f"{_E}/gas.py", "corner, area / 6.0)", "corner, area / 3.0)", _GAS),
-    ("gas-hessian", f"{_E}/gas.py", "csr_array(pressure / volume *", "csr_array(2.0 * pressure / volume *", _GAS),
+    ("gas-hessian", f"{_E}/gas.py", "csr_array(pressure / volume *", "csr_array(2.0 * pressure / volume *", _SLOPES),
     ("dashpots-origin", f"{_E}/dashpots.py", "self._along(start.origin)", "self._along(start.expected)", _DAMPING),
     (
         "dashpots-rate",
@@ -86,7 +86,7 @@ _TABLE = (
         "solvers/contact/energy.py",
         "@ np.minimum(0.0, self.gap(p)) ** 2",
         "@ np.maximum(0.0, self.gap(p)) ** 2",
-        f"{_U}/test_effect_contact.py",
+        _SLOPES,
     ),
     (
         "contact-friction",
@@ -99,7 +99,7 @@ _TABLE = (
         "contact-way",
         "solvers/contact/planes.py",
         "s = begin - (far - radius) / slope",
-        "s = begin - 0.5 * (far - radius) / slope",
+        "s = begin - (far - 0.5 * radius) / slope",
         f"{_U}/test_contact_planes.py",
     ),
     ("gravity-mass", f"{_F}/gravity.py", "mass[:, None] * np.array", "mass.mean() * np.array", f"{_U}/test_effects.py"),
