@@ -66,6 +66,7 @@ def run(
     from harness.config.load import load_any
     from harness.experiments.plan import of_other_code
     from harness.experiments.sweep import failures, run_sweep
+    from harness.report.learned import closing
     from harness.report.named import draw_reports
     from harness.report.timing_table import summary_table
 
@@ -82,6 +83,8 @@ def run(
         _say(f"reported in {path}")
     failed = failures(table)
     for line in failed:
+        _say(line)
+    for line in closing(table, config, results, folder):
         _say(line)
     raise typer.Exit(1 if failed else 0)
 

@@ -144,6 +144,12 @@ COLUMNS = (
     Column("objective", _REAL, "J", "the step's objective, the sum of all terms"),
     Column("largest_strain", _REAL, "", "largest |length / rest length - 1| of a spring after the step"),
     Column(
+        "strain_99",
+        _REAL,
+        "",
+        "what 99 % of the springs stay below of it; the largest grows with the mesh where a single vertex bears a load",
+    ),
+    Column(
         "penetration",
         _REAL,
         "m",

@@ -5,7 +5,7 @@ Nothing here runs beside the measurements: bars are redrawn between steps, while
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Protocol
@@ -142,6 +142,13 @@ def left_in_words(seconds: float | None) -> str:
     return f"about {seconds:.0f} s left" if seconds < 600 else f"about {seconds / 60:.0f} min left"
 
 
+def _at_hand(going: Sequence[_Running]) -> str:
+    """The first of the runs that go on and do not wait, and how many there are beside it: one short line."""
+    run = min(going, key=lambda one: bool(one.aside))
+    others = f"; {len(going) - 1} more at hand" if len(going) > 1 else ""
+    return f"{run.title}: {run.doing}, {100 * run.done:.0f} %{others}"
+
+
 class Bars:
     """A bar for the sweep and one for each run that goes on."""
 
@@ -217,8 +224,7 @@ class Lines:
 
     def _changed(self, run: _Running) -> None:
         if monotonic() - self._printed > _SILENT:
-            told = [f"{going.title}: {going.doing}, {100 * going.done:.0f} %" for going in self._going]
-            self._print("; ".join(told))
+            self._print(_at_hand(self._going))
 
     def _ended(self, run: _Running, outcome: str) -> None:
         self._going.remove(run)

@@ -12,10 +12,11 @@ import numpy as np
 import pyarrow as pa
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
-from harness.report.page import count, quantity
+from harness.report.page import quantity
 from harness.report.references import cited
 
 
@@ -23,9 +24,10 @@ class RunTimes(NamedTuple):
     """One run: what it was, and its times [ms]; None where the rows do not say.
 
     cold and warm: of preparing; step: median, its quartiles and the least of all steps; local, global_:
-    medians of one such step; iterations: median of a step; residual [J^(1/2)]: of the last step;
-    largest_strain: of the whole run; interrupted: whether steps were, in any round; adds_up: whether the phases add up
-    to an iteration. The fields are the columns of `_SUMMARY`, in order.
+    medians of one such step; iterations: median of a step; stopped: what ended a step's iterations, the least welcome;
+    residual [J^(1/2)]: of the last step; largest_strain, and strain_99, which 99 % of the springs stay below: of the
+    whole run; interrupted: whether steps were, in any round; adds_up: whether the phases add up to an iteration. The
+    fields are the columns of `_SUMMARY`, in order.
     """
 
     run_id: str
@@ -47,8 +49,10 @@ class RunTimes(NamedTuple):
     local: float | None
     global_: float | None
     iterations: float | None
+    stopped: str | None
     residual: float | None
     largest_strain: float | None
+    strain_99: float | None
     interrupted: bool | None
     adds_up: bool | None
 
@@ -68,8 +72,9 @@ select run_id, any_value(scene), any_value("size"), any_value(solver), any_value
     1e3 * median(seconds) filter (phase = 'local'),
     1e3 * median(seconds) filter (phase = 'global'),
     median(iterations) filter (phase = 'step'),
+    arg_min(stopped, list_position(['iterations', 'stalled', 'tolerance', 'floor'], stopped)),
     arg_max(residual, frame) filter (phase = 'step'),
-    max(largest_strain), bool_or(interrupted) filter (phase = 'step'), bool_and(adds_up)
+    max(largest_strain), max(strain_99), bool_or(interrupted) filter (phase = 'step'), bool_and(adds_up)
 from numbered group by run_id order by min(place)
 """
 
@@ -99,19 +104,24 @@ def labels(found: Sequence[RunTimes]) -> dict[str, str]:
 
 
 _NUMBERS = (
-    "vertices",
-    "springs",
-    "status",
-    "prepare\ncold ms",
-    "\nwarm ms",
-    "step\nms",
-    "least\nms",
-    "local\nms",
-    "global\nms",
-    "iter.",
-    "residual",
+    "prepare\ncold",
+    "\nwarm",
+    "\nstep",
+    "\nleast",
+    "\nlocal",
+    "\nglobal",
+    "\niter.",
+    "\nstopped",
+    "resi-\ndual",
     "largest\nstrain",
+    "99 %\nbelow",
 )
+
+WIDTH = 100
+"""Characters that a line of the table takes, unless its numbers alone take more."""
+
+_NAMES = 12
+"""Characters within which solvers' and scenes' names are folded, where there is no place for more."""
 
 INTERRUPTED = "! the process was interrupted while steps were timed: its least time is nearest to the truth"
 APART = "~ local and global, timed alone, do not add up to an iteration within 15 %"
@@ -120,41 +130,44 @@ SHARED = "timed beside others, up to {} at once, each on cores of its own: slowe
 
 
 def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
-    """One line for each run: what it was, whether it succeeded, and its times [ms], marked where they are doubtful.
+    """One line for each run: what it was, how it ended, and its times [ms], marked where they are doubtful.
 
     other_code: the ids of the runs that were done by other code than today's, which are marked.
     """
-    title = "times are medians over the rounds and over the steps"
+    found = runs(table)
+    names, scenes = labels(found), {run.scene for run in found}
+    what, above = f"{scenes.pop()}: " if len(scenes) == 1 else "", list[str]()
     out = Table(
-        title=title,
+        title=f"{what}times in milliseconds, medians over the rounds and over the steps",
         title_justify="left",
         caption_justify="left",
         box=SIMPLE_HEAD,
-        collapse_padding=True,
+        padding=0,
         pad_edge=False,
     )
-    for name in ("scene", "size", "solver"):
-        out.add_column(name, overflow="fold", justify="right" if name == "size" else "left", min_width=len(name))
+    out.add_column("\nsize", justify="right", min_width=4)
+    out.add_column("\nsolver", overflow="fold", min_width=min(_NAMES, max(map(len, names.values()), default=0)))
     for name in _NUMBERS:
-        out.add_column(name, justify="left" if name == "status" else "right", no_wrap=True)
-    found = runs(table)
-    names = labels(found)
+        out.add_column(name, justify="left" if name == "\nstopped" else "right", no_wrap=True)
     for run in found:
+        if not what and (not above or above[-1] != run.scene):
+            out.add_section()
+            out.add_row("", f"[bold]{escape(run.scene)}[/]")
+            above.append(run.scene)
         out.add_row(
-            run.scene,
             str(run.size) if run.size else "–",
-            names[run.run_id],
-            _number(run.vertices, count),
-            _number(run.springs, count),
-            f"[{'green' if run.status == 'ok' else 'bold red'}]{run.status}[/]"
-            + ("[yellow] by other code[/]" if run.run_id in other_code else ""),
+            escape(names[run.run_id]),
             *(_number(value, quantity) for value in (run.cold, run.warm)),
             _number(run.step, quantity) + ("!" if run.interrupted else ""),
             _number(run.least, quantity),
             *(_number(value, quantity) + _apart(run, value) for value in (run.local, run.global_)),
             _number(run.iterations, quantity),
+            _ended(run) + ("[yellow] by other code[/]" if run.run_id in other_code else ""),
             _number(run.residual, "{:.1e}".format),
-            _number(run.largest_strain, lambda strain: f"{100 * strain:.3g} %"),
+            *(
+                _number(strain, lambda strain: f"{100 * strain:.3g} %")
+                for strain in (run.largest_strain, run.strain_99)
+            ),
         )
     marks = {INTERRUPTED: any(run.interrupted for run in found), APART: any(_apart(run, run.local) for run in found)}
     shared = [
@@ -162,9 +175,16 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
     ]
     marks[SHARED.format(max(shared, default=0))] = bool(shared)
     out.caption = "\n".join([*(words for words, there in marks.items() if there), *_methods(table)]) or None
+    longest = max(map(len, [*names.values(), *scenes]), default=0)
     # Lines longer than a narrow terminal keep their numbers; Rich would cut them to ellipses.
-    out.width = Measurement.get(wide := Console(width=1000), wide.options, out).maximum
+    most = Measurement.get(wide := Console(width=1000), wide.options, out).maximum
+    out.width = max(min(most, WIDTH), most - max(0, longest - _NAMES))
     return out
+
+
+def _ended(run: RunTimes) -> str:
+    """What ended the iterations of a run that succeeded; else how the run itself ended."""
+    return run.stopped or "ok" if run.status == "ok" else f"[bold red]{run.status}[/]"
 
 
 def _apart(run: RunTimes, value: float | None) -> str:
@@ -175,7 +195,11 @@ def _apart(run: RunTimes, value: float | None) -> str:
 def _methods(table: pa.Table) -> list[str]:
     """Where each solver comes from."""
     known = dict(zip(*(table[name].to_pylist() for name in ("solver", "reference")), strict=True))
-    return [f"{solver}: {cited(reference)}" for solver, reference in known.items() if reference]
+    solvers: dict[str, list[str]] = defaultdict(list)
+    for solver, reference in known.items():
+        if reference:
+            solvers[reference].append(solver)
+    return [f"{', '.join(names)}: {cited(reference)}" for reference, names in solvers.items()]
 
 
 def _number(value: Any, words: Callable[[Any], str]) -> str:

@@ -55,7 +55,7 @@ def observe(
             **{f"energy_{name}": terms[name] for name in _OWN if name in terms},
             "energy_effects": sum(value for name, value in terms.items() if name not in _OWN),
             "objective": sum(terms.values()),
-            "largest_strain": largest_strain(scene, p),
+            **strain_of(scene, p),
             "penetration": penetration(scene, p, scene.time(step.index)),
             "iterations": step.iterations,
             "stages": len(step.stages),
@@ -113,10 +113,13 @@ def stopped(step: Step) -> str:
     return min((solution.stopped for _, solution in step.stages), key=_WORST.index)
 
 
-def largest_strain(scene: Scene, p: Positions) -> float:
-    """The largest |length / rest length - 1| of a spring at p (n, 3) [m]; 0 without springs."""
+def strain_of(scene: Scene, p: Positions) -> dict[str, float]:
+    """The columns of |length / rest length - 1| of the springs at p (n, 3) [m]: its largest value, and its 99th
+    percentile; both 0 without springs."""
     of_spring, _ = strains(p, scene.springs.edges, scene.springs.rest_length)
-    return float(np.abs(of_spring).max(initial=0.0))
+    strain = np.abs(of_spring)
+    percentile = float(np.percentile(strain, 99)) if len(strain) else 0.0
+    return {"largest_strain": float(strain.max(initial=0.0)), "strain_99": percentile}
 
 
 def require_numbers(by_frame: Mapping[int, dict[str, Any]], *, minimises: bool, yardstick: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
@@ -18,11 +19,13 @@ from rich.console import Console
 from harness.base.columns import SCHEMA
 from harness.report import page, timing_plot
 from harness.report.labels import LINE, spread
+from harness.report.learned import closing, sentences
 from harness.report.style import HEIGHT, WIDTH, marks
 from harness.report.timing_plot import draw_timing
 from harness.report.timing_table import APART, INTERRUPTED, labels, runs, summary_table
 from solvers.registry import EVERY
 
+ROOT = Path(__file__).parents[2]
 POWERS = {"sparse": 1.0, "dense": 2.0, "xpbd": 1.5}  # of the vertices, in the times of each solver
 EXPLOSION = "the positions are not finite from frame 3 on"
 
@@ -61,7 +64,7 @@ def run_rows(scene: str, size: int, solver: str, omega: float, *, failed: bool) 
     }
     if failed:
         return [{**known, "phase": "run", "status": "diverged", "reason": EXPLOSION}]
-    second = 1e-6 * omega * (size**2) ** POWERS[solver]
+    second = 1e-6 * omega * (size**2) ** POWERS.get(solver, 1.0)
     prepare = [
         {**known, "phase": "prepare", "round": k, "seconds": seconds * second} for k, seconds in enumerate((8, 2, 4, 3))
     ]
@@ -74,7 +77,9 @@ def run_rows(scene: str, size: int, solver: str, omega: float, *, failed: bool) 
             "seconds": second * (0.99 + 0.005 * k),
             "iterations": 10,
             "residual": 10.0**-k,
+            "stopped": "tolerance" if k else "iterations",
             "largest_strain": 0.1 * k,
+            "strain_99": 0.01 * k,
         }
         for k in range(5)
     ]
@@ -83,6 +88,16 @@ def run_rows(scene: str, size: int, solver: str, omega: float, *, failed: bool) 
         for phase, share in (("local", 0.1), ("global", 0.2))
     ]
     return prepare + steps + phases
+
+
+def learned(**how: Any) -> list[str]:
+    """Whole sentences of what rows say."""
+    return learned_from(rows(**how).to_pylist())
+
+
+def learned_from(told: list[dict[str, Any]]) -> list[str]:
+    lines = "\n".join(sentences(runs(pa.Table.from_pylist(told, schema=SCHEMA))))
+    return lines.replace("\n  ", " ").splitlines()
 
 
 @pytest.fixture
@@ -106,9 +121,17 @@ def test_a_run_is_summed_up_in_milliseconds() -> None:
     (run,) = runs(rows(sizes=(10,), solvers=("sparse",)))
     # The step takes 1e-6 s * 100 = 0.1 ms; round-off of a few products.
     expected = {"cold": 0.8, "warm": 0.3, "step": 0.1, "least": 0.099, "lower": 0.0995, "upper": 0.1005}
-    expected |= {"local": 0.01, "global_": 0.02, "iterations": 10, "residual": 1e-4, "largest_strain": 0.4}
+    expected |= {
+        "local": 0.01,
+        "global_": 0.02,
+        "iterations": 10,
+        "residual": 1e-4,
+        "largest_strain": 0.4,
+        "strain_99": 0.04,
+    }
     assert {name: getattr(run, name) for name in expected} == pytest.approx(expected, rel=1e-9)
     assert (run.scene, run.size, run.vertices, run.springs, run.status) == ("cloth", 10, 100, 400, "ok")
+    assert run.stopped == "iterations", "one step of five was cut off"
 
 
 def test_runs_keep_the_order_of_their_rows() -> None:
@@ -189,8 +212,50 @@ def test_the_summary_has_a_line_for_each_run() -> None:
     console = Console(width=200, record=True, file=StringIO())
     console.print(summary_table(rows(sizes=(10,), failed=[(10, "dense")])))
     lines = [" ".join(line.split()) for line in console.export_text().splitlines()]
-    assert "cloth 10 sparse 100 400 ok 0.8 0.3 0.1 0.099 0.01 0.02 10 1.0e-04 40 %" in lines
-    assert f"cloth 10 dense 100 400 diverged{9 * ' –'}" in lines
+    assert "cloth: times in milliseconds, medians over the rounds and over the steps" in lines
+    assert "10 sparse 0.8 0.3 0.1 0.099 0.01 0.02 10 iterations 1.0e-04 40 % 4 %" in lines
+    assert f"10 dense{7 * ' –'} diverged{3 * ' –'}" in lines
+
+
+def test_the_summary_and_the_words_after_it_fit_a_hundred_columns() -> None:
+    scenes, sizes = ("hanging-cloth", "a-scene-with-a-long-name"), (8, 32)
+    table = rows(scenes=scenes, sizes=sizes, solvers=("local-global-sparse", "dense"), omegas=(1.0, 1.25))
+    console = Console(width=240, record=True, file=StringIO())
+    console.print(summary_table(table))
+    assert max(len(line.rstrip()) for line in console.export_text().splitlines()) <= 100
+    assert max(map(len, sentences(runs(table)))) <= 98, "two more go before each"
+
+
+def test_what_was_learned_is_told_and_what_is_not_so_is_not() -> None:
+    (speed, limit) = learned(sizes=(10, 20), failed=[(20, "dense")])
+    assert "cloth 10, equal residuals, 1.0e-04: a step by sparse is shortest; xpbd 10 times, dense 100" in speed
+    assert limit.startswith("All 5 runs stopped at the limit of iterations")
+    told = rows(sizes=(10, 20), solvers=("sparse", "dense")).to_pylist()
+    for row in told:
+        row["stopped"] = row["stopped"] and "tolerance"
+        row["residual"] = row["residual"] and row["residual"] * (100 if row["solver"] == "dense" else 1)
+        row["largest_strain"] = row["largest_strain"] and row["largest_strain"] * row["size"]
+    (speed, strain) = learned_from(told)
+    assert "cloth 20, unequal residuals, 1.0e-04 to 1.0e-02" in speed
+    assert "grows with the mesh, from 400 to 800 %, where 99 % of the springs stay below 4 and 4 %" in strain
+
+
+def test_a_sweep_ends_with_three_commands_and_one_link(tmp_path: Path) -> None:
+    table, config = rows(scenes=("hanging-cloth",)), ROOT / "configs" / "quickstart.yaml"
+    results = tmp_path / "my results"
+    (results / "q" / "recordings").mkdir(parents=True)
+    seen = results / "q" / "recordings" / "hanging-cloth-32-sparse-hanging-cloth 32 sparse 1.0.rrd"
+    seen.touch()
+    lines = closing(table, config, results, results / "q")
+    commands = [shlex.split(line) for line in lines if line.startswith("  springbench")]
+    scene = str(ROOT / "configs" / "scenes" / "hanging-cloth.yaml")
+    assert commands == [
+        ["springbench", "view", str(seen)],
+        ["springbench", "recommend", "--error", "1e-2", scene],
+        ["springbench", "report", str(results)],
+    ]
+    (results / "index.html").touch()
+    assert closing(table, config, results, results / "q")[-1].endswith("/my%20results/index.html")
 
 
 def test_the_summary_marks_times_that_are_doubtful_and_says_why() -> None:
@@ -201,9 +266,9 @@ def test_the_summary_marks_times_that_are_doubtful_and_says_why() -> None:
     console = Console(width=200, record=True, file=StringIO())
     console.print(summary_table(pa.Table.from_pylist(told, schema=SCHEMA)))
     text = " ".join(console.export_text().split())
-    assert "ok 0.8 0.3 0.1! 0.099 0.01~ 0.02~ 10" in text
+    assert "10 sparse 0.8 0.3 0.1! 0.099 0.01~ 0.02~ 10" in text
     assert INTERRUPTED in text
     assert APART in text
     console.print(summary_table(rows(sizes=(10,), solvers=("sparse",))))
     text = " ".join(console.export_text().split())
-    assert not {"!", "~"} & set(text.split("strain")[-1]), "rows that say nothing of it have no marks"
+    assert not {"!", "~"} & set(text.split("below")[-1]), "rows that say nothing of it have no marks"
