@@ -68,6 +68,7 @@ def run(
     from harness.experiments.sweep import failures, run_sweep
     from harness.report.learned import closing
     from harness.report.named import draw_reports
+    from harness.report.site import keep
     from harness.report.timing_table import summary_table
 
     sweep = load_any(config, solvers=solver or (), sizes=size or (), **given.obj)
@@ -81,6 +82,7 @@ def run(
     _say(f"rows, recordings and pictures are in {folder}")
     for path in draw_reports(sweep.reports, table, folder):
         _say(f"reported in {path}")
+    keep(results, folder, _say)
     failed = failures(table)
     for line in failed:
         _say(line)
@@ -103,6 +105,7 @@ def speed(
     from harness.base.progress import display
     from harness.config.load import load_sweep
     from harness.experiments.speed.comparison import run_speed
+    from harness.report.site import keep
     from harness.report.speed.figures import figures
     from harness.report.speed.pictures import draw
     from harness.report.speed.table import remarks, speed_table
@@ -118,6 +121,7 @@ def speed(
         _say(line)
     draw(found, folder / "pictures")
     _say(f"rows and pictures are in {folder}")
+    keep(results, folder, _say)
     raise typer.Exit(1 if any(f.status in ("failed", "diverged") for f in found) else 0)
 
 
@@ -135,12 +139,14 @@ def accuracy(
     from harness.config.accuracy_load import load_accuracy
     from harness.experiments.accuracy.studies import failures, run_accuracy
     from harness.report.accuracy import draw
+    from harness.report.site import keep
 
     asked = load_accuracy(config)
     folder = claimed(results / asked.name, config)
     files = run_accuracy(asked, folder, display(err), _say, again=again, changed=changed, isolated=not here)
     drawn = draw(folder, files)
-    _say(f"rows are in {folder / 'accuracy'}; {len(drawn)} pictures and pages tell of them, {drawn[-1]} of all")
+    _say(f"rows are in {folder / 'accuracy'}; {len(drawn)} pictures and tables tell of them")
+    keep(results, folder, _say)
     failed = failures(files)
     for line in failed:
         _say(line)
@@ -178,20 +184,18 @@ def recommend(
 
 @app.command()
 def report(
-    folder: Annotated[Path, typer.Argument(help="The results of a sweep with `judge: true`, such as results/hard.")],
+    results: Annotated[Path, typer.Argument(help="A folder of results, or that of one sweep.")] = Path("results"),
 ) -> None:
-    """Draw the map of robustness: solvers x cases, coloured by what became of each run."""
-    from harness.report.robustness import read_cells, summary
-    from harness.report.robustness_map import draw_map, headline, write_page
+    """Write the page of all results, `index.html`, and the map of solvers x cases of those that were judged."""
+    from harness.report.robustness import summary
+    from harness.report.robustness_map import draw_maps
+    from harness.report.site import update
 
-    cells = read_cells(folder)
-    title = headline(cells, folder.resolve().name)
-    picture, page = folder / "pictures" / "robustness.png", folder / "robustness.html"
-    picture.parent.mkdir(exist_ok=True)
-    draw_map(cells, picture, title)
-    write_page(cells, page, title)
-    out.print(summary(cells))
-    _say(f"the map is {picture}, with reasons and recordings {page}")
+    page = update(results, meshes=True, say=_say)
+    for picture, cells in draw_maps(results):
+        out.print(summary(cells))
+        _say(f"the map is {picture}")
+    _say(f"the page is {page}; a browser opens it, and needs no network for it")
 
 
 app.command(cls=taking("frames", "iterations", "tolerance", "rounds"))(ablate)

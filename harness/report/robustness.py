@@ -78,8 +78,8 @@ _ENDED = {
 @dataclass(frozen=True, slots=True)
 class Cell:
     """One run: its case, its solver, what became of it and why; worst: the largest `beyond` of a step, or where
-    `graded` is "distance" the largest distance from the reference, None where there is none; recording: where it is;
-    reference: where the solver comes from, as rows have it."""
+    `graded` is "distance" the largest distance from the reference, None where there is none;
+    reference: where the solver comes from, as rows have it; run_id: of the run."""
 
     case: str
     solver: str
@@ -87,8 +87,8 @@ class Cell:
     worst: float | None
     graded: str
     reason: str
-    recording: Path | None
     reference: str = ""
+    run_id: str = ""
 
     @property
     def figure(self) -> str:
@@ -122,8 +122,8 @@ def read_cells(folder: Path) -> list[Cell]:
     for run in sorted(runs.values(), key=lambda run: run[0]["started"]):
         case, solver = _case(run[0], firsts), _solver(run[0], firsts)
         outcome, worst, graded, reason = judged(run)
-        recording = next((folder / "recordings").glob(f"*-{run[0]['run_id']}.rrd"), None)
-        cells[case, solver] = Cell(case, solver, outcome, worst, graded, reason, recording, run[0]["reference"] or "")
+        run_id, reference = run[0]["run_id"], run[0]["reference"] or ""
+        cells[case, solver] = Cell(case, solver, outcome, worst, graded, reason, reference, run_id)
     order = [*SOLVERS, *OPTIONAL, *(first["solver"] for first in firsts)]
     return sorted(cells.values(), key=lambda cell: (cell.case, order.index(cell.solver.split()[0]), cell.solver))
 

@@ -1,11 +1,11 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs say nothing of most keywords.
-"""The robustness map: solvers x cases, coloured by outcome, the worst residual in each cell; a picture and a page."""
+"""The robustness map: solvers x cases, coloured by outcome, the worst residual in each cell."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from html import escape
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
 
@@ -13,8 +13,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from harness.report.references import cited
-from harness.report.robustness import DIVERGED, FAILED, OUTCOMES, RIGHT, WRONG, Cell, Outcome, percent, scores
+from harness.base import shelf
+from harness.base.errors import InputError
+from harness.report.robustness import (
+    DIVERGED,
+    FAILED,
+    OUTCOMES,
+    RIGHT,
+    WRONG,
+    Cell,
+    Outcome,
+    percent,
+    read_cells,
+    scores,
+)
 from harness.report.style import DPI, INK, MUTED, PAGE, RULE
 
 _ROW, _COLUMN, _LEFT, _TOP, _BOTTOM, _ACROSS = 0.2, 0.64, 2.3, 1.75, 1.5, 2.2
@@ -115,59 +127,12 @@ def _ink(outcome: Outcome) -> str:
     return INK if 0.3 * red + 0.6 * green + 0.1 * blue > 120 else PAGE
 
 
-_PAGE = """<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>{title}</title>
-<style>
-body {{ font: 14px/1.45 system-ui, sans-serif; color: {ink}; background: {page}; margin: 2rem; max-width: 110rem }}
-table {{ border-collapse: separate; border-spacing: 2px }}
-th {{ font-weight: normal; text-align: left; white-space: nowrap; padding-right: .6rem }}
-thead th {{ writing-mode: vertical-rl; transform: rotate(180deg); padding: .4rem 0 }}
-td {{ text-align: center; min-width: 3.2rem; font-size: 12px; padding: 1px 4px }}
-td a {{ color: inherit }}
-li span {{ display: inline-block; width: 1rem; height: .8rem; margin-right: .5rem }}
-ul {{ list-style: none; padding: 0 }}
-</style>
-<h1>{title}</h1>
-<p>{note} Point at a cell for its reason; a cell that is underlined leads to the recording of its run.</p>
-<ul>{legend}</ul>
-<table><thead><tr><th></th>{head}</tr></thead><tbody>
-{scores}
-{body}
-</tbody></table></html>
-"""
-
-
-def write_page(cells: Sequence[Cell], path: Path, title: str) -> None:
-    """Write the map as a page of its own, with each cell's reason and a link to its recording, where there is one."""
-    cases, solvers = (list(dict.fromkeys(getattr(cell, key) for cell in cells)) for key in ("case", "solver"))
-    by_place = {(cell.case, cell.solver): _cell(cell, path.parent) for cell in cells}
-    body = "\n".join(
-        f"<tr><th>{escape(case)}</th>{''.join(by_place.get((case, solver), '<td></td>') for solver in solvers)}</tr>"
-        for case in cases
-    )
-    legend = "".join(f'<li><span style="background:{o.color}"></span>{o.words}: {o.meaning}</li>' for o in OUTCOMES)
-    references = {cell.solver: cited(cell.reference) for cell in cells}
-    head = "".join(f'<th title="{escape(references[name], quote=True)}">{escape(name)}</th>' for name in solvers)
-    found = scores(cells)
-    rows = {
-        "right": [percent(score.right) for score in found],
-        "finite": [percent(score.finite) for score in found],
-        "worst": [score.worst.figure for score in found],
-    }
-    shares = "\n".join(
-        f"<tr><th><b>{name}</b></th>{''.join(f'<td>{words}</td>' for words in row)}</tr>" for name, row in rows.items()
-    )
-    page = _PAGE.format(
-        title=escape(title), note=NOTE, legend=legend, head=head, scores=shares, body=body, ink=INK, page=PAGE
-    )
-    path.write_text(page, encoding="utf-8")
-
-
-def _cell(cell: Cell, folder: Path) -> str:
-    figure = cell.figure or "&nbsp;"
-    if cell.recording:
-        figure = f'<a href="{escape(cell.recording.relative_to(folder).as_posix())}">{figure}</a>'
-    worst = "" if cell.worst is None else f" ({cell.graded} {cell.worst:.1e})"
-    words = escape(f"{cell.case}, {cell.solver}: {cell.outcome.words}{worst}. {cell.reason}", quote=True)
-    style = f"background:{cell.outcome.color};color:{_ink(cell.outcome)}"
-    return f'<td style="{style}" title="{words}">{figure}</td>'
+def draw_maps(results: Path) -> Iterator[tuple[Path, list[Cell]]]:
+    """Draw the maps of those sweeps in a folder of results, or of one sweep, whose runs were judged."""
+    for rows in shelf.folders(results, "rows"):
+        with suppress(InputError):
+            cells = read_cells(rows.parent)
+            picture = rows.parent / "pictures" / "robustness.png"
+            picture.parent.mkdir(exist_ok=True)
+            draw_map(cells, picture, headline(cells, rows.parent.resolve().name))
+            yield picture, cells

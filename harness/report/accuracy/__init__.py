@@ -1,15 +1,13 @@
-"""What the rows of `springbench accuracy` say: pictures, findings, a table and one interactive page."""
+"""What the rows of `springbench accuracy` say: pictures, findings and a table."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import chain
 from pathlib import Path
 
 from harness.report.accuracy.convergence import draw_convergence
 from harness.report.accuracy.findings import failures, findings, write_findings, write_summary
 from harness.report.accuracy.growth import draw_growth
-from harness.report.accuracy.interactive import write_page
 from harness.report.accuracy.measured import without_short
 from harness.report.accuracy.paper import draw_paper
 from harness.report.accuracy.pictures import draw_meshes
@@ -21,7 +19,7 @@ from harness.report.references import write_bibtex
 
 
 def draw(folder: Path, files: Iterable[Path] | None = None) -> list[Path]:
-    """Draw all that the rows under `folder`/accuracy say to `folder`/report; returns the files, the page last.
+    """Draw all that the rows under `folder`/accuracy say to `folder`/report; returns the files.
 
     folder: of one config's results; files: those of its rows that count, all if left out. Raises InputError where
     there are no rows.
@@ -30,7 +28,6 @@ def draw(folder: Path, files: Iterable[Path] | None = None) -> list[Path]:
     table, out = without_short(everything), folder / "report"
     out.mkdir(parents=True, exist_ok=True)
     title, failed, chapters = f"What accuracy costs: {folder.name}", failures(everything), findings(everything)
-    meshes = draw_meshes(table, folder, out / "meshes")
     pictures = [
         *draw_convergence(table, out / "convergence"),
         *draw_times(table, out / "times"),
@@ -38,18 +35,10 @@ def draw(folder: Path, files: Iterable[Path] | None = None) -> list[Path]:
         *draw_profiles(table, out / "profiles"),
         *draw_growth(table, out / "growth"),
         *draw_paper(everything, out / "liu2013"),
-        *meshes.values(),
+        *draw_meshes(table, folder, out / "meshes").values(),
     ]
-    page, words, numbers = out / "report.html", out / "findings.md", out / "summary.json"
+    words, numbers = out / "findings.md", out / "summary.json"
     write_findings(words, title, chapters, failed)
     write_summary(numbers, everything)
-    write_page(
-        page,
-        title,
-        table,
-        pictures={digest: path.relative_to(out).as_posix() for digest, path in meshes.items()},
-        findings=list(chain.from_iterable(chapters.values())),
-        failures=failed,
-    )
     books = write_bibtex(out / "references.bib", [each.reference for each in (*table.curves, *table.works)])
-    return [*pictures, words, numbers, books, page]
+    return [*pictures, words, numbers, books]

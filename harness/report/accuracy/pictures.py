@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from harness.report import opengl
-from harness.report.accuracy.measured import Measurements
+from harness.report.accuracy.measured import Curve, Measurements, Problem
 
 
 def draw_meshes(table: Measurements, results: Path, folder: Path) -> dict[str, Path]:
@@ -20,15 +20,20 @@ def draw_meshes(table: Measurements, results: Path, folder: Path) -> dict[str, P
 
     drawn: dict[str, Path] = {}
     for problem in table.problems:
-        recorded = [
-            curve
-            for curve in table.curves
-            if curve.problem is problem and curve.recording and (results / curve.recording).is_file()
-        ]
-        if recorded:
-            best = min(recorded, key=lambda curve: (curve.status != "ok", curve.gap[-1]))
-            path = folder / f"{problem.scene}-{problem.size}-{problem.moment}-{problem.digest}.png"
+        if best := nearest(table, problem, results):
+            path = place(problem, folder)
             path.parent.mkdir(parents=True, exist_ok=True)
             draw_run(read_replay(results / best.recording, [-1]), path)
             drawn[problem.digest] = path
     return drawn
+
+
+def place(problem: Problem, folder: Path) -> Path:
+    """Where the picture of a problem's mesh lies."""
+    return folder / f"{problem.scene}-{problem.size}-{problem.moment}-{problem.digest}.png"
+
+
+def nearest(table: Measurements, problem: Problem, results: Path) -> Curve | None:
+    """Of the solves of a problem whose recordings are there, the one that came nearest the lowest minimum."""
+    recorded = [c for c in table.curves if c.problem is problem and c.recording and (results / c.recording).is_file()]
+    return min(recorded, key=lambda curve: (curve.status != "ok", curve.gap[-1]), default=None)

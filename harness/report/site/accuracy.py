@@ -1,95 +1,60 @@
-"""One interactive page of all that was measured, in one file that needs no network: Plotly's script is in it.
+"""The charts of an accuracy measurement for the page: convergence, times, work and precision, profiles, growth.
 
-A chart is a list of items, each a line with its solver, what it was, and named columns of numbers; the page's script
-filters items by `filters`, puts them into a panel each `panel`, and draws the chosen columns.
+A chart is a list of items, each a line with its solver, what it was, and named columns of numbers; the page filters
+items by `filters`, puts them into a panel each `panel`, and draws the chosen columns.
 """
 
 from __future__ import annotations
 
-import html
-import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plotly.offline import get_plotlyjs  # pyright: ignore[reportMissingTypeStubs]
 
-from harness.base.files import replacing
 from harness.report.accuracy.convergence import GUESSES
 from harness.report.accuracy.growth import TARGET, growths
 from harness.report.accuracy.measured import Curve, Measurements, WorkPoint, step_words
+from harness.report.accuracy.pictures import nearest, place
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
-from harness.report.references import cited
-from harness.report.style import DASH_DOTTED, DASHED, DOTTED, STARS, Mark, looks
+from harness.report.site.marks import drawn
+from harness.report.site.runs import references
+from harness.report.site.script import numbers as _numbers
+from harness.report.style import looks
 
 Item = dict[str, Any]
 
-_SYMBOLS = {
-    "o": "circle", "s": "square", "^": "triangle-up", "v": "triangle-down", "<": "triangle-left",
-    ">": "triangle-right", "D": "diamond", "d": "diamond-tall", "P": "cross", "X": "x", "p": "pentagon",
-    "h": "hexagon", "*": "star", "H": "hexagon2", "8": "octagon",
-    STARS[0]: "star-diamond", STARS[1]: "hexagram", STARS[2]: "star-triangle-up", STARS[3]: "star-square",
-    STARS[4]: "star-triangle-down",
-}  # fmt: skip
-_DASHES = {"-": "solid", DASHED: "dash", DOTTED: "dot", DASH_DOTTED: "dashdot"}
-
-_LOG = {"type": "log"}
+LOG = {"type": "log"}
 _SHARES = {"range": [-0.02, 1.05], "tickformat": ".0%"}
 
 
-def write_page(
-    path: Path,
-    title: str,
-    table: Measurements,
-    *,
-    pictures: Mapping[str, str],
-    findings: Sequence[str],
-    failures: Sequence[Item],
-) -> None:
-    """Write the page; pictures: of meshes by the digest of the problem, relative to the page.
-
-    findings: sentences; failures: rows of a table, all with the same keys.
-    """
-    labels = [(c.label, c.solver) for c in table.curves] + [(w.label, w.solver) for w in table.works]
-    data = {
-        "marks": {label: _mark(mark) for label, mark in looks(labels).items()},
-        "references": {each.label: cited(each.reference) for each in (*table.curves, *table.works)},
-        "charts": [
-            _convergence(table, pictures, path.parent),
-            _times(table, pictures),
-            _work(table.works),
-            _profiles(table),
-            _growth(table),
-        ],
-        "findings": findings,
-        "failures": failures,
+def charts(table: Measurements, folder: Path) -> dict[str, Item]:
+    """The charts that the rows have something for, by their ids; folder: of the sweep's results."""
+    pictures: dict[str, Item] = {}
+    for problem in table.problems:
+        path, best = place(problem, Path("report/meshes")), nearest(table, problem, folder)
+        if best and (folder / path).is_file():
+            pictures[problem.digest] = {"path": path.as_posix(), "of": best.label, "recording": best.recording}
+    made = {
+        "convergence": _convergence(table, pictures, folder),
+        "times": _times(table, pictures),
+        "work": _work(table.works),
+        "profiles": _profiles(table),
+        "growth": _growth(table),
     }
-    filled = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
-    # "</" would end the script that holds the data.
-    words = {"__DATA__": json.dumps(data, allow_nan=False).replace("</", "<\\/"), "__PLOTLY__": get_plotlyjs()}
-    words |= {"__TITLE__": html.escape(title), "__FACTS__": html.escape("   ·   ".join(table.machine))}
-    for place in ("__TITLE__", "__FACTS__", "__DATA__", "__PLOTLY__"):
-        filled = filled.replace(place, words[place])
-    with replacing(path) as partial:
-        partial.write_text(filled, encoding="utf-8")
+    everyone = (*table.curves, *table.works)
+    marks = {label: drawn(mark) for label, mark in looks((each.label, each.solver) for each in everyone).items()}
+    shared = {"marks": marks, "references": references((each.label, each.reference) for each in everyone)}
+    return {name: chart | shared for name, chart in made.items() if chart["items"]}
 
 
-def _mark(mark: Mark) -> dict[str, str]:
-    return {"color": mark.color, "symbol": _SYMBOLS[mark.marker], "dash": _DASHES.get(mark.dash, "longdash")}
+def axis(column: str, title: str, how: Mapping[str, Any] = LOG) -> Item:
+    """What a chart can be drawn by: a column of its items, and how Plotly draws the axis."""
+    return {"column": column, "title": title, "axis": how}
 
 
-def _numbers(values: Iterable[float]) -> list[float | None]:
-    """To five digits, which is more than a page shows; what is not finite is missing."""
-    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]
-
-
-def _axis(column: str, title: str, axis: Mapping[str, Any] = _LOG) -> Item:
-    return {"column": column, "title": title, "axis": axis}
-
-
-def _run(curve: Curve, pictures: Mapping[str, str]) -> Item:
+def _run(curve: Curve, pictures: Mapping[str, Item]) -> Item:
     """What all items of a curve say."""
     return {
         "label": curve.label,
@@ -97,12 +62,12 @@ def _run(curve: Curve, pictures: Mapping[str, str]) -> Item:
         "problem": curve.problem.name + (" (reference not certified)" if curve.problem.doubt else ""),
         "parameters": curve.parameters,
         "panel": GUESSES.get(curve.first_guess, curve.first_guess),
-        "picture": pictures.get(curve.problem.digest, ""),
-        "recording": f"../{curve.recording}" if curve.recording else "",
+        "picture": pictures.get(curve.problem.digest),
+        "recording": curve.recording,
     }
 
 
-def _convergence(table: Measurements, pictures: Mapping[str, str], folder: Path) -> Item:
+def _convergence(table: Measurements, pictures: Mapping[str, Item], folder: Path) -> Item:
     items: list[Item] = []
     for curve in table.curves:
         run = _run(curve, pictures)
@@ -128,19 +93,19 @@ def _convergence(table: Measurements, pictures: Mapping[str, str], folder: Path)
         "note": "Energy gap (g − g*)/(g0 − g*) against the lowest minimum known; vertex errors against the minimum "
         "that was reached. A cross ends a curve that failed or met a limit.",
         "filters": ["problem"],
-        "x": [_axis("iteration", "iterations"), _axis("seconds", "wall seconds")],
+        "x": [axis("iteration", "iterations"), axis("seconds", "wall seconds")],
         "y": [
-            _axis("gap", "energy gap"),
-            _axis("largest", "largest vertex error, mean rest lengths"),
-            _axis("metres", "largest vertex error, m"),
-            _axis("stationarity", "stationarity"),
+            axis("gap", "energy gap"),
+            axis("largest", "largest vertex error, mean rest lengths"),
+            axis("metres", "largest vertex error, m"),
+            axis("stationarity", "stationarity"),
         ],
         "hover": [*hover, ["minimum", "minimum reached"], ["status", "status"]],
         "items": items,
     }
 
 
-def _times(table: Measurements, pictures: Mapping[str, str]) -> Item:
+def _times(table: Measurements, pictures: Mapping[str, Item]) -> Item:
     items: list[Item] = []
     for curve in table.curves:
         found = [reach(curve, target) for target in TARGETS]
@@ -157,13 +122,13 @@ def _times(table: Measurements, pictures: Mapping[str, str]) -> Item:
                 "set_up": curve.warm if np.isfinite(curve.warm) else None,
             }
         )
-    shown = [_axis("alone", "seconds, the step alone")]
-    shown += [_axis(f"over {n}", f"seconds, set-up over {n} step{'s' if n > 1 else ''}") for n in STEPS]
+    shown = [axis("alone", "seconds, the step alone")]
+    shown += [axis(f"over {n}", f"seconds, set-up over {n} step{'s' if n > 1 else ''}") for n in STEPS]
     return {
         "title": "Time to accuracy",
         "note": "Median over the rounds; where a line ends the solver goes no further.",
         "filters": ["problem"],
-        "x": [_axis("target", "energy gap", {"type": "category"})],
+        "x": [axis("target", "energy gap", {"type": "category"})],
         "y": shown,
         "hover": [["target", "gap"], ["iteration", "iterations"], ["alone", "seconds alone"], ["set_up", "set-up, s"]],
         "items": items,
@@ -197,8 +162,8 @@ def _work(works: Sequence[WorkPoint]) -> Item:
         "note": "Total error of the positions at the horizon against wall time; a line joins time steps, open marks "
         "do a fixed number of iterations.",
         "filters": ["scene"],
-        "x": [_axis("seconds", "wall seconds a simulated second")],
-        "y": [_axis("error", "relative error")],
+        "x": [axis("seconds", "wall seconds a simulated second")],
+        "y": [axis("error", "relative error")],
         "hover": [["step", "time step"], ["error", "relative error"], ["seconds", "seconds a simulated second"]],
         "items": items,
     }
@@ -227,8 +192,8 @@ def _profiles(table: Measurements) -> Item:
         "note": "The share of the problems solved within a multiple of the fastest solver's time, and of the time of "
         f"one plain local-global iteration. What failed is never solved. {' '.join(not_shown(table))}",
         "filters": ["gap"],
-        "x": [_axis("ratio", "multiple")],
-        "y": [_axis("share", "share of the problems solved", _SHARES)],
+        "x": [axis("ratio", "multiple")],
+        "y": [axis("share", "share of the problems solved", _SHARES)],
         "hover": [["ratio", "multiple"], ["share", "share"]],
         "shape": "hv",
         "items": items,
@@ -253,8 +218,8 @@ def _growth(table: Measurements) -> Item:
         "title": f"Growth with size: time to a gap of {power(TARGET)}",
         "note": "Median over the steps of a mesh, set-up apart.",
         "filters": ["scene"],
-        "x": [_axis("vertices", "vertices")],
-        "y": [_axis("seconds", "seconds")],
+        "x": [axis("vertices", "vertices")],
+        "y": [axis("seconds", "seconds")],
         "hover": [["vertices", "vertices"], ["seconds", "seconds"], ["exponent", "fitted power"]],
         "items": items,
     }

@@ -1,0 +1,103 @@
+"""Brings the page up to date: what is new of each sweep, then the index of all."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from harness.base import shelf
+from harness.base.errors import InputError
+from harness.base.files import replacing
+from harness.report.site import script
+from harness.report.site.assets import place
+from harness.report.site.folders import KINDS, Folder, folder_of, folders
+from harness.report.site.overview import Overview, overview
+
+SUMMARY = "summary.json"
+"""What the index says of a sweep, kept beside its data."""
+
+
+def update(
+    results: Path,
+    *,
+    only: Collection[Path] | None = None,
+    meshes: bool = False,
+    say: Callable[[str], None] = lambda words: None,
+) -> Path:
+    """Write what is new of a folder of results, or of one sweep, to its page; returns `index.html`.
+
+    only: the folders of sweeps that have something new, all if left out; meshes: whether last positions and iterates
+    are taken from recordings, for what the page draws of meshes; say: prints a remark.
+    Raises InputError where there are no rows, CannotWrite.
+    """
+    found = folders(results) if only is None else [folder_of(path, results) for path in only]
+    data, code = results / "site" / "data", place(results)
+    for folder in found:
+        home = data / folder.slug
+        state = _state(folder, code, meshes)
+        if _known(home).get("state") != state:
+            _write(home, folder, overview(folder, home, meshes=meshes, say=say), state)
+    _index(results, data)
+    return results / "index.html"
+
+
+def keep(results: Path, folder: Path, say: Callable[[str], None]) -> None:
+    """Bring the page of all results up to date with what is new in a sweep's folder, and say where it is.
+
+    Where rows beside those of this sweep are damaged, it says so: what was measured is there all the same.
+    """
+    try:
+        say(f"all results are on one page: {update(results, only=[folder])}")
+    except InputError as error:
+        say(f"the page of all results stays as it was: {error}")
+
+
+def _write(home: Path, folder: Folder, found: Overview, state: str) -> None:
+    for name, value in found.scripts.items():
+        script.write(home / f"{name}.js", f"{folder.slug}/{name}", value)
+    for old in home.glob("*.js"):
+        if old.stem not in found.scripts:
+            old.unlink()
+    home.mkdir(parents=True, exist_ok=True)
+    with replacing(home / SUMMARY) as partial:
+        partial.write_text(json.dumps(found.summary | {"state": state}, allow_nan=False), encoding="utf-8")
+
+
+def _known(home: Path) -> dict[str, Any]:
+    """What was written of a sweep the last time; nothing where that is not there, or not whole."""
+    try:
+        return json.loads((home / SUMMARY).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def _state(folder: Folder, code: str, meshes: bool) -> str:
+    """What changes when there is something new of a sweep, or when this program would tell it otherwise."""
+    told: list[Any] = [code, meshes]
+    for kind in KINDS:
+        home = folder.path / kind
+        own = [(home / f"{unit}.parquet").stat().st_mtime_ns for unit in shelf.own_files(home)]
+        packed = shelf.packed_file(home)
+        told += [len(own), max(own, default=0), packed.stat().st_mtime_ns if packed.exists() else 0]
+    for part in ("pictures", "recordings", "report"):
+        told.append(sum(1 for _ in (folder.path / part).glob("*")))
+    return sha256(repr(told).encode()).hexdigest()[:16]
+
+
+def _index(results: Path, data: Path) -> None:
+    """The index of all sweeps that were written and are still there; those that never were are counted."""
+    there = {folder.slug: folder for folder in folders(results)}
+    known = {slug: _known(data / slug) for slug in there}
+    told = sorted((summary for summary in known.values() if summary), key=lambda s: s["to"] or "", reverse=True)
+    value = {
+        "title": results.resolve().name,
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+        "sweeps": [{key: part for key, part in summary.items() if key != "state"} for summary in told],
+        "absent": [there[slug].name for slug, summary in known.items() if not summary],
+        "viewer": (results / "site" / "viewer.js").is_file(),
+    }
+    script.write(data / "index.js", "index", value)

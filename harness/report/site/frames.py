@@ -1,0 +1,46 @@
+"""What the rows of each run say frame by frame, a script for each run: loaded where a run is opened or compared."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+import duckdb
+import pyarrow as pa
+
+from harness.report.site import script
+from harness.report.site.folders import Folder
+
+_FIGURES = {
+    "ms": "1e3 * median(seconds)",
+    "least": "1e3 * min(seconds)",
+    "lower": "1e3 * quantile_cont(seconds, 0.25)",
+    "upper": "1e3 * quantile_cont(seconds, 0.75)",
+    "iterations": "max(iterations)",
+    "residual": "max(residual)",
+    "strain": "max(largest_strain)",
+    "objective": "max(objective)",
+    "springs": "max(energy_springs)",
+    "distance": "max(distance)",
+}
+"""Columns of a run's script, and each as SQL over the rounds of a frame."""
+
+
+def write(folder: Folder, table: pa.Table, data: Path, wanted: Collection[str]) -> None:
+    """Write the scripts of these runs."""
+    if not wanted:
+        return
+    inner = ", ".join(f"{sql} as {name}" for name, sql in _FIGURES.items())
+    # Single precision, whose shortest decimals to_json writes, is more than a page shows.
+    outer = ", ".join(
+        f"'{name}': list(case when isfinite({name}) then {name}::float end order by frame)" for name in _FIGURES
+    )
+    sql = f"""
+        with steps as (
+            select run_id, frame, {inner} from rows_of
+            where phase = 'step' and frame is not null and run_id in (select unnest($wanted)) group by run_id, frame
+        ) select run_id, to_json({{'frame': list(frame order by frame), {outer}}}) from steps group by run_id"""
+    with duckdb.connect() as connection:
+        connection.register("rows_of", table)
+        for run, value in connection.execute(sql, {"wanted": list(wanted)}).fetchall():
+            script.write_text(data / "runs" / f"{run}.js", f"{folder.slug}/runs/{run}", value)

@@ -1,0 +1,50 @@
+"""The map of hard cases for the page: solvers x cases, what became of each run and why."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyarrow as pa
+
+from harness.report.references import cited
+from harness.report.robustness import OUTCOMES, read_cells, scores
+from harness.report.robustness_map import NOTE, headline
+from harness.report.site.folders import Folder
+from harness.report.site.script import number
+
+TITLE = "Hard cases"
+
+
+def judged(table: pa.Table) -> bool:
+    """Whether an oracle judged any of these rows."""
+    columns = [table[name] for name in ("stationarity", "distance") if name in table.column_names]
+    return any(column.null_count < len(column) for column in columns)
+
+
+def chart(folder: Folder) -> dict[str, Any]:
+    """The map: cells by case and solver, the solvers' shares, and what the colours mean. Raises InputError."""
+    cells = read_cells(folder.path)
+    words = [outcome.words for outcome in OUTCOMES]
+    return {
+        "kind": "map",
+        "title": TITLE,
+        "note": NOTE.replace("\n", " "),
+        "headline": headline(cells, folder.name),
+        "outcomes": [{**o._asdict(), "count": sum(cell.outcome == o for cell in cells)} for o in OUTCOMES],
+        "cases": list(dict.fromkeys(cell.case for cell in cells)),
+        "solvers": list(dict.fromkeys(cell.solver for cell in cells)),
+        "references": {cell.solver: cited(cell.reference) for cell in cells},
+        "scores": [
+            {"solver": s.solver, "right": number(s.right), "finite": number(s.finite), "worst": s.worst.figure}
+            for s in scores(cells)
+        ],
+        "cells": [
+            [cell.case, cell.solver, words.index(cell.outcome.words), cell.figure, cell.reason, cell.run_id]
+            for cell in cells
+        ],
+    }
+
+
+def outcomes(map_of: dict[str, Any]) -> dict[str, Any]:
+    """By run id, what became of it."""
+    return {cell[5]: {"words": map_of["outcomes"][cell[2]]["words"], "reason": cell[4]} for cell in map_of["cells"]}

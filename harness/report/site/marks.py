@@ -1,0 +1,21 @@
+"""Colours, marks and line styles of `harness.report.style` as Plotly and the page's legends name them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from harness.report.style import DASH_DOTTED, DASHED, DOTTED, STARS, Mark
+
+_SYMBOLS: dict[Any, str] = {
+    "o": "circle", "s": "square", "^": "triangle-up", "v": "triangle-down", "<": "triangle-left",
+    ">": "triangle-right", "D": "diamond", "d": "diamond-tall", "P": "cross", "X": "x", "p": "pentagon",
+    "h": "hexagon", "*": "star", "H": "hexagon2", "8": "octagon",
+    STARS[0]: "star-diamond", STARS[1]: "hexagram", STARS[2]: "star-triangle-up", STARS[3]: "star-square",
+    STARS[4]: "star-triangle-down",
+}  # fmt: skip
+_DASHES: dict[Any, str] = {"-": "solid", DASHED: "dash", DOTTED: "dot", DASH_DOTTED: "dashdot"}
+
+
+def drawn(mark: Mark) -> dict[str, str]:
+    """A mark in Plotly's names."""
+    return {"color": mark.color, "symbol": _SYMBOLS[mark.marker], "dash": _DASHES.get(mark.dash, "longdash")}

@@ -1,0 +1,112 @@
+"""Meshes for the page, from recordings: the last frame of each run, and each solve's iterates beside its reference.
+
+Positions are single precision, as recordings have them: differences below 1e-7 of a scene's size are none.
+"""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.base.errors import SpringbenchError
+from harness.record.base import Replay
+from harness.record.reader import read_replay
+from harness.report.accuracy.measured import Curve, Measurements
+from harness.report.site import script
+from harness.report.site.folders import Folder
+
+Say = Callable[[str], None]
+
+KEPT = 25
+"""So many iterates of a solve at most, evenly spread over those that were recorded: of more a slider shows no more."""
+_NEAR = 1e-6
+"""Of the largest distance: where the scale of distances ends."""
+
+
+def write_last(folder: Folder, home: Path, units: Sequence[str], say: Say) -> set[str]:
+    """The last frames of these runs, where they are not there yet; returns the units whose are there."""
+    there: set[str] = set()
+    for unit in units:
+        recording, target = folder.path / "recordings" / f"{unit}.rrd", home / "meshes" / f"{unit}.js"
+        if not _fresh(target, recording):
+            replay = _read(recording, [-1], say)
+            if replay is None or not len(replay.frames):
+                continue
+            value = _shape(replay) | {"positions": _packed(replay.positions[-1], np.float32)}
+            script.write(target, f"{folder.slug}/meshes/{unit}", value)
+        there.add(unit)
+    return there
+
+
+def write_solves(folder: Folder, home: Path, table: Measurements, say: Say) -> dict[str, str]:
+    """The iterates of all solves that were recorded; returns the names of their scripts by their recordings."""
+    written: dict[str, str] = {}
+    for problem in table.problems:
+        curves = [c for c in table.curves if c.problem is problem and (folder.path / (c.recording or ".")).is_file()]
+        ended = [curve for curve in curves if len(curve.largest) and np.isfinite(curve.largest[-1])]
+        if ended:
+            best = min(ended, key=lambda curve: curve.largest[-1])
+            written |= _solves(folder, home, curves, best, say)
+    return written
+
+
+def _solves(folder: Folder, home: Path, curves: Sequence[Curve], best: Curve, say: Say) -> dict[str, str]:
+    """Those of one step; best: whose last iterate all are held against."""
+    truth = folder.path / best.recording
+    targets = {curve.recording: home / "solves" / f"{Path(curve.recording).stem}.js" for curve in curves}
+    stale = [name for name, target in targets.items() if not _fresh(target, folder.path / name, truth)]
+    last = _read(truth, [-1], say) if stale else None
+    for name in stale:
+        replay = _read(folder.path / name, None, say)
+        if replay is None or last is None or not len(replay.frames):
+            continue
+        distance = script.number(float(best.largest[-1] * best.problem.mean_rest_length))
+        told = {"of": best.label, "distance": distance, "positions": _packed(last.positions[-1], np.float32)}
+        value = _iterates(replay, last.positions[-1]) | {"reference": told}
+        script.write(targets[name], f"{folder.slug}/solves/{targets[name].stem}", value)
+    return {name: f"solves/{target.stem}" for name, target in targets.items() if target.exists()}
+
+
+def _iterates(replay: Replay, reference: NDArray[np.float32]) -> dict[str, Any]:
+    """Some of a solve's iterates, and the ends of the scale of their distances [m] from the reference."""
+    kept = np.unique(np.linspace(0, len(replay.frames) - 1, min(KEPT, len(replay.frames))).round().astype(int))
+    farthest = float(np.linalg.norm(replay.positions[kept] - reference, axis=2).max()) or 1.0
+    return _shape(replay) | {
+        "iterations": replay.frames[kept].tolist(),
+        "positions": _packed(replay.positions[kept], np.float32),
+        "farthest": script.number(farthest),
+        "nearest": script.number(_NEAR * farthest),
+    }
+
+
+def _shape(replay: Replay) -> dict[str, Any]:
+    """What does not change: triangles, springs, and the mean rest length [m]."""
+    lengths = replay.rest_lengths
+    return {
+        "triangles": _packed(replay.triangles, np.uint32),
+        "springs": _packed(replay.springs, np.uint32),
+        "length": script.number(float(lengths.mean())) if lengths.any() else 1.0,
+    }
+
+
+def _packed(values: NDArray[Any], kind: type) -> str:
+    """The bytes of an array, little endian, in base 64."""
+    return b64encode(np.ascontiguousarray(values, np.dtype(kind).newbyteorder("<")).tobytes()).decode()
+
+
+def _fresh(made: Path, *sources: Path) -> bool:
+    return made.exists() and all(source.stat().st_mtime_ns <= made.stat().st_mtime_ns for source in sources)
+
+
+def _read(recording: Path, frames: list[int] | None, say: Say) -> Replay | None:
+    """A recording; None, and a remark, where it is damaged."""
+    try:
+        return read_replay(recording, frames)
+    except SpringbenchError as error:
+        say(f"not on the page: {error}")
+        return None

@@ -1,0 +1,180 @@
+# pyright: reportUnknownMemberType=false
+# pyarrow's stubs know not every kind of file that Parquet is written to.
+"""Everything that the page says of one sweep: its line in the index, and the scripts with its runs and its charts."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from harness.base import rows, shelf
+from harness.base.files import replacing
+from harness.report.site import ablation, frames, hard, provenance, runs, speed
+from harness.report.site.failures import Failed, causes
+from harness.report.site.folders import Folder
+from harness.report.site.sentences import sentences
+
+Say = Callable[[str], None]
+
+_PICTURES = 3
+"""So many pictures of a sweep stand in the overview."""
+
+
+class Overview(NamedTuple):
+    """summary: what the index says of a sweep; scripts: the rest by name."""
+
+    summary: dict[str, Any]
+    scripts: dict[str, Any]
+
+
+class _Told(NamedTuple):
+    """What one kind of rows has to say."""
+
+    scripts: dict[str, Any]
+    plots: list[tuple[str, str]]
+    findings: list[dict[str, Any]]
+    failures: list[dict[str, Any]]
+    made: list[dict[str, Any]]
+    facts: dict[str, Any]
+
+
+def overview(folder: Folder, home: Path, *, meshes: bool, say: Say) -> Overview:
+    """What the rows of a sweep say; home: the folder of its data, where scripts of single runs are written."""
+    kinds = {"rows": _runs, "accuracy": _accuracy, "ablation": _ablation}
+    there = [kind for kind in kinds if shelf.units(folder.path / kind)]
+    told = [kinds[kind](folder, home, meshes, say) for kind in there]
+    made = [one for each in told for one in each.made]
+    summary: dict[str, Any] = {
+        "slug": folder.slug,
+        "name": folder.name,
+        "up": folder.up,
+        "kinds": there,
+        "config": provenance.config_of(folder.path),
+        "scenes": provenance.scenes_of(folder.path),
+        "made": made,
+        "from": min((one["from"] or "" for one in made), default=""),
+        "to": max((one["to"] or "" for one in made), default=""),
+        "plots": [{"id": name, "title": title} for each in told for name, title in each.plots],
+        "findings": [said for each in told for said in each.findings],
+        "failures": [cause for each in told for cause in each.failures],
+        "pictures": _pictures(folder),
+    }
+    for each in told:
+        summary |= each.facts
+    return Overview(summary, {name: value for each in told for name, value in each.scripts.items()})
+
+
+def _runs(folder: Folder, home: Path, meshes: bool, say: Say) -> _Told:
+    table = runs.read(folder)
+    found = runs.table_of(folder, table)
+    scripts: dict[str, Any] = {}
+    findings = sentences(found)
+    if speed.is_speed(table):
+        scripts["speed"], said = speed.chart(table)
+        findings = [{"words": words} for words in said]
+    outcomes: dict[str, Any] = {}
+    if hard.judged(table):
+        scripts["hard"] = hard.chart(folder)
+        outcomes = hard.outcomes(scripts["hard"])
+        findings = [{"words": f"{scripts['hard']['headline']}.", "plot": "hard"}, *findings[-1:]]
+    plots = [(name, chart["title"]) for name, chart in scripts.items()]
+    _add_meshes(folder, home, found, meshes, say)
+    scripts["runs"] = runs.as_script(folder, found, outcomes)
+    _parquet(home / "runs.parquet", found)
+    frames.write(folder, table, home, _without(folder, home, found))
+    failed = [Failed(r["scene"], r["label"], r["status"], r["reason"] or "", r["run_id"]) for r in found]
+    facts = {
+        "runs": len(found),
+        "statuses": Counter(run["status"] for run in found),
+        "took": sum(run["took"] or 0.0 for run in found),
+        "solvers": sorted({run["solver"] for run in found}),
+        "sizes": sorted({run["size"] for run in found if run["size"]}),
+        "other": sum(run["by"] == "other code" for run in found),
+    }
+    bad = causes(one for one in failed if one.status != "ok")
+    return _Told(scripts, plots, findings, bad, provenance.made(table, "run_id"), facts)
+
+
+def _add_meshes(folder: Folder, home: Path, found: Sequence[dict[str, Any]], anew: bool, say: Say) -> None:
+    """Whether a run's last frame is among the page's data; anew: those that are not are taken from recordings."""
+    there = {path.stem for path in (home / "meshes").glob("*.js")}
+    if anew and (recorded := [run["unit"] for run in found if run["recording"]]):
+        from harness.report.site.meshes import write_last
+
+        there = write_last(folder, home, recorded, say)
+    for run in found:
+        run["mesh"] = int(run["unit"] in there)
+
+
+def _without(folder: Folder, home: Path, found: Sequence[dict[str, Any]]) -> list[str]:
+    """The runs whose script is missing, or older than their rows."""
+    scripts = {path.stem: path.stat().st_mtime_ns for path in (home / "runs").glob("*.js")}
+    packed = shelf.packed_file(folder.path / "rows")
+    otherwise = packed.stat().st_mtime_ns if packed.exists() else 0
+    wanted: list[str] = []
+    for run in found:
+        try:
+            made = (folder.path / "rows" / f"{run['unit']}.parquet").stat().st_mtime_ns
+        except OSError:
+            made = otherwise
+        if scripts.get(run["run_id"], -1) < made:
+            wanted.append(run["run_id"])
+    return wanted
+
+
+def _parquet(path: Path, found: Sequence[dict[str, Any]]) -> None:
+    """The table of runs as a file for programs."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as partial:
+        pq.write_table(pa.Table.from_pylist([{k: v for k, v in r.items() if k != "settings"} for r in found]), partial)
+
+
+def _accuracy(folder: Folder, home: Path, meshes: bool, say: Say) -> _Told:
+    from harness.report.accuracy.findings import failures, findings
+    from harness.report.accuracy.measured import without_short
+    from harness.report.accuracy.reading import read
+    from harness.report.site.accuracy import charts
+
+    table = read(folder.path)
+    scripts, facts = charts(without_short(table), folder.path), dict[str, Any]()
+    if meshes:
+        from harness.report.site.meshes import write_solves
+
+        facts["solves"] = write_solves(folder, home, without_short(table), say)
+    chapters = findings(table)
+    told = [{"words": w, "chapter": name} for name, some in chapters.items() if name != "Methods" for w in some]
+    failed = [Failed(row["where"], row["solver"], row["status"], row["reason"]) for row in failures(table)]
+    plots = [(name, chart["title"]) for name, chart in scripts.items()]
+    facts |= {"curves": len(table.curves), "works": len(table.works)}
+    return _Told(scripts, plots, told, causes(failed), provenance.made(_plain(folder, "accuracy"), "unit"), facts)
+
+
+def _ablation(folder: Folder, home: Path, meshes: bool, say: Say) -> _Told:
+    table = _plain(folder, "ablation")
+    scripts, words = ablation.charts(table.to_pylist())
+    plots = [(name, chart["title"]) for name, chart in scripts.items()]
+    said = [{"words": f"{one}.", "chapter": "Effects"} for one in words]
+    return _Told(dict(scripts), plots, said, [], provenance.made(table, shelf.FILE), {"ablations": len(words)})
+
+
+def _plain(folder: Folder, kind: str) -> pa.Table:
+    units = shelf.units(folder.path / kind)
+    return rows.read(units, pa.schema([]), named=True, promote="permissive")
+
+
+def _pictures(folder: Folder) -> list[dict[str, str]]:
+    """The best of a sweep's pictures: solvers side by side before single runs, large meshes before small ones."""
+    found = sorted((folder.path / "pictures").glob("*.png"), key=_worth, reverse=True)
+    found += [p for name in ("convergence", "work") for p in sorted((folder.path / "report").glob(f"{name}/*.png"))][:2]
+    shown = [path for path in found if path.stem != "timing"][:_PICTURES]
+    return [{"path": p.relative_to(folder.path).as_posix(), "words": p.stem.replace("-", " ")} for p in shown]
+
+
+def _worth(path: Path) -> tuple[bool, int, str]:
+    sizes = [int(part) for part in path.stem.split("-") if part.isdigit()]
+    return path.stem.endswith("-solvers"), max(sizes, default=0), path.stem

@@ -1,0 +1,59 @@
+"""By which code and on which machine rows were made, and where the config lies that says how to make them again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import pyarrow as pa
+
+from harness.base.claim import NAME as CLAIM
+
+_COLUMNS = ("machine", "cpu", "cores", "memory_gib", "system", "commit")
+
+_MADE = f"""
+select {", ".join(f'"{name}"' for name in _COLUMNS)}, list(distinct code order by code), min(started), max(started),
+    count(distinct {{unit}})
+from rows_of where machine is not null group by all order by max(started) desc
+"""
+
+
+def made(table: pa.Table, unit: str) -> list[dict[str, Any]]:
+    """Machines and commits of rows, the newest first; unit: the column that counts what was measured."""
+    lacking = [name for name in (*_COLUMNS, "code", "started", unit) if name not in table.column_names]
+    for name in lacking:
+        table = table.append_column(name, pa.nulls(len(table), pa.string()))
+    with duckdb.connect() as connection:
+        connection.register("rows_of", table)
+        found = connection.execute(_MADE.format(unit=unit)).fetchall()
+    names = (*_COLUMNS, "codes", "from", "to", "count")
+    return [dict(zip(names, row, strict=True)) for row in found]
+
+
+def config_of(folder: Path) -> str:
+    """The config of a sweep's folder as it is best called in a command line; empty where it is not known or gone."""
+    note = folder / CLAIM
+    said = note.read_text(errors="replace").strip() if note.is_file() else ""
+    path = folder / said
+    if not said or "\0" in said or not path.is_file():
+        return ""
+    there = path.resolve()
+    for above in (Path.cwd(), *there.parents):  # as it is called from the folder that holds `configs/`
+        if there.is_relative_to(above) and (above == Path.cwd() or (above / "configs").is_dir()):
+            return there.relative_to(above).as_posix()
+    return there.name
+
+
+def scenes_of(folder: Path) -> dict[str, str]:
+    """By name, the files of the scenes that a sweep's config lists, called like the config itself."""
+    from harness.base.yaml import read_yaml
+
+    called = config_of(folder)
+    if not called:
+        return {}
+    data = read_yaml(folder / (folder / CLAIM).read_text().strip()).data
+    if "mesh" in data:
+        return {Path(called).stem: called}
+    listed = [str(scene) for scene in data.get("scenes") or ()]
+    return {Path(scene).stem: (Path(called).parent / scene).as_posix() for scene in listed}

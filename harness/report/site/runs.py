@@ -1,0 +1,132 @@
+"""A sweep's runs as the table of the page: one line a run, of what its rows say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+
+from harness.base import rows, shelf
+from harness.report.references import bibtex, cited
+from harness.report.site.folders import Folder
+from harness.report.site.marks import drawn
+from harness.report.site.script import column
+from harness.report.style import looks
+from harness.report.timing_table import labels, runs
+
+Run = dict[str, Any]
+
+MACHINE = "machine"
+"""The solver of rows that are no solver's: the limits of the machine itself, in a speed report."""
+
+_NEEDED = ("run_id", "scene", "size", "solver", "phase", "status")
+
+_MORE = """
+select run_id, any_value(file) as unit, any_value(family) as family, any_value(reference) as reference,
+    any_value(integrator) as integrator, any_value(time_step) as time_step, any_value(first_guess) as first_guess,
+    any_value(max_iterations) as max_iterations, any_value(tolerance) as tolerance, any_value(threads) as threads,
+    max(frame) as frames, 1 + max("round") filter (phase = 'step') as rounds,
+    arg_max(stopped, frame) filter (phase = 'step' and stopped is not null) as stopped,
+    sum(seconds) filter (phase in ('step', 'prepare')) as took,
+    arg_max(digest, frame) filter (digest is not null) as digest,
+    max(penetration) as penetration, any_value(machine) as machine, any_value(cpu) as cpu, any_value(cores) as cores,
+    any_value(memory_gib) as memory, any_value("system") as os, any_value("commit") as "commit",
+    any_value(code) as code, any_value(own) as own, any_value(started) as started, any_value(timing) as timing,
+    any_value(versions) as versions
+    {percentile}
+from numbered group by run_id
+"""
+_PERCENTILE = "strain_99"
+"""The column of the strain that 99 % of the springs stay below, in rows that have it."""
+
+
+def read(folder: Folder) -> pa.Table:
+    """The rows of a sweep, with the name of each one's unit. Raises InputError for damaged ones."""
+    return rows.read(shelf.units(folder.path / "rows"), needed=_NEEDED, named=True)
+
+
+def table_of(folder: Folder, table: pa.Table) -> list[Run]:
+    """The runs in rows, in their order: what each was, how it ended, and its times [ms]."""
+    there = {
+        part: _files(folder.path / part, suffix) for part, suffix in (("pictures", ".png"), ("recordings", ".rrd"))
+    }
+    timed = [run for run in runs(table) if run.solver != MACHINE]
+    names, more = labels(timed), _more(table)
+    found: list[Run] = []
+    for run in timed:
+        told: Run = {**run._asdict(), **more[run.run_id], "label": names[run.run_id]}
+        told["global"] = told.pop("global_")
+        told["options"] = names[run.run_id].removeprefix(run.solver).removeprefix(", ")
+        told |= {part[:-1]: int(told["unit"] in files) for part, files in there.items()}
+        found.append(told)
+    for run, how in zip(found, _other_code(found), strict=True):
+        run["by"] = how
+    return found
+
+
+def as_script(folder: Folder, found: Sequence[Run], outcomes: Mapping[str, Any]) -> dict[str, Any]:
+    """The table as columns; outcomes: of judged runs by their ids, an outcome's words and its reason."""
+    columns = {name: [run[name] for run in found] for name in _SHOWN if found and name in found[0]}
+    columns["parameters"] = [run["parameters"] or "{}" for run in found]
+    if outcomes:
+        columns["outcome"] = [outcomes.get(run["run_id"], {}).get("words") for run in found]
+    marks = looks((run["label"], run["solver"]) for run in found)
+    return {
+        "slug": folder.slug,
+        "up": folder.up,
+        "n": len(found),
+        "columns": {name: column(values) for name, values in columns.items()},
+        "marks": {label: drawn(mark) for label, mark in marks.items()},
+        "references": references((run["solver"], run["reference"]) for run in found),
+    }
+
+
+def references(pairs: Any) -> dict[str, dict[str, str]]:
+    """By solver, the reference in a line and as BibTeX."""
+    known = {solver: reference for solver, reference in pairs if reference}
+    return {s: {"cited": cited(reference), "bibtex": bibtex([reference])} for s, reference in known.items()}
+
+
+_SHOWN = (
+    *("run_id", "unit", "scene", "size", "solver", "label", "options", "family", "vertices", "springs"),
+    *("integrator", "time_step", "first_guess", "max_iterations", "tolerance", "threads", "frames", "rounds"),
+    *("status", "reason", "stopped", "iterations", "residual", "cold", "warm", "step", "lower", "upper", "least"),
+    *("local", "global", "largest_strain", _PERCENTILE, "penetration", "interrupted", "adds_up", "timing", "digest"),
+    *("picture", "recording", "mesh", "by", "machine", "cpu", "commit", "code", "started", "took", "own", "versions"),
+)
+
+
+def _more(table: pa.Table) -> dict[str, Run]:
+    """What the table of a sweep's end does not say of its runs, by their ids."""
+    there = _PERCENTILE in table.column_names
+    percentile = f", max({_PERCENTILE}) as {_PERCENTILE}" if there else ""
+    numbered = table.append_column("place", pa.array(np.arange(len(table))))
+    with duckdb.connect() as connection:
+        connection.register("numbered", numbered)
+        answer = connection.execute(_MORE.format(percentile=percentile))
+        names = [column[0] for column in answer.description or ()]
+        return {row[0]: dict(zip(names[1:], row[1:], strict=True)) for row in answer.fetchall()}
+
+
+def _files(folder: Path, suffix: str) -> set[str]:
+    return {path.stem for path in folder.glob(f"*{suffix}")} if folder.is_dir() else set()
+
+
+def _other_code(found: Sequence[Run]) -> list[str]:
+    """Of each run: `other code` than the newest run of its scene by its solver, an `earlier commit` than the newest of
+    all, or nothing."""
+    newest: dict[Any, Run] = {}
+    for run in sorted(found, key=lambda run: run["started"] or ""):
+        newest[run["scene"], run["solver"]] = newest[None] = run
+    return [
+        "other code"
+        if run["code"] != newest[run["scene"], run["solver"]]["code"]
+        else "earlier commit"
+        if run["commit"] != newest[None]["commit"]
+        else ""
+        for run in found
+    ]

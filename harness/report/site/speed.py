@@ -1,0 +1,67 @@
+"""The chart of a speed report for the page: times and bytes a second by size, beside what the machine allows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyarrow as pa
+
+from harness.report.references import cited
+from harness.report.site.accuracy import LOG, axis
+from harness.report.site.marks import drawn
+from harness.report.site.runs import MACHINE
+from harness.report.site.script import number
+from harness.report.speed.figures import Figures, figures
+from harness.report.speed.table import remarks
+from harness.report.style import looks
+
+_LINEAR = {"rangemode": "tozero"}
+_SHARE = {"rangemode": "tozero", "tickformat": ".0%"}
+_COLUMNS = {
+    "step": axis("step", "ms, a step of 50 iterations"),
+    "global_": axis("global_", "ms, a global step"),
+    "local": axis("local", "ms, a local step"),
+    "warm": axis("warm", "ms, to prepare, warm"),
+    "touched": axis("touched", "bytes a second that an iteration touches", LOG),
+    "reached": axis("reached", "of the limit that binds", _SHARE),
+    "faster": axis("faster", "times faster than the yardstick in C++", _LINEAR),
+}
+
+
+def is_speed(table: pa.Table) -> bool:
+    """Whether rows are those of a speed report: the machine's own limits are among them."""
+    return MACHINE in table["solver"].unique().to_pylist()
+
+
+def chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
+    """The chart, and what there is to say."""
+    found = figures(table)
+    timed = [f for f in found if f.status == "ok"]
+    reference = dict(zip(*(table[name].to_pylist() for name in ("solver", "reference")), strict=True))
+    lines: dict[tuple[str, str], list[Figures]] = {}
+    for f in sorted(timed, key=lambda f: f.vertices):
+        lines.setdefault((f.scene, f.label), []).append(f)
+    marks = looks((f.label, f.solver) for f in timed)
+    hover = [["vertices", "vertices"], ["step", "ms a step"], ["global_", "ms a global step"]]
+    return {
+        "title": "Speed and its limits",
+        "note": "Medians over the rounds. A limit is what the machine reads or computes at most, measured beside the "
+        "solvers; the yardstick is the same method in C++ with Eigen.",
+        "filters": ["scene"],
+        "x": [axis("vertices", "vertices")],
+        "y": list(_COLUMNS.values()),
+        "hover": [*hover, ["binds", "limit that binds"], ["reached", "share of that limit reached"]],
+        "items": [_item(scene, label, some) for (scene, label), some in lines.items()],
+        "marks": {label: drawn(mark) for label, mark in marks.items()},
+        "references": {f.label: {"cited": cited(reference.get(f.solver)), "bibtex": ""} for f in timed},
+    }, remarks(found)
+
+
+def _item(scene: str, label: str, some: list[Figures]) -> dict[str, Any]:
+    names = ("vertices", *(name for name in _COLUMNS if name != "faster"))
+    columns = {name: [number(getattr(f, name)) for f in some] for name in names}
+    columns["faster"] = [number(f.faster and f.faster.middle) for f in some]
+    ends = {f"faster_{end}": [number(getattr(f.faster, end, None)) for f in some] for end in ("low", "high")}
+    threads = f"{some[0].threads} thread{'s' if some[0].threads > 1 else ''}"
+    told = {"label": label, "what": f"{scene}, {threads}", "scene": scene, "panel": scene, "parameters": "{}"}
+    return told | columns | ends | {"binds": [f.binds for f in some]}

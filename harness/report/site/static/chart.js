@@ -1,0 +1,138 @@
+// One way to draw lines and points, for all plots: by Plotly, with a legend, a remark and keys of our own.
+"use strict";
+springbench.chart = (() => {
+  const { element, script, number, colour, glyph } = springbench;
+  const tip = element("div.tip", { hidden: true, role: "tooltip" });
+  const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const at = (item, column, k) => (Array.isArray(item[column]) ? item[column][k] : item[column]);
+
+  function told(chart, item, k) {
+    const rows = chart.hover.map(([column, words]) => {
+      const value = at(item, column, k);
+      return value === null || value === undefined ? null : element("tr", {}, element("td", {}, words), element("td", {}, typeof value === "string" ? value : number(value)));
+    });
+    return [element("b", {}, item.label), item.what, element("table", {}, element("tbody", {}, ...rows.filter(Boolean)))];
+  }
+
+  // Beside the point and inside the window, never wider than a remark.
+  function show(x, y, content) {
+    tip.replaceChildren(...content);
+    if (!tip.isConnected) document.body.append(tip);
+    tip.hidden = false;
+    const { width, height } = tip.getBoundingClientRect();
+    tip.style.left = `${x + 18 + width < innerWidth ? x + 18 : Math.max(6, x - width - 18)}px`;
+    tip.style.top = `${Math.max(6, y - height - 14 > 60 ? y - height - 14 : y + 18)}px`;
+  }
+  const hide = () => { tip.hidden = true; };
+  addEventListener("hashchange", hide);
+
+  function trace(chart, item, x, y, panel, tail) {
+    const mark = chart.marks[item.label], ink = colour(mark.color), points = chart.shape === "points";
+    const ends = ["", "_low", "_high"].map(end => item[`${x.column}${end}`]), upright = ["", "_low", "_high"].map(end => item[`${y.column}${end}`]);
+    const bars = some => (some[1] && some[2] ? {
+      type: "data", symmetric: false, color: ink, thickness: 1.2, width: 3,
+      array: some[2].map((v, k) => v - some[0][k]), arrayminus: some[1].map((v, k) => some[0][k] - v),
+    } : undefined);
+    const hollow = item.open ? "-open" : "";
+    return {
+      x: item[x.column], y: item[y.column], name: item.label, xaxis: `x${tail}`, yaxis: `y${tail}`, meta: { item },
+      mode: points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
+      line: { color: ink, dash: mark.dash, width: 1.7, shape: chart.shape === "hv" ? "hv" : undefined },
+      // Marks stand apart: so many of a line at most, whatever the number of its points.
+      marker: { symbol: mark.symbol + hollow, color: ink, size: 8, maxdisplayed: points ? 0 : chart.shape === "hv" ? 4 : 9, line: { width: item.open ? 1.6 : 0, color: ink } },
+    };
+  }
+
+  function failed(item, x, y, tail, ink) {
+    const k = item[y.column].findLastIndex((v, j) => v !== null && item[x.column][j] !== null);
+    return k < 0 ? [] : [{
+      x: [item[x.column][k]], y: [item[y.column][k]], xaxis: `x${tail}`, yaxis: `y${tail}`, mode: "markers", hoverinfo: "skip",
+      marker: { symbol: "x-thin", size: 12, line: { width: 2.4, color: ink } },
+    }];
+  }
+
+  // Draw the items of a chart, by the columns x and y, a panel for each of `item.panel`.
+  async function draw(plot, chart, items, x, y, { hidden = new Set(), onPoint = () => {}, small = false } = {}) {
+    await script("site/plotly.js");
+    const panels = [...new Set(items.map(item => item.panel ?? ""))], narrow = plot.clientWidth < 640 && panels.length > 1;
+    const style = {
+      gridcolor: css("--hair"), linecolor: css("--muted"), zeroline: false, zerolinecolor: css("--rule"), exponentformat: "power", minexponent: 4, ticks: "outside", ticklen: 4, tickcolor: css("--rule"),
+      tickfont: { color: css("--muted"), size: small ? 11 : 12 }, title: { font: { color: css("--muted"), size: small ? 12 : 13 }, standoff: 8 }, automargin: true, dtick: undefined,
+    };
+    const layout = {
+      margin: { t: panels[0] ? 30 : 12, l: 20, r: 10, b: 20 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", hovermode: "closest", hoverdistance: 24, showlegend: false,
+      annotations: [], font: { family: getComputedStyle(document.body).fontFamily, color: css("--ink") }, dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
+    };
+    const traces = [], gap = narrow ? 0.16 : 0.05, n = panels.length;
+    const range = axis => (axis.axis.type === "log" ? { ...axis.axis, nticks: small ? 5 : 9 } : axis.axis);
+    panels.forEach((panel, k) => {
+      const tail = k ? k + 1 : "", size = (1 + gap) / n - gap, low = k * (size + gap);
+      const across = narrow ? [0, 1] : [low, Math.min(1, low + size)], up = narrow ? [Math.max(0, 1 - low - size), 1 - low] : [0, 1];
+      layout[`xaxis${tail}`] = { ...style, ...range(x), title: { ...style.title, text: narrow && k < n - 1 ? "" : x.title }, domain: across, anchor: `y${tail}` };
+      layout[`yaxis${tail}`] = { ...style, ...range(y), title: { ...style.title, text: k && !narrow ? "" : y.title }, domain: up, anchor: `x${tail}`, matches: k ? "y" : undefined, showticklabels: !k || narrow };
+      if (panel && n > 0) layout.annotations.push({ text: `<b>${panel}</b>`, x: across[0], y: up[1], yshift: 22, xref: "paper", yref: "paper", showarrow: false, xanchor: "left", font: { size: 13, color: css("--ink") } });
+      for (const item of items) {
+        if ((item.panel ?? "") !== panel || hidden.has(item.label)) continue;
+        traces.push(trace(chart, item, x, y, panel, tail));
+        if (item.status && item.status !== "ok") traces.push(...failed(item, x, y, tail, colour(chart.marks[item.label].color)));
+      }
+    });
+    await Plotly.react(plot, traces, layout, { displayModeBar: false, responsive: true, showTips: false });
+    plot.removeAllListeners("plotly_hover");
+    plot.removeAllListeners("plotly_unhover");
+    plot.removeAllListeners("plotly_click");
+    plot.on("plotly_hover", ({ points: [p], event }) => {
+      if (!p.data.meta) return;
+      const box = plot.getBoundingClientRect();
+      const [left, top] = [p.xaxis._offset + p.xaxis.d2p(p.x) + box.left, p.yaxis._offset + p.yaxis.d2p(p.y) + box.top];
+      show(left, top, told(chart, p.data.meta.item, p.pointNumber));
+    });
+    plot.on("plotly_unhover", hide);
+    plot.on("plotly_click", ({ points: [p] }) => { if (p.data.meta) onPoint(p.data.meta.item, p.pointNumber); });
+    keys(plot, chart, onPoint);
+  }
+
+  // Left and right go along a line, up and down to the next line, Enter opens the point, Home shows all again.
+  function keys(plot, chart, onPoint) {
+    let line = -1, k = 0;
+    plot.onkeydown = event => {
+      const lines = plot.data.map((one, number) => [one, number]).filter(([one]) => one.meta);
+      const step = { ArrowRight: [0, 1], ArrowLeft: [0, -1], ArrowDown: [1, 0], ArrowUp: [-1, 0] }[event.key];
+      if (event.key === "Enter" && line >= 0) onPoint(lines[line][0].meta.item, k);
+      else if (event.key === "Home") Plotly.relayout(plot, Object.fromEntries(Object.keys(plot.layout).filter(key => /^[xy]axis/.test(key)).map(key => [`${key}.autorange`, plot.layout[key].autorange === "reversed" ? "reversed" : true])));
+      else if (step && lines.length) {
+        line = line < 0 ? 0 : (line + step[0] + lines.length) % lines.length;
+        const [one, curve] = lines[line];
+        for (let tries = 0; tries <= one.x.length; tries++) {
+          k = (k + (step[1] || (tries ? 1 : 0)) + one.x.length) % one.x.length;
+          if (one.x[k] !== null && one.y[k] !== null) break;
+        }
+        const full = plot._fullData[curve], box = plot.getBoundingClientRect(), axes = [plot._fullLayout[full.xaxis.replace("x", "xaxis")], plot._fullLayout[full.yaxis.replace("y", "yaxis")]];
+        show(axes[0]._offset + axes[0].d2p(one.x[k]) + box.left, axes[1]._offset + axes[1].d2p(one.y[k]) + box.top, told(chart, one.meta.item, k));
+        springbench.tell(`${one.name}: ${number(one.x[k])}, ${number(one.y[k])}`);
+      } else return;
+      event.preventDefault();
+    };
+    plot.onblur = hide;
+  }
+
+  // Names with their marks; each is a switch.
+  function legend(labels, chart, items, hidden, onChange) {
+    return labels.map(label => {
+      const source = chart.references?.[label], drawn = items.some(item => item.label === label && item[chart.x[0].column].some(v => v !== null));
+      return element("li", {}, element("button", {
+        type: "button", "aria-pressed": String(!hidden.has(label)), title: source?.cited,
+        onclick: event => {
+          const next = new Set(hidden);
+          if (event.shiftKey || event.detail === 2) {
+            labels.forEach(one => next.add(one));
+            next.delete(label);
+          } else if (!next.delete(label)) next.add(label);
+          onChange(next);
+        },
+      }, glyph(chart.marks[label]), element("span", {}, label, !drawn && element("span.muted", {}, " – nothing to draw"))));
+    });
+  }
+
+  return { draw, legend, hide };
+})();

@@ -1,0 +1,108 @@
+// Runs side by side: in what they differ, their times with intervals, their curves, and how far apart they end.
+"use strict";
+(() => {
+  const { element, data, number, fixed, percent, state, glyph, title, address, rowOf, picture, floats, whole } = springbench;
+  const FIELDS = [
+    ["scene", "scene"], ["size", "size"], ["solver", "solver"], ["parameters", "parameters"], ["integrator", "integrator"], ["time_step", "time step, s"], ["first_guess", "first guess"],
+    ["max_iterations", "iterations at most"], ["tolerance", "tolerance"], ["threads", "threads"], ["frames", "frames"], ["rounds", "rounds"], ["cpu", "processor"], ["commit", "commit"], ["code", "sources"],
+  ];
+  const CURVES = [["ms", "ms a step", { type: "log" }], ["residual", "residual, J^½", { type: "log" }], ["iterations", "iterations", {}], ["strain", "largest strain, %", {}], ["objective", "objective, J", {}], ["distance", "from the reference, sizes", { type: "log" }]];
+
+  // The median over frames of a ratio with its 95 % interval, by resampling the frames (seeded, so it repeats).
+  function interval(logs) {
+    const middle = some => { const s = Float64Array.from(some).sort(), h = s.length >> 1; return s.length % 2 ? s[h] : (s[h - 1] + s[h]) / 2; };
+    let seed = 12345;
+    const random = () => { seed = (1103515245 * seed + 12345) % 2147483648; return seed / 2147483648; };
+    const found = Float64Array.from({ length: logs.length > 1 ? 1000 : 1 }, () => middle(logs.map(() => logs[Math.floor(random() * logs.length)]))).sort();
+    return [middle(logs), found[Math.floor(0.025 * found.length)], found[Math.min(found.length - 1, Math.floor(0.975 * found.length))]].map(Math.exp);
+  }
+
+  function ratio(frames, first) {
+    const logs = frames.least.map((v, k) => Math.log(v / first.least[k])).filter(Number.isFinite);
+    return logs.length ? interval(logs) : null;
+  }
+
+  function table(rows, series) {
+    const differing = FIELDS.filter(([key]) => rows.length > 1 && new Set(rows.map(row => row[key])).size > 1);
+    const same = FIELDS.filter(field => !differing.includes(field)).map(([key, words]) => [words, rows[0][key]]).filter(([, v]) => v !== null && v !== undefined && v !== "{}");
+    const line = (words, cells) => element("tr", {}, element("th", { scope: "row" }, words), ...cells.map(cell => element("td", {}, cell ?? "–")));
+    const against = rows.map((row, k) => {
+      const found = k && series[k] && series[0] ? ratio(series[k], series[0]) : null;
+      return k ? (found ? `${number(found[0])} (${number(found[1])} to ${number(found[2])})` : "–") : "1";
+    });
+    const body = [
+      ...differing.map(([key, words]) => line(words, rows.map(row => (key === "commit" ? (row[key] || "").slice(0, 10) : String(row[key] ?? "–"))))),
+      line("status", rows.map(row => state(row.status))), line("ms a step, quartiles", rows.map(row => (row.step === null ? "–" : `${number(row.step)} (${number(row.lower)} to ${number(row.upper)})`))),
+      rows.length > 1 && line("times the first, frame by frame, 95 %", against), line("least ms", rows.map(row => number(row.least))), line("prepare ms, cold, warm", rows.map(row => `${number(row.cold)}, ${number(row.warm)}`)),
+      line("iterations, stopped by", rows.map(row => `${number(row.iterations)}, ${row.stopped || "–"}`)), line("last residual", rows.map(row => fixed(row.residual))), line("largest strain", rows.map(row => percent(row.largest_strain))),
+      rows.length > 1 && line("last positions", rows.map((row, k) => (k ? (row.digest && row.digest === rows[0].digest ? "equal to the bit" : "differ") : ""))),
+    ];
+    const head = rows.map(row => element("th", { scope: "col" }, glyph(row.mark), " ", element("a", { href: address("runs", { sweep: row.slug, run: row.key }) }, title(row))));
+    return [element("div.scroll", { tabIndex: 0, role: "region", "aria-label": "The runs side by side" }, element("table.plain", {}, element("thead", {}, element("tr", {}, element("td"), ...head)), element("tbody", {}, ...body.filter(Boolean)))),
+      element("p.muted", {}, `The same in all: ${same.map(([words, v]) => `${words} ${typeof v === "number" ? number(v) : v}`).join(", ")}.`)];
+  }
+
+  async function curves(box, rows, series) {
+    const labels = rows.map((row, k) => `${k + 1} ${title(row)}`), twice = row => rows.filter(other => other.mark.color === row.mark.color).length > 1;
+    const DASHES = ["solid", "dash", "dot", "dashdot"];
+    const marks = Object.fromEntries(rows.map((row, k) => [labels[k], twice(row) ? { ...row.mark, dash: DASHES[k % 4] } : row.mark]));
+    for (const [column, words, how] of CURVES) {
+      const items = rows.map((row, k) => series[k] && {
+        label: labels[k], what: "", frame: series[k].frame, [column]: column === "strain" ? series[k].strain.map(v => v && 100 * v) : series[k][column],
+        ...(column === "ms" ? { ms_low: series[k].lower, ms_high: series[k].upper } : {}),
+      }).filter(item => item && item[column].some(v => v !== null));
+      if (!items.length) continue;
+      const plot = element("div.plot.small", { tabIndex: 0, role: "group", "aria-label": `Plot: ${words} by frame. Arrow keys go through its points.` });
+      box.append(plot);
+      const chart = { marks, hover: [["frame", "frame"], [column, words]] };
+      await springbench.chart.draw(plot, chart, items, { column: "frame", title: "frame", axis: {} }, { column, title: words, axis: how }, { small: true });
+    }
+  }
+
+  async function differences(box, rows) {
+    const tables = new Map();
+    for (const row of rows) {
+      if (row.mesh) tables.set(row, await data(`${row.slug}/meshes/${row.unit}`));
+    }
+    const [first, ...others] = rows, base = tables.get(first);
+    if (!base || !others.some(row => tables.has(row))) {
+      box.append(element("p.muted", {}, "Where they differ is drawn from their recordings: ", element("code", {}, "springbench report"), " takes the last frames in."));
+      return;
+    }
+    const p = floats(base.positions), view = springbench.camera(p), shape = { springs: whole(base.springs), triangles: whole(base.triangles) };
+    for (const row of others) {
+      const found = tables.get(row);
+      if (!found || found.positions.length !== base.positions.length) {
+        box.append(element("p.muted", {}, `${title(row)}: another mesh than the first run's, or no recording.`));
+        continue;
+      }
+      const q = floats(found.positions), far = new Float32Array(q.length / 3);
+      for (let i = 0; i < far.length; i++) far[i] = Math.hypot(q[3 * i] - p[3 * i], q[3 * i + 1] - p[3 * i + 1], q[3 * i + 2] - p[3 * i + 2]);
+      const most = far.reduce((a, b) => Math.max(a, b), 0), drawn = springbench.mesh(view, shape, `Last frame of ${title(row)}, coloured by its distance from the first run`);
+      box.append(element("figure", {}, drawn.canvas, element("figcaption", {}, `${title(row)}: at most ${number(most)} m from ${title(first)}, ${number(most / base.length)} mean rest lengths`),
+        springbench.scaleBox("0", `${number(most || 0)} m`)));
+      drawn.show(q, far.map(v => (most ? v / most : 0)));
+    }
+  }
+
+  springbench.views.compare = async (content, query) => {
+    const box = element("div.page.compare");
+    content.append(box);
+    async function update(next) {
+      const keys = (next.get("sel") || "").split(",").filter(Boolean).slice(0, 8), rows = (await Promise.all(keys.map(rowOf))).filter(Boolean);
+      box.replaceChildren(element("h1", {}, rows.length > 1 ? "Comparison" : "Frame by frame"), element("p", {}, element("a", { href: address("runs", { sel: keys.join(",") }) }, "Choose other runs")));
+      if (!rows.length) return void box.append(element("p", {}, "No run is chosen: tick two or more in the table of runs."));
+      const series = await Promise.all(rows.map(row => (row.step === null ? null : data(`${row.slug}/runs/${row.run_id}`))));
+      const plots = element("div.curves"), meshes = element("div.differ"), shots = rows.filter(row => picture(row));
+      box.append(...table(rows, series), element("h3", {}, "Frame by frame"), element("ul.legend", { style: "display:flex;flex-wrap:wrap;gap:4px 20px" }, ...rows.map((row, k) => element("li", {}, glyph(row.mark), ` ${k + 1} ${title(row)}`))), plots);
+      if (rows.length > 1) box.append(element("h3", {}, "Difference of the last positions"), meshes);
+      if (shots.length) box.append(element("div.pictures", {}, ...shots.map(row => element("figure", {}, element("a", { href: picture(row) }, element("img", { src: picture(row), alt: `Picture of ${title(row)}` })), element("figcaption", {}, title(row))))));
+      await curves(plots, rows, series);
+      if (rows.length > 1) await differences(meshes, rows);
+    }
+    const recolour = () => update(springbench.where().query);
+    addEventListener("recolour", recolour);
+    await update(query);
+    return { update, leave: () => removeEventListener("recolour", recolour) };
+  };
+})();

@@ -1,0 +1,63 @@
+// The runs of all sweeps as rows, and what is known of each.
+"use strict";
+Object.assign(springbench, (() => {
+  const { data } = springbench;
+  let index = null;
+  const tables = new Map();
+
+  // The rows of a sweep's runs, made of its columns.
+  async function rowsOf(sweep) {
+    if (tables.has(sweep.slug)) return tables.get(sweep.slug);
+    const table = await data(`${sweep.slug}/runs`), names = Object.keys(table.columns);
+    const read = names.map(name => {
+      const column = table.columns[name];
+      return Array.isArray(column) ? k => column[k] : k => (column.at[k] < 0 ? null : column.of[column.at[k]]);
+    });
+    const rows = Array.from({ length: table.n }, (_, k) => {
+      const row = { sweep: sweep.name, slug: sweep.slug };
+      for (let c = 0; c < names.length; c++) row[names[c]] = read[c](k);
+      row.key = `${sweep.slug}/${row.run_id}`;
+      row.mark = table.marks[row.label];
+      return row;
+    });
+    tables.set(sweep.slug, rows);
+    return rows;
+  }
+
+  // All rows, or those of one sweep.
+  async function rows(slug = "") {
+    index ??= await data("index");
+    const chosen = index.sweeps.filter(sweep => sweep.runs && (!slug || sweep.slug === slug));
+    return (await Promise.all(chosen.map(rowsOf))).flat();
+  }
+
+  async function rowOf(key) {
+    const slug = key.slice(0, key.lastIndexOf("/"));
+    return (await rows(slug)).find(row => row.key === key);
+  }
+
+  const sweepOf = slug => index.sweeps.find(sweep => sweep.slug === slug);
+  const references = async slug => (await data(`${slug}/runs`)).references;
+  const picture = row => (row.picture ? `${sweepOf(row.slug).up}pictures/${encodeURIComponent(row.unit)}.png` : "");
+  const recording = row => (row.recording ? `${sweepOf(row.slug).up}recordings/${encodeURIComponent(row.unit)}.rrd` : "");
+  const title = row => `${row.scene}${row.size ? ` ${row.size}` : ""}, ${row.label}`;
+
+  // A word as a shell takes it.
+  const quoted = words => (/^[\w./:=@%+,-]+$/.test(words) ? words : `'${String(words).replaceAll("'", "'\\''")}'`);
+
+  // The command line that does a run again: of its scene alone where the solver is called by its name, else the sweep.
+  function command(row) {
+    const sweep = sweepOf(row.slug), scene = sweep.scenes[row.scene];
+    const whole = `springbench run ${quoted(sweep.config || `${sweep.name}.yaml`)}`;
+    if (!scene || row.parameters !== "{}" || row.own) return `${whole} --again`;
+    const options = {
+      size: row.size || null, solver: row.solver, iterations: row.max_iterations, tolerance: row.tolerance,
+      integrator: row.integrator, "time-step": row.time_step, "first-guess": row.first_guess, threads: row.threads,
+      frames: row.frames, rounds: row.rounds,
+    };
+    const told = Object.entries(options).filter(([, value]) => value !== null && value !== undefined);
+    return [`springbench run ${quoted(scene)}`, ...told.map(([name, value]) => `--${name} ${quoted(String(value))}`)].join(" ");
+  }
+
+  return { rows, rowOf, sweepOf, references, picture, recording, title, command };
+})());

@@ -1,0 +1,99 @@
+// One run: what it was, what became of it, its picture and recording, and the command that does it again.
+"use strict";
+Object.assign(springbench, (() => {
+  const { element, data, script, number, percent, fixed, step, day, glyph, state, copy, title, picture, recording, command, rowOf, references, sweepOf } = springbench;
+
+  const pair = ([name, value]) => [element("dt", {}, name), element("dd", {}, value ?? "–")];
+  const list = pairs => element("dl", {}, ...pairs.filter(([, value]) => value !== null && value !== undefined && value !== "").flatMap(pair));
+
+  function code(words, label) {
+    return element("div.command", {}, element("code", { tabIndex: 0, "aria-label": label }, words), element("button.quiet", { type: "button", onclick: () => copy(words) }, "Copy"));
+  }
+
+  // A method's source: authors, year and doi, and BibTeX to copy.
+  function method(reference) {
+    if (!reference) return null;
+    const doi = /doi:(\S+)$/.exec(reference.cited);
+    const words = doi ? reference.cited.slice(0, doi.index).replace(/, $/, "") : reference.cited;
+    return element("p.method", {}, words, doi && ", ", doi && element("a", { href: `https://doi.org/${doi[1]}`, rel: "noreferrer" }, `doi:${doi[1]}`), " ",
+      reference.bibtex && element("button.quiet", { type: "button", onclick: () => copy(reference.bibtex) }, "Copy BibTeX"));
+  }
+
+  // A recording: replayed in the page where its viewer is there, offered as a file else.
+  function replay(id, file, unit, slug) {
+    if (!file) return element("p.muted", {}, "No recording was kept.");
+    const box = element("div.replay"), view = `springbench view ${decodeURI(file)}`;
+    const offer = why => [element("p.muted", {}, `${why} `, element("a", { href: file }, "The file"), " opens by"), code(view, "Command that opens the recording")];
+    const name = `site/data/${encodeURIComponent(slug)}/recordings/${encodeURIComponent(unit)}.js`;
+    const button = element("button.strong", {
+      type: "button",
+      onclick: async () => {
+        button.disabled = true;
+        button.textContent = "Loading the viewer…";
+        try {
+          if (!springbench.replay) await script("site/viewer.js");
+          await springbench.replay(id, name);
+          button.textContent = "Replay";
+        } catch (error) {
+          button.remove();
+          box.append(...offer(`The viewer cannot start here: ${error.message}.`));
+        }
+        button.disabled = false;
+      },
+    }, "Replay");
+    data("index").then(index => {
+      if (index.viewer) box.append(button, element("a", { href: file }, "Recording (.rrd)"));
+      else box.append(...offer("Not replayed in this page."));
+    });
+    return box;
+  }
+
+  function settings(row) {
+    const own = Object.entries(JSON.parse(row.parameters || "{}"));
+    return list([
+      ["mesh", `${number(row.vertices, 6)} vertices, ${number(row.springs, 6)} springs`], ["integrator", row.integrator], ["time step", row.time_step && step(row.time_step)],
+      ["first guess", row.first_guess], ["iterations at most", row.max_iterations], ["tolerance", row.tolerance],
+      ["threads", row.threads], ["frames, rounds", row.frames && `${row.frames}, ${row.rounds}`], ...own.map(([name, value]) => [name, String(value)]),
+    ]);
+  }
+
+  function figures(row) {
+    if (row.step === null) return null;
+    return list([
+      ["ms a step", `${number(row.step)}   (quartiles ${number(row.lower)} to ${number(row.upper)}, least ${number(row.least)})`],
+      ["prepare, ms", `cold ${number(row.cold)}, warm ${number(row.warm)}`], ["local, global, ms", row.local !== null ? `${number(row.local)}, ${number(row.global)}` : null],
+      ["iterations", `${number(row.iterations)}, stopped by ${row.stopped || "their number"}`],
+      ["last residual", row.residual === null ? "none: it minimises nothing" : `${fixed(row.residual)} J^½`],
+      ["largest strain", percent(row.largest_strain)], ["99 % of springs below", row.strain_99 === undefined || row.strain_99 === null ? null : percent(row.strain_99)],
+      ["deepest inside an obstacle", row.penetration ? `${number(row.penetration)} m` : null],
+    ]);
+  }
+
+  async function detail(panel, key, { close }) {
+    const row = await rowOf(key);
+    const shut = element("button.quiet.close", { type: "button", onclick: close, "aria-label": "Close" }, "×");
+    panel.onkeydown = event => { if (event.key === "Escape") close(); };
+    if (!row) {
+      panel.append(shut, element("p", {}, `There is no run ${key} any more.`));
+      return;
+    }
+    const source = (await references(row.slug))[row.solver], src = picture(row), sweep = sweepOf(row.slug);
+    panel.append(shut, element("h2", {}, glyph(row.mark), ` ${row.scene}${row.size ? ` ${row.size}` : ""}`), element("p.label", {}, row.label),
+      element("p.states", {}, state(row.status), row.outcome && state(row.outcome), row.by && element("span.code", {}, row.by)),
+      row.reason && element("p.reason", {}, row.reason),
+      src && element("a.shot", { href: src }, element("img", { src, alt: `The run's last frame and earlier ones: ${title(row)}` })),
+      replay(row.run_id, recording(row), row.unit, row.slug),
+      element("h3", {}, "Measured"), figures(row) || element("p.muted", {}, "Nothing: see its status."),
+      element("h3", {}, "Asked"), settings(row),
+      element("h3", {}, "Do it again"), code(command(row), "Command that repeats the run"),
+      source && element("h3", {}, "Method"), method(source),
+      element("h3", {}, "Made by"), list([
+        ["code", element("span", {}, element("code", {}, (row.commit || "unknown").slice(0, 12)), ` (sources ${row.code})`)], ["machine", `${row.cpu || "unknown"} (${(row.machine || "").slice(0, 6)})`],
+        ["on", (row.started || "").replace("T", " ").slice(0, 16)], ["timed", row.timing], ["own code", row.own],
+      ]),
+      element("p", {}, element("a", { href: `${sweep.up}rows/${encodeURIComponent(row.unit)}.parquet` }, "Its rows (Parquet)"), " · ",
+        element("a", { href: springbench.address("compare", { sel: key }) }, "Frame by frame")));
+  }
+
+  return { detail, method, replay, commandBox: code, definitions: list };
+})());

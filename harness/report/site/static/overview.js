@@ -1,0 +1,97 @@
+// The first view: what was run, by which code and where, what is known now, what failed and why.
+"use strict";
+(() => {
+  const { element, address, many, count, duration, day, state } = springbench;
+
+  function facts(sweep) {
+    const told = [];
+    if (sweep.runs) told.push(many(sweep.runs, "run"));
+    if (sweep.curves) told.push(many(sweep.curves, "solve"));
+    if (sweep.works) told.push(many(sweep.works, "simulation"));
+    if (sweep.ablations) told.push(many(sweep.ablations, "verdict"));
+    if (sweep.sizes?.length) told.push(`size${sweep.sizes.length > 1 ? `s ${sweep.sizes[0]} to ${sweep.sizes.at(-1)}` : ` ${sweep.sizes[0]}`}`);
+    if (sweep.took) told.push(`${duration(sweep.took)} timed`);
+    return told.join(" · ");
+  }
+
+  function outcome(sweep) {
+    const told = Object.entries(sweep.statuses || {}).map(([status, n]) => state(status, `${count(n)} ${status}`));
+    if (sweep.other) told.push(element("span.state.mild", {}, element("span", { "aria-hidden": "true" }, "↻ "), `${count(sweep.other)} by other code`));
+    return told;
+  }
+
+  function made(sweep) {
+    return sweep.made.slice(0, 3).map(m => element("div", {},
+      `${m.cpu || "unknown processor"}, ${many(m.cores || 0, "core")}, ${m.memory_gib ?? "?"} GiB`, element("br"),
+      element("span.muted", {}, `code `, element("code", {}, (m.commit || "unknown").slice(0, 10) + (/dirty/.test(m.commit) ? "-dirty" : "")),
+        ` · machine ${(m.machine || "unknown").slice(0, 6)} · ${day(m.from) === day(m.to) ? day(m.to) : `${day(m.from)} to ${day(m.to)}`}`)));
+  }
+
+  function way(sweep, finding) {
+    if (finding.plot) return address("plots", { sweep: sweep.slug, plot: finding.plot });
+    if (finding.filter) return address("runs", { sweep: sweep.slug, ...finding.filter });
+    if (finding.runs?.length > 1) return address("compare", { sel: finding.runs.map(id => `${sweep.slug}/${id}`).join(",") });
+    if (finding.runs?.length) return address("runs", { sweep: sweep.slug, run: `${sweep.slug}/${finding.runs[0]}` });
+    return null;
+  }
+
+  function findings(sweep) {
+    const some = sweep.findings, list = element("ul.findings");
+    const line = finding => {
+      const one = way(sweep, finding), run = finding.runs?.length > 1 && address("runs", { sweep: sweep.slug, run: `${sweep.slug}/${finding.runs[0]}` });
+      return element("li", {}, finding.words.replace(/\|/g, " "), one && " ",
+        run && element("a", { href: run }, "the run"), run && ", ",
+        one && element("a", { href: one }, finding.plot ? "the map" : finding.runs?.length > 1 ? "compare" : "show"));
+    };
+    list.append(...some.slice(0, 6).map(line));
+    if (some.length <= 6) return [list];
+    const more = element("ul.findings", {}, ...some.slice(6).map(line));
+    return [list, element("details", {}, element("summary", {}, `${many(some.length - 6, "more finding")}`), more)];
+  }
+
+  function failures(sweep) {
+    if (!sweep.failures.length) return [];
+    const rows = sweep.failures.map(cause => {
+      const who = some => some.slice(0, 4).map(([name, n]) => (n > 1 ? `${name} (${count(n)})` : name)).join(", ")
+        + (some.length > 4 ? ` and ${some.length - 4} more` : "");
+      const link = cause.run && address("runs", { sweep: sweep.slug, status: cause.status, run: `${sweep.slug}/${cause.run}` });
+      return element("tr", {}, element("td.num", {}, count(cause.count)), element("td", {}, state(cause.status)),
+        element("td.reason", {}, cause.reason, cause.varied && element("span.muted", {}, " and the like"), link && " ", link && element("a", { href: link }, "show")),
+        element("td", {}, who(cause.solvers)), element("td", {}, who(cause.where)));
+    });
+    const head = ["runs", "status", "cause", "solvers", "where"].map((words, k) => element(k ? "th" : "th.num", { scope: "col" }, words));
+    return [element("h3", {}, "What did not succeed"), element("div.scroll", { tabIndex: 0, role: "region", "aria-label": "What did not succeed" },
+      element("table.plain", {}, element("thead", {}, element("tr", {}, ...head)), element("tbody", {}, ...rows)))];
+  }
+
+  function pictures(sweep) {
+    if (!sweep.pictures.length) return null;
+    return element("div.pictures", {}, ...sweep.pictures.map(p => element("figure", {},
+      element("a", { href: sweep.up + encodeURI(p.path) }, element("img", { src: sweep.up + encodeURI(p.path), alt: `Picture: ${p.words}`, loading: "lazy", decoding: "async" })),
+      element("figcaption", {}, p.words))));
+  }
+
+  function card(sweep) {
+    const id = `sweep-${sweep.slug}`;
+    const links = [];
+    if (sweep.runs) links.push(element("a.button", { href: address("runs", { sweep: sweep.slug }) }, `All ${many(sweep.runs, "run")}`));
+    links.push(...sweep.plots.slice(0, 6).map(plot => element("a.button", { href: address("plots", { sweep: sweep.slug, plot: plot.id }) }, plot.title)));
+    if (sweep.runs && !sweep.plots.length) links.push(element("a.button", { href: address("plots", { sweep: sweep.slug }) }, "Plots"));
+    return element("section.sweep", { "aria-labelledby": id },
+      element("div.head", {},
+        element("div", {}, element("h2", { id }, sweep.name), element("p.muted", {}, facts(sweep)), element("p.states", {}, ...outcome(sweep))),
+        element("div.made", {}, ...made(sweep))),
+      ...findings(sweep), element("p.links", {}, ...links), pictures(sweep), ...failures(sweep));
+  }
+
+  springbench.views.overview = (content, query, index) => {
+    const runs = index.sweeps.reduce((sum, s) => sum + (s.runs || 0), 0);
+    const failed = index.sweeps.reduce((sum, s) => sum + s.failures.reduce((n, f) => n + f.count, 0), 0);
+    const line = [many(index.sweeps.length, "set of results", "sets of results"), runs && many(runs, "run"), failed && `${count(failed)} did not succeed`,
+      `written ${index.written.slice(0, 16).replace("T", " ")} UTC`].filter(Boolean).join(" · ");
+    content.append(element("div.page", {}, element("h1", {}, index.title), element("p.muted", {}, line),
+      ...index.sweeps.map(card),
+      index.absent.length > 0 && element("p.muted", {}, `Not on this page yet: ${index.absent.join(", ")}. `, element("code", {}, "springbench report"), " takes them in.")));
+    return { update() {} };
+  };
+})();

@@ -1,0 +1,131 @@
+// All plots of the project, one at a time, with what they are drawn by in the URL; a point leads to its run.
+"use strict";
+(() => {
+  const { element, data, change, address, where, save } = springbench;
+  const LOG = { type: "log" }, PLAIN = {};
+  const axis = (column, title, how = LOG) => ({ column, title, axis: how });
+
+  // What a sweep's runs themselves say, as a chart.
+  const OF_RUNS = {
+    size: {
+      title: "Time by size", note: "The median over frames and rounds, with its quartiles, at each size; point at a mark to read its run.",
+      x: [axis("vertices", "vertices"), axis("size", "mesh size")], y: [axis("step", "ms a step"), axis("least", "ms, the least step"), axis("warm", "ms to prepare, warm"), axis("local", "ms, a local step"), axis("global", "ms, a global step"), axis("iterations", "iterations a step", PLAIN), axis("strain", "largest strain, %", PLAIN)],
+    },
+    accuracy: {
+      title: "Time and accuracy", shape: "points", note: "What a step takes against how far its last iterate is from a minimum: to the lower left is better.",
+      x: [axis("step", "ms a step"), axis("least", "ms, the least step")], y: [axis("residual", "last residual, J^½"), axis("strain", "largest strain, %", PLAIN)],
+    },
+  };
+
+  async function ofRuns(sweep, id) {
+    const rows = (await springbench.rows(sweep.slug)).filter(row => row.step !== null), table = await data(`${sweep.slug}/runs`);
+    const groups = new Map();
+    for (const row of rows) {
+      const name = `${row.scene}\n${row.label}`;
+      groups.set(name, [...(groups.get(name) || []), row]);
+    }
+    const items = [...groups.values()].map(some => {
+      some.sort((a, b) => a.vertices - b.vertices);
+      const column = name => some.map(row => row[name]);
+      return {
+        label: some[0].label, what: some[0].scene, scene: some[0].scene, panel: some[0].scene, runs: column("key"), vertices: column("vertices"), size: column("size"), step: column("step"),
+        step_low: column("lower"), step_high: column("upper"), least: column("least"), warm: column("warm"), local: column("local"), global: column("global"),
+        iterations: column("iterations"), residual: column("residual"), strain: some.map(row => row.largest_strain === null ? null : 100 * row.largest_strain),
+      };
+    });
+    const hover = [["vertices", "vertices"], ["step", "ms a step"], ["least", "least ms"], ["iterations", "iterations"], ["residual", "last residual"], ["strain", "largest strain, %"]];
+    return { ...OF_RUNS[id], filters: ["scene"], hover, items, marks: table.marks, references: Object.fromEntries(items.map(item => [item.label, table.references[item.label.split(",")[0]]])) };
+  }
+
+  const plotsOf = sweep => [...(sweep.runs ? Object.entries(OF_RUNS).map(([id, { title }]) => ({ id, title })) : []), ...sweep.plots];
+  const load = (sweep, id) => (id in OF_RUNS ? ofRuns(sweep, id) : data(`${sweep.slug}/${id}`));
+
+  springbench.views.plots = async (content, query, index) => {
+    const sweeps = index.sweeps.filter(sweep => plotsOf(sweep).length);
+    const box = element("div.plots"), top = element("div.choice.aside"), tabs = element("div.tabs", { role: "navigation", "aria-label": "Plots" });
+    const title = element("h1"), note = element("p.muted"), choice = element("div.choice"), body = element("div"), point = element("section.point", { hidden: true, tabIndex: -1, "aria-label": "The chosen point" });
+    box.append(element("div.headline", {}, title, top), tabs, note, choice, body, point);
+    content.append(box);
+    let last = "", current = null, pointed = "";
+
+    const pick = (words, key, names, value, named = name => name) => element("label.field", {}, element("span", {}, words),
+      element("select", { "aria-label": words, onchange: event => change({ [key]: event.target.value, point: "" }) }, ...names.map(name => element("option", { value: name, selected: name === value }, named(name)))));
+
+    async function update(next) {
+      const sweep = sweeps.find(one => one.slug === next.get("sweep")) || sweeps[0], plots = plotsOf(sweep);
+      const plot = plots.find(one => one.id === next.get("plot")) || plots.find(one => one.id === "convergence") || plots[0];
+      const drawn = [...next].filter(([key]) => key !== "point").join("&") + sweep.slug + plot.id;
+      const anew = last.split("\n")[1] !== `${sweep.slug}/${plot.id}`;
+      if (drawn !== last.split("\n")[0]) {
+        last = `${drawn}\n${sweep.slug}/${plot.id}`;
+        const chart = await load(sweep, plot.id);
+        title.textContent = chart.title;
+        note.textContent = chart.note || "";
+        top.hidden = sweeps.length < 2;
+        top.replaceChildren(element("label.field", {}, element("span", {}, "Results"), element("select", { onchange: event => { location.hash = address("plots", { sweep: event.target.value }); } },
+          ...sweeps.map(one => element("option", { value: one.slug, selected: one === sweep }, one.name)))));
+        tabs.replaceChildren(...plots.map(one => element("a", { href: address("plots", { sweep: sweep.slug, plot: one.id }), "aria-current": one === plot && "page" }, one.title)));
+        if (chart.kind === "map") {
+          choice.replaceChildren();
+          body.replaceChildren(...springbench.map(chart, sweep));
+          current = null;
+        } else {
+          await drawChart(sweep, plot, chart, next, anew);
+        }
+      }
+      await showPoint(sweep, next.get("point") || "");
+    }
+
+    async function drawChart(sweep, plot, chart, next, anew) {
+      const distinct = key => [...new Set(chart.items.map(item => item[key]))], chosen = {};
+      for (const key of chart.filters) {
+        const names = distinct(key), asked = next.get(key);
+        chosen[key] = names.includes(asked) || asked === "all" ? asked : names[0];
+      }
+      const one = (axes, name) => axes.find(a => a.column === name) || axes[0], x = one(chart.x, next.get("x")), y = one(chart.y, next.get("y"));
+      const items = chart.items.filter(item => chart.filters.every(key => chosen[key] === "all" || item[key] === chosen[key]));
+      const hidden = new Set((next.get("off") || "").split("~").filter(Boolean)), labels = [...new Set(items.map(item => item.label))];
+      const words = { problem: "Step", scene: "Scene", gap: "To a gap of" };
+      const plotBox = anew || !current ? element("div.plot", { tabIndex: 0, role: "group", "aria-label": `Plot: ${chart.title}. Arrow keys go through its points, Enter opens one.` }) : current.plotBox;
+      const names = element("ul.legend", { "aria-label": "Solvers" }, ...springbench.chart.legend(labels, chart, items, hidden, off => change({ off: [...off].join("~") })));
+      choice.replaceChildren(...chart.filters.filter(key => distinct(key).length > 1).map(key => pick(words[key] || key, key, distinct(key), chosen[key])),
+        ...(chart.y.length > 1 ? [pick("Shown", "y", chart.y.map(a => a.column), y.column, name => one(chart.y, name).title)] : []),
+        ...(chart.x.length > 1 ? [pick("Against", "x", chart.x.map(a => a.column), x.column, name => one(chart.x, name).title)] : []),
+        element("button.quiet", { type: "button", onclick: () => Plotly.downloadImage(plotBox, { format: "svg", filename: `${sweep.slug}-${plot.id}` }) }, "SVG"),
+        element("button.quiet", { type: "button", onclick: () => save(`${sweep.slug}-${plot.id}.csv`, csv(items, x, y), "text/csv") }, "CSV"),
+        hidden.size > 0 && element("button.quiet", { type: "button", onclick: () => change({ off: "" }) }, "Show all") || "");
+      if (plotBox !== current?.plotBox) body.replaceChildren(element("div.frame", {}, plotBox, names));
+      else body.querySelector(".legend").replaceWith(names);
+      const redraw = () => springbench.chart.draw(plotBox, chart, items, x, y, {
+        hidden, onPoint: (item, k) => change({ point: `${chart.items.indexOf(item)}.${k}` }, true),
+      });
+      current = { plotBox, chart, redraw };
+      await redraw();
+    }
+
+    async function showPoint(sweep, asked) {
+      if (asked === pointed) return;
+      pointed = asked;
+      point.replaceChildren();
+      const [number, k] = asked.split(".").map(Number), item = asked && current?.chart.items[number];
+      point.hidden = !item;
+      if (!item) return;
+      const close = () => { change({ point: "" }); current.plotBox.focus(); };
+      if (item.runs) await springbench.detail(point, item.runs[k], { close });
+      else await springbench.solve(point, sweep, current.chart, item, k, close);
+      point.scrollIntoView({ block: "nearest" });
+      point.focus({ preventScroll: true });
+    }
+
+    const recolour = () => { if (current) { last = ""; update(where().query); } };
+    addEventListener("recolour", recolour);
+    await update(query);
+    return { update, leave: () => { removeEventListener("recolour", recolour); springbench.chart.hide(); } };
+  };
+
+  function csv(items, x, y) {
+    const quote = v => (v === null || v === undefined ? "" : /[",]/.test(String(v)) ? `"${String(v).replaceAll('"', '""')}"` : v);
+    const lines = items.flatMap(item => item[x.column].map((value, k) => [item.label, item.what, value, item[y.column][k]].map(quote).join(",")));
+    return [["solver", "what", x.title, y.title].map(quote).join(","), ...lines].join("\n") + "\n";
+  }
+})();

@@ -1,0 +1,166 @@
+// All runs in a table: sorted, filtered, chosen to be compared; the whole of what is shown stands in the URL.
+"use strict";
+(() => {
+  const { element, change, address, number, count, percent, fixed, glyph, state, many, save, picture } = springbench;
+  const words = (row, key) => row[key] ?? "";
+  const shot = row => {
+    const src = picture(row);
+    return src ? element("img", { src, alt: "", loading: "lazy", decoding: "async", width: 64, height: 36 }) : element("span.noshot");
+  };
+  const marked = row => (row.by ? element("span.code", { title: row.by === "other code" ? "made by other code than the newest run of its scene and solver" : "made by an earlier commit than the newest run" }, row.by) : "");
+  const doubt = row => (row.interrupted ? element("span.doubt", { title: "the process was interrupted while steps were timed: its least time is nearest to the truth" }, " !") : "");
+
+  // title: of the column; meaning: on pointing; show: of a row; numeric: largest last, to the right.
+  const COLUMNS = [
+    { id: "check", title: "Compare", sort: false, show: (row, on) => element("span.box", { "aria-label": on ? "chosen to compare" : "not chosen" , role: "img"}, on ? "✓" : "") },
+    { id: "shot", title: "Picture", sort: false, show: shot },
+    { id: "sweep", title: "Results", show: row => row.sweep },
+    { id: "scene", title: "Scene", show: row => row.scene },
+    { id: "size", title: "Size", numeric: true, show: row => row.size || "–" },
+    { id: "solver", title: "Solver", meaning: "and the options in which its runs differ", show: row => element("span.who", {}, glyph(row.mark), row.solver, row.options && element("span.options", {}, row.options)) },
+    { id: "status", title: "Status", show: row => element("span", {}, state(row.status), row.by && " ", marked(row)) },
+    { id: "outcome", title: "Judged", show: row => (row.outcome ? state(row.outcome) : "–") },
+    { id: "stopped", title: "Stopped by", meaning: "what ended the last step's iterations", show: row => words(row, "stopped") || "–" },
+    { id: "iterations", title: "Iter.", meaning: "median iterations a step", numeric: true, show: row => number(row.iterations) },
+    { id: "residual", title: "Residual", meaning: "of the last step, J^(1/2)", numeric: true, show: row => fixed(row.residual) },
+    { id: "step", title: "ms a step", meaning: "the median over frames and rounds", numeric: true, show: row => element("span", {}, number(row.step), doubt(row)) },
+    { id: "least", title: "Least ms", numeric: true, show: row => number(row.least) },
+    { id: "warm", title: "Prepare ms", meaning: "warm", numeric: true, show: row => number(row.warm) },
+    { id: "largest_strain", title: "Strain", meaning: "the largest of all springs and frames", numeric: true, show: row => percent(row.largest_strain) },
+    { id: "strain_99", title: "99 %", meaning: "strain that 99 % of the springs stay below", numeric: true, show: row => percent(row.strain_99) },
+  ];
+  const FACETS = [["sweep", "Results"], ["scene", "Scene"], ["size", "Size"], ["solver", "Solver"], ["status", "Status"], ["outcome", "Judged"], ["stopped", "Stopped by"], ["by", "Code"]];
+  const LIMITS = [["residual", "Residual at most"], ["step", "ms a step at most"], ["largest_strain", "Strain at most (%)"]];
+
+  const value = (row, key) => (key === "sweep" ? row.slug : String(row[key] ?? ""));
+
+  function fits(row, query, except = "") {
+    for (const [key] of FACETS) if (key !== except && query.get(key) && value(row, key) !== query.get(key)) return false;
+    for (const [key] of LIMITS) {
+      const most = query.get(`max-${key}`);
+      if (most && !(row[key] !== null && row[key] <= Number(most) / (key === "largest_strain" ? 100 : 1))) return false;
+    }
+    const wanted = (query.get("q") || "").toLowerCase();
+    if (!wanted) return true;
+    const all = `${row.scene} ${row.size} ${row.label} ${row.integrator} ${row.reason || ""} ${row.run_id} ${row.parameters}`.toLowerCase();
+    return wanted.split(/\s+/).every(word => all.includes(word));
+  }
+
+  function sorted(rows, by) {
+    const down = by.startsWith("-"), key = down ? by.slice(1) : by, sign = down ? -1 : 1;
+    if (!key) return rows;
+    return [...rows].sort((a, b) => {
+      const x = a[key], y = b[key];
+      if (x === y) return 0;
+      if (x === null || x === undefined) return 1;  // what is not known comes last, whichever way
+      if (y === null || y === undefined) return -1;
+      return sign * (typeof x === "number" ? x - y : String(x).localeCompare(String(y)));
+    });
+  }
+
+  function csv(rows) {
+    const names = Object.keys(rows[0] || {}).filter(name => !["mark", "key", "slug"].includes(name));
+    const cell = v => (v === null || v === undefined ? "" : /[",\n]/.test(String(v)) ? `"${String(v).replaceAll('"', '""')}"` : String(v));
+    return [names.join(","), ...rows.map(row => names.map(name => cell(row[name])).join(","))].join("\n") + "\n";
+  }
+
+  springbench.views.runs = async (content, query, index) => {
+    const all = await springbench.rows();
+    const known = key => all.some(row => row[key] !== null && row[key] !== undefined && row[key] !== "");
+    const several = key => new Set(all.map(row => row[key])).size > 1;
+    const hidden = new Set([...["outcome", "strain_99", "picture"].filter(key => !known(key)), ...(several("sweep") ? [] : ["sweep"])]);
+    if (hidden.has("picture")) hidden.add("shot");
+    const columns = COLUMNS.filter(column => !hidden.has(column.id));
+    let shown = all, selected = new Set(), now = query;
+
+    const facets = FACETS.filter(([key]) => !hidden.has(key) && known(key) && (several(key) || query.get(key))).map(([key, title]) => {
+      const select = element("select", { id: `facet-${key}`, onchange: event => change({ [key]: event.target.value }) });
+      return { key, title, select, field: element("label.field", { for: select.id }, element("span", {}, title), select) };
+    });
+    const search = element("input", { type: "search", id: "search", placeholder: "scene, solver, option, reason", oninput: event => change({ q: event.target.value }) });
+    const limits = LIMITS.map(([key, title]) => {
+      const input = element("input", { type: "number", min: 0, step: "any", id: `max-${key}`, oninput: event => change({ [`max-${key}`]: event.target.value }) });
+      return { key, input, field: element("label.field", { for: input.id }, element("span", {}, title), input) };
+    });
+    const clear = element("button.quiet", { type: "button", onclick: () => { location.hash = address("runs", { sel: now.get("sel"), sort: now.get("sort") }); } }, "Clear");
+    const total = element("p.total", { role: "status" });
+    const downloads = element("span.downloads");
+    const more = element("details.more", { open: LIMITS.some(([key]) => query.get(`max-${key}`)) }, element("summary", {}, "Limits"), element("div.fields", {}, ...limits.map(l => l.field)));
+    const filters = element("details.filters", { open: innerWidth > 760 }, element("summary", {}, "Filters"),
+      element("div.fields", {}, element("label.field.wide", { for: "search" }, element("span", {}, "Search"), search), ...facets.map(f => f.field), more, clear));
+    const chosen = element("div.chosen", { role: "region", "aria-label": "Chosen to compare" });
+    const table = springbench.table({
+      columns,
+      onOpen: row => change({ run: row.key }, true),
+      onSelect: row => {
+        const next = new Set(selected);
+        if (!next.delete(row.key)) next.add(row.key);
+        change({ sel: [...next].join(",") });
+      },
+      onSort: id => {
+        const numeric = columns.find(column => column.id === id).numeric;
+        const before = now.get("sort") || "";
+        change({ sort: before === id ? `-${id}` : before === `-${id}` && !numeric ? "" : before === `-${id}` ? "" : id });
+      },
+    });
+    table.grid.style.setProperty("--columns", columns.map(column => WIDTHS[column.id]).join(" "));
+    table.grid.style.setProperty("--least", `${columns.reduce((sum, column) => sum + parseFloat(WIDTHS[column.id].match(/\d+/)[0]), 0)}px`);
+    const panel = element("aside.panel", { hidden: true, "aria-label": "Run", tabIndex: -1 });
+    content.append(element("div.runs", {}, element("div.left", {}, element("h1.unseen", {}, "Runs"), filters,
+      element("div.toolbar", {}, total, downloads), table.grid, chosen), panel));
+    let opened = null, asked = null;
+
+    async function update(next) {
+      const filter = [...next].filter(([key]) => key !== "sel" && key !== "run").join("&");
+      now = next;
+      const changes = {};
+      if (asked !== filter) {
+        asked = filter;
+        const sort = next.get("sort") || "";
+        shown = sorted(all.filter(row => fits(row, next)), sort);
+        changes.rows = shown;
+        changes.sort = [sort.replace("-", ""), sort.startsWith("-")];
+        total.textContent = shown.length === all.length ? many(all.length, "run") : `${count(shown.length)} of ${many(all.length, "run")}`;
+        for (const { key, select } of facets) {
+          const sizes = new Map();
+          for (const row of all) if (fits(row, next, key)) sizes.set(value(row, key), (sizes.get(value(row, key)) || 0) + 1);
+          const names = [...sizes.keys()].filter(Boolean).sort((a, b) => a.localeCompare(b, "en", { numeric: true }));
+          const current = next.get(key) || "";
+          if (current && !names.includes(current)) names.push(current);
+          select.replaceChildren(element("option", { value: "" }, "all"), ...names.map(name =>
+            element("option", { value: name, selected: name === current }, `${key === "sweep" ? springbench.sweepOf(name)?.name ?? name : name} (${sizes.get(name) || 0})`)));
+        }
+        if (document.activeElement !== search) search.value = next.get("q") || "";
+        for (const { key, input } of limits) if (document.activeElement !== input) input.value = next.get(`max-${key}`) || "";
+        const slugs = [...new Set(shown.map(row => row.slug))];
+        downloads.replaceChildren(
+          element("button.quiet", { type: "button", onclick: () => save("runs.csv", csv(shown), "text/csv") }, "CSV"),
+          ...slugs.slice(0, 3).map(slug => element("a.quiet", { href: `site/data/${encodeURIComponent(slug)}/runs.parquet`, download: `${slug}-runs.parquet` },
+            slugs.length > 1 ? `Parquet: ${springbench.sweepOf(slug).name}` : "Parquet")));
+      }
+      selected = changes.selected = new Set((next.get("sel") || "").split(",").filter(Boolean));
+      changes.opened = next.get("run") || "";
+      chosen.hidden = !selected.size;
+      chosen.replaceChildren(element("span", {}, `${selected.size} chosen`),
+        selected.size > 1 ? element("a.button.strong", { href: address("compare", { sel: [...selected].join(",") }) }, "Compare") : element("span.muted", {}, "choose another to compare"),
+        element("button.quiet", { type: "button", onclick: () => change({ sel: "" }) }, "Clear"));
+      table.update(changes);
+      if (opened !== changes.opened) {
+        const before = opened;
+        opened = changes.opened;
+        panel.hidden = !opened;
+        panel.replaceChildren();
+        if (opened) await springbench.detail(panel, opened, { close: () => { change({ run: "" }, true); table.grid.focus(); } });
+        if (opened && before !== null) panel.focus({ preventScroll: innerWidth > 760 });
+      }
+    }
+    await update(query);
+    return { update, leave: table.leave };
+  };
+
+  const WIDTHS = {
+    check: "34px", shot: "76px", sweep: "minmax(100px, 1fr)", scene: "minmax(120px, 1.3fr)", size: "58px", solver: "minmax(170px, 2fr)",
+    status: "minmax(120px, 1fr)", outcome: "minmax(130px, 1fr)", stopped: "92px", iterations: "64px", residual: "84px", step: "88px", least: "82px", warm: "92px",
+    largest_strain: "74px", strain_99: "68px",
+  };
+})();

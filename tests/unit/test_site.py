@@ -1,0 +1,194 @@
+"""The page's data: what it says of rows whose answers are known."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from harness.base import rows
+from harness.base.errors import InputError
+from harness.report.site import build, keep, update
+from harness.report.site.failures import Failed, causes
+from harness.report.site.script import column
+from harness.report.site.sentences import sentences
+from tests import accuracy_rows, site_results
+from tests.site_results import fails, run
+
+COUNT = 40
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("results")
+    made = site_results.write(folder, COUNT)
+    site_results.picture(made / "pictures" / f"{run(0)['file']}.png")
+    small = accuracy_rows.problem("net", 6, "early") + list(accuracy_rows.curve("net", 6, "early", "numba"))
+    accuracy_rows.write(folder / "study", [*small, accuracy_rows.failure("net", 6, "early", "dense", "failed", "why")])
+    update(folder)
+    return folder
+
+
+def read(results: Path, name: str) -> Any:
+    """The value that a script of data gives."""
+    words = (results / "site" / "data" / f"{name}.js").read_text().strip()
+    assert words.startswith(f"springbench.give({json.dumps(name)}, ")
+    return json.loads(words.partition(", ")[2].removesuffix(");"))
+
+
+def cells(table: dict[str, Any], name: str) -> list[Any]:
+    found = table["columns"][name]
+    return found if isinstance(found, list) else [found["of"][k] if k >= 0 else None for k in found["at"]]
+
+
+def test_every_run_is_a_line_of_the_table(results: Path):
+    table = read(results, "made/runs")
+    assert table["n"] == COUNT
+    assert sorted(cells(table, "run_id")) == [run(k)["run_id"] for k in range(COUNT)]
+    first = cells(table, "run_id").index(run(0)["run_id"])
+    # Steps of 1 and 1.1 times 3.2 ms, and 2 % more a frame: the median of frames 3 and 4.
+    assert cells(table, "step")[first] == pytest.approx(3.2 * (1.05 + 0.07), rel=1e-3)
+    assert cells(table, "residual")[first] == pytest.approx(1e-3 / site_results.FRAMES, rel=1e-4), "of the last frame"
+    assert cells(table, "largest_strain")[first] == pytest.approx(0.3)
+    assert cells(table, "picture")[first] == 1
+    assert sum(cells(table, "picture")) == 1
+    assert sum(cells(table, "recording")) == 0
+
+
+def test_rows_of_other_code_are_marked(results: Path):
+    table = read(results, "made/runs")
+    marked = dict(zip(cells(table, "run_id"), cells(table, "by"), strict=True))
+    assert [name for name, how in marked.items() if how == "other code"] == [run(1)["run_id"]]
+
+
+def test_one_cause_is_told_once_with_the_number_of_its_runs(results: Path):
+    index = read(results, "index")
+    made = next(sweep for sweep in index["sweeps"] if sweep["name"] == "made")
+    (cause,) = made["failures"]
+    assert cause["count"] == sum(fails(k) for k in range(COUNT)) == 2
+    assert cause["varied"], "their reasons differ in a number"
+    assert site_results.REASON in cause["reason"]
+    assert made["statuses"] == {"ok": COUNT - 2, "unsupported": 2}
+    study = next(sweep for sweep in index["sweeps"] if sweep["name"] == "study")
+    assert [(cause["status"], cause["reason"]) for cause in study["failures"]] == [("failed", "why")]
+
+
+def test_causes_differ_in_more_than_numbers_and_names():
+    failed = [Failed(f"net {k}", "one", "failed", f"one: net {k} needs {k}.5 GiB") for k in (4, 8)]
+    failed += [Failed("net 4", "two", "failed", "two: net 4 needs 4.5 GiB"), Failed("net 4", "one", "diverged", "x")]
+    assert [(cause["status"], cause["count"]) for cause in causes(failed)] == [("failed", 3), ("diverged", 1)]
+
+
+def test_all_that_is_shown_says_by_which_code_and_where(results: Path):
+    for sweep in read(results, "index")["sweeps"]:
+        assert sweep["made"], sweep["name"]
+        for made in sweep["made"]:
+            assert made["commit"]
+            assert made["machine"]
+            assert made["cpu"]
+
+
+def test_the_fastest_is_told_among_those_that_are_equally_accurate():
+    runs = [
+        {"run_id": name, "scene": "net", "size": 8, "label": name, "status": "ok", "step": step, "residual": residual}
+        | {"integrator": "euler", "time_step": 0.1, "stopped": "tolerance"}
+        for name, step, residual in (("slow", 4.0, 1e-6), ("fair", 2.0, 5e-6), ("hasty", 1.0, 1e-2))
+    ]
+    told = [said["words"] for said in sentences(runs)]
+    assert told[0].startswith("net 8: fastest at equal accuracy is fair, 2 ms a step; slow takes 2 times as long")
+    assert "hasty is faster" in told[1]
+    assert len(told) == 2
+
+
+def test_a_run_s_frames_are_a_script_of_their_own(results: Path):
+    frames = read(results, f"made/runs/{run(0)['run_id']}")
+    assert frames["frame"] == list(range(1, site_results.FRAMES + 1))
+    assert frames["least"][0] == pytest.approx(3.2 * 1.02, rel=1e-5)
+    assert frames["distance"] == [None] * site_results.FRAMES, "what is not in the rows is missing"
+
+
+def test_the_table_comes_as_parquet_too(results: Path):
+    table = pq.read_table(results / "site" / "data" / "made" / "runs.parquet")
+    assert len(table) == COUNT
+    assert {"run_id", "step", "residual", "stopped"} <= set(table.column_names)
+
+
+def test_accuracy_s_charts_are_there_with_the_solvers_marks(results: Path):
+    chart = read(results, "study/convergence")
+    assert {item["label"] for item in chart["items"]} == {"numba", "dense"}
+    assert set(chart["marks"]) == {"numba", "dense"}
+    assert "Liu" in chart["references"]["numba"]["cited"]
+    assert chart["references"]["numba"]["bibtex"].startswith("@misc{liu2013")
+
+
+def test_only_what_is_new_is_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name in ("one", "other"):
+        site_results.write(tmp_path, 3, name)
+    update(tmp_path)
+    seen: list[str] = []
+    told = build.overview
+    monkeypatch.setattr(build, "overview", lambda folder, *a, **k: (seen.append(folder.name), told(folder, *a, **k))[1])
+    update(tmp_path)
+    assert not seen
+    frames = tmp_path / "site" / "data" / "one" / "runs" / f"{run(0)['run_id']}.js"
+    os.utime(frames, (0, 0))  # older than its rows
+    packed = tmp_path / "one" / "rows.parquet"
+    later = packed.stat().st_mtime_ns + 10**9
+    os.utime(packed, ns=(later, later))
+    update(tmp_path, only=[tmp_path / "one"])
+    assert seen == ["one"]
+    assert frames.stat().st_mtime > 1
+    (tmp_path / "other" / "rows.parquet").rename(tmp_path / "gone")
+    update(tmp_path)
+    assert [sweep["name"] for sweep in read(tmp_path, "index")["sweeps"]] == ["one"], "what went is not shown"
+
+
+def test_sweeps_that_were_never_taken_in_are_named(tmp_path: Path):
+    for name in ("one", "other"):
+        site_results.write(tmp_path, 3, name)
+    update(tmp_path, only=[tmp_path / "one"])
+    index = read(tmp_path, "index")
+    assert [sweep["name"] for sweep in index["sweeps"]] == ["one"]
+    assert index["absent"] == ["other"]
+
+
+def test_one_sweep_s_folder_has_a_page_of_its_own(tmp_path: Path):
+    folder = site_results.write(tmp_path, 3)
+    assert update(folder) == folder / "index.html"
+    (sweep,) = read(folder, "index")["sweeps"]
+    assert (sweep["slug"], sweep["up"], sweep["name"]) == ("this", "", "made")
+
+
+def test_damaged_rows_keep_no_run_from_ending(tmp_path: Path):
+    (tmp_path / "sweep" / "rows").mkdir(parents=True)
+    (tmp_path / "sweep" / "rows" / "x.parquet").write_text("no rows")
+    said: list[str] = []
+    keep(tmp_path, tmp_path / "sweep", said.append)
+    assert "stays as it was" in said[0]
+    assert "x.parquet" in said[0]
+    with pytest.raises(InputError, match=r"x\.parquet"):
+        update(tmp_path)
+
+
+def test_a_folder_without_rows_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="holds no rows"):
+        update(tmp_path)
+    with pytest.raises(InputError, match="is no folder"):
+        update(tmp_path / "none")
+
+
+def test_words_are_kept_once():
+    assert column(["b", "a", "b", None]) == {"of": ["b", "a"], "at": [0, 1, 0, -1]}
+    assert column([1.23456789, None, float("nan"), 2]) == [1.2346, None, None, 2]
+
+
+def test_a_run_alone_is_on_the_page(tmp_path: Path):
+    same = {key: value for key, value in site_results.rows(12)[0].items() if key != "file"}
+    (tmp_path / "sweep" / "rows").mkdir(parents=True)
+    rows.write(tmp_path / "sweep" / "rows" / "a-failed-run.parquet", [same])
+    update(tmp_path)
+    assert cells(read(tmp_path, "sweep/runs"), "status") == ["unsupported"]
