@@ -185,13 +185,16 @@ def recommend(
 @app.command()
 def report(
     results: Annotated[Path, typer.Argument(help="A folder of results, or that of one sweep.")] = Path("results"),
+    viewer: Annotated[
+        bool, typer.Option("--viewer/--without-viewer", help="Put Rerun's viewer into the page, 19 MB.")
+    ] = True,
 ) -> None:
     """Write the page of all results, `index.html`, and the map of solvers x cases of those that were judged."""
     from harness.report.robustness import summary
     from harness.report.robustness_map import draw_maps
     from harness.report.site import update
 
-    page = update(results, meshes=True, say=_say)
+    page = update(results, recorded=True, viewer=viewer, say=_say)
     for picture, cells in draw_maps(results):
         out.print(summary(cells))
         _say(f"the map is {picture}")

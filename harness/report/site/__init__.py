@@ -5,6 +5,8 @@
     site/data/index.js             which sweeps there are: all that the first view shows
     site/data/<sweep>/runs.js      the table of its runs; <chart>.js, runs/<run id>.js and so on: loaded when asked for
 
+    site/viewer.js                 Rerun's web viewer, if `springbench report` put it there: loaded for a recording
+
 Data are scripts, since a page from the file system may load nothing else: each calls `springbench.give(name, value)`.
 """
 

@@ -25,22 +25,27 @@ def update(
     results: Path,
     *,
     only: Collection[Path] | None = None,
-    meshes: bool = False,
+    recorded: bool = False,
+    viewer: bool = False,
     say: Callable[[str], None] = lambda words: None,
 ) -> Path:
     """Write what is new of a folder of results, or of one sweep, to its page; returns `index.html`.
 
-    only: the folders of sweeps that have something new, all if left out; meshes: whether last positions and iterates
-    are taken from recordings, for what the page draws of meshes; say: prints a remark.
+    only: the folders of sweeps that have something new, all if left out; recorded: whether recordings, and what the
+    page draws of their meshes, become scripts; viewer: whether Rerun's is put beside them; say: prints a remark.
     Raises InputError where there are no rows, CannotWrite.
     """
     found = folders(results) if only is None else [folder_of(path, results) for path in only]
     data, code = results / "site" / "data", place(results)
     for folder in found:
         home = data / folder.slug
-        state = _state(folder, code, meshes)
+        state = _state(folder, code, recorded)
         if _known(home).get("state") != state:
-            _write(home, folder, overview(folder, home, meshes=meshes, say=say), state)
+            _write(home, folder, overview(folder, home, recorded=recorded, say=say), state)
+    if viewer and any(True for folder in found for _ in (data / folder.slug / "recordings").glob("*.js")):
+        from harness.report.site.viewer import write_viewer
+
+        write_viewer(results / "site")
     _index(results, data)
     return results / "index.html"
 
@@ -75,9 +80,9 @@ def _known(home: Path) -> dict[str, Any]:
         return {}
 
 
-def _state(folder: Folder, code: str, meshes: bool) -> str:
+def _state(folder: Folder, code: str, recorded: bool) -> str:
     """What changes when there is something new of a sweep, or when this program would tell it otherwise."""
-    told: list[Any] = [code, meshes]
+    told: list[Any] = [code, recorded]
     for kind in KINDS:
         home = folder.path / kind
         own = [(home / f"{unit}.parquet").stat().st_mtime_ns for unit in shelf.own_files(home)]
@@ -98,6 +103,5 @@ def _index(results: Path, data: Path) -> None:
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "sweeps": [{key: part for key, part in summary.items() if key != "state"} for summary in told],
         "absent": [there[slug].name for slug, summary in known.items() if not summary],
-        "viewer": (results / "site" / "viewer.js").is_file(),
     }
     script.write(data / "index.js", "index", value)

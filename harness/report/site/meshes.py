@@ -6,7 +6,7 @@ Positions are single precision, as recordings have them: differences below 1e-7 
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from harness.record.reader import read_replay
 from harness.report.accuracy.measured import Curve, Measurements
 from harness.report.site import script
 from harness.report.site.folders import Folder
+from harness.report.site.viewer import write_recording
 
 Say = Callable[[str], None]
 
@@ -53,6 +54,14 @@ def write_solves(folder: Folder, home: Path, table: Measurements, say: Say) -> d
             best = min(ended, key=lambda curve: curve.largest[-1])
             written |= _solves(folder, home, curves, best, say)
     return written
+
+
+def write_recordings(folder: Folder, home: Path, recordings: Mapping[str, str]) -> dict[str, str]:
+    """Recordings with their titles as scripts, where they are not there yet; returns the names of those by these."""
+    there = {name: f"recordings/{Path(name).stem}" for name in recordings if (folder.path / name).is_file()}
+    for name, script_of in there.items():
+        write_recording(folder.path / name, home / f"{script_of}.js", recordings[name])
+    return there
 
 
 def _solves(folder: Folder, home: Path, curves: Sequence[Curve], best: Curve, say: Say) -> dict[str, str]:

@@ -43,11 +43,12 @@ class _Told(NamedTuple):
     facts: dict[str, Any]
 
 
-def overview(folder: Folder, home: Path, *, meshes: bool, say: Say) -> Overview:
-    """What the rows of a sweep say; home: the folder of its data, where scripts of single runs are written."""
+def overview(folder: Folder, home: Path, *, recorded: bool, say: Say) -> Overview:
+    """What the rows of a sweep say. home: the folder of its data, where scripts of single runs are written; recorded:
+    whether meshes and recordings become scripts too, which takes longer."""
     kinds = {"rows": _runs, "accuracy": _accuracy, "ablation": _ablation}
     there = [kind for kind in kinds if shelf.units(folder.path / kind)]
-    told = [kinds[kind](folder, home, meshes, say) for kind in there]
+    told = [kinds[kind](folder, home, recorded, say) for kind in there]
     made = [one for each in told for one in each.made]
     summary: dict[str, Any] = {
         "slug": folder.slug,
@@ -69,7 +70,7 @@ def overview(folder: Folder, home: Path, *, meshes: bool, say: Say) -> Overview:
     return Overview(summary, {name: value for each in told for name, value in each.scripts.items()})
 
 
-def _runs(folder: Folder, home: Path, meshes: bool, say: Say) -> _Told:
+def _runs(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
     table = runs.read(folder)
     found = runs.table_of(folder, table)
     scripts: dict[str, Any] = {}
@@ -83,7 +84,7 @@ def _runs(folder: Folder, home: Path, meshes: bool, say: Say) -> _Told:
         outcomes = hard.outcomes(scripts["hard"])
         findings = [{"words": f"{scripts['hard']['headline']}.", "plot": "hard"}, *findings[-1:]]
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
-    _add_meshes(folder, home, found, meshes, say)
+    _add_recorded(folder, home, found, recorded, say)
     scripts["runs"] = runs.as_script(folder, found, outcomes)
     _parquet(home / "runs.parquet", found)
     frames.write(folder, table, home, _without(folder, home, found))
@@ -100,15 +101,17 @@ def _runs(folder: Folder, home: Path, meshes: bool, say: Say) -> _Told:
     return _Told(scripts, plots, findings, bad, provenance.made(table, "run_id"), facts)
 
 
-def _add_meshes(folder: Folder, home: Path, found: Sequence[dict[str, Any]], anew: bool, say: Say) -> None:
-    """Whether a run's last frame is among the page's data; anew: those that are not are taken from recordings."""
-    there = {path.stem for path in (home / "meshes").glob("*.js")}
-    if anew and (recorded := [run["unit"] for run in found if run["recording"]]):
-        from harness.report.site.meshes import write_last
+def _add_recorded(folder: Folder, home: Path, found: Sequence[dict[str, Any]], anew: bool, say: Say) -> None:
+    """Whether a run's last frame and its recording are among the page's data; anew: those that are not are taken in."""
+    there = {part: {path.stem for path in (home / part).glob("*.js")} for part in ("meshes", "recordings")}
+    if anew and (recorded := {run["unit"]: title(run) for run in found if run["recording"]}):
+        from harness.report.site.meshes import write_last, write_recordings
 
-        there = write_last(folder, home, recorded, say)
+        there["meshes"] = write_last(folder, home, list(recorded), say)
+        kept = {f"recordings/{unit}.rrd": words for unit, words in recorded.items()}
+        there["recordings"] = {Path(name).stem for name in write_recordings(folder, home, kept)}
     for run in found:
-        run["mesh"] = int(run["unit"] in there)
+        run |= {name: int(run["unit"] in there[part]) for name, part in (("mesh", "meshes"), ("replay", "recordings"))}
 
 
 def _without(folder: Folder, home: Path, found: Sequence[dict[str, Any]]) -> list[str]:
@@ -134,7 +137,7 @@ def _parquet(path: Path, found: Sequence[dict[str, Any]]) -> None:
         pq.write_table(pa.Table.from_pylist([{k: v for k, v in r.items() if k != "settings"} for r in found]), partial)
 
 
-def _accuracy(folder: Folder, home: Path, meshes: bool, say: Say) -> _Told:
+def _accuracy(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
     from harness.report.accuracy.findings import failures, findings
     from harness.report.accuracy.measured import without_short
     from harness.report.accuracy.reading import read
@@ -142,10 +145,12 @@ def _accuracy(folder: Folder, home: Path, meshes: bool, say: Say) -> _Told:
 
     table = read(folder.path)
     scripts, facts = charts(without_short(table), folder.path), dict[str, Any]()
-    if meshes:
-        from harness.report.site.meshes import write_solves
+    if recorded:
+        from harness.report.site.meshes import write_recordings, write_solves
 
         facts["solves"] = write_solves(folder, home, without_short(table), say)
+        kept = {c.recording: f"{c.label}, {c.problem.name}" for c in table.curves if c.recording in facts["solves"]}
+        facts["replays"] = write_recordings(folder, home, kept)
     chapters = findings(table)
     told = [{"words": w, "chapter": name} for name, some in chapters.items() if name != "Methods" for w in some]
     failed = [Failed(row["where"], row["solver"], row["status"], row["reason"]) for row in failures(table)]
@@ -154,7 +159,7 @@ def _accuracy(folder: Folder, home: Path, meshes: bool, say: Say) -> _Told:
     return _Told(scripts, plots, told, causes(failed), provenance.made(_plain(folder, "accuracy"), "unit"), facts)
 
 
-def _ablation(folder: Folder, home: Path, meshes: bool, say: Say) -> _Told:
+def _ablation(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
     table = _plain(folder, "ablation")
     scripts, words = ablation.charts(table.to_pylist())
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
@@ -165,6 +170,11 @@ def _ablation(folder: Folder, home: Path, meshes: bool, say: Say) -> _Told:
 def _plain(folder: Folder, kind: str) -> pa.Table:
     units = shelf.units(folder.path / kind)
     return rows.read(units, pa.schema([]), named=True, promote="permissive")
+
+
+def title(run: dict[str, Any]) -> str:
+    """A run in words."""
+    return f"{run['scene']}{' ' + str(run['size']) if run['size'] else ''}, {run['label']}"
 
 
 def _pictures(folder: Folder) -> list[dict[str, str]]:

@@ -96,7 +96,21 @@ _SHOWN = (
     *("integrator", "time_step", "first_guess", "max_iterations", "tolerance", "threads", "frames", "rounds"),
     *("status", "reason", "stopped", "iterations", "residual", "cold", "warm", "step", "lower", "upper", "least"),
     *("local", "global", "largest_strain", _PERCENTILE, "penetration", "interrupted", "adds_up", "timing", "digest"),
-    *("picture", "recording", "mesh", "by", "machine", "cpu", "commit", "code", "started", "took", "own", "versions"),
+    *(
+        "picture",
+        "recording",
+        "mesh",
+        "replay",
+        "by",
+        "machine",
+        "cpu",
+        "commit",
+        "code",
+        "started",
+        "took",
+        "own",
+        "versions",
+    ),
 )
 
 

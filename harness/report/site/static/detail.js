@@ -1,7 +1,7 @@
 // One run: what it was, what became of it, its picture and recording, and the command that does it again.
 "use strict";
 Object.assign(springbench, (() => {
-  const { element, data, script, number, percent, fixed, step, day, glyph, state, copy, title, picture, recording, command, rowOf, references, sweepOf } = springbench;
+  const { element, number, percent, fixed, step, day, glyph, state, copy, title, picture, recording, command, rowOf, references, sweepOf } = springbench;
 
   const pair = ([name, value]) => [element("dt", {}, name), element("dd", {}, value ?? "–")];
   const list = pairs => element("dl", {}, ...pairs.filter(([, value]) => value !== null && value !== undefined && value !== "").flatMap(pair));
@@ -19,32 +19,17 @@ Object.assign(springbench, (() => {
       reference.bibtex && element("button.quiet", { type: "button", onclick: () => copy(reference.bibtex) }, "Copy BibTeX"));
   }
 
-  // A recording: replayed in the page where its viewer is there, offered as a file else.
-  function replay(id, file, unit, slug) {
+  // A recording: replayed in the page where it is among the page's scripts, offered as a file else.
+  function replay(id, file, name, words) {
     if (!file) return element("p.muted", {}, "No recording was kept.");
-    const box = element("div.replay"), view = `springbench view ${decodeURI(file)}`;
-    const offer = why => [element("p.muted", {}, `${why} `, element("a", { href: file }, "The file"), " opens by"), code(view, "Command that opens the recording")];
-    const name = `site/data/${encodeURIComponent(slug)}/recordings/${encodeURIComponent(unit)}.js`;
-    const button = element("button.strong", {
-      type: "button",
-      onclick: async () => {
-        button.disabled = true;
-        button.textContent = "Loading the viewer…";
-        try {
-          if (!springbench.replay) await script("site/viewer.js");
-          await springbench.replay(id, name);
-          button.textContent = "Replay";
-        } catch (error) {
-          button.remove();
-          box.append(...offer(`The viewer cannot start here: ${error.message}.`));
-        }
-        button.disabled = false;
-      },
-    }, "Replay");
-    data("index").then(index => {
-      if (index.viewer) box.append(button, element("a", { href: file }, "Recording (.rrd)"));
-      else box.append(...offer("Not replayed in this page."));
-    });
+    const box = element("div.replays");
+    if (name) {
+      box.append(element("button.strong", { type: "button", onclick: () => springbench.replay(id, name, { title: words, file }) }, "Replay"),
+        element("a", { href: file }, "Recording (.rrd)"));
+    } else {
+      box.append(element("p.muted", {}, element("a", { href: file }, "The recording (.rrd)"), " opens by this; ", element("code", {}, "springbench report"), " puts it into this page."),
+        code(`springbench view ${decodeURI(file)}`, "Command that opens the recording"));
+    }
     return box;
   }
 
@@ -82,7 +67,7 @@ Object.assign(springbench, (() => {
       element("p.states", {}, state(row.status), row.outcome && state(row.outcome), row.by && element("span.code", {}, row.by)),
       row.reason && element("p.reason", {}, row.reason),
       src && element("a.shot", { href: src }, element("img", { src, alt: `The run's last frame and earlier ones: ${title(row)}` })),
-      replay(row.run_id, recording(row), row.unit, row.slug),
+      replay(row.run_id, recording(row), row.replay && `site/data/${encodeURIComponent(row.slug)}/recordings/${encodeURIComponent(row.unit)}.js`, title(row)),
       element("h3", {}, "Measured"), figures(row) || element("p.muted", {}, "Nothing: see its status."),
       element("h3", {}, "Asked"), settings(row),
       element("h3", {}, "Do it again"), code(command(row), "Command that repeats the run"),
@@ -95,5 +80,5 @@ Object.assign(springbench, (() => {
         element("a", { href: springbench.address("compare", { sel: key }) }, "Frame by frame")));
   }
 
-  return { detail, method, replay, commandBox: code, definitions: list };
+  return { detail, method, replayBox: replay, commandBox: code, definitions: list };
 })());

@@ -1,7 +1,7 @@
 // Meshes on a canvas, turned by dragging or by arrow keys, coloured by a number at each vertex; and solves, iterate by iterate.
 "use strict";
 Object.assign(springbench, (() => {
-  const { element, data, number, copy } = springbench;
+  const { element, data, number } = springbench;
   // From near to far: a scale that is read in grey as well (viridis).
   const RAMP = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
   const ramp = t => {
@@ -97,7 +97,7 @@ Object.assign(springbench, (() => {
         element("div", {}, element("h3", {}, "At this point"), figures),
         element("div", {}, element("h3", {}, "Do it again"), springbench.commandBox(command, "Command that repeats the measurement"),
           springbench.method(chart.references?.[item.label]),
-          own && element("h3", {}, `Recording of ${item.label}'s solve`), own && springbench.replay(item.recording, own, item.recording.split("/").pop().replace(/\.rrd$/, ""), sweep.slug),
+          own && element("h3", {}, `Recording of ${item.label}'s solve`), own && springbench.replayBox(item.recording, own, sweep.replays?.[item.recording] && `site/data/${encodeURIComponent(sweep.slug)}/${sweep.replays[item.recording]}.js`, `${item.label}: ${item.what}`),
           element("p.muted", {}, `Made by code ${(made.commit || "unknown").slice(0, 12)} on ${made.cpu || "an unknown machine"}${sweep.made.length > 1 ? `, and by ${sweep.made.length - 1} more (see the overview)` : ""}.`)),
         item.picture && element("figure", {}, element("a", { href: sweep.up + item.picture.path }, element("img", { src: sweep.up + item.picture.path, alt: `The step's mesh, by ${item.picture.of}` })),
           element("figcaption", {}, `Not this point: the mesh where ${item.picture.of} came nearest the minimum of this step.`))));
@@ -137,5 +137,5 @@ Object.assign(springbench, (() => {
     show();
   }
 
-  return { mesh, camera, floats, whole, scaleBox, solve, copy };
+  return { mesh, camera, floats, whole, scaleBox, solve };
 })());
