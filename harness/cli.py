@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from harness.base.commands import Again, Changed, Commands, InThisProcess, Results, Rows
+from harness.base.commands import Again, Changed, Check, Commands, Error, Horizon, InThisProcess, Results, Rows
 from harness.base.console import err, out
 from harness.base.console import say as _say
 from harness.base.errors import InputError, Mistake
@@ -47,6 +47,9 @@ def run(
     results: Results = Path("results"),
     solver: Annotated[list[str] | None, typer.Option(help="For a scene: solvers; repeatable.")] = None,
     size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
+    error: Error = None,
+    horizon: Horizon = None,
+    check: Check = False,
     positions: Annotated[
         Path | None, typer.Option(help="Store the positions after every step (float64, .npz) of one run.")
     ] = None,
@@ -71,8 +74,16 @@ def run(
     from harness.report.site import keep
     from harness.report.timing_table import summary_table
 
-    sweep = load_any(config, solvers=solver or (), sizes=size or (), **given.obj)
     _check_positions(positions)
+    if error is not None:
+        from harness.experiments.asked.command import run_to_error
+
+        others = {"solver": solver, "on": on, "workers": workers, **given.obj}
+        wanted = {"horizon": horizon, "sizes": size or (), "check": check, "positions": positions}
+        raise typer.Exit(0 if run_to_error(config, error, results, _say, **wanted, others=others) else 1)
+    if horizon is not None or check:
+        raise InputError(Mistake("is of a run with --error; leave it out", key="--check" if check else "--horizon"))
+    sweep = load_any(config, solvers=solver or (), sizes=size or (), **given.obj)
     folder = claimed(results / sweep.name, config)
     runs = sweep.runs()
     how: dict[str, Any] = {"again": again, "changed": changed, "positions": positions, "isolated": not here}

@@ -225,16 +225,17 @@ class StepProblem:
 
 @dataclass(frozen=True, slots=True)
 class StopRule:
-    """When a solve ends: after `iterations`, or with a `tolerance` once the residual is at most so much of its value at
-    the current positions, or the gradient round-off, so that a scene at rest stops at once.
+    """When a solve ends: after `iterations`, or once the residual is at most `within` [J^(1/2)], or a `tolerance` times
+    its value at the current positions, or the gradient round-off, so that a scene at rest stops at once.
 
-    The residual at p is |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q [J^(1/2)] over the unpinned vertices, the same for every
-    method. Round-off is at each of them at most `floor` times its bound (see `solvers.round_off`); 0 looks for none.
+    It is |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q over the unpinned vertices for every method. Round-off is at each of them
+    at most `floor` times its bound (see `solvers.round_off`); 0 looks for none.
     """
 
     iterations: int = 50
     tolerance: float | None = None
     floor: float = 8.0
+    within: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,6 +27,12 @@ Changed = Annotated[bool, typer.Option("--changed", help="Do also what is there 
 InThisProcess = Annotated[
     bool, typer.Option("--here", help="Do all in this process, without limits, as a debugger wants it.")
 ]
+Error = Annotated[
+    float | None,
+    typer.Option(help="For a scene: the error wanted at its end, relative to the displacement; how, is chosen."),
+]
+Horizon = Annotated[float | None, typer.Option(help="With --error: simulated seconds; all frames if left out.")]
+Check = Annotated[bool, typer.Option("--check", help="With --error: let the reference grade it.")]
 
 
 class Commands(TyperGroup):

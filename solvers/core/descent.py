@@ -128,7 +128,7 @@ class Metric:
         """|Q^-1 g|_Q [J^(1/2)] over the unpinned vertices, of a gradient g (n, 3)."""
         e, pins = self.solve(gradient), self.system.pins
         if pins.exact.all():  # then |Q^-1 g|_Q is what g does along it
-            return max(0.0, dot(e, gradient)) ** 0.5
+            return max(dot(e, gradient), 0.0) ** 0.5  # in this order, which keeps NaN
         e[pins.vertices] = 0.0
         return matrices.energy_norm(self._Q, e)
 

@@ -91,11 +91,12 @@ class Iterative(ABC):
         computed."""
         run = self.begin(problem, problem.first_guess)
         limits, yardstick, close = at_most(stop.iterations), float("nan"), False
-        if stop.tolerance is not None and self.residual_of != "none":
-            yardstick = self.residual_at(problem, problem.current)
-            near = _NEAR * self.scale(problem) if stop.floor > 0.0 else 0.0
-            limits = Limits(stop.iterations, stop.tolerance * yardstick, near, loop.EACH)
-            close = stop.tolerance <= _CLOSE
+        if (stop.tolerance is not None or stop.within > 0.0) and self.residual_of != "none":
+            near, limit = _NEAR * self.scale(problem) if stop.floor > 0.0 else 0.0, stop.within
+            if stop.tolerance is not None:
+                yardstick = self.residual_at(problem, problem.current)
+                limit, close = max(limit, stop.tolerance * yardstick), stop.tolerance <= _CLOSE
+            limits = Limits(stop.iterations, limit, near, loop.EACH)
         count, residual, ended = self._iterated(run, problem, limits, stop.floor)
         while close and ended in (loop.TOLERANCE, loop.FLOOR) and not run.certifies():
             left = limits._replace(iterations=stop.iterations - count)

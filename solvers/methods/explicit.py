@@ -231,8 +231,9 @@ class PreparedExplicit(Iterative):
         """The same with so many times the substeps."""
         return replace(self, substeps=times * self.substeps)
 
-    def step(self, problem: StepProblem) -> tuple[Positions, Positions, NDArray[np.float64]]:
-        """Positions and velocities (n, 3) at the step's end, and what `integrate` tells."""
+    def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, NDArray[np.float64]]:
+        """Positions and velocities (n, 3) at the step's end, and what `integrate` tells. h: the first substep [s] of a
+        method that chooses them, from the fastest motion if left out."""
         s, pins, start, frame = self.system, self.system.pins.vertices, problem.start, self.system.time_step
         begin, end = np.ascontiguousarray(start.positions[pins]), problem.pin_targets.copy()
         p, v = rows_of_four(start.positions, far=True), rows_of_four(start.velocity)
@@ -245,7 +246,7 @@ class PreparedExplicit(Iterative):
         if isinstance(self.method, Composition):
             self._compose(forces, self.method, p, v)
         else:
-            self._integrate(forces, self.method, p, v, told)
+            self._integrate(forces, self.method, p, v, h, told)
         velocity = v.reshape(-1, 4)[: s.vertices, :3].copy()
         velocity[pins] = (end - begin) / frame
         return p.reshape(-1, 4)[: s.vertices, :3].copy(), velocity, told
@@ -259,14 +260,20 @@ class PreparedExplicit(Iterative):
         compose(forces, method.drifts, np.exp(-gone), gained, self.substeps, h, p, v, np.zeros_like(v))
 
     def _integrate(
-        self, forces: Forces, method: Tableau, p: NDArray[np.float64], v: NDArray[np.float64], told: NDArray[np.float64]
+        self,
+        forces: Forces,
+        method: Tableau,
+        p: NDArray[np.float64],
+        v: NDArray[np.float64],
+        h: float | None,
+        told: NDArray[np.float64],
     ) -> None:
         frame, rows = self.system.time_step, np.zeros((2, len(method.a), len(p)))
         fixed = not self.tolerance
-        h = frame / self.substeps if fixed else min(frame, 1.0 / self.rate if self.rate else frame)
+        first = frame / self.substeps if fixed else min(frame, h or (1.0 / self.rate if self.rate else frame))
         errors = np.zeros((1, len(method.a))) if fixed else method.errors
         most = self.substeps if fixed else _TRIED * self.substeps + 10_000
-        whole = (self.tolerance or 1.0, float(most), frame, frame, h)
+        whole = (self.tolerance or 1.0, float(most), frame, frame, first)
         q, w = aligned(len(p)), aligned(len(p))
         integrate(forces, method.a, method.times, errors, method.power, *whole, p, v, q, w, *rows, told)
         if told[3] < frame:

@@ -10,7 +10,7 @@ Wanner, Solving Ordinary Differential Equations I, section II.5), whose coeffici
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,6 +137,7 @@ TSITOURAS_5 = Tableau(
 )
 
 
+@cache
 def dormand_prince_8() -> Tableau:
     """The method of order 8."""
     from scipy.integrate import DOP853  # for those who ask for it

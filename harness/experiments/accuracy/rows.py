@@ -7,6 +7,7 @@ One table holds all kinds of rows, which `kind` tells apart:
     prepare   the time in which a solver prepares for it
     curve     an iterate of a solver on it: energy, errors, stationarity, and when it came
     work      a simulation of the horizon: its error, and the wall time that it took
+    asked     a simulation to an error that was asked for (`springbench run SCENE --error`)
 
 Rows hold energies and errors of positions, never gaps: whoever reads them computes gaps from `g`, `g0` and the
 lowest `g` of the minima, so that a better minimum needs no new measurement.
@@ -21,7 +22,7 @@ from harness.base.columns import OF_SOLVER, PROVENANCE, Column, as_in_runs, sche
 _TEXT, _INT, _REAL, _YES = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 
 COLUMNS = (
-    Column("kind", _TEXT, "", "problem, minimum, prepare, curve or work"),
+    Column("kind", _TEXT, "", "problem, minimum, prepare, curve, work or asked"),
     Column("unit", _TEXT, "", "hash of all that determines the unit's result and timing"),
     *as_in_runs("sweep", "scene", "size", "vertices", "springs", "solver", "parameters", "integrator", "time_step"),
     *OF_SOLVER,
@@ -70,6 +71,13 @@ COLUMNS = (
     Column("error", _REAL, "", "|p(T) - reference(T)| / |reference(T) - p(0)|, Frobenius norms, vertices not pinned"),
     Column("error_rms_m", _REAL, "m", "root mean square distance of a vertex from the reference at the horizon"),
     Column("iterations_done", _INT, "", "iterations done in all steps together"),
+    Column("asked", _REAL, "", "the error that was asked for, as `error`"),
+    Column("estimated", _REAL, "", "the error, estimated by a motion to a closer tolerance"),
+    Column("local_tolerance_m", _REAL, "m", "what each step may err by, root mean square over the free coordinates"),
+    Column("accepted", _INT, "", "steps that kept to it"),
+    Column("rejected", _INT, "", "steps that did not, and were done again"),
+    Column("factorisations", _INT, "", "factors made for steps of different lengths; 0 of explicit methods"),
+    Column("estimate_seconds", _REAL, "s", "wall time of all that was simulated to choose and to estimate"),
     *PROVENANCE,
 )
 

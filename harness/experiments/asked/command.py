@@ -1,0 +1,144 @@
+"""`springbench run SCENE --error 1e-3`: the scene simulated to an error, its row, its recording and its picture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from harness.base import machine, rows
+from harness.base.claim import claimed
+from harness.base.errors import InputError, Mistake
+from harness.base.stated import stated
+from harness.config.load import load_scene
+from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.units import references
+from harness.experiments.asked.search import Answer, foresee, search
+from harness.experiments.asked.ways import Asked
+from harness.experiments.provenance import provenance
+from harness.experiments.run import save_positions
+from harness.record.base import Frame, RecordingInfo
+from harness.record.rerun import RerunRecorder
+
+Say = Callable[[str], None]
+
+
+def run_to_error(
+    config: Path,
+    error: float,
+    results: Path,
+    say: Say,
+    *,
+    horizon: float | None = None,
+    sizes: Sequence[int] = (),
+    check: bool = False,
+    positions: Path | None = None,
+    others: Mapping[str, Any] | None = None,
+) -> bool:
+    """Simulate the scene in a file to a relative error at a horizon [s], and say what it took.
+
+    sizes: of the mesh, one at most; check: whether the reference grades it; positions: where to store those of the frames; others: options that were
+    given besides, which are refused. Returns whether what was checked holds. Raises InputError, RunFailed.
+    """
+    _require(error, horizon, {**(others or {}), "second --size": sizes[1:]})
+    asked = Asked.of(load_scene(config), sizes[0] if sizes else None, horizon)
+    folder = claimed(results / config.stem, config)
+    with machine.pinned_threads(1):
+        seen = foresee(asked, error, say)
+        answer = search(asked, error, seen, say)
+    path, best = answer.best.path, answer.best
+    each = path.seconds / asked.horizon
+    say(f"asked {error:g}, estimated {best.estimated:.1g}, {1e3 * each:.3g} ms a simulated second")
+    factors = f", {path.factorisations} factorisations" if path.factorisations else ""
+    say(
+        f"by {best.way}: {path.accepted} steps, {path.rejected} rejected{factors}"
+        + (f"; more exact than asked, for {answer.note}" if answer.note else "")
+    )
+    say(f"choosing, and a closer motion for the estimate, took {answer.seconds:.3g} s besides")
+    measured = None
+    if check:
+        trajectory = references(results).trajectory(asked.scene, asked.size, [asked.horizon], error=error)
+        measured = trajectory.error(-1, path.positions[-1])
+        say(f"by the reference it errs by {measured:.2g}, {'as' if measured <= error else 'not as'} asked")
+    label = f"{config.stem}-{asked.size}-asked-{error:g}-{asked.horizon:g}"
+    recording = _record(folder / "recordings" / f"{label}.rrd", config.stem, asked, answer)
+    row = _row(config.stem, asked, error, answer) | {"error": measured, "recording": f"recordings/{recording.name}"}
+    (folder / "accuracy").mkdir(exist_ok=True)
+    rows.write(folder / "accuracy" / f"{label}.parquet", [row | {"unit": label}], SCHEMA)
+    if positions:
+        save_positions(positions, path.positions[1:])
+    say(f"the row is in {folder / 'accuracy'}, the recording is {recording}")
+    return measured is None or measured <= error
+
+
+def _require(error: float, horizon: float | None, others: Mapping[str, Any]) -> None:
+    """Raise InputError for what cannot be asked."""
+    mistakes = [
+        Mistake("with --error, solver and steps are chosen; leave it out", key=f"--{name.replace('_', '-')}")
+        for name, value in others.items()
+        if value
+    ]
+    if not 0.0 < error < 1.0:
+        mistakes.append(Mistake(f"came {error:g}; wanted a number between 0 and 1", key="--error"))
+    if horizon is not None and not (isfinite(horizon) and 0.0 < horizon <= 1e4):
+        mistakes.append(Mistake(f"came {horizon:g}; wanted seconds above 0, at most 10,000", key="--horizon"))
+    if mistakes:
+        raise InputError(mistakes)
+
+
+def _row(name: str, asked: Asked, error: float, answer: Answer) -> dict[str, Any]:
+    best, path = answer.best, answer.best.path
+    return {
+        "kind": "asked",
+        "status": "ok",
+        "reason": answer.note,
+        "sweep": name,
+        "scene": name,
+        "size": asked.size,
+        "vertices": path.positions.shape[1],
+        "solver": best.way.solver,
+        "parameters": json.dumps({}),
+        **stated(best.way.solver),
+        "integrator": best.way.integrator,
+        "time_step": asked.frame,
+        "threads": 1,
+        "horizon": asked.horizon,
+        "asked": error,
+        "estimated": best.estimated,
+        "local_tolerance_m": best.tolerance,
+        "accepted": path.accepted,
+        "rejected": path.rejected,
+        "factorisations": path.factorisations,
+        "iterations_done": path.iterations,
+        "seconds": [path.seconds],
+        "seconds_per_simulated": path.seconds / asked.horizon,
+        "estimate_seconds": answer.seconds,
+        **provenance(),
+    }
+
+
+def _record(path: Path, name: str, asked: Asked, answer: Answer) -> Path:
+    """The recording of the motion at its frames, and of what was asked."""
+    scene, best = asked.bound(asked.frame, "own"), answer.best
+    properties = {"scene": name, "size": asked.size, "solver": best.way.solver, "integrator": best.way.integrator}
+    info = RecordingInfo(
+        title=f"{name} {asked.size or ''}".strip() + f" - {best.way}, estimated error {best.estimated:.1g}",
+        run_id=f"{path.stem}-{machine.describe().id}",
+        mesh=scene.mesh,
+        springs=scene.springs.edges,
+        rest_lengths=scene.springs.rest_length,
+        pinned=scene.system.pins.vertices,
+        time_step=asked.frame,
+        strain_range=0.1,
+        properties={**properties, "status": "ok", "estimated": best.estimated},
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    recorder = RerunRecorder(path, info)
+    try:
+        for k, p in enumerate(best.path.positions):
+            recorder.frame(Frame(k, k * asked.frame, p, {}, float("nan"), 0))
+        return recorder.close({})
+    finally:
+        recorder.abandon()

@@ -1,0 +1,177 @@
+"""The cheapest way to an error: all ways are run, the best one's tolerance is moved until its error is the one asked.
+
+    estimate = |p(T) - q(T)| / |q(T) - p(0)|,    q the same motion to a much closer tolerance
+
+in Frobenius norms over the vertices that are not pinned, as errors are told everywhere. How the cost of a way grows
+with its error is known from its order: a step is in proportion to error^(1/order).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+
+from harness.base.errors import RunFailed
+from harness.experiments.asked.ways import Asked, Way, ways
+from harness.reference.growth import Growth, growth
+from harness.simulation.controlled import Path, Stuck, TooSlow
+from solvers.problem import Positions
+
+AIM = 0.6
+"""Of the error asked, what a tolerance is chosen for: estimates scatter."""
+WIDE = 1 / 3
+"""An error below this part of the one asked was bought for too much, if a cheaper way is stable."""
+CLOSER = 1 / 50
+"""Of a tolerance, that of the motion that errors are estimated by."""
+DOUBT = 1.1
+"""What an estimate is multiplied by: the closer motion errs too, by a tenth of it where the order is 4."""
+_FINER = 1.3
+"""Times as many steps, at which a motion counts as closer: an order of 8 takes 1.6 times as many for 1/50."""
+_MOVES, _CLOSINGS = 6, 3
+_PATIENCE = 4.0
+"""Times the fastest so far, what a way may take."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """A way, its tolerance [m], the path that it gave, and its estimated relative error."""
+
+    way: Way
+    tolerance: float
+    path: Path
+    estimated: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """best: what keeps to the error; others: the other ways at the first tolerance; closer: by which errors were
+    estimated; seconds: wall time of all that was simulated besides; note: why it is far more exact than was asked."""
+
+    best: Found
+    others: tuple[Found, ...]
+    closer: Found
+    seconds: float
+    note: str
+
+
+def foresee(asked: Asked, error: float, say: Callable[[str], None]) -> Growth:
+    """How far ahead the motion can be known, told before anything else. Raises RunFailed where the error cannot be had
+    at the horizon, with the one that can."""
+    seen = growth(asked.bound, asked.horizon, asked.frames)
+    if not seen.scale > 0.0:
+        raise RunFailed("nothing moves up to the horizon, and errors are relative to what does")
+    worst = float(seen.grown[-1])
+    told = (
+        f"what differs by 1e-12 of the size at the start differs by {worst:.1g} of the motion after {asked.horizon:g} s"
+    )
+    if not seen.known(error) >= asked.horizon * (1.0 - 1e-9):
+        raise RunFailed(
+            f"{told}: nobody can know the motion to {error:g} there; it can be known to {seen.least:.1g}, and to "
+            f"{error:g} up to {seen.known(error):.3g} s: ask for a larger --error or a shorter --horizon"
+        )
+    say(f"{told}: an error of {error:g} can be known there, and of {seen.least:.0e} at the least")
+    return seen
+
+
+def search(asked: Asked, error: float, seen: Growth, say: Callable[[str], None]) -> Answer:
+    """The cheapest way that keeps to a relative error at the horizon. Raises RunFailed where none does."""
+    return _Search(asked, error, seen, say).answer()
+
+
+class _Search:
+    def __init__(self, asked: Asked, error: float, seen: Growth, say: Callable[[str], None]) -> None:
+        self._asked, self._error, self._seen, self._say = asked, error, seen, say
+        self._free = asked.bound(asked.frame, "own").system.free
+        self._seconds = 0.0
+
+    def answer(self) -> Answer:
+        self._say("ways to the error:")
+        tolerance = 0.2 * self._error * self._seen.scale
+        raced = self._race(ways(self._asked), tolerance)
+        closer = self._closer(raced)
+        graded = sorted((self._graded(one, closer) for one in raced), key=self._promise)
+        for one in graded:
+            self._say(f"  {one.way}: {one.path.seconds:.3g} s, an error of {one.estimated:.1e}")
+        best, closer, note = self._moved(graded[0], closer)
+        return Answer(best, tuple(graded[1:]), closer, self._seconds - best.path.seconds, note)
+
+    def _run(self, way: Way, tolerance: float, limit: float = inf) -> Found:
+        path = way.follower.follow(tolerance, limit=limit)
+        self._seconds += path.seconds
+        return Found(way, tolerance, path, inf)
+
+    def _race(self, ways: list[Way], tolerance: float) -> list[Found]:
+        """Those that end, none of which takes much longer than the fastest."""
+        found, stuck, limit = list[Found](), list[Stuck](), inf
+        for way in ways:
+            try:
+                found.append(self._run(way, tolerance, limit))
+                limit = max(1.0, _PATIENCE * min(one.path.seconds for one in found))
+            except Stuck as error:
+                stuck.append(error)
+            except TooSlow:
+                self._say(f"  {way}: given up after {limit:.3g} s, for it is slower than others")
+        if not found:
+            raise stuck[0]
+        return found
+
+    def _closer(self, raced: list[Found]) -> Found:
+        """The same motion to a closer tolerance, by what is the cheapest there."""
+        best = min(raced, key=lambda one: one.path.seconds * CLOSER ** (-1.0 / one.way.follower.order))
+        found = best
+        for _ in range(_CLOSINGS):  # where frames or stability rule the steps, a closer tolerance may change nothing
+            found = self._run(best.way, CLOSER * found.tolerance)
+            if found.path.accepted >= _FINER * best.path.accepted:
+                break
+        return found
+
+    def _graded(self, one: Found, closer: Found) -> Found:
+        p, q = one.path.positions, closer.path.positions
+        moved = self._apart(q[-1], q[0])
+        least = closer.tolerance / self._seen.scale
+        estimated = max(DOUBT * self._apart(p[-1], q[-1]) / moved, least) if moved else inf
+        return Found(one.way, one.tolerance, one.path, estimated)
+
+    def _apart(self, p: Positions, q: Positions) -> float:
+        return float(np.linalg.norm((p - q)[self._free]))
+
+    def _promise(self, one: Found) -> float:
+        """The seconds that a way would take to the error asked; where it is more exact than that, those that it took,
+        for explicit steps may be as long as is stable already."""
+        return one.path.seconds * max(1.0, one.estimated / (AIM * self._error)) ** (1.0 / one.way.follower.order)
+
+    def _moved(self, one: Found, closer: Found) -> tuple[Found, Found, str]:
+        """The way at the tolerance that gives the error asked."""
+        best, closings = None if one.estimated > self._error else one, 0
+        for _ in range(_MOVES):
+            if best and best.estimated >= WIDE * self._error:
+                return best, closer, ""
+            order = one.way.follower.order
+            ratio = AIM * self._error / max(one.estimated, 1e-3 * AIM * self._error)
+            factor = min(100.0, max(1e-3, ratio ** ((order + 1.0) / order)))
+            following = self._run(one.way, one.tolerance * factor)
+            if following.tolerance * CLOSER < 0.5 * closer.tolerance and closings < _CLOSINGS:
+                closer, closings = self._run(closer.way, CLOSER * following.tolerance), closings + 1
+            before, one = one, self._graded(following, closer)
+            if best and (one.estimated > self._error or one.path.seconds > 0.9 * best.path.seconds):
+                return best, closer, _STABLE
+            if one.estimated <= self._error:
+                best = one
+            elif best is None and one.estimated > 0.5 * before.estimated and factor < 0.1:
+                raise self._nothing(min(one, before, key=lambda x: x.estimated))
+        if best is None:
+            raise self._nothing(one)
+        return best, closer, ""
+
+    def _nothing(self, nearest: Found) -> RunFailed:
+        return RunFailed(
+            f"no tolerance keeps to an error of {self._error:g}: {nearest.way} reached {nearest.estimated:.1g} at "
+            f"{nearest.tolerance:.1e} m a step, and closer tolerances do not come nearer; ask for a larger --error or "
+            "a shorter --horizon"
+        )
+
+
+_STABLE = "longer steps are unstable, or cost as much"

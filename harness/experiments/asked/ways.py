@@ -1,0 +1,105 @@
+"""Ways to follow a motion to an error: explicit pairs, and implicit ones with the solvers of their steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from harness.base.errors import InputError, RunFailed
+from harness.config.load import misfits
+from harness.reference.frozen import bind
+from harness.scenes.bind import Scene
+from harness.scenes.spec import SceneSpec
+from harness.simulation.controlled import Explicit, Follower, Implicit
+from solvers.contact.touching import without_contact
+from solvers.problem import NotPositiveDefinite, Unsupported
+from solvers.registry import SOLVERS, load
+
+TRIED = (
+    ("own", "tsitouras-5"),
+    ("own", "dormand-prince-8"),
+    ("esdirk-4", "lbfgs"),
+    ("esdirk-4", "newton"),
+)
+"""Integrators and solvers: those that were the cheapest of their kind for some scene and error."""
+
+_ONCE = 1e-2
+"""Of the mesh's size: the tolerance of what only compiles."""
+_CONTACT = (
+    "contact begins and ends within steps, where every method here has order 1: no error can be promised; run it with "
+    "steps of one length (--integrator, --time-step), and halve them until the motion stays as it is"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A scene of one size, up to a horizon [s] that is so many frames. Pins are exact, as in the reference."""
+
+    scene: SceneSpec
+    size: int
+    horizon: float
+    frames: int
+
+    @classmethod
+    def of(cls, scene: SceneSpec, size: int | None, horizon: float | None) -> Asked:
+        """Of the scene's own size and length where none are given; frames are about as long as its time step.
+
+        Raises InputError, and RunFailed for contact."""
+        scene.require_even_steps()
+        horizon = horizon or scene.frames * scene.time_step
+        size = size or scene.default_size or 0
+        frames = max(1, round(horizon / scene.time_step))
+        if mistakes := misfits(scene, [size]):
+            raise InputError(mistakes)
+        asked = cls(scene, size, horizon, frames)
+        system = asked.bound(asked.frame, "implicit-euler").system
+        if without_contact(system) is not system:
+            raise RunFailed(_CONTACT)
+        return asked
+
+    def bound(self, time_step: float, integrator: str) -> Scene:
+        """The scene with steps of a length [s] and an integrator by name."""
+        return bind(self.scene.stepped(time_step), self.size, integrator)
+
+    @property
+    def frame(self) -> float:
+        """The length of a frame [s]."""
+        return self.horizon / self.frames
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """An integrator and a solver by name, and how they follow the motion."""
+
+    integrator: str
+    solver: str
+    follower: Follower
+
+    def __str__(self) -> str:
+        return self.solver if self.integrator == "own" else f"{self.integrator} with {self.solver}"
+
+
+def ways(asked: Asked) -> list[Way]:
+    """Those that know the scene, warmed up: what they compile counts against nobody. Raises RunFailed for none."""
+    found, reasons = list[Way](), list[str]()
+    for integrator, solver in TRIED:
+        way = Way(integrator, solver, _follower(asked, integrator, solver))
+        try:
+            _warm(asked, integrator, solver)
+            found.append(way)
+        except (Unsupported, NotPositiveDefinite) as error:
+            reasons.append(f"{way}: {error}")
+    if not found:
+        raise RunFailed(f"no method that keeps to an error knows this scene: {'; '.join(reasons)}")
+    return found
+
+
+def _follower(asked: Asked, integrator: str, solver: str, frames: int | None = None) -> Follower:
+    made, frames = load(SOLVERS[solver])(), frames or asked.frames
+    if integrator == "own":
+        return Explicit(asked.bound(asked.frame, integrator), made, frames)
+    return Implicit(lambda h: asked.bound(h, integrator), made, asked.frame * frames, frames)
+
+
+def _warm(asked: Asked, integrator: str, solver: str) -> None:
+    size = asked.bound(asked.frame, "own").mesh.size or 1.0
+    _follower(asked, integrator, solver, 1).follow(_ONCE * size)

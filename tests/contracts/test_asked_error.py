@@ -1,0 +1,163 @@
+"""Errors that are asked for: the ladder of steps, the growth of what cannot be known, the choice, what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from harness.base.errors import RunFailed
+from harness.cli import app
+from harness.config.load import load_scene
+from harness.experiments.asked.search import foresee, search
+from harness.experiments.asked.ways import Asked
+from harness.reference.growth import growth
+from harness.reference.trajectory import integrate
+from harness.scenes.bind import Scene, build
+from harness.scenes.effects.dashpots import Dashpots
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.spec import SceneSpec
+from harness.simulation.controlled import Implicit, Stuck, hermite
+from solvers.integrators import Motion
+from solvers.methods.newton import Newton
+
+SCENES = Path(__file__).parents[2] / "configs" / "scenes"
+HELD = Pins(at=("first",), weight="exact")
+END, FRAMES = 0.5, 10
+
+
+def chain(*effects: Any, size: int = 5) -> SceneSpec:
+    """Of 1 kg, thrown."""
+    given = {"mesh": Chain(), "effects": effects, "velocity": (0.5, 1.0, 2.0), "time_step": END / FRAMES}
+    return SceneSpec(mass=1.0, frames=FRAMES, path=Path("scene.yaml"), default_size=size, **given)
+
+
+def implicit(spec: SceneSpec, integrator: str, forces: tuple[Any, ...] = ()) -> Implicit:
+    def bound(h: float) -> Scene:
+        return replace(build(spec.stepped(h), 5, integrator), forces=forces)
+
+    return Implicit(bound, Newton(), END, FRAMES)
+
+
+SWINGING = chain(Springs(stretch=40.0), Gravity(), HELD)
+
+
+@pytest.mark.parametrize("integrator", ["tr-bdf2", "esdirk-3", "esdirk-4", "sdirk-4"])
+def test_a_closer_tolerance_gives_a_smaller_error_by_more_steps_and_few_factors(integrator):
+    truth = integrate(build(SWINGING, 5, "own"), [END])
+    paths = [implicit(SWINGING, integrator).follow(tolerance) for tolerance in (1e-3, 1e-6)]
+    coarse, fine = (truth.error(0, path.positions[-1]) for path in paths)
+    assert fine < 0.1 * coarse  # a thousandth to the power 3/4 or 2/3 is a hundredth, steps being halves
+    assert fine < 1e-3
+    for path in paths:
+        assert path.positions.shape == (FRAMES + 1, 5, 3)
+        assert path.factorisations <= 1 + np.log2(path.steps[1] / path.steps[0]) + path.rejected
+        assert path.accepted >= END / path.steps[1]
+
+
+def test_frames_lie_on_the_motion_though_steps_are_longer_than_they_are():
+    path = implicit(SWINGING, "esdirk-4").follow(3e-4)
+    assert path.steps[1] > END / FRAMES
+    truth = integrate(build(SWINGING, 5, "own"), list(np.linspace(0.0, END, FRAMES + 1)[1:]))
+    away = np.abs(path.positions[1:] - truth.positions).max()
+    assert away < 0.03 * np.abs(truth.positions[-1] - path.positions[0]).max()  # h^4/384 of a cubic, and its tolerance
+
+
+def test_steps_grow_again_after_what_made_them_short():
+    """Dashpots stop the throw within a thousandth of a second; what is left is slow."""
+    path = implicit(chain(Springs(stretch=40.0), Dashpots(stretch=100.0), Gravity(), HELD), "esdirk-4").follow(1e-5)
+    assert path.steps[1] >= 16 * path.steps[0]
+    assert path.accepted < 100
+
+
+def test_the_same_motion_has_the_same_bits():
+    one, two = (implicit(SWINGING, "esdirk-4").follow(1e-5) for _ in "ab")
+    np.testing.assert_array_equal(one.positions, two.positions)
+
+
+def test_a_step_below_the_floor_ends_with_the_frame_the_cause_and_what_was_reached():
+    def breaks(p: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+        return np.full_like(p, np.nan if t > 0.22 else 0.0)
+
+    with pytest.raises(
+        Stuck, match=r"frame 5, after 0\.2\d+ s: even a step of .* not solved; up to there \d+ steps kept"
+    ):
+        implicit(chain(Springs(stretch=40.0), HELD), "esdirk-4", (breaks,)).follow(1e-3)
+
+
+def test_hermites_cubic_is_exact_for_cubics():
+    rng = np.random.default_rng(3)
+    c = rng.normal(size=(4, 2, 3))
+    at = [Motion(sum(c[k] * t**k for k in range(4)), sum(k * c[k] * t ** (k - 1) for k in (1, 2, 3))) for t in (0.5, 2)]
+    wanted = sum(c[k] * 0.95**k for k in range(4))
+    np.testing.assert_allclose(hermite(*at, 1.5, 0.3), wanted, rtol=0, atol=1e-14)  # some roundings of numbers near 10
+
+
+@pytest.mark.parametrize("error", [1e-2, 1e-3, 1e-4])
+@pytest.mark.parametrize(("scene", "size", "horizon"), [("single-spring", 2, 1.0), ("chain", 5, 0.5)])
+def test_the_error_is_never_above_the_one_that_was_asked_for(scene, size, horizon, error):
+    asked = Asked.of(load_scene(SCENES / f"{scene}.yaml"), size, horizon)
+    told = list[str]()
+    found = search(asked, error, foresee(asked, error, told.append), told.append).best
+    true = integrate(asked.bound(asked.frame, "own"), [horizon]).error(0, found.path.positions[-1])
+    assert true <= found.estimated <= error
+    # The doubt, and the closer tolerance, which no estimate is below.
+    assert found.estimated <= 1.5 * true + 0.01 * error
+    assert any("an error of" in line for line in told)
+
+
+def test_growth_tells_a_motion_that_can_be_known_from_one_that_cannot():
+    pendulum = Asked.of(load_scene(SCENES / "single-spring.yaml"), 2, 1.0)
+    cloth = Asked.of(load_scene(SCENES / "hanging-cloth.yaml"), 9, 2.0)
+    calm, wild = (growth(one.bound, one.horizon, one.frames) for one in (pendulum, cloth))
+    assert calm.least < 1e-9  # 1e-12 of the size grows with the time, and no faster
+    assert wild.least > 1e3 * calm.least
+    assert wild.known(wild.least / 10) < 2.0 <= wild.known(1.01 * wild.least)
+    with pytest.raises(RunFailed, match=r"nobody can know the motion to .* it can be known to .* up to"):
+        foresee(cloth, wild.least / 10, lambda line: None)
+
+
+def test_contact_is_refused_before_anything_is_simulated():
+    with pytest.raises(RunFailed, match="contact begins and ends within steps"):
+        Asked.of(load_scene(SCENES / "block-drop.yaml"), None, None)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--error", "2"), "--error: came 2; wanted a number between 0 and 1"),
+        (("--error", "nan"), "--error: came nan"),
+        (("--error", "1e-3", "--horizon", "-1"), "--horizon: came -1; wanted seconds above 0"),
+        (("--error", "1e-3", "--solver", "newton"), "--solver: with --error, solver and steps are chosen"),
+        (("--error", "1e-3", "--integrator", "bdf2"), "--integrator: with --error"),
+        (("--horizon", "1"), "--horizon: is of a run with --error"),
+        (("--check",), "--check: is of a run with --error"),
+    ],
+)
+def test_what_cannot_be_asked_is_the_users_mistake(options, told, tmp_path, capsys):
+    given = ["run", str(SCENES / "chain.yaml"), "--results", str(tmp_path), *options]
+    found = CliRunner().invoke(app, given)
+    assert found.exit_code == 2
+    assert told in " ".join((found.stderr + capsys.readouterr().err).split())
+
+
+def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_path):
+    from harness.base import rows
+    from harness.experiments.accuracy.rows import SCHEMA
+
+    where = ["--results", str(tmp_path), "--positions", str(tmp_path / "p.npz")]
+    given = ["run", str(SCENES / "chain.yaml"), "--size", "5", "--error", "1e-3", "--horizon", "0.2", "--check", *where]
+    found = CliRunner().invoke(app, given)
+    assert found.exit_code == 0, found.output
+    (row,) = rows.read((tmp_path / "chain" / "accuracy").glob("*.parquet"), SCHEMA).to_pylist()
+    assert row["error"] <= row["estimated"] <= row["asked"] == 1e-3
+    assert row["accepted"] > 0
+    assert (tmp_path / "chain" / row["recording"]).is_file()
+    assert np.load(tmp_path / "p.npz")["positions"].shape == (6, 5, 3)
