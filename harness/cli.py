@@ -21,6 +21,7 @@ from harness.base.console import say as _say
 from harness.base.errors import InputError, Mistake
 from harness.config.command_line import taking
 from harness.experiments.ablation.command import ablate
+from harness.experiments.accuracy.command import recommend
 from harness.experiments.archive.command import compact, merge, publish, verify
 from harness.experiments.gallery import gallery
 from harness.experiments.gates.command import gate
@@ -79,7 +80,7 @@ def run(
         from harness.experiments.asked.command import run_to_error
 
         others = {"solver": solver, "on": on, "workers": workers, **given.obj}
-        wanted = {"horizon": horizon, "sizes": size or (), "check": check, "positions": positions}
+        wanted: dict[str, Any] = {"horizon": horizon, "sizes": size or (), "check": check, "positions": positions}
         raise typer.Exit(0 if run_to_error(config, error, results, _say, **wanted, others=others) else 1)
     if horizon is not None or check:
         raise InputError(Mistake("is of a run with --error; leave it out", key="--check" if check else "--horizon"))
@@ -165,35 +166,6 @@ def accuracy(
 
 
 @app.command()
-def recommend(
-    scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
-    error: Annotated[float, typer.Option(help="The error wanted, relative to the displacement from the start.")],
-    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
-    horizon: Annotated[float, typer.Option(help="After how many simulated seconds the error counts.")] = 1.0,
-    time_limit: Annotated[float, typer.Option(help="Wall seconds that a simulation may take.")] = 5.0,
-    results: Results = Path("results"),
-) -> None:
-    """Find the cheapest integrator, time step, tolerance and solver that keep to an error, and check them."""
-    from harness.base.progress import display
-    from harness.experiments.accuracy.recommend import recommend as find
-
-    found = find(
-        scene,
-        error,
-        size=size,
-        horizon=horizon,
-        time_limit=time_limit,
-        results=results,
-        display=display(err),
-        say=_say,
-    )
-    table = Table("", "error", "wall s per simulated s", "way")
-    for name, way in (("predicted", found.best), ("measured", found.checked)):
-        table.add_row(name, f"{way.error:.3g}", f"{way.cost:.4g}", str(way))
-    out.print(table)
-
-
-@app.command()
 def report(
     results: Annotated[Path, typer.Argument(help="A folder of results, or that of one sweep.")] = Path("results"),
     viewer: Annotated[
@@ -213,6 +185,7 @@ def report(
 
 
 app.command(cls=taking("frames", "iterations", "tolerance", "rounds"))(ablate)
+app.command()(recommend)
 app.command()(compact)
 app.command()(merge)
 app.command()(publish)

@@ -228,9 +228,8 @@ class StopRule:
     """When a solve ends: after `iterations`, or once the residual is at most `within` [J^(1/2)], or a `tolerance` times
     its value at the current positions, or the gradient round-off, so that a scene at rest stops at once.
 
-    It is |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q over the unpinned vertices for every method. Round-off is at each of them
-    at most `floor` times its bound (see `solvers.round_off`); 0 looks for none.
-    """
+    It is |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q over the unpinned vertices. Round-off is at each of them at most `floor`
+    times its bound (see `solvers.round_off`); 0 looks for none."""
 
     iterations: int = 50
     tolerance: float | None = None

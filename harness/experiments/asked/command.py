@@ -39,8 +39,9 @@ def run_to_error(
 ) -> bool:
     """Simulate the scene in a file to a relative error at a horizon [s], and say what it took.
 
-    sizes: of the mesh, one at most; check: whether the reference grades it; positions: where to store those of the frames; others: options that were
-    given besides, which are refused. Returns whether what was checked holds. Raises InputError, RunFailed.
+    sizes: of the mesh, one at most; check: whether the reference grades it; positions: where to store those of the
+    frames; others: options that were given besides, which are refused. Returns whether what was checked holds. Raises
+    InputError, RunFailed.
     """
     _require(error, horizon, {**(others or {}), "second --size": sizes[1:]})
     asked = Asked.of(load_scene(config), sizes[0] if sizes else None, horizon)

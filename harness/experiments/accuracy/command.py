@@ -1,0 +1,40 @@
+"""`springbench recommend`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from harness.base.commands import Results
+from harness.base.console import err, out, say
+
+
+def recommend(
+    scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
+    error: Annotated[float, typer.Option(help="The error wanted, relative to the displacement from the start.")],
+    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
+    horizon: Annotated[float, typer.Option(help="After how many simulated seconds the error counts.")] = 1.0,
+    time_limit: Annotated[float, typer.Option(help="Wall seconds that a simulation may take.")] = 5.0,
+    results: Results = Path("results"),
+) -> None:
+    """Find the cheapest integrator, time step, tolerance and solver that keep to an error, and check them."""
+    from harness.base.progress import display
+    from harness.experiments.accuracy.recommend import recommend as find
+
+    found = find(
+        scene,
+        error,
+        size=size,
+        horizon=horizon,
+        time_limit=time_limit,
+        results=results,
+        display=display(err),
+        say=say,
+    )
+    table = Table("", "error", "wall s per simulated s", "way")
+    for name, way in (("predicted", found.best), ("measured", found.checked)):
+        table.add_row(name, f"{way.error:.3g}", f"{way.cost:.4g}", str(way))
+    out.print(table)
