@@ -94,7 +94,7 @@ def run(
     _say(f"rows, recordings and pictures are in {folder}")
     for path in draw_reports(sweep.reports, table, folder):
         _say(f"reported in {path}")
-    keep(results, folder, _say)
+    keep(results, folder, _say, quiet=True)
     failed = failures(table)
     for line in failed:
         _say(line)

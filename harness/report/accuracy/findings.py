@@ -25,8 +25,8 @@ def findings(table: Measurements) -> Chapters:
     """Sentences by the title of their chapter; chapters without any are left out."""
     compared = without_short(table)
     chapters = {
-        "Time to accuracy": list(_times(compared)),
         "Over all steps": list(_profiles(compared)),
+        "Time to accuracy": list(_times(compared)),
         "Work and precision": list(_works(table)),
         "Growth with size": list(_growth(compared)),
         "Liu et al. 2013": list(_paper(table)),

@@ -50,13 +50,15 @@ def update(
     return results / "index.html"
 
 
-def keep(results: Path, folder: Path, say: Callable[[str], None]) -> None:
-    """Bring the page of all results up to date with what is new in a sweep's folder, and say where it is.
+def keep(results: Path, folder: Path, say: Callable[[str], None], *, quiet: bool = False) -> None:
+    """Bring the page of all results up to date with what is new in a sweep's folder; says where it is, unless `quiet`.
 
     Where rows beside those of this sweep are damaged, it says so: what was measured is there all the same.
     """
     try:
-        say(f"all results are on one page: {update(results, only=[folder])}")
+        page = update(results, only=[folder])
+        if not quiet:
+            say(f"all results are on one page: {page}")
     except InputError as error:
         say(f"the page of all results stays as it was: {error}")
 
@@ -93,6 +95,12 @@ def _state(folder: Folder, code: str, recorded: bool) -> str:
     return sha256(repr(told).encode()).hexdigest()[:16]
 
 
+def _called(results: Path) -> str:
+    """The folder as commands call it from where this one was called; its name alone where it lies elsewhere."""
+    there, here = results.resolve(), Path.cwd()
+    return there.relative_to(here).as_posix() if there.is_relative_to(here) else there.name
+
+
 def _index(results: Path, data: Path) -> None:
     """The index of all sweeps that were written and are still there; those that never were are counted."""
     there = {folder.slug: folder for folder in folders(results)}
@@ -100,6 +108,7 @@ def _index(results: Path, data: Path) -> None:
     told = sorted((summary for summary in known.values() if summary), key=lambda s: s["to"] or "", reverse=True)
     value = {
         "title": results.resolve().name,
+        "place": _called(results),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "sweeps": [{key: part for key, part in summary.items() if key != "state"} for summary in told],
         "absent": [there[slug].name for slug, summary in known.items() if not summary],

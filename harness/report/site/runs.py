@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from harness.report.site.marks import drawn
 from harness.report.site.script import column
 from harness.report.style import looks
 from harness.report.timing_table import labels, runs
+from solvers.registry import EVERY, load
 
 Run = dict[str, Any]
 
@@ -30,18 +33,14 @@ select run_id, any_value(file) as unit, any_value(family) as family, any_value(r
     any_value(integrator) as integrator, any_value(time_step) as time_step, any_value(first_guess) as first_guess,
     any_value(max_iterations) as max_iterations, any_value(tolerance) as tolerance, any_value(threads) as threads,
     max(frame) as frames, 1 + max("round") filter (phase = 'step') as rounds,
-    arg_max(stopped, frame) filter (phase = 'step' and stopped is not null) as stopped,
     sum(seconds) filter (phase in ('step', 'prepare')) as took,
     arg_max(digest, frame) filter (digest is not null) as digest,
     max(penetration) as penetration, any_value(machine) as machine, any_value(cpu) as cpu, any_value(cores) as cores,
     any_value(memory_gib) as memory, any_value("system") as os, any_value("commit") as "commit",
     any_value(code) as code, any_value(own) as own, any_value(started) as started, any_value(timing) as timing,
     any_value(versions) as versions
-    {percentile}
 from numbered group by run_id
 """
-_PERCENTILE = "strain_99"
-"""The column of the strain that 99 % of the springs stay below, in rows that have it."""
 
 
 def read(folder: Folder) -> pa.Table:
@@ -60,6 +59,7 @@ def table_of(folder: Folder, table: pa.Table) -> list[Run]:
     for run in timed:
         told: Run = {**run._asdict(), **more[run.run_id], "label": names[run.run_id]}
         told["global"] = told.pop("global_")
+        told["plain"] = int(_is_plain(run.solver, run.parameters))
         told["options"] = names[run.run_id].removeprefix(run.solver).removeprefix(", ")
         told |= {part[:-1]: int(told["unit"] in files) for part, files in there.items()}
         found.append(told)
@@ -75,11 +75,12 @@ def as_script(folder: Folder, found: Sequence[Run], outcomes: Mapping[str, Any])
     if outcomes:
         columns["outcome"] = [outcomes.get(run["run_id"], {}).get("words") for run in found]
     marks = looks((run["label"], run["solver"]) for run in found)
+    exact = {name: [run[name] for run in found] for name in _EXACT}
     return {
         "slug": folder.slug,
         "up": folder.up,
         "n": len(found),
-        "columns": {name: column(values) for name, values in columns.items()},
+        "columns": {name: column(values) for name, values in columns.items()} | exact,
         "marks": {label: drawn(mark) for label, mark in marks.items()},
         "references": references((run["solver"], run["reference"]) for run in found),
     }
@@ -91,11 +92,14 @@ def references(pairs: Any) -> dict[str, dict[str, str]]:
     return {s: {"cited": cited(reference), "bibtex": bibtex([reference])} for s, reference in known.items()}
 
 
+_EXACT = ("time_step", "tolerance")
+"""What a command line asks for to the last digit."""
+
 _SHOWN = (
-    *("run_id", "unit", "scene", "size", "solver", "label", "options", "family", "vertices", "springs"),
+    *("run_id", "unit", "scene", "size", "solver", "label", "options", "plain", "family", "vertices", "springs"),
     *("integrator", "time_step", "first_guess", "max_iterations", "tolerance", "threads", "frames", "rounds"),
     *("status", "reason", "stopped", "iterations", "residual", "cold", "warm", "step", "lower", "upper", "least"),
-    *("local", "global", "largest_strain", _PERCENTILE, "penetration", "interrupted", "adds_up", "timing", "digest"),
+    *("local", "global", "largest_strain", "strain_99", "penetration", "interrupted", "adds_up", "timing", "digest"),
     *(
         "picture",
         "recording",
@@ -116,14 +120,21 @@ _SHOWN = (
 
 def _more(table: pa.Table) -> dict[str, Run]:
     """What the table of a sweep's end does not say of its runs, by their ids."""
-    there = _PERCENTILE in table.column_names
-    percentile = f", max({_PERCENTILE}) as {_PERCENTILE}" if there else ""
     numbered = table.append_column("place", pa.array(np.arange(len(table))))
     with duckdb.connect() as connection:
         connection.register("numbered", numbered)
-        answer = connection.execute(_MORE.format(percentile=percentile))
+        answer = connection.execute(_MORE)
         names = [column[0] for column in answer.description or ()]
         return {row[0]: dict(zip(names[1:], row[1:], strict=True)) for row in answer.fetchall()}
+
+
+def _is_plain(solver: str, parameters: str | None) -> bool:
+    """Whether a solver has its parameters' usual values, so that its name alone calls it."""
+    given = json.loads(parameters or "{}")
+    if solver not in EVERY or not given:
+        return not given
+    usual = {f.name: f.default for f in fields(load(EVERY[solver])) if f.default is not MISSING}
+    return all(name in usual and usual[name] == value for name, value in given.items())
 
 
 def _files(folder: Path, suffix: str) -> set[str]:

@@ -55,8 +55,12 @@ window.springbench = (() => {
       else if (key === "style" || key.includes("-") || key === "role" || key === "for") made.setAttribute(key, value);
       else made[key] = value;
     }
-    made.append(...children.filter(child => child !== null && child !== undefined && child !== false));
-    return made;
+    return put(made, ...children);
+  }
+  // Append what there is: nothing of null, undefined, false, 0 and empty words.
+  function put(parent, ...children) {
+    parent.append(...children.filter(Boolean));
+    return parent;
   }
 
   // A remark that screen readers hear, and that goes by itself.
@@ -93,5 +97,5 @@ window.springbench = (() => {
     return chosen ? chosen === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   };
 
-  return { give, script, data, where, address, change, element, tell, copy, save, isDark, views: {} };
+  return { give, script, data, where, address, change, element, put, tell, copy, save, isDark, views: {} };
 })();

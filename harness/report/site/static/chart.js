@@ -55,16 +55,25 @@ springbench.chart = (() => {
   async function draw(plot, chart, items, x, y, { hidden = new Set(), onPoint = () => {}, small = false } = {}) {
     await script("site/plotly.js");
     const panels = [...new Set(items.map(item => item.panel ?? ""))], narrow = plot.clientWidth < 640 && panels.length > 1;
+    plot.style.height = narrow ? `${330 * panels.length}px` : "";
     const style = {
       gridcolor: css("--hair"), linecolor: css("--muted"), zeroline: false, zerolinecolor: css("--rule"), exponentformat: "power", minexponent: 4, ticks: "outside", ticklen: 4, tickcolor: css("--rule"),
-      tickfont: { color: css("--muted"), size: small ? 11 : 12 }, title: { font: { color: css("--muted"), size: small ? 12 : 13 }, standoff: 8 }, automargin: true, dtick: undefined,
+      tickfont: { color: css("--muted"), size: small ? 11 : 12 }, title: { font: { color: css("--muted"), size: small ? 12 : 13 }, standoff: 8 }, automargin: true,
     };
     const layout = {
       margin: { t: panels[0] ? 30 : 12, l: 20, r: 10, b: 20 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", hovermode: "closest", hoverdistance: 24, showlegend: false,
       annotations: [], font: { family: getComputedStyle(document.body).fontFamily, color: css("--ink") }, dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
     };
     const traces = [], gap = narrow ? 0.16 : 0.05, n = panels.length;
-    const range = axis => (axis.axis.type === "log" ? { ...axis.axis, nticks: small ? 5 : 9 } : axis.axis);
+    // Of few decades 1, 2 and 5 are named, of more the powers of ten.
+    const room = axis => (axis === y ? (narrow ? 330 : plot.clientHeight) / 42 : plot.clientWidth / (narrow ? 1 : panels.length) / 70);
+    const range = axis => {
+      if (axis.axis.type !== "log") return axis.axis;
+      let [low, high] = [Infinity, 0];
+      for (const item of items) for (const v of item[axis.column]) if (v > 0) [low, high] = [Math.min(low, v), Math.max(high, v)];
+      const decades = Math.log10(high / low);
+      return { ...axis.axis, dtick: decades > 2.4 ? Math.max(1, Math.ceil(decades / room(axis))) : "D2" };
+    };
     panels.forEach((panel, k) => {
       const tail = k ? k + 1 : "", size = (1 + gap) / n - gap, low = k * (size + gap);
       const across = narrow ? [0, 1] : [low, Math.min(1, low + size)], up = narrow ? [Math.max(0, 1 - low - size), 1 - low] : [0, 1];

@@ -24,14 +24,14 @@
 
   function table(rows, series) {
     const differing = FIELDS.filter(([key]) => rows.length > 1 && new Set(rows.map(row => row[key])).size > 1);
-    const same = FIELDS.filter(field => !differing.includes(field)).map(([key, words]) => [words, rows[0][key]]).filter(([, v]) => v !== null && v !== undefined && v !== "{}");
+    const same = FIELDS.filter(field => !differing.includes(field)).map(([key, words]) => [words, rows[0][key]]).filter(([key, v]) => v !== null && v !== undefined && v !== "{}" && key !== "commit");
     const line = (words, cells) => element("tr", {}, element("th", { scope: "row" }, words), ...cells.map(cell => element("td", {}, cell ?? "–")));
     const against = rows.map((row, k) => {
       const found = k && series[k] && series[0] ? ratio(series[k], series[0]) : null;
       return k ? (found ? `${number(found[0])} (${number(found[1])} to ${number(found[2])})` : "–") : "1";
     });
     const body = [
-      ...differing.map(([key, words]) => line(words, rows.map(row => (key === "commit" ? (row[key] || "").slice(0, 10) : String(row[key] ?? "–"))))),
+      ...differing.map(([key, words]) => line(words, rows.map(row => (key === "commit" ? (row[key] || "").slice(0, 10) : key === "parameters" ? Object.entries(JSON.parse(row[key])).map(pair => pair.join(" ")).join(", ") || "–" : String(row[key] ?? "–"))))),
       line("status", rows.map(row => state(row.status))), line("ms a step, quartiles", rows.map(row => (row.step === null ? "–" : `${number(row.step)} (${number(row.lower)} to ${number(row.upper)})`))),
       rows.length > 1 && line("times the first, frame by frame, 95 %", against), line("least ms", rows.map(row => number(row.least))), line("prepare ms, cold, warm", rows.map(row => `${number(row.cold)}, ${number(row.warm)}`)),
       line("iterations, stopped by", rows.map(row => `${number(row.iterations)}, ${row.stopped || "–"}`)), line("last residual", rows.map(row => fixed(row.residual))), line("largest strain", rows.map(row => percent(row.largest_strain))),
@@ -46,6 +46,7 @@
     const labels = rows.map((row, k) => `${k + 1} ${title(row)}`), twice = row => rows.filter(other => other.mark.color === row.mark.color).length > 1;
     const DASHES = ["solid", "dash", "dot", "dashdot"];
     const marks = Object.fromEntries(rows.map((row, k) => [labels[k], twice(row) ? { ...row.mark, dash: DASHES[k % 4] } : row.mark]));
+    const drawings = [];
     for (const [column, words, how] of CURVES) {
       const items = rows.map((row, k) => series[k] && {
         label: labels[k], what: "", frame: series[k].frame, [column]: column === "strain" ? series[k].strain.map(v => v && 100 * v) : series[k][column],
@@ -55,8 +56,9 @@
       const plot = element("div.plot.small", { tabIndex: 0, role: "group", "aria-label": `Plot: ${words} by frame. Arrow keys go through its points.` });
       box.append(plot);
       const chart = { marks, hover: [["frame", "frame"], [column, words]] };
-      await springbench.chart.draw(plot, chart, items, { column: "frame", title: "frame", axis: {} }, { column, title: words, axis: how }, { small: true });
+      drawings.push(() => springbench.chart.draw(plot, chart, items, { column: "frame", title: "frame", axis: {} }, { column, title: words, axis: how }, { small: true }));
     }
+    for (const draw of drawings) await draw();  // all of them have their places now
   }
 
   async function differences(box, rows) {
@@ -79,7 +81,7 @@
       const q = floats(found.positions), far = new Float32Array(q.length / 3);
       for (let i = 0; i < far.length; i++) far[i] = Math.hypot(q[3 * i] - p[3 * i], q[3 * i + 1] - p[3 * i + 1], q[3 * i + 2] - p[3 * i + 2]);
       const most = far.reduce((a, b) => Math.max(a, b), 0), drawn = springbench.mesh(view, shape, `Last frame of ${title(row)}, coloured by its distance from the first run`);
-      box.append(element("figure", {}, drawn.canvas, element("figcaption", {}, `${title(row)}: at most ${number(most)} m from ${title(first)}, ${number(most / base.length)} mean rest lengths`),
+      box.append(element("figure", {}, drawn.canvas, element("figcaption", {}, `${title(row)}: at most ${number(most)} m from ${title(first)}, ${number(base.length ? most / base.length : 0)} mean rest lengths`),
         springbench.scaleBox("0", `${number(most || 0)} m`)));
       drawn.show(q, far.map(v => (most ? v / most : 0)));
     }

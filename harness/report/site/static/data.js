@@ -49,15 +49,18 @@ Object.assign(springbench, (() => {
   function command(row) {
     const sweep = sweepOf(row.slug), scene = sweep.scenes[row.scene];
     const whole = `springbench run ${quoted(sweep.config || `${sweep.name}.yaml`)}`;
-    if (!scene || row.parameters !== "{}" || row.own) return `${whole} --again`;
+    if (!scene || !row.plain || row.own) return `${whole} --again`;
     const options = {
       size: row.size || null, solver: row.solver, iterations: row.max_iterations, tolerance: row.tolerance,
-      integrator: row.integrator, "time-step": row.time_step, "first-guess": row.first_guess, threads: row.threads,
+      integrator: row.integrator, "time-step": row.time_step && (Math.abs(Math.round(1 / row.time_step) * row.time_step - 1) < 1e-12 ? `1/${Math.round(1 / row.time_step)}` : row.time_step), "first-guess": row.first_guess, threads: row.threads,
       frames: row.frames, rounds: row.rounds,
     };
     const told = Object.entries(options).filter(([, value]) => value !== null && value !== undefined);
     return [`springbench run ${quoted(scene)}`, ...told.map(([name, value]) => `--${name} ${quoted(String(value))}`)].join(" ");
   }
 
-  return { rows, rowOf, sweepOf, references, picture, recording, title, command };
+  // A file of the results, as commands call it.
+  const called = file => quoted(`${index.place === "." ? "" : `${index.place}/`}${decodeURI(file)}`);
+
+  return { called, rows, rowOf, sweepOf, references, picture, recording, title, command };
 })());

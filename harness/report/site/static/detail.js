@@ -1,7 +1,7 @@
 // One run: what it was, what became of it, its picture and recording, and the command that does it again.
 "use strict";
 Object.assign(springbench, (() => {
-  const { element, number, percent, fixed, step, day, glyph, state, copy, title, picture, recording, command, rowOf, references, sweepOf } = springbench;
+  const { element, put, number, percent, fixed, step, day, glyph, state, copy, title, picture, recording, command, rowOf, references, sweepOf } = springbench;
 
   const pair = ([name, value]) => [element("dt", {}, name), element("dd", {}, value ?? "–")];
   const list = pairs => element("dl", {}, ...pairs.filter(([, value]) => value !== null && value !== undefined && value !== "").flatMap(pair));
@@ -28,7 +28,7 @@ Object.assign(springbench, (() => {
         element("a", { href: file }, "Recording (.rrd)"));
     } else {
       box.append(element("p.muted", {}, element("a", { href: file }, "The recording (.rrd)"), " opens by this; ", element("code", {}, "springbench report"), " puts it into this page."),
-        code(`springbench view ${decodeURI(file)}`, "Command that opens the recording"));
+        code(`springbench view ${springbench.called(file)}`, "Command that opens the recording"));
     }
     return box;
   }
@@ -63,7 +63,7 @@ Object.assign(springbench, (() => {
       return;
     }
     const source = (await references(row.slug))[row.solver], src = picture(row), sweep = sweepOf(row.slug);
-    panel.append(shut, element("h2", {}, glyph(row.mark), ` ${row.scene}${row.size ? ` ${row.size}` : ""}`), element("p.label", {}, row.label),
+    put(panel, shut, element("h2", {}, glyph(row.mark), ` ${row.scene}${row.size ? ` ${row.size}` : ""}`), element("p.label", {}, row.label),
       element("p.states", {}, state(row.status), row.outcome && state(row.outcome), row.by && element("span.code", {}, row.by)),
       row.reason && element("p.reason", {}, row.reason),
       src && element("a.shot", { href: src }, element("img", { src, alt: `The run's last frame and earlier ones: ${title(row)}` })),

@@ -13,8 +13,8 @@ Object.assign(springbench, (() => {
     return String(Number(value.toPrecision(digits))).replace("-", "−");
   }
   const count = value => (value ?? 0).toLocaleString("en").replaceAll(",", " ");
-  const percent = value => (value === null || value === undefined ? "–" : `${number(100 * value)} %`);
-  const fixed = value => (value === null || value === undefined ? "–" : power(value.toExponential(1)));
+  const percent = value => (value === null || value === undefined ? "–" : value !== 0 && Math.abs(value) < 1e-5 ? "≈ 0 %" : `${number(100 * value)} %`);
+  const fixed = value => (value === null || value === undefined ? "–" : value === 0 ? "0" : power(value.toExponential(1)));
   const many = (n, one, more = `${one}s`) => `${count(n)} ${n === 1 ? one : more}`;
   function duration(seconds) {
     if (seconds < 90) return `${number(seconds)} s`;

@@ -13,7 +13,7 @@ springbench.map = (chart, sweep) => {
       type: "button", tabIndex: -1, title: words, "aria-label": words, onmouseenter: read, onfocus: read,
       style: `background:${outcome.color};color:${dark(outcome.color) ? "#ffffff" : "#16181b"}`,
       onclick: () => { location.hash = address("runs", { sweep: sweep.slug, run: `${sweep.slug}/${found[5]}` }); },
-    }, found[3] || " "));
+    }, found[3] || "\u00a0"));
   }
 
   const head = element("tr", {}, element("th", {}, element("b", {}, "case")), ...chart.solvers.map(name => element("th", { scope: "col", title: chart.references[name] }, element("span", {}, name))));

@@ -1,7 +1,7 @@
 // Meshes on a canvas, turned by dragging or by arrow keys, coloured by a number at each vertex; and solves, iterate by iterate.
 "use strict";
 Object.assign(springbench, (() => {
-  const { element, data, number } = springbench;
+  const { element, put, data, number } = springbench;
   // From near to far: a scale that is read in grey as well (viridis).
   const RAMP = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
   const ramp = t => {
@@ -91,7 +91,7 @@ Object.assign(springbench, (() => {
       .map(([words, value]) => [words, typeof value === "number" ? number(value) : value]));
     const made = sweep.made[0] || {}, command = `springbench ${sweep.kinds.includes("accuracy") ? "accuracy" : "ablate"} ${sweep.config || "CONFIG.yaml"}`;
     const scrub = element("div"), own = item.recording && sweep.up + item.recording;
-    box.append(shut, element("h2", {}, springbench.glyph(chart.marks[item.label]), ` ${item.label}`), element("p.label", {}, item.what),
+    put(box, shut, element("h2", {}, springbench.glyph(chart.marks[item.label]), ` ${item.label}`), element("p.label", {}, item.what),
       item.parameters && item.parameters !== "{}" && element("p.muted", {}, item.parameters), scrub,
       element("div.cols", {},
         element("div", {}, element("h3", {}, "At this point"), figures),

@@ -1,7 +1,7 @@
 // The first view: what was run, by which code and where, what is known now, what failed and why.
 "use strict";
 (() => {
-  const { element, address, many, count, duration, day, state } = springbench;
+  const { element, put, address, many, count, duration, day, state } = springbench;
 
   function facts(sweep) {
     const told = [];
@@ -89,7 +89,7 @@
     const failed = index.sweeps.reduce((sum, s) => sum + s.failures.reduce((n, f) => n + f.count, 0), 0);
     const line = [many(index.sweeps.length, "set of results", "sets of results"), runs && many(runs, "run"), failed && `${count(failed)} did not succeed`,
       `written ${index.written.slice(0, 16).replace("T", " ")} UTC`].filter(Boolean).join(" · ");
-    content.append(element("div.page", {}, element("h1", {}, index.title), element("p.muted", {}, line),
+    put(content, element("div.page", {}, element("h1", {}, index.title), element("p.muted", {}, line),
       ...index.sweeps.map(card),
       index.absent.length > 0 && element("p.muted", {}, `Not on this page yet: ${index.absent.join(", ")}. `, element("code", {}, "springbench report"), " takes them in.")));
     return { update() {} };

@@ -10,24 +10,24 @@
   const marked = row => (row.by ? element("span.code", { title: row.by === "other code" ? "made by other code than the newest run of its scene and solver" : "made by an earlier commit than the newest run" }, row.by) : "");
   const doubt = row => (row.interrupted ? element("span.doubt", { title: "the process was interrupted while steps were timed: its least time is nearest to the truth" }, " !") : "");
 
-  // title: of the column; meaning: on pointing; show: of a row; numeric: largest last, to the right.
+  // meaning: on pointing; show: of a row; numeric: to the right; spare: the higher, the sooner it goes where there is no room.
   const COLUMNS = [
-    { id: "check", title: "Compare", sort: false, show: (row, on) => element("span.box", { "aria-label": on ? "chosen to compare" : "not chosen" , role: "img"}, on ? "✓" : "") },
-    { id: "shot", title: "Picture", sort: false, show: shot },
-    { id: "sweep", title: "Results", show: row => row.sweep },
-    { id: "scene", title: "Scene", show: row => row.scene },
-    { id: "size", title: "Size", numeric: true, show: row => row.size || "–" },
-    { id: "solver", title: "Solver", meaning: "and the options in which its runs differ", show: row => element("span.who", {}, glyph(row.mark), row.solver, row.options && element("span.options", {}, row.options)) },
-    { id: "status", title: "Status", show: row => element("span", {}, state(row.status), row.by && " ", marked(row)) },
-    { id: "outcome", title: "Judged", show: row => (row.outcome ? state(row.outcome) : "–") },
-    { id: "stopped", title: "Stopped by", meaning: "what ended the last step's iterations", show: row => words(row, "stopped") || "–" },
-    { id: "iterations", title: "Iter.", meaning: "median iterations a step", numeric: true, show: row => number(row.iterations) },
-    { id: "residual", title: "Residual", meaning: "of the last step, J^(1/2)", numeric: true, show: row => fixed(row.residual) },
-    { id: "step", title: "ms a step", meaning: "the median over frames and rounds", numeric: true, show: row => element("span", {}, number(row.step), doubt(row)) },
-    { id: "least", title: "Least ms", numeric: true, show: row => number(row.least) },
-    { id: "warm", title: "Prepare ms", meaning: "warm", numeric: true, show: row => number(row.warm) },
-    { id: "largest_strain", title: "Strain", meaning: "the largest of all springs and frames", numeric: true, show: row => percent(row.largest_strain) },
-    { id: "strain_99", title: "99 %", meaning: "strain that 99 % of the springs stay below", numeric: true, show: row => percent(row.strain_99) },
+    { id: "check", width: "34px", title: "Compare", sort: false, show: (row, on) => element("span.box", { "aria-label": on ? "chosen to compare" : "not chosen" , role: "img"}, on ? "✓" : "") },
+    { id: "shot", width: "76px", spare: 4, title: "Picture", sort: false, show: shot },
+    { id: "sweep", width: "minmax(96px, 1fr)", spare: 5, title: "Results", show: row => row.sweep },
+    { id: "scene", width: "minmax(104px, 1.3fr)", title: "Scene", show: row => row.scene },
+    { id: "size", width: "58px", title: "Size", numeric: true, show: row => row.size || "–" },
+    { id: "solver", width: "minmax(150px, 2fr)", title: "Solver", meaning: "and the options in which its runs differ", show: row => element("span.who", {}, glyph(row.mark), row.solver, row.options && element("span.options", {}, row.options)) },
+    { id: "status", width: "minmax(104px, 1fr)", title: "Status", show: row => element("span", {}, state(row.status), row.by && " ", marked(row)) },
+    { id: "outcome", width: "minmax(116px, 1fr)", title: "Judged", show: row => (row.outcome ? state(row.outcome) : "–") },
+    { id: "stopped", width: "92px", spare: 3, title: "Stopped by", meaning: "what ended the last step's iterations", show: row => words(row, "stopped") || "–" },
+    { id: "iterations", width: "64px", spare: 6, title: "Iter.", meaning: "median iterations a step", numeric: true, show: row => number(row.iterations) },
+    { id: "residual", width: "84px", title: "Residual", meaning: "of the last step, J^(1/2)", numeric: true, show: row => fixed(row.residual) },
+    { id: "step", width: "86px", title: "ms a step", meaning: "the median over frames and rounds", numeric: true, show: row => element("span", {}, number(row.step), doubt(row)) },
+    { id: "least", width: "82px", spare: 7, title: "Least ms", numeric: true, show: row => number(row.least) },
+    { id: "warm", width: "92px", spare: 8, title: "Prepare ms", meaning: "warm", numeric: true, show: row => number(row.warm) },
+    { id: "largest_strain", width: "74px", spare: 1, title: "Strain", meaning: "the largest of all springs and frames", numeric: true, show: row => percent(row.largest_strain) },
+    { id: "strain_99", width: "68px", spare: 2, title: "99 %", meaning: "strain that 99 % of the springs stay below", numeric: true, show: row => percent(row.strain_99) },
   ];
   const FACETS = [["sweep", "Results"], ["scene", "Scene"], ["size", "Size"], ["solver", "Solver"], ["status", "Status"], ["outcome", "Judged"], ["stopped", "Stopped by"], ["by", "Code"]];
   const LIMITS = [["residual", "Residual at most"], ["step", "ms a step at most"], ["largest_strain", "Strain at most (%)"]];
@@ -93,7 +93,7 @@
       columns,
       onOpen: row => change({ run: row.key }, true),
       onSelect: row => {
-        const next = new Set(selected);
+        const next = new Set((springbench.where().query.get("sel") || "").split(",").filter(Boolean));
         if (!next.delete(row.key)) next.add(row.key);
         change({ sel: [...next].join(",") });
       },
@@ -103,8 +103,6 @@
         change({ sort: before === id ? `-${id}` : before === `-${id}` && !numeric ? "" : before === `-${id}` ? "" : id });
       },
     });
-    table.grid.style.setProperty("--columns", columns.map(column => WIDTHS[column.id]).join(" "));
-    table.grid.style.setProperty("--least", `${columns.reduce((sum, column) => sum + parseFloat(WIDTHS[column.id].match(/\d+/)[0]), 0)}px`);
     const panel = element("aside.panel", { hidden: true, "aria-label": "Run", tabIndex: -1 });
     content.append(element("div.runs", {}, element("div.left", {}, element("h1.unseen", {}, "Runs"), filters,
       element("div.toolbar", {}, total, downloads), table.grid, chosen), panel));
@@ -156,11 +154,5 @@
     }
     await update(query);
     return { update, leave: table.leave };
-  };
-
-  const WIDTHS = {
-    check: "34px", shot: "76px", sweep: "minmax(100px, 1fr)", scene: "minmax(120px, 1.3fr)", size: "58px", solver: "minmax(170px, 2fr)",
-    status: "minmax(120px, 1fr)", outcome: "minmax(130px, 1fr)", stopped: "92px", iterations: "64px", residual: "84px", step: "88px", least: "82px", warm: "92px",
-    largest_strain: "74px", strain_99: "68px",
   };
 })();

@@ -14,10 +14,10 @@ springbench.table = ({ columns, onOpen, onSelect, onSort }) => {
     return cell;
   });
   head.append(...heads);
-  let rows = [], selected = new Set(), active = 0, opened = "", first = -1, last = -1, high = 44;
+  let shownColumns = columns, rows = [], selected = new Set(), active = 0, opened = "", first = -1, last = -1, high = 44;
 
   function line(row, k) {
-    const cells = columns.map(column => {
+    const cells = shownColumns.map(column => {
       const cell = element(`div.td.c-${column.id}${column.numeric ? ".num" : ""}`, { role: "gridcell" });
       cell.append(column.show(row, selected.has(row.key)) ?? "");
       return cell;
@@ -75,7 +75,21 @@ springbench.table = ({ columns, onOpen, onSelect, onSort }) => {
     else return;
     event.preventDefault();
   });
+  // Columns that there is no room for go, the least wanted first; the panel of a run has all figures.
+  function fit() {
+    const least = some => some.reduce((sum, column) => sum + parseFloat(column.width.match(/\d+/)[0]), 48);
+    let some = columns;
+    for (const column of columns.filter(one => one.spare).sort((a, b) => b.spare - a.spare)) {
+      if (least(some) <= grid.clientWidth || innerWidth <= 760) break;
+      some = some.filter(one => one !== column);
+    }
+    heads.forEach((cell, k) => { cell.hidden = !some.includes(columns[k]); });
+    shownColumns = some;
+    grid.style.setProperty("--columns", some.map(column => column.width).join(" "));
+    grid.style.setProperty("--least", `${least(some) - 48}px`);
+  }
   const sized = new ResizeObserver(() => {
+    fit();
     high = parseFloat(getComputedStyle(grid).getPropertyValue("--row")) || 44;
     body.style.height = `${rows.length * high}px`;
     paint(true);

@@ -1,0 +1,213 @@
+"""The page of all results in a real browser, from the file system: quick, quiet, for the keyboard, on any width."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.report.site import update
+from tests import accuracy_rows, site_results
+from tests.browser import chromium
+from tests.site_results import fails, run
+
+COUNT = 300
+VIEWS = {
+    "overview": "overview",
+    "runs": "runs",
+    "a run": f"runs?run=made/{run(3)['run_id']}",
+    "two runs": f"compare?sel=made/{run(0)['run_id']},made/{run(1)['run_id']}",
+    "plots": "plots?sweep=made",
+    "convergence": "plots?sweep=study&plot=convergence",
+}
+
+FITS = "document.documentElement.scrollWidth <= innerWidth"
+
+
+def results(folder: Path, count: int) -> Path:
+    made = site_results.write(folder, count)
+    for number in range(4):
+        site_results.picture(made / "pictures" / f"{run(number)['file']}.png")
+    rows = accuracy_rows.problem("net", 6, "early", branches=2)
+    for solver in ("numba", "newton", "lbfgs"):
+        rows += list(accuracy_rows.curve("net", 6, "early", solver))
+    rows.append(accuracy_rows.failure("net", 6, "early", "dense", "failed", "why"))
+    accuracy_rows.write(folder / "study", rows)
+    return update(folder)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return results(tmp_path_factory.mktemp("results"), COUNT).as_uri()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as found:
+        yield found
+
+
+class Tab:
+    """A page of the browser that keeps what it says and asks for."""
+
+    def __init__(self, browser: Any, width: int = 1280, height: int = 800, scheme: str = "light") -> None:
+        self.page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
+        self.said: list[str] = []
+        self.asked: list[str] = []
+        self.page.on("console", lambda message: self.said.append(message.text))
+        self.page.on("pageerror", lambda error: self.said.append(str(error)))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+
+    def open(self, page: str, view: str = "") -> Any:
+        self.page.goto("about:blank")
+        self.page.goto(f"{page}#{view}")
+        self.page.wait_for_selector("html[data-ready]")
+        return self.page
+
+    def view(self) -> str:
+        return self.page.evaluate("location.hash")
+
+    def close(self) -> None:
+        """Ends it; no message, and no request but to files."""
+        self.page.close()
+        assert not self.said
+        assert all(url.startswith(("file:", "about:", "data:", "blob:")) for url in self.asked), self.asked
+
+
+@pytest.fixture
+def tab(browser: Any) -> Iterator[Tab]:
+    made = Tab(browser)
+    yield made
+    made.close()
+
+
+def rows_shown(page: Any) -> int:
+    return int(page.get_by_role("grid").get_attribute("aria-rowcount")) - 1
+
+
+@pytest.mark.parametrize("view", list(VIEWS.values())[:3], ids=list(VIEWS)[:3])
+def test_a_view_fits_a_phone(browser: Any, page: str, view: str):
+    tab = Tab(browser, 390, 844)
+    assert tab.open(page, view).evaluate(FITS)
+    tab.close()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("width", [390, 1280, 2560])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_view_is_legible_and_fits(browser: Any, page: str, width: int, scheme: str):
+    from axe_playwright_python.sync_playwright import Axe
+
+    # Style sheets are no documents that a page from the file system may ask for.
+    rules = {"resultTypes": ["violations"], "preload": False, "runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]}
+    tab = Tab(browser, width, 844 if width == 390 else 1000, scheme)
+    for name, view in VIEWS.items():
+        shown = tab.open(page, view)
+        assert shown.evaluate(FITS), f"{name} is wider than the window"
+        found = Axe().run(shown, options=rules).response["violations"]
+        told = {one["id"]: [node["html"][:160] for node in one["nodes"][:3]] for one in found}
+        assert not told, f"{name} at {width} pixels, {scheme}: {told}"
+    tab.close()
+
+
+def test_it_loads_runs_and_plots_when_they_are_asked_for(tab: Tab, page: str):
+    shown = tab.open(page)
+    assert not any("plotly.js" in url or "made/runs.js" in url for url in tab.asked), "they are not shown yet"
+    shown.get_by_role("link", name="Runs", exact=True).click()
+    shown.get_by_role("grid").wait_for()
+    assert rows_shown(shown) == COUNT
+    assert shown.get_by_role("row").count() < 60, "only what is in sight is made"
+
+
+def test_the_table_sorts_filters_and_says_so_in_the_url(tab: Tab, page: str):
+    shown = tab.open(page, "runs")
+    shown.get_by_role("button", name="ms a step", exact=True).click()
+    assert tab.view() == "#runs?sort=step"
+    first = shown.locator(".body .tr").first
+    assert "xpbd" in first.inner_text(), "the fastest of the smallest size"
+    shown.get_by_label("Status").select_option("unsupported")
+    assert rows_shown(shown) == sum(fails(k) for k in range(COUNT))
+    shown.get_by_label("Status").select_option("ok")
+    shown.get_by_label("Solver").select_option("newton")
+    shown.get_by_label("Search").fill("curtain 12")
+    shown.wait_for_function("location.hash.includes('q=curtain')")
+    left = rows_shown(shown)
+    expected = sum(
+        (r["solver"], r["scene"], r["size"]) == ("newton", "curtain", 12) and not fails(k)
+        for k in range(COUNT)
+        for r in [run(k)]
+    )
+    assert 0 < left <= expected + 20
+    address = tab.view()
+    again = tab.open(page, address[1:])
+    assert rows_shown(again) == left, "a link shows what was seen"
+    assert again.get_by_label("Solver").input_value() == "newton"
+
+
+def test_a_run_says_what_it_was_and_how_to_repeat_it_by_keys_alone(tab: Tab, page: str):
+    shown = tab.open(page, "runs?solver=numba&sort=step")
+    shown.get_by_role("grid").focus()
+    shown.keyboard.press("ArrowDown")
+    shown.keyboard.press("Enter")
+    panel = shown.get_by_role("complementary")
+    panel.get_by_role("heading", level=2).wait_for()
+    said = panel.inner_text()
+    for words in ("1" * 12, "A processor of 3 GHz", "--again", "Liu, Bargteil", "frames, rounds"):
+        assert words in said
+    shown.wait_for_function("document.activeElement.matches('aside')")
+    shown.keyboard.press("Escape")
+    panel.wait_for(state="hidden")
+    shown.keyboard.press("Space")
+    shown.keyboard.press("ArrowDown")
+    shown.keyboard.press("Space")
+    shown.get_by_role("link", name="Compare").press("Enter")
+    shown.get_by_role("heading", name="Comparison").wait_for()
+    assert "times the first" in shown.inner_text("table")
+
+
+def test_a_failure_is_told_in_words_with_the_number_of_its_runs(tab: Tab, page: str):
+    shown = tab.open(page)
+    row = shown.get_by_role("row").filter(has_text="unsupported")
+    assert row.count() == 1
+    assert str(sum(fails(k) for k in range(COUNT))) in row.inner_text()
+    assert site_results.REASON in row.inner_text(), "words cannot end a script"
+
+
+def test_a_point_of_a_curve_leads_to_its_solve_by_keys(tab: Tab, page: str):
+    shown = tab.open(page, "plots?sweep=study&plot=convergence")
+    plot = shown.get_by_role("group")
+    plot.focus()
+    for key in ("ArrowRight", "ArrowRight", "Enter"):
+        shown.keyboard.press(key)
+    point = shown.get_by_role("region", name="The chosen point")
+    point.get_by_text("springbench accuracy").wait_for()
+    assert "point=" in tab.view()
+    assert "A processor" in point.inner_text()
+    shown.get_by_label("Shown").select_option("stationarity")
+    shown.wait_for_function("!location.hash.includes('point=')")
+    assert not point.is_visible(), "the card goes when something else is shown"
+
+
+def test_light_and_dark_are_a_choice(tab: Tab, page: str):
+    shown = tab.open(page)
+    ground = "getComputedStyle(document.documentElement).backgroundColor"
+    light = shown.evaluate(ground)
+    shown.get_by_role("button", name="Show the page dark").click()
+    assert shown.evaluate(ground) != light
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("count", "goal"), [(1_000, 1.5), (10_000, 3.0)])
+def test_it_is_ready_within_seconds(tmp_path: Path, browser: Any, count: int, goal: float):
+    tab, page = Tab(browser), results(tmp_path, count).as_uri()
+    for view in ("overview", "runs"):
+        # The least of three: others may have the processor for a while.
+        seconds = min(tab.open(page, view).evaluate("performance.now() / 1000") for _ in range(3))
+        assert seconds < goal, f"{view}: {seconds:.2f} s"
+    assert rows_shown(tab.page) == count
+    tab.page.get_by_role("grid").focus()
+    tab.page.keyboard.press("End")
+    assert tab.page.locator(".body .tr.active").count() == 1
+    tab.close()
