@@ -24,4 +24,7 @@ class Quiet:
         if self.finished_units == self._stop_after:
             raise KeyboardInterrupt
 
+    def elsewhere(self, title: str, work: float, outcome: str) -> None:
+        self.titles.append(f"{title} {outcome}")
+
     def end(self) -> None: ...

@@ -175,8 +175,11 @@ def _is_safe(name: str) -> bool:
     return bool(parts) and ".." not in parts and not name.startswith("/") and name != INDEX
 
 
+_OURS = (INDEX, ".lock", ".claims")
+
+
 def _is_result(path: Path) -> bool:
-    return path.is_file() and path.name not in (INDEX, ".lock") and not any("partial" in part for part in path.parts)
+    return path.is_file() and path.name not in _OURS and not any("partial" in part for part in path.parts)
 
 
 def _holds_rows(name: str) -> bool:

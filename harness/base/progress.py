@@ -48,6 +48,10 @@ class Display(Protocol):
         """A run begins: it will take so many ticks."""
         ...
 
+    def elsewhere(self, title: str, work: float, outcome: str) -> None:
+        """A run that is none of this command's any more, and why in words."""
+        ...
+
     def end(self) -> None:
         """The sweep has ended, or was stopped."""
         ...
@@ -198,6 +202,13 @@ class Bars:
         self._bars.console.print(f"{run.title}: {outcome}", highlight=False)
         self._show()
 
+    def elsewhere(self, title: str, work: float, outcome: str) -> None:
+        """See Display."""
+        self._pace.work -= work
+        self._bars.update(self._sweep, total=self._pace.work)
+        self._bars.console.print(f"{title}: {outcome}", highlight=False)
+        self._show()
+
     def end(self) -> None:
         """See Display."""
         self._bars.stop()
@@ -230,6 +241,12 @@ class Lines:
         self._going.remove(run)
         self._number += 1
         self._print(f"{run.title}: {outcome}")
+
+    def elsewhere(self, title: str, work: float, outcome: str) -> None:
+        """See Display."""
+        self._pace.work -= work
+        self._number += 1
+        self._print(f"{title}: {outcome}")
 
     def _print(self, told: str) -> None:
         left = left_in_words(self._pace.left(sum(run.done * run.work for run in self._going)))

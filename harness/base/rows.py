@@ -7,11 +7,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
-import stat
-from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -154,42 +152,3 @@ def _same(one: Any, other: Any) -> bool:
     if pa.types.is_float64(one.type):
         one, other = one.view(pa.int64()), other.view(pa.int64())
     return one.equals(other)
-
-
-@contextmanager
-def alone(folder: Path) -> Generator[None]:
-    """Hold a folder of results for one process; whatever is left half written is removed."""
-    lock = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
-    _LOCKS.add(lock)
-    try:
-        if not stat.S_ISREG(os.fstat(lock).st_mode):
-            raise InputError(Mistake("is no plain file; take it away", folder / ".lock"))
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise InputError(f"{folder}: another springbench is running this sweep; wait for it or stop it") from error
-        _remove_partial(folder)
-        try:
-            yield
-        finally:
-            _remove_partial(folder)  # of workers that were ended
-    finally:
-        _LOCKS.discard(lock)
-        os.close(lock)
-
-
-def _remove_partial(folder: Path) -> None:
-    for partial in folder.glob("*/.*partial*"):
-        partial.unlink(missing_ok=True)
-
-
-_LOCKS: set[int] = set()
-
-
-def _let_go() -> None:
-    """A copy of this process holds no folder, and so holds up nobody who comes after this one."""
-    while _LOCKS:
-        os.close(_LOCKS.pop())
-
-
-os.register_at_fork(after_in_child=_let_go)

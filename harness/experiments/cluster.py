@@ -82,9 +82,11 @@ class Cluster(NamedTuple):
     client: Client
     machines: Sequence[str]
 
-    def do_all(self, units: Sequence[RunUnit], folder: Path, display: Display) -> None:
+    def do_all(
+        self, folder: Path, display: Display, units: Sequence[RunUnit], another: Callable[[RunUnit], str]
+    ) -> None:
         """See `do_on`."""
-        do_on(self.client, units, folder, display)
+        do_on(self.client, units, folder, display, another)
 
 
 @contextmanager
@@ -152,9 +154,15 @@ def _about(plugins: Sequence[Plugin]) -> tuple[About, dict[str, str]]:
     return About.this(), missing
 
 
-def do_on(client: Client, units: Sequence[RunUnit], folder: Path, display: Display) -> None:
-    """Do the runs of units on a client's workers; their files come to `folder`. Raises InputError, CannotWrite,
-    RunFailed where the scheduler is gone."""
+def do_on(
+    client: Client,
+    units: Sequence[RunUnit],
+    folder: Path,
+    display: Display,
+    another: Callable[[RunUnit], str] = lambda unit: "",
+) -> None:
+    """Do the runs of units on a client's workers; their files come to `folder`. another: see `core.do_together`. Raises
+    InputError, CannotWrite, RunFailed where the scheduler is gone."""
     token = (
         folder / f".{uuid4().hex}.partial"
     )  # who sees it shares the folder; a killed client's goes as partial files do
@@ -169,6 +177,9 @@ def do_on(client: Client, units: Sequence[RunUnit], folder: Path, display: Displ
             workers = {name: threads for name, threads in _threads(client).items() if name not in excluded}
             while left and len(going) < _AHEAD * max(1, sum(workers.values())):
                 number, unit = left.pop()
+                if why := another(unit):
+                    display.elsewhere(unit.title, unit.work, why)
+                    continue
                 key = f"springbench-{unit.run.title.replace(' ', '-')}-{uuid4().hex}"
                 only = list(workers) if excluded and workers else None
                 task = client.submit(_do, unit, *fixed, key=key, pure=False, workers=only)

@@ -7,14 +7,16 @@ the experiment, and so do the user's mistakes.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
-from typing import Protocol, runtime_checkable
+from pathlib import Path
+from typing import Protocol, TypeVar, runtime_checkable
 
 from harness.base import machine
 from harness.base.asides import compiling_told
 from harness.base.crew import Task, done_by
+from harness.base.holding import TAKEN, Claims
 from harness.base.machine_lock import alone
 from harness.base.progress import Display, Run
 from harness.base.workers import Limits, Lost, Tick
@@ -60,6 +62,9 @@ class Unit(Protocol):
         ...
 
 
+U = TypeVar("U", bound=Unit)
+
+
 @runtime_checkable
 class Sharing(Protocol):
     """What units have that say themselves when they are timed (`harness.base.machine_lock`); others are as a whole."""
@@ -70,24 +75,66 @@ class Sharing(Protocol):
         ...
 
 
-def do_all(todo: Sequence[Unit], display: Display, *, isolated: bool = True, at_once: int = 1) -> None:
+class Filed(Unit, Protocol):
+    """A unit that several commands may be about to do."""
+
+    @property
+    def place(self) -> Path:
+        """The file of its rows."""
+        ...
+
+
+F = TypeVar("F", bound=Filed)
+
+
+def do_together(todo: Sequence[F], claims: Claims, do: Callable[[Sequence[F], Callable[[F], str]], None]) -> None:
+    """Do those of some units that no other command does; what one leaves undone is done here in the end.
+
+    do: does units, asking of each, when its turn comes, why it is another's; empty where it is ours.
+    """
+    while todo:
+        left: list[F] = []
+
+        def another(unit: F, left: list[F] = left) -> str:
+            why = claims.take(unit.place)
+            if why == TAKEN:
+                left.append(unit)
+            return why
+
+        do(todo, another)
+        claims.wait([unit.place for unit in left])
+        todo = left
+
+
+def do_all(
+    todo: Sequence[U],
+    display: Display,
+    *,
+    isolated: bool = True,
+    at_once: int = 1,
+    another: Callable[[U], str] = lambda unit: "",
+) -> None:
     """Do units; isolated: in workers, so many at once, else in this process, one after the other and without limits.
 
-    Nothing else of ours is done on the machine while a unit is timed. Raises InputError, CannotWrite.
+    another: see `do_together`. Nothing else of ours is done on the machine while a unit is timed. Raises InputError,
+    CannotWrite.
     """
     display.begin(len(todo), sum(unit.work for unit in todo), at_once)
     runs: dict[int, Run] = {}
 
-    def start(number: int) -> Task:
+    def start(number: int) -> Task | None:
         unit = todo[number]
+        if why := another(unit):
+            display.elsewhere(unit.title, unit.work, why)
+            return None
         run = runs[number] = display.run(unit.title, unit.ticks, unit.work)
         return Task(partial(watched, unit), run.tick, unit.limits)
 
     try:
         if not isolated:
-            for unit in todo:
-                run = display.run(unit.title, unit.ticks, unit.work)
-                run.finished(watched(unit, run.tick))
+            for number, unit in enumerate(todo):
+                if task := start(number):
+                    runs.pop(number).finished(watched(unit, task.tick))
             return
         groups = [unit.group if isinstance(unit, Sharing) else None for unit in todo]
         tables = [dict(table) for table in TABLES]

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass
+from functools import partial
+from glob import escape
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from harness.base import machine, rows
+from harness.base import holding, machine, rows
 from harness.base.errors import InputError, Mistake
+from harness.base.holding import Claims
 from harness.base.progress import Display
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts
-from harness.experiments.core import do_all, require_threads, workers_at_once
+from harness.experiments.core import do_all, do_together, require_threads, workers_at_once
 from harness.experiments.plan import NEEDED, Files, plan
 from harness.experiments.provenance import common
 from harness.experiments.resume import wanted
@@ -41,6 +44,11 @@ class RunUnit:
     def title(self) -> str:
         """The run in words."""
         return self.run.title
+
+    @property
+    def place(self) -> Path:
+        """See Filed."""
+        return self.files.rows
 
     @property
     def ticks(self) -> int:
@@ -75,8 +83,8 @@ def _abandoned(run: RunSpec, files: Files, status: str, reason: str) -> list[dic
     """The rows of a run whose process gave no answer, written; what it left half written is removed."""
     for earlier in (files.recording, files.picture):
         earlier.unlink(missing_ok=True)
-        for partial in earlier.parent.glob(".*partial*"):
-            partial.unlink()
+        for half in earlier.parent.glob(f".{escape(earlier.stem[:100])}.*partial*"):
+            half.unlink(missing_ok=True)
     found = [common(run) | {"code": code(parts(run))} | {"phase": "run", "status": status, "reason": reason}]
     rows.write(files.rows, found)
     return found
@@ -120,18 +128,25 @@ def run_sweep(
     for part in ("rows", "recordings", "pictures"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     with ExitStack() as held:
-        held.enter_context(rows.alone(folder))
+        held.enter_context(holding.together(folder))
         away = held.enter_context(_away(on, runs, say)) if on else None
         machines = away.machines if away else (None,)
+        claims = held.enter_context(
+            closing(Claims(folder, [Files.of(r, folder, m).rows for r in runs for m in machines]))
+        )
         planned = plan(runs, folder, machines)
         todo = wanted(planned, "runs", say, again=again or positions is not None, changed=changed)
         many = min(at_once or workers_at_once(), max(1, len(todo)))
         units = [RunUnit(p.run, p.files, positions, many if p.run.timing == "shared" else 1) for p in todo]
         if away:
-            away.do_all(units, folder, display)
+            do_together(units, claims, partial(away.do_all, folder, display))
             planned = plan(runs, folder, machines)
         else:
-            do_all(units, display, isolated=isolated, at_once=many)
+
+            def do(units: Sequence[RunUnit], another: Callable[[RunUnit], str]) -> None:
+                do_all(units, display, isolated=isolated, at_once=many, another=another)
+
+            do_together(units, claims, do)
         from harness.report.sweep import Pictured, draw_sweep  # takes a second, in which runs can be done already
 
         table = rows.read((p.files.rows for p in planned), needed=NEEDED)

@@ -25,12 +25,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class Case(NamedTuple):
-    """What a solver does while it solves, the status of its run, what is said of it, and options of the sweep."""
+    """What a solver does while it solves, the status of its run, what is said of it, and the limit it runs into."""
 
     does: str
     status: str
     said: str
-    options: str = ""
+    limit: str = ""
 
 
 CASES = {
@@ -44,11 +44,17 @@ CASES = {
     "an exit by Python": Case("raise SystemExit(0)", "failed", "raised SystemExit: 0 ({line})"),
     "the end of a generator": Case("raise GeneratorExit", "failed", "raised GeneratorExit ({line})"),
     "a kill": Case("import os; os.kill(os.getpid(), 9)", "killed", "was killed by SIGKILL"),
-    "a loop": Case("while True: hang = 1", "time-limit", "did not end within 8 s", ", time_limit: 8"),
+    "a loop": Case("while True: hang = 1", "time-limit", "did not end within 8 s", "time_limit: 8"),
     "too much memory": Case(
-        "swollen = [bytes(2**20) for _ in range(2**12)]", "failed", "MemoryError:  ({line})", ", memory_limit: 0.5"
+        "swollen = [bytes(2**20) for _ in range(2**12)]", "failed", "MemoryError:  ({line})", "memory_limit: 0.5"
     ),
 }
+
+
+def limited(made: Own, limit: str) -> None:
+    """Limit the solver's run, and that alone."""
+    beside = f"exclude: [{{solver: mine}}]\ninclude: [{{solver: mine, {limit}}}]\n"
+    made.sweep.write_text(made.sweep.read_text() + beside)
 
 
 def ran(made: Own, *more: str) -> Result:
@@ -64,7 +70,9 @@ def first_rows(made: Own) -> dict[str, dict[str, Any]]:
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_a_sweep_survives_its_solvers(case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    made = own(tmp_path, monkeypatch, solving=case.does, options=OPTIONS + case.options)
+    made = own(tmp_path, monkeypatch, solving=case.does)
+    if case.limit:
+        limited(made, case.limit)
     told = ran(made)
     assert told.exit_code == 1, told.output
     assert "Traceback" not in told.output
@@ -83,7 +91,8 @@ def test_a_sweep_survives_its_solvers(case: Case, tmp_path: Path, monkeypatch: p
 def test_a_run_that_took_too_long_is_done_again_with_another_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     flag = tmp_path / "quick"
     hangs = f"import pathlib\n        while not pathlib.Path({str(flag)!r}).exists(): hang = 1"
-    made = own(tmp_path, monkeypatch, solving=hangs, options=OPTIONS + ", time_limit: 8")
+    made = own(tmp_path, monkeypatch, solving=hangs)
+    limited(made, "time_limit: 8")
     assert ran(made).exit_code == 1
     flag.touch()
     assert "2 of 2 runs are there already" in re.sub(r"\s+", " ", ran(made).output)

@@ -13,7 +13,7 @@ import pytest
 
 from harness.base import machine
 from harness.base.errors import InputError, RunFailed
-from harness.base.rows import alone
+from harness.base.holding import alone
 from harness.config.load import load_any, load_sweep
 from harness.config.sweep import RunSpec, SolverSpec
 from harness.experiments.speed import candidates, limits, turns

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from harness.base import machine, rows
+from harness.base import holding, machine, rows
 from harness.base.errors import InputError
 from harness.base.progress import Display
 from harness.base.workers import Limits, Lost, Tick
@@ -126,6 +126,6 @@ def price_all(
     scene.require_even_steps()
     priced(scene)
     folder.mkdir(parents=True, exist_ok=True)
-    with rows.alone(folder):
+    with holding.alone(folder):
         do_all(wanted(units, "prices", say, again=again, changed=changed), display, isolated=isolated)
     return [unit.path for unit in units]

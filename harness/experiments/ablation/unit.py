@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from harness.base import machine, rows
+from harness.base import holding, machine, rows
 from harness.base.errors import InputError
 from harness.base.progress import Display
 from harness.base.workers import Limits, Lost, Tick
@@ -123,7 +123,7 @@ def run_ablation(
     run.scene.require_even_steps()
     unit = Ablation(run, folder, pairs)
     folder.mkdir(parents=True, exist_ok=True)
-    with rows.alone(folder):
+    with holding.alone(folder):
         do_all(wanted([unit], "ablations", say, again=again, changed=changed), display, isolated=isolated)
     return unit.path
 

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from harness.base import machine, rows
+from harness.base import holding, machine, rows
 from harness.base.progress import Display
 from harness.config.accuracy import CurveSpec, WorkSpec
 from harness.config.accuracy_load import Accuracy
@@ -54,7 +54,7 @@ def run_accuracy(
     home = Home(accuracy.name, folder)
     require_threads({spec.how.threads for spec in (*accuracy.curves, *accuracy.work)})
     (folder / "accuracy").mkdir(parents=True, exist_ok=True)
-    with rows.alone(folder):
+    with holding.alone(folder):
         do_all(_steps(accuracy.curves, home), display, isolated=isolated)  # quick where they were found before
         planned = _planned([*_curves(accuracy.curves, home), *_work(accuracy.work, home)], home)
         todo = wanted(planned, "units", say, again=again, changed=changed)

@@ -17,7 +17,7 @@ from time import time
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.base import columns, rows, shelf
+from harness.base import columns, holding, rows, shelf
 from harness.base.errors import InputError, Mistake
 from harness.base.files import replacing
 
@@ -41,7 +41,7 @@ def compact(results: Path, say: Callable[[str], None], *, days: float = 0.0) -> 
         raise InputError(Mistake("holds no rows; wanted a folder of results, or that of a sweep", results))
     count = 0
     for folder in folders:
-        with rows.alone(folder.parent):
+        with holding.alone(folder.parent):
             count += _compact(folder, time() - _DAY * days, say)
     return count
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.base import columns, rows, shelf, union
+from harness.base import columns, holding, rows, shelf, union
 from harness.base.claim import NAME as CLAIM
 from harness.base.claim import claimed
 from harness.base.errors import InputError, Mistake
@@ -71,7 +71,7 @@ def merge(sources: Sequence[Path], into: Path, say: Callable[[str], None]) -> Me
     for place in sorted({place for _, place in places}):
         home = into / place
         home.mkdir(parents=True, exist_ok=True)
-        with rows.alone(home):
+        with holding.alone(home):
             for table in TABLES:
                 found = [source / place / table for source in sources if (source, place) in places]
                 count = _table([folder for folder in found if shelf.units(folder)], home / table)

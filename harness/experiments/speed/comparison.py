@@ -15,7 +15,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from harness.base import machine, rows
+from harness.base import holding, machine, rows
 from harness.base.columns import SCHEMA
 from harness.base.progress import Display
 from harness.base.workers import Limits, Lost, Tick
@@ -127,7 +127,7 @@ def run_speed(
     runs = [run.but(threads=machine.threads(run.threads).number) for run in sweep.runs()]
     require_threads({machine.threads(run.threads).number for run in runs})
     (folder / "rows").mkdir(parents=True, exist_ok=True)
-    with rows.alone(folder):
+    with holding.alone(folder):
         planned: list[Comparison] = []
         smaller: list[tuple[str, Path]] = []
         for group in _groups(runs):

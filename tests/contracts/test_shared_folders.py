@@ -1,0 +1,138 @@
+"""Two commands may share a folder of results: each run is done once, and what one leaves undone the other does."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+from time import sleep
+
+import pytest
+
+from harness.base import holding, rows
+from harness.base.errors import InputError
+from harness.base.holding import DONE, TAKEN, Claims
+from tests.own_solvers import SCENE
+
+ROOT = Path(__file__).resolve().parents[2]
+RUNS = 4
+SWEEP = f"scenes: [scene.yaml]\nsizes: {list(range(3, 3 + RUNS))}\nsolvers: [sparse]\n" + (
+    "options: {frames: 40, rounds: 1, iterations: 20, record: false, pictures: false}\n"
+)
+
+
+def sweep(folder: Path) -> Path:
+    (folder / "scene.yaml").write_text(SCENE)
+    (folder / "sweep.yaml").write_text(SWEEP)
+    return folder / "sweep.yaml"
+
+
+def begun(config: Path, workers: int = 1) -> subprocess.Popen[str]:
+    command = ["run", str(config), "--results", str(config.parent / "r"), "--workers", str(workers)]
+    return subprocess.Popen([sys.executable, "-m", "harness.cli", *command], cwd=ROOT, stdout=-1, stderr=-2, text=True)
+
+
+def done(said: str) -> Counter[str]:
+    """How often each run was done, by what a command printed."""
+    return Counter(re.findall(r"scene (\d+) sparse: [\d.]+ ms a step", " ".join(said.split())))
+
+
+def test_each_run_is_done_by_one_of_two_commands(tmp_path: Path):
+    config = sweep(tmp_path)
+    both = [begun(config), begun(config)]
+    said = [command.communicate()[0] for command in both]
+    assert [command.returncode for command in both] == [0, 0], said
+    counts = [done(one) for one in said]
+    assert sum(counts, Counter()) == Counter(map(str, range(3, 3 + RUNS))), said
+    assert len(list((tmp_path / "r" / "sweep" / "rows").glob("*.parquet"))) == RUNS
+
+
+@pytest.mark.long
+def test_what_a_killed_command_had_claimed_is_done_by_the_other(tmp_path: Path):
+    config, kept = sweep(tmp_path), tmp_path / "r" / "sweep" / "rows"
+    first = begun(config)
+    while not list(kept.glob("*.parquet")) and first.poll() is None:
+        sleep(0.01)
+    second = begun(config)
+    sleep(0.5)
+    first.kill()
+    first.communicate()
+    said, _ = second.communicate()
+    assert second.returncode == 0, said
+    assert len(list(kept.glob("*.parquet"))) == RUNS
+    assert not list((tmp_path / "r").rglob(".*partial*"))
+
+
+CLAIM = "from pathlib import Path; from harness.base.holding import Claims; import sys\n"
+
+
+def claimed_elsewhere(folder: Path, unit: Path) -> subprocess.Popen[str]:
+    code = f"{CLAIM}c = Claims(Path(sys.argv[1]), [u := Path(sys.argv[2])]); print(c.take(u), flush=True); input()"
+    other = subprocess.Popen([sys.executable, "-c", code, str(folder), str(unit)], stdin=-1, stdout=-1, text=True)
+    assert other.stdout
+    assert other.stdout.readline() == "\n"
+    return other
+
+
+def test_a_claim_holds_against_others_and_goes_with_its_process(tmp_path: Path):
+    unit, free = tmp_path / "a.parquet", tmp_path / "b.parquet"
+    claims = Claims(tmp_path, [unit, free])
+    other = claimed_elsewhere(tmp_path, unit)
+    assert claims.take(unit) == TAKEN
+    assert claims.take(free) == ""
+    other.kill()
+    other.wait()
+    claims.wait([unit])
+    assert claims.take(unit) == ""
+    claims.close()
+
+
+def test_what_its_claimant_has_done_is_done_though_the_claim_is_kept(tmp_path: Path):
+    unit = tmp_path / "a.parquet"
+    claims, other = Claims(tmp_path, [unit]), claimed_elsewhere(tmp_path, unit)
+    rows.write(unit, [{"run_id": "x"}])
+    claims.wait([unit])
+    assert claims.take(unit) == DONE
+    other.kill()
+    other.wait()
+    claims.close()
+
+
+def test_what_somebody_else_has_done_since_is_left_to_that(tmp_path: Path):
+    unit = tmp_path / "a.parquet"
+    claims = Claims(tmp_path, [unit])
+    rows.write(unit, [{"run_id": "x"}])
+    assert claims.take(unit) == DONE
+    claims.wait([unit])
+    claims.close()
+
+
+def test_whoever_packs_a_folder_has_it_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(holding, "_PATIENCE", 0.0)
+    with (
+        holding.together(tmp_path),
+        pytest.raises(InputError, match="another springbench is running"),
+        holding.alone(tmp_path),
+    ):
+        pass
+    with (
+        holding.alone(tmp_path),
+        pytest.raises(InputError, match="has it for itself"),
+        holding.together(tmp_path),
+    ):
+        pass
+
+
+def test_the_first_and_the_last_remove_what_is_half_written(tmp_path: Path):
+    half = tmp_path / "rows" / ".a.1.partial.parquet"
+    half.parent.mkdir()
+    half.touch()
+    with holding.together(tmp_path):
+        assert not half.exists()
+        half.touch()
+        with holding.together(tmp_path):
+            assert half.exists()
+        assert half.exists()
+    assert not half.exists()
