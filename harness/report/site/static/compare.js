@@ -81,7 +81,7 @@
       const q = floats(found.positions), far = new Float32Array(q.length / 3);
       for (let i = 0; i < far.length; i++) far[i] = Math.hypot(q[3 * i] - p[3 * i], q[3 * i + 1] - p[3 * i + 1], q[3 * i + 2] - p[3 * i + 2]);
       const most = far.reduce((a, b) => Math.max(a, b), 0), drawn = springbench.mesh(view, shape, `Last frame of ${title(row)}, coloured by its distance from the first run`);
-      box.append(element("figure", {}, drawn.canvas, element("figcaption", {}, `${title(row)}: at most ${number(most)} m from ${title(first)}, ${number(base.length ? most / base.length : 0)} mean rest lengths`),
+      box.append(element("figure", {}, drawn.canvas, element("figcaption", {}, `${title(row)}: at most ${number(most)} m from ${title(first)}, ${number(base.length ? most / base.length : 0)} mean rest lengths${most < 1e-6 * view.radius ? "; recordings are of single precision, and tell no less" : ""}`),
         springbench.scaleBox("0", `${number(most || 0)} m`)));
       drawn.show(q, far.map(v => (most ? v / most : 0)));
     }
