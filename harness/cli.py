@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from harness.base.commands import Again, Changed, Check, Commands, Error, Horizon, InThisProcess, Results, Rows
+from harness.base.commands import Again, Changed, Check, Commands, Error, Horizon, InThisProcess, Peers, Results, Rows
 from harness.base.console import err, out
 from harness.base.console import say as _say
 from harness.base.errors import InputError, Mistake
@@ -51,6 +51,7 @@ def run(
     error: Error = None,
     horizon: Horizon = None,
     check: Check = False,
+    peers: Peers = False,
     positions: Annotated[
         Path | None, typer.Option(help="Store the positions after every step (float64, .npz) of one run.")
     ] = None,
@@ -80,10 +81,12 @@ def run(
         from harness.experiments.asked.command import run_to_error
 
         others = {"solver": solver, "on": on, "workers": workers, **given.obj}
-        wanted: dict[str, Any] = {"horizon": horizon, "sizes": size or (), "check": check, "positions": positions}
-        raise typer.Exit(0 if run_to_error(config, error, results, _say, **wanted, others=others) else 1)
-    if horizon is not None or check:
-        raise InputError(Mistake("is of a run with --error; leave it out", key="--check" if check else "--horizon"))
+        wanted: dict[str, Any] = {"horizon": horizon, "sizes": size or (), "check": check, "beside": peers}
+        wanted |= {"positions": positions, "others": others}
+        raise typer.Exit(0 if run_to_error(config, error, results, _say, **wanted) else 1)
+    for key, value in {"--horizon": horizon, "--check": check, "--peers": peers}.items():
+        if value:
+            raise InputError(Mistake("is of a run with --error; leave it out", key=key))
     sweep = load_any(config, solvers=solver or (), sizes=size or (), **given.obj)
     folder = claimed(results / sweep.name, config)
     runs = sweep.runs()

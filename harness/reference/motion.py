@@ -39,8 +39,8 @@ class Unintegrable(RunFailed):
 class Field:
     """F of a scene whose pins are exact."""
 
-    def __init__(self, scene: Scene) -> None:
-        """Raises Unintegrable."""
+    def __init__(self, scene: Scene, *, compiled: bool = True) -> None:
+        """compiled: whether springs are, or go through NumPy. Raises Unintegrable."""
         system = scene.system
         self._scene, self._free, self._system = scene, system.free, system
         self._mass = system.mass[self._free, None]
@@ -50,9 +50,10 @@ class Field:
             raise Unintegrable("pins by penalty vibrate faster than can be followed; make them exact")
         if without_contact(system) is not system:
             raise Unintegrable("contact is stiff, and its friction begins anew each step; leave it out")
-        springs = scene.springs
-        self._springs = springs.edges, springs.stiffness, springs.rest_length, springs.rest_direction
-        self._others = tuple(energy for energy in system.energies if not isinstance(energy, Springs))
+        x = scene.springs
+        arrays = x.edges, x.stiffness, x.rest_length, x.rest_direction
+        self._springs = arrays if compiled else None
+        self._others = tuple(energy for energy in system.energies if not (compiled and isinstance(energy, Springs)))
         self._drag = _drag(scene)
         self._p, self._v = scene.mesh.rest.copy(), np.zeros_like(scene.mesh.rest)
         self._p[system.pins.vertices] = scene.pins_at(0.0)
@@ -75,7 +76,8 @@ class Field:
         """F(t, y)."""
         p, v = self.motion(t, y)
         push = np.negative(self._scene.load)
-        add_springs(p, *self._springs, push)
+        if self._springs:
+            add_springs(p, *self._springs, push)
         if self._others:
             rate = self._system.rate
             here = Start(p, v, t, p - v / rate, rate, t)

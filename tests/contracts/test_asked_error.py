@@ -10,12 +10,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from harness.base import rows
 from harness.base.errors import RunFailed
 from harness.cli import app
 from harness.config.load import load_scene
+from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.asked.peers import PEERS, pattern
 from harness.experiments.asked.search import foresee, search
 from harness.experiments.asked.ways import Asked
 from harness.reference.growth import growth
+from harness.reference.motion import Field
 from harness.reference.trajectory import integrate
 from harness.scenes.bind import Scene, build
 from harness.scenes.effects.dashpots import Dashpots
@@ -124,6 +128,15 @@ def test_growth_tells_a_motion_that_can_be_known_from_one_that_cannot():
         foresee(cloth, wild.least / 10, lambda line: None)
 
 
+def test_the_pattern_of_the_jacobian_holds_all_that_differs_from_zero():
+    scene = build(chain(Springs(stretch=40.0), Dashpots(stretch=1.0), Gravity(), HELD), 5, "newmark")
+    field = Field(scene)
+    y, found = field.start + 0.1 * np.random.default_rng(2).normal(size=24), pattern(scene).toarray() > 0
+    changes = np.array([field(0.0, y + step) - field(0.0, y) for step in 1e-4 * np.eye(24)]).T
+    assert (found | (np.abs(changes) < 1e-14)).all()  # round-off of forces of some newtons
+    assert not found.all()
+
+
 def test_contact_is_refused_before_anything_is_simulated():
     with pytest.raises(RunFailed, match="contact begins and ends within steps"):
         Asked.of(load_scene(SCENES / "block-drop.yaml"), None, None)
@@ -148,16 +161,25 @@ def test_what_cannot_be_asked_is_the_users_mistake(options, told, tmp_path, caps
     assert told in " ".join((found.stderr + capsys.readouterr().err).split())
 
 
-def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_path):
-    from harness.base import rows
-    from harness.experiments.accuracy.rows import SCHEMA
-
-    where = ["--results", str(tmp_path), "--positions", str(tmp_path / "p.npz")]
-    given = ["run", str(SCENES / "chain.yaml"), "--size", "5", "--error", "1e-3", "--horizon", "0.2", "--check", *where]
-    found = CliRunner().invoke(app, given)
+def rows_of(folder: Path, *options: str) -> list[dict[str, Any]]:
+    """The rows that a run of a small chain to an error leaves."""
+    given = ["run", str(SCENES / "chain.yaml"), "--size", "5", "--error", "1e-3", "--horizon", "0.2", *options]
+    found = CliRunner().invoke(app, [*given, "--results", str(folder)])
     assert found.exit_code == 0, found.output
-    (row,) = rows.read((tmp_path / "chain" / "accuracy").glob("*.parquet"), SCHEMA).to_pylist()
+    return rows.read((folder / "chain" / "accuracy").glob("*.parquet"), SCHEMA).to_pylist()
+
+
+def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_path):
+    (row,) = rows_of(tmp_path, "--check", "--positions", str(tmp_path / "p.npz"))
     assert row["error"] <= row["estimated"] <= row["asked"] == 1e-3
     assert row["accepted"] > 0
     assert (tmp_path / "chain" / row["recording"]).is_file()
     assert np.load(tmp_path / "p.npz")["positions"].shape == (6, 5, 3)
+
+
+@pytest.mark.long
+def test_peers_have_rows_beside_it(tmp_path):
+    _, *beside = rows_of(tmp_path, "--peers")
+    assert [peer["solver"] for peer in beside] == list(PEERS)
+    assert all(peer["reason"] or peer["estimated"] <= 1e-3 for peer in beside)
+    assert [peer["status"] for peer in beside][:2] == ["ok", "ok"]

@@ -8,6 +8,7 @@ One table holds all kinds of rows, which `kind` tells apart:
     curve     an iterate of a solver on it: energy, errors, stationarity, and when it came
     work      a simulation of the horizon: its error, and the wall time that it took
     asked     a simulation to an error that was asked for (`springbench run SCENE --error`)
+    peer      the same by another library's integrator (`--peers`), whose name is `solver`
 
 Rows hold energies and errors of positions, never gaps: whoever reads them computes gaps from `g`, `g0` and the
 lowest `g` of the minima, so that a better minimum needs no new measurement.
@@ -22,7 +23,7 @@ from harness.base.columns import OF_SOLVER, PROVENANCE, Column, as_in_runs, sche
 _TEXT, _INT, _REAL, _YES = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 
 COLUMNS = (
-    Column("kind", _TEXT, "", "problem, minimum, prepare, curve, work or asked"),
+    Column("kind", _TEXT, "", "problem, minimum, prepare, curve, work, asked or peer"),
     Column("unit", _TEXT, "", "hash of all that determines the unit's result and timing"),
     *as_in_runs("sweep", "scene", "size", "vertices", "springs", "solver", "parameters", "integrator", "time_step"),
     *OF_SOLVER,

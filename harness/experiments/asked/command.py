@@ -15,6 +15,7 @@ from harness.base.stated import stated
 from harness.config.load import load_scene
 from harness.experiments.accuracy.rows import SCHEMA
 from harness.experiments.accuracy.units import references
+from harness.experiments.asked.peers import peers
 from harness.experiments.asked.search import Answer, foresee, search
 from harness.experiments.asked.ways import Asked
 from harness.experiments.provenance import provenance
@@ -23,6 +24,8 @@ from harness.record.base import Frame, RecordingInfo
 from harness.record.rerun import RerunRecorder
 
 Say = Callable[[str], None]
+_SHARED = ("sweep", "scene", "size", "vertices", "threads", "horizon", "asked")
+"""Columns that the rows of peers have too."""
 
 
 def run_to_error(
@@ -34,14 +37,15 @@ def run_to_error(
     horizon: float | None = None,
     sizes: Sequence[int] = (),
     check: bool = False,
+    beside: bool = False,
     positions: Path | None = None,
     others: Mapping[str, Any] | None = None,
 ) -> bool:
     """Simulate the scene in a file to a relative error at a horizon [s], and say what it took.
 
-    sizes: of the mesh, one at most; check: whether the reference grades it; positions: where to store those of the
-    frames; others: options that were given besides, which are refused. Returns whether what was checked holds. Raises
-    InputError, RunFailed.
+    sizes: of the mesh, one at most; check: whether the reference grades it; beside: whether peers are timed as well;
+    positions: where to store those of the frames; others: options that were given besides, which are refused. Returns
+    whether what was checked holds. Raises InputError, RunFailed.
     """
     _require(error, horizon, {**(others or {}), "second --size": sizes[1:]})
     asked = Asked.of(load_scene(config), sizes[0] if sizes else None, horizon)
@@ -67,7 +71,8 @@ def run_to_error(
     recording = _record(folder / "recordings" / f"{label}.rrd", config.stem, asked, answer)
     row = _row(config.stem, asked, error, answer) | {"error": measured, "recording": f"recordings/{recording.name}"}
     (folder / "accuracy").mkdir(exist_ok=True)
-    rows.write(folder / "accuracy" / f"{label}.parquet", [row | {"unit": label}], SCHEMA)
+    found = [row, *(_beside(row, asked, error, answer, say) if beside else ())]
+    rows.write(folder / "accuracy" / f"{label}.parquet", [one | {"unit": label} for one in found], SCHEMA)
     if positions:
         save_positions(positions, path.positions[1:])
     say(f"the row is in {folder / 'accuracy'}, the recording is {recording}")
@@ -118,6 +123,23 @@ def _row(name: str, asked: Asked, error: float, answer: Answer) -> dict[str, Any
         "estimate_seconds": answer.seconds,
         **provenance(),
     }
+
+
+def _beside(row: dict[str, Any], asked: Asked, error: float, answer: Answer, say: Say) -> list[dict[str, Any]]:
+    """The peers' rows, each of which is told with its time beside ours."""
+    shared = {name: row[name] for name in _SHARED} | provenance()
+    found = list[dict[str, Any]]()
+    say("beside it, on the same machine in the same process, to the same error:")
+    for peer in peers(asked, error, answer):
+        told = f"{peer.ratio:.3g} times the processor time, an error of {peer.estimated:.1g}"
+        say(f"  {peer.name}: {peer.reason or told}")
+        became = {"status": "failed", "reason": peer.reason} if peer.reason else {"status": "ok"}
+        times = (
+            {} if peer.reason else {"seconds": [peer.seconds], "seconds_per_simulated": peer.seconds / asked.horizon}
+        )
+        estimated = {} if peer.reason else {"estimated": peer.estimated}
+        found.append(shared | became | times | estimated | {"kind": "peer", "solver": peer.name})
+    return found
 
 
 def _record(path: Path, name: str, asked: Asked, answer: Answer) -> Path:
