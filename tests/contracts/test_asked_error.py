@@ -99,9 +99,13 @@ def test_a_step_below_the_floor_ends_with_the_frame_the_cause_and_what_was_reach
 def test_hermites_cubic_is_exact_for_cubics():
     rng = np.random.default_rng(3)
     c = rng.normal(size=(4, 2, 3))
-    at = [Motion(sum(c[k] * t**k for k in range(4)), sum(k * c[k] * t ** (k - 1) for k in (1, 2, 3))) for t in (0.5, 2)]
-    wanted = sum(c[k] * 0.95**k for k in range(4))
-    np.testing.assert_allclose(hermite(*at, 1.5, 0.3), wanted, rtol=0, atol=1e-14)  # some roundings of numbers near 10
+
+    def at(t: float) -> Motion:
+        return Motion(c[0] + t * (c[1] + t * (c[2] + t * c[3])), c[1] + t * (2.0 * c[2] + 3.0 * t * c[3]))
+
+    found = hermite(at(0.5), at(2.0), 1.5, 0.3)
+    # Some roundings of numbers near 10.
+    np.testing.assert_allclose(found, at(0.95).positions, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("error", [1e-2, 1e-3, 1e-4])
