@@ -43,7 +43,7 @@ springbench.table = ({ columns, onOpen, onSelect, onSort }) => {
       one.classList.toggle("active", k === active);
       one.classList.toggle("opened", rows[k]?.key === opened);
     }
-    if (rows[active]) grid.setAttribute("aria-activedescendant", `row-${active}`);
+    if (document.getElementById(`row-${active}`)) grid.setAttribute("aria-activedescendant", `row-${active}`);
     else grid.removeAttribute("aria-activedescendant");
   }
 
@@ -90,9 +90,11 @@ springbench.table = ({ columns, onOpen, onSelect, onSort }) => {
   }
   const sized = new ResizeObserver(() => {
     fit();
+    const before = high;
     high = parseFloat(getComputedStyle(grid).getPropertyValue("--row")) || 44;
     body.style.height = `${rows.length * high}px`;
     paint(true);
+    if (high !== before && opened) move(active);
   });
   sized.observe(grid);
 
