@@ -23,6 +23,7 @@ from harness.config.command_line import taking
 from harness.experiments.ablation.command import ablate
 from harness.experiments.accuracy.command import recommend
 from harness.experiments.archive.command import compact, merge, publish, verify
+from harness.experiments.figure import figure
 from harness.experiments.gallery import gallery
 from harness.experiments.gates.command import gate
 from harness.experiments.gates.history_command import history
@@ -176,12 +177,13 @@ def report(
     ] = True,
 ) -> None:
     """Write the page of all results, `index.html`, and the map of solvers x cases of those that were judged."""
+    from harness.experiments.older import older_of
     from harness.report.robustness import summary
     from harness.report.robustness_map import draw_maps
     from harness.report.site import update
 
     page = update(results, recorded=True, viewer=viewer, say=_say)
-    for picture, cells in draw_maps(results):
+    for picture, cells in draw_maps(results, older_of):
         out.print(summary(cells))
         _say(f"the map is {picture}")
     _say(f"the page is {page}; a browser opens it, and needs no network for it")
@@ -193,6 +195,7 @@ app.command()(compact)
 app.command()(merge)
 app.command()(publish)
 app.command()(verify)
+app.command()(figure)
 app.command()(gallery)
 app.command()(gate)
 app.command()(history)

@@ -65,7 +65,7 @@ def _tile(path: Path) -> Any:
         scalars={},
         properties=declared(listed(run.scene.effects)),
     )
-    kinds = dict.fromkeys(effect.kind for effect in run.scene.effects if not getattr(effect, "usual", False))
+    kinds = dict.fromkeys(effect.kind for effect in run.scene.effects)
     camera = run.scene.camera
     return Tile(
         replay=replay,

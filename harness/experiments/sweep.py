@@ -21,7 +21,7 @@ from harness.base.workers import Limits, Lost, Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts
 from harness.experiments.core import do_all, do_together, require_threads, workers_at_once
-from harness.experiments.plan import NEEDED, Files, plan
+from harness.experiments.plan import NEEDED, Files, of_other_code, plan
 from harness.experiments.provenance import common
 from harness.experiments.resume import wanted
 from harness.experiments.run import execute
@@ -151,7 +151,7 @@ def run_sweep(
 
         table = rows.read((p.files.rows for p in planned), needed=NEEDED)
         pictured = [Pictured(p.run, p.files.recording, p.files.picture) for p in planned]
-        draw_sweep(name, pictured, folder, table, say, at_once=many)
+        draw_sweep(name, pictured, folder, table, say, at_once=many, older=of_other_code(runs, table))
     return table
 
 

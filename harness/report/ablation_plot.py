@@ -15,14 +15,15 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 
+from harness.base import machine
 from harness.report.ablation import Row, known_error, of_kind
 from harness.report.page import axes, header, new_page, quantity, save, text, ticks
-from harness.report.style import INK, MUTED, RC, RULE, WARNING, numbered
+from harness.report.style import INK, MUTED, PAGE, RC, RULE, WARNING, numbered
 
 _ERRORS = {"solver": "error of the solver", "time-step": "error of the time step"}
 _NOTHING = 1e-6
 """Displacements below this, in mean rest lengths, are drawn at it."""
-_APART = 15
+_APART = 18
 """Pixels between two names."""
 
 
@@ -38,12 +39,14 @@ def draw_ablation(rows: Sequence[Row], path: Path) -> None:
             f"{whole['frames']} steps of {quantity(1e3 * whole['time_step'])} ms, {whole['rounds']} rounds",
         ]
         header(page, f"{whole['scene']}: what its effects cost and change", facts)
-        ax = axes(page, 130, 130, 1380, 640)
+        ax = axes(page, 130, 138, 1380, 630)
         _errors(ax, rows, points)
-        _effects(ax, points, whole["seconds"])
+        older = whole["code"] not in (None, machine.code_hash())
+        _effects(ax, points, whole["seconds"], hollow=older)
         gone = [row["name"] for row in of_kind(rows, "without") if row["status"] != "ok"]
         called = [row["name"] for row in of_kind(rows, "suggestion")]
         below = [f"impossible without {', '.join(gone)}"] if gone else []
+        below += ["hollow: measured by other code than today's"] if older else []
         below += [f"not listed, but called for by the motion: {', '.join(called)}"] if called else []
         text(page, 130, 866, "   ·   ".join(below), size=10.5, color=WARNING if called else MUTED)
         save(page, path)
@@ -57,8 +60,10 @@ def _errors(ax: Axes, rows: Sequence[Row], points: Sequence[Row]) -> None:
     ax.set_yscale("log")
     ax.set_ylim(low, high)
     ax.yaxis.set_major_formatter(ticks("{:g}".format))
-    ax.set_ylabel("largest displacement where it is left out [mean rest lengths]")
-    ax.set_xlabel("cost [% of a step, with the 95 % interval]")
+    words: Any = {"loc": "left", "fontsize": 12, "color": INK}
+    ax.set_title("largest displacement where it is left out [mean rest lengths]", pad=12, **words)
+    ax.set_xlabel("cost [% of a step, with the 95 % interval]", labelpad=8, **words)
+    ax.tick_params(labelsize=12, length=4)
     ax.grid(axis="y", which="major")
     error, _ = known_error(rows)
     if np.isfinite(error):
@@ -67,17 +72,19 @@ def _errors(ax: Axes, rows: Sequence[Row], points: Sequence[Row]) -> None:
         y = max(row["largest"], _NOTHING)
         ax.axhline(y, color=MUTED, linewidth=1.0, linestyle=(0, (5, 3)))
         place: Any = {"xycoords": ("axes fraction", "data"), "xytext": (-4, 3), "textcoords": "offset points"}
-        ax.annotate(_ERRORS[row["name"]], (1.0, y), ha="right", fontsize=9.5, color=MUTED, **place)
+        ax.annotate(_ERRORS[row["name"]], (1.0, y), ha="right", fontsize=11.5, color=MUTED, **place)
 
 
-def _effects(ax: Axes, points: Sequence[Row], whole: float) -> None:
-    """One point an effect with its interval and its name; names that would meet are moved apart."""
+def _effects(ax: Axes, points: Sequence[Row], whole: float, *, hollow: bool) -> None:
+    """One point an effect with its interval and its name; names that would meet are moved apart. hollow: where other
+    code than today's measured them."""
     taken: list[tuple[float, float]] = []
+    face: Any = {"mfc": PAGE, "mew": 1.8} if hollow else {}
     for i, row in enumerate(sorted(points, key=lambda row: -row["largest"])):
         look, y = numbered(i), max(row["largest"], _NOTHING)
         x, low, high = (100.0 * row[key] / whole for key in ("cost", "cost_low", "cost_high"))
         ax.plot([low, high], [y, y], color=look.color, linewidth=1.6, alpha=0.6, solid_capstyle="butt")
-        ax.plot([x], [y], marker=look.marker, color=look.color, markersize=9, linestyle="none")
+        ax.plot([x], [y], marker=look.marker, color=look.color, markersize=9, linestyle="none", **face)
         taken.append((x, y))
     ax.axvline(0.0, color=MUTED, linewidth=0.8)
     ax.margins(x=0.12)
@@ -86,7 +93,7 @@ def _effects(ax: Axes, points: Sequence[Row], whole: float) -> None:
     for (x, y), row in zip(taken, sorted(points, key=lambda row: -row["largest"]), strict=True):
         across, up = ax.transData.transform((x, y))
         lift = 9.0
-        while any(abs(across - a) < 130 and abs(up + lift - b) < _APART for a, b in used):
+        while any(abs(across - a) < 150 and abs(up + lift - b) < _APART for a, b in used):
             lift += _APART
         used.append((across, up + lift))
-        ax.annotate(row["name"], (x, y), (9, lift * 0.72), textcoords="offset points", fontsize=10.5, color=INK)
+        ax.annotate(row["name"], (x, y), (9, lift * 0.72), textcoords="offset points", fontsize=12, color=INK)

@@ -24,6 +24,8 @@ from harness.report.render import (
     drawable_frames,
     frame_all,
     natural_angles,
+    shape,
+    shown_limit,
     spacing,
     spring_strain,
 )
@@ -32,8 +34,6 @@ from harness.report.style import HEIGHT, MUTED, RC, RULE, WIDTH, Mark, marks
 
 _LEFT, _TOP, _RIGHT, _BOTTOM = 40, 118, WIDTH - 40, HEIGHT - 28
 _HEADING, _CAPTION, _GAP = 26, 104, 16
-_ASPECT = 1.4  # of a tile, width / height, that suits most scenes
-_SLIMMEST = 1.05  # a tile is no taller than this allows: captions stay near their pictures
 
 
 class _Grid(NamedTuple):
@@ -46,54 +46,60 @@ class _Grid(NamedTuple):
 
 
 def draw_comparison(replays: Mapping[str, Replay], path: Path) -> None:
-    """Draw the final frames of several runs to `path`, WIDTH x HEIGHT pixels, PNG.
+    """Draw the final frames of several runs to `path`, WIDTH pixels wide and HEIGHT at most, PNG.
 
-    replays: by a label that is used where the solver's name alone does not tell; the first of each scene and size is
-    what the others' distances are taken from. Raises RunFailed where the system cannot draw, and
+    replays: by a label that is used where the solver's name alone does not tell; of each scene and size the run of the
+    lowest residual is what the others' distances are taken from. Raises RunFailed where the system cannot draw, and
     ValueError for no replays.
     """
     if not replays:
         raise ValueError("a comparison needs at least one recording")
-    limit = max(replay.strain_range for replay in replays.values())
+    finite = [replay for replay in replays.values() if _ends_finite(replay)]
+    limit = shown_limit(finite, [-1] * len(finite)) if finite else max(r.strain_range for r in replays.values())
     panels: dict[str, list[tuple[str, Replay]]] = {}
     for label, replay in replays.items():
         panels.setdefault(headline(replay), []).append((label, replace(replay, strain_range=limit)))
     looks = marks(_solver(label, replay) for label, replay in replays.items())
-    grid = _layout(len(panels), max(map(len, panels.values())))
+    grid = _layout(len(panels), max(map(len, panels.values())), _shape(finite))
     rows = ceil(len(panels) / grid.panel_columns)
     across = (_RIGHT - _LEFT + 2 * _GAP) / grid.panel_columns
     tile_rows = ceil(max(map(len, panels.values())) / grid.tile_columns)
-    slack = (_BOTTOM - _TOP) / rows - _HEADING - tile_rows * (grid.height + _CAPTION)
-    down = (_BOTTOM - _TOP + _GAP) / rows
+    down = min(_HEADING + tile_rows * (grid.height + _CAPTION) + _GAP, (_BOTTOM - _TOP + _GAP) / rows)
     with matplotlib.rc_context(RC), Studio(grid.width, grid.height) as studio:
         page = new_page()
         _title(page, panels)
         strain_scale(page, limit, pins=any(len(replay.pinned) for replay in replays.values()))
         for k, (heading, panel) in enumerate(panels.items()):
             row, column = divmod(k, grid.panel_columns)
-            left, top = round(_LEFT + column * across), round(_TOP + row * down + max(slack, 0) / 2)
+            left, top = round(_LEFT + column * across), round(_TOP + row * down)
             if len(panels) > 1:
                 text(page, left + 2, top + 16, shorten(heading, int(across / 9)), size=11.5, weight="bold")
             _panel(page, studio, panel, left, top + _HEADING, grid, looks)
-        save(page, path)
+        save(page, path, used=min(_TOP + rows * down + 12, HEIGHT))
 
 
-def _layout(panels: int, tiles: int) -> _Grid:
-    """The grid with the largest tiles."""
+def _shape(finite: Sequence[Replay]) -> float:
+    """Width over height of what most runs show at their end."""
+    shapes = [shape(seen(r, [-1]), natural_angles(r.positions[-1], area_vectors(r, -1))) for r in finite]
+    return float(np.clip(np.median(shapes), 0.5, 2.2)) if shapes else 1.0
+
+
+def _layout(panels: int, tiles: int, aspect: float) -> _Grid:
+    """The grid in which scenes of this width / height are largest."""
 
     def grid(panel_columns: int, tile_columns: int) -> _Grid:
         columns = panel_columns * tile_columns
         rows = ceil(panels / panel_columns) * ceil(tiles / tile_columns)
         width = (_RIGHT - _LEFT - (columns + panel_columns) * _GAP) // columns
         height = (_BOTTOM - _TOP - ceil(panels / panel_columns) * (_HEADING + _GAP)) // rows - _CAPTION
-        return _Grid(panel_columns, tile_columns, max(width, 48), max(min(height, int(width / _SLIMMEST)), 48))
+        return _Grid(panel_columns, tile_columns, max(width, 48), max(min(height, int(width / aspect)), 48))
 
     choices = [grid(p, t) for p, t in product(range(1, panels + 1), range(1, tiles + 1))]
-    return max(choices, key=lambda g: min(g.width, _ASPECT * g.height))
+    return max(choices, key=lambda g: min(g.width, aspect * g.height))
 
 
 def _title(page: Figure, panels: Mapping[str, Sequence[tuple[str, Replay]]]) -> None:
-    meaning = "final frames; distance: the farthest vertex from the first solver's, in mean rest lengths"
+    meaning = "distance: of the farthest vertex from the run of the lowest residual, in mean rest lengths"
     if len(panels) > 1:
         header(page, "Solvers side by side", [meaning])
         return
@@ -120,6 +126,7 @@ def _panel(
     framed = np.concatenate([seen(r, [-1]) for r in finite] or [points])
     view = frame_all(framed, aspect=grid.width / grid.height, angles=angles)
     solvers = [_solver(*entry) for entry in panel]
+    best = panel[reference([replay for _, replay in panel])][1]
     for k, (label, replay) in enumerate(panel):
         # Runs of one solver that differ in their settings go by their labels.
         name = solvers[k] if solvers.count(solvers[k]) == 1 else label
@@ -133,7 +140,7 @@ def _panel(
             box = {"facecolor": "none", "edgecolor": RULE, "boxstyle": "round,pad=1.2"}
             middle = x + grid.width / 2, y + grid.height / 2
             text(page, *middle, words, size=10.5, ha="center", va="center", bbox=box)
-        _caption(page, name, looks[solvers[k]], _facts(replay, panel[0][1]), x, y + grid.height, grid.width)
+        _caption(page, name, looks[solvers[k]], _facts(replay, best), x, y + grid.height, grid.width)
 
 
 def _caption(page: Figure, solver: str, mark: Mark, facts: Mapping[str, str], x: int, y: int, width: int) -> None:
@@ -153,17 +160,16 @@ def _solver(label: str, replay: Replay) -> str:
     return str(replay.properties.get("solver", label))
 
 
-def _facts(replay: Replay, reference: Replay) -> dict[str, str]:
+def _facts(replay: Replay, best: Replay) -> dict[str, str]:
     final = len(replay.frames) - 1
     finite = _ends_finite(replay)
     strain = np.abs(spring_strain(replay, final)).max(initial=0.0) if finite else np.nan
-    distance = _distance(replay, reference)
     cost = replay.properties.get("milliseconds_per_step")
     return {
         "ms a step": "–" if cost is None else quantity(float(cost)),
         "largest strain": f"{100 * strain:.3g} %" if finite else "–",
         "residual": _last(replay, "residual"),
-        "distance": "first" if replay is reference else "–" if np.isnan(distance) else f"{distance:.2g}",
+        "distance": distance_words(replay, best),
     }
 
 
@@ -183,6 +189,24 @@ def _distance(replay: Replay, reference: Replay) -> float:
         return np.nan
     away = replay.positions[-1].astype(np.float64) - reference.positions[-1]
     return float(np.linalg.norm(away, axis=1).max(initial=0.0) / spacing(replay))
+
+
+def reference(replays: Sequence[Replay]) -> int:
+    """Which of the runs of one scene the others' distances are taken from: the one whose last residual is the lowest
+    of those that end finite, so that the nearest to the minimum judges and not the first of a list; else the first."""
+
+    def badness(k: int) -> tuple[bool, float]:
+        known = "/residual" in replays[k].scalars and len(replays[k].scalars["/residual"][1])
+        last = float(replays[k].scalars["/residual"][1][-1]) if known else np.inf
+        return not _ends_finite(replays[k]), last if np.isfinite(last) else np.inf
+
+    return min(range(len(replays)), key=badness)
+
+
+def distance_words(replay: Replay, best: Replay) -> str:
+    """The distance from the run that is nearest to the minimum, in words."""
+    distance = _distance(replay, best)
+    return "reference" if replay is best else "–" if np.isnan(distance) else f"{distance:.2g}"
 
 
 def _last(replay: Replay, name: str) -> str:

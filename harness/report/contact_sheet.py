@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 
 import matplotlib
 import numpy as np
@@ -21,12 +22,13 @@ from harness.report.render import Studio, area_vectors, frame_all, natural_angle
 from harness.report.solids import seen
 from harness.report.style import DPI, INK, MUTED, PAGE, RC, WIDTH
 
-COLUMNS = 4
+_MOST, _FEWEST = 5, 3
+"""Tiles in a row."""
 _LINES = 70
 """Pixels for each vertex from which on the mesh's lines are drawn: the mesh is to be seen, if only as a texture."""
 _BOB, _HEAVY = 0.03, 20.0
 """Vertices so many times heavier than most are drawn as balls, of this radius in the scene's size."""
-_MARGIN, _GAP, _TILE, _CAPTION = 28, 20, 290, 62
+_MARGIN, _GAP, _TILE, _CAPTION = 28, 20, 290, 78
 """Pixels: around the sheet, between tiles, a tile's height, the type below it."""
 
 
@@ -47,19 +49,33 @@ class Tile:
 
 def draw_sheet(tiles: Sequence[Tile], path: Path) -> None:
     """Draw the tiles row by row, PNG. Raises RunFailed where the system cannot draw."""
-    width = (WIDTH - 2 * _MARGIN - (COLUMNS - 1) * _GAP) // COLUMNS
+    columns = abreast(len(tiles))
+    width = (WIDTH - 2 * _MARGIN - (columns - 1) * _GAP) // columns
     step = _TILE + _CAPTION
-    height = 2 * _MARGIN + -(-len(tiles) // COLUMNS) * step - _GAP // 2
+    height = 2 * _MARGIN + -(-len(tiles) // columns) * step - _GAP // 2
     with matplotlib.rc_context(RC), Studio(width, _TILE, mesh_lines=_LINES) as studio:
         page = Figure(figsize=(WIDTH / DPI, height / DPI), dpi=DPI, facecolor=PAGE)
         FigureCanvasAgg(page)
         for k, tile in enumerate(tiles):
-            row, column = divmod(k, COLUMNS)
+            row, column = divmod(k, columns)
             left, top = _MARGIN + column * (width + _GAP), _MARGIN + row * step
             page.figimage(_drawn(studio, tile, width / _TILE), xo=left, yo=height - top - _TILE, origin="upper")
-            for words, below, size, color in ((tile.name, 20, 15.0, INK), (tile.effects, 41, 10.5, MUTED)):
+            for words, below, size, color in ((tile.name, 20, 15.0, INK), *_lines(tile.effects, width)):
                 page.text(left / WIDTH, 1 - (top + _TILE + below) / height, words, size=size, color=color)
         save(page, path)
+
+
+def abreast(count: int) -> int:
+    """How many tiles in a row leave the fewest places blank; of those that leave as few, 4 or what is nearest."""
+    if count < _FEWEST:
+        return max(count, 1)
+    return min(range(_FEWEST, _MOST + 1), key=lambda columns: (-count % columns, abs(columns - 4)))
+
+
+def _lines(effects: str, width: int) -> list[tuple[str, int, float, str]]:
+    """The effects in two lines at most, with their places."""
+    lines = wrap(effects, int(width / 7.2), max_lines=2, placeholder=" …")
+    return [(words, 40 + 16 * k, 10.0, MUTED) for k, words in enumerate(lines)]
 
 
 def _drawn(studio: Studio, tile: Tile, aspect: float) -> np.ndarray:

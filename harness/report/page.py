@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
+from PIL import Image
 
 from harness.base.files import replacing
 from harness.record.base import Replay
@@ -51,10 +53,17 @@ def paste(page: Figure, pixels: NDArray[np.uint8], left: int, top: int) -> None:
     page.figimage(pixels, xo=left, yo=HEIGHT - top - pixels.shape[0], origin="upper")
 
 
-def save(page: Figure, path: Path) -> None:
-    """Write the page under a partial name and rename it: a kill leaves all of it or nothing. Raises CannotWrite."""
+def save(page: Figure, path: Path, *, used: float = HEIGHT) -> None:
+    """Write the page under a partial name and rename it: a kill leaves all of it or nothing. Raises CannotWrite.
+
+    used: the pixels from the top that are drawn on; what is empty below is cut off.
+    """
     with replacing(path) as partial:
         page.savefig(partial, format="png", dpi=DPI)
+        if used < HEIGHT:
+            with Image.open(partial) as whole:
+                part = whole.crop((0, 0, WIDTH, ceil(used)))
+            part.save(partial, format="png")
 
 
 def header(page: Figure, headline: str, facts: Sequence[str], *, letters: int = 56) -> None:

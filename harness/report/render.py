@@ -117,12 +117,8 @@ def frame_all(points: Points, *, aspect: float, angles: tuple[float, float]) -> 
     A point with camera coordinates (a, b, c), c towards the viewer, is seen from (ea, eb, ec) where
     |a - ea| <= tan (ec - c), and alike for b. Each pair of bounds is tight at one ec; the further one sees all.
     """
-    towards = _towards(*angles)
-    right = np.cross([0.0, 1.0, 0.0], towards)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(towards, right), towards])
-    low = points[:, 1].min()
-    ground = float(low - 0.02 * _extent(points))
+    axes = _camera_axes(angles)
+    ground = _ground(points)
     a, b, c = axes @ np.concatenate([points, _cast(points, ground)]).astype(np.float64).T
     tan = (1.0 - 2.0 * _MARGIN) * np.tan(_HALF_ANGLE)
     eye, distance = np.zeros(3), 0.0
@@ -133,6 +129,36 @@ def frame_all(points: Points, *, aspect: float, angles: tuple[float, float]) -> 
     middle = (c.min() + c.max()) / 2.0
     eye[2] = max(distance, middle + 1e-3)
     return View(eye @ axes, np.array([eye[0], eye[1], middle]) @ axes, ground)
+
+
+def _camera_axes(angles: tuple[float, float]) -> Points:
+    """What is right, up and towards the viewer, as rows (3, 3)."""
+    towards = _towards(*angles)
+    right = np.cross([0.0, 1.0, 0.0], towards)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(towards, right), towards])
+
+
+def _ground(points: Points) -> float:
+    """The height [m] that the shadow of points (q, 3) falls on."""
+    return float(points[:, 1].min() - 0.02 * _extent(points))
+
+
+def shape(points: Points, angles: tuple[float, float]) -> float:
+    """Width over height of points (q, 3) [m] and of their shadow as they are seen from afar at these angles."""
+    whole = np.concatenate([points, _cast(points, _ground(points))])
+    across, up, _ = np.ptp(_camera_axes(angles) @ whole.astype(np.float64).T, axis=1)
+    return float(across / max(up, 1e-30))
+
+
+def shown_limit(replays: Sequence[Replay], frames: Sequence[int]) -> float:
+    """The end of a scale that shows the strains of these frames, one of each recording: the round number above what
+    99 % of the vertices have, so that a few at a pin do not leave all others grey."""
+    strains = np.concatenate([np.abs(vertex_strain(r, k)) for r, k in zip(replays, frames, strict=True)])
+    strains = strains[np.isfinite(strains)]
+    wanted = max(float(np.quantile(strains, 0.99)) if len(strains) else 0.0, 1e-3)
+    decade = 10.0 ** np.floor(np.log10(wanted) + 1e-9)
+    return float(next(step * decade for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * decade >= 0.999 * wanted))
 
 
 def _extent(p: Points) -> float:
@@ -161,17 +187,19 @@ def _balls(at: Points, radius: float) -> pv.PolyData:
 class Studio:
     """One off-screen window of `width` x `height` pixels, reused for all frames; a context manager.
 
-    mesh_lines: how many pixels each vertex needs for the mesh's lines to be drawn.
-    Raises RunFailed where the system cannot draw.
+    mesh_lines: how many pixels each vertex needs for the mesh's lines to be drawn; background: a colour, or None for
+    none, and no shadow either. Raises RunFailed where the system cannot draw.
     """
 
-    def __init__(self, width: int, height: int, *, mesh_lines: int = _MESH_LINES) -> None:
+    def __init__(
+        self, width: int, height: int, *, mesh_lines: int = _MESH_LINES, background: str | None = PAGE
+    ) -> None:
         opengl.require()
-        self._mesh_lines = mesh_lines
+        self._mesh_lines, self._page = mesh_lines, background
         self._pixels, self._height = width * height, height
         size = [_SUPERSAMPLING * width, _SUPERSAMPLING * height]
         self._plotter = pv.Plotter(off_screen=True, window_size=size, lighting="none")
-        self._plotter.background_color = pv.Color(PAGE)
+        self._plotter.background_color = pv.Color(background or "white")
         self._plotter.disable_anti_aliasing()
         # From the camera's upper left, so that every view is lit alike; the fill keeps the scale's colours true.
         for place, strength in (((-1.2, 1.5, 1.6), 0.7), ((0.6, -0.5, 2.0), 0.55)):
@@ -187,7 +215,8 @@ class Studio:
         self._plotter.close()
 
     def draw(self, replay: Replay, frame: int, view: View, more: Sequence[pv.PolyData] = ()) -> NDArray[np.uint8]:
-        """A recorded frame as pixels (height, width, 3), with more solids than its obstacles; it must be finite."""
+        """A recorded frame as pixels (height, width, 3), or 4 without a background, with more solids than its
+        obstacles; it must be finite."""
         plotter = self._plotter
         plotter.clear_actors()
         plotter.camera.position = tuple(view.position)
@@ -195,7 +224,8 @@ class Studio:
         plotter.camera.up = (0.0, 1.0, 0.0)
         plotter.camera.view_angle = 2.0 * np.degrees(_HALF_ANGLE)
         p = np.ascontiguousarray(replay.positions[frame], np.float32)
-        self._shadow(replay, p, view.ground)
+        if self._page is not None:
+            self._shadow(replay, p, view.ground, self._page)
         if len(replay.triangles):
             self._surface(replay, frame, p)
         else:
@@ -205,8 +235,9 @@ class Studio:
             plotter.add_mesh(solid, color=_SOLID, smooth_shading=solid.n_cells > 6, **_MATERIAL)
         plotter.reset_camera_clipping_range()
         plotter.render()
-        pixels = Image.fromarray(np.asarray(plotter.screenshot(None, return_img=True))[..., :3])
-        return np.asarray(pixels.reduce(_SUPERSAMPLING))
+        clear = self._page is None
+        pixels = np.asarray(plotter.screenshot(None, return_img=True, transparent_background=clear))
+        return np.asarray(Image.fromarray(pixels if clear else pixels[..., :3]).reduce(_SUPERSAMPLING))
 
     def _surface(self, replay: Replay, frame: int, p: NDArray[np.float32]) -> None:
         mesh = pv.PolyData.from_regular_faces(p, replay.triangles)
@@ -259,7 +290,7 @@ class Studio:
             pins = _balls(p[replay.pinned], radius)
             self._plotter.add_mesh(pins, color=INK, smooth_shading=True, **_MATERIAL)
 
-    def _shadow(self, replay: Replay, p: NDArray[np.float32], ground: float) -> None:
+    def _shadow(self, replay: Replay, p: NDArray[np.float32], ground: float, behind: str) -> None:
         """A soft shadow on the ground: the scene seen from the light, as a blurred picture on an unlit plane."""
         flat = _cast(p, ground)[:, [0, 2]]
         centre = (flat.min(axis=0) + flat.max(axis=0)) / 2
@@ -275,7 +306,7 @@ class Studio:
             for ends in at[replay.springs].reshape(-1, 4).tolist():
                 pen.line(ends, fill=255, width=3)
         dark = np.asarray(stencil.filter(ImageFilter.GaussianBlur(11)), np.float32)[..., None] / 255
-        page, shade = (np.array(pv.Color(c).int_rgb, np.float32) for c in (PAGE, _SHADE))
+        page, shade = (np.array(pv.Color(c).int_rgb, np.float32) for c in (behind, _SHADE))
         texture = pv.Texture((page + dark * (shade - page)).round().astype(np.uint8))
         plane = pv.Plane(center=(centre[0], ground, centre[1]), direction=(0, 1, 0), i_size=side, j_size=side)
         corner = (plane.points[:, [0, 2]] - centre) / side + 0.5

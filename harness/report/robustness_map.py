@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
+from textwrap import wrap
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -29,16 +30,22 @@ from harness.report.robustness import (
 )
 from harness.report.style import DPI, INK, MUTED, PAGE, RULE
 
-_ROW, _COLUMN, _LEFT, _TOP, _BOTTOM, _ACROSS = 0.2, 0.64, 2.3, 1.75, 1.5, 2.2
-"""Inches: a cell's height and width, room for the cases' names, for title and solvers' names, and for the legend, and
-from one of its columns to the next."""
+_ROW, _COLUMN, _LEFT, _TOP, _ACROSS, _LEGEND, _LINE = 0.2, 0.64, 2.3, 1.35, 2.1, 0.26, 0.17
+"""Inches: a cell's height and width, room for the cases' names and for the solvers', the legend's columns and rows, and
+a line of the note."""
+
+_NARROWEST, _TURNED = 6.5, 0.075
+"""Inches: the least width, and what a letter takes across in a name that is turned."""
+
+_TITLE, _NOTE, _LETTER = 13.0, 8.0, 0.64
+"""Points of the type, and the width of a letter in it."""
 
 _SCORES, _HEADING = 3, 1.2
 """Rows for the solvers' scores, and rows from the last case of a family to the first of the next."""
 
 NOTE = (
-    "Figures: the largest residual |Q\u207b\u00b9 grad g|_Q that a step ended with, over its value at its start\n"
-    "(or round-off); of methods that do not minimise, the largest distance from a converged run, in per cent of the\n"
+    "Figures: the largest residual |Q\u207b\u00b9 grad g|_Q that a step ended with, over its value at its start "
+    "(or round-off); of methods that do not minimise, the largest distance from a converged run, in per cent of the "
     "size. Shares: of the cases that a solver does not refuse."
 )
 
@@ -50,13 +57,22 @@ def headline(cells: Sequence[Cell], name: str) -> str:
     return f"{name}: {of[RIGHT]} of {len(cells)} runs right, {of[WRONG]} silently wrong, {broken} diverged or failed"
 
 
-def draw_map(cells: Sequence[Cell], path: Path, title: str) -> None:
-    """Draw the map to a PNG."""
+def draw_map(cells: Sequence[Cell], path: Path, title: str, older: Collection[str] = ()) -> None:
+    """Draw the map to a PNG. older: the ids of the runs that other code than today's did, which get a hollow mark."""
     solvers = list(dict.fromkeys(cell.solver for cell in cells))
     places, rows = _places(list(dict.fromkeys(cell.case for cell in cells)))
-    width, height = _LEFT + _COLUMN * len(solvers) + 0.8, _TOP + _ROW * rows + _BOTTOM
+    used = [outcome for outcome in OUTCOMES if any(cell.outcome == outcome for cell in cells)]
+    ends = [_COLUMN * (x + 0.45) + _TURNED * len(solver) for x, solver in enumerate(solvers)]
+    width = max(_LEFT + max([_COLUMN * len(solvers) + 0.3, *ends]), _NARROWEST)
+    head, foot = _fitted(title, width, _TITLE), _fitted(NOTE, width, _NOTE)
+    if any(cell.run_id in older for cell in cells):
+        foot += _fitted("Hollow marks: runs that other code than today's did.", width, _NOTE)
+    across = max(1, int((width - 0.3) / _ACROSS))
+    legend, below = _LEGEND * -(-len(used) // across), _LINE * len(foot) + 0.35
+    top, bottom = _TOP + 0.28 * len(head), below + legend + 0.15
+    height = top + _ROW * rows + bottom
     figure = Figure((width, height), DPI, facecolor=PAGE)
-    ax = figure.add_axes((_LEFT / width, _BOTTOM / height, _COLUMN * len(solvers) / width, _ROW * rows / height))
+    ax = figure.add_axes((_LEFT / width, bottom / height, _COLUMN * len(solvers) / width, _ROW * rows / height))
     ax.set_xlim(0, len(solvers))
     ax.set_ylim(rows, 0)
     ax.set_axis_off()
@@ -64,6 +80,8 @@ def draw_map(cells: Sequence[Cell], path: Path, title: str) -> None:
         x, y = solvers.index(cell.solver), places[cell.case]
         ax.add_patch(Rectangle((x + 0.02, y + 0.05), 0.96, 0.9, facecolor=cell.outcome.color, linewidth=0))
         ax.text(x + 0.5, y + 0.53, cell.figure, ha="center", va="center", fontsize=8, color=_ink(cell.outcome))
+        if cell.run_id in older:
+            ax.plot(x + 0.1, y + 0.5, "o", mfc=PAGE, mec=INK, ms=4.5, mew=1.0)
     for x, solver in enumerate(solvers):
         ax.text(x + 0.45, -0.25, solver, ha="left", va="bottom", rotation=40, fontsize=9, color=INK)
     for case, y in places.items():
@@ -71,8 +89,11 @@ def draw_map(cells: Sequence[Cell], path: Path, title: str) -> None:
     for family, of in groupby(places, _family):
         ax.text(-0.1, places[next(of)] - 0.45, family, ha="right", va="center", fontsize=9, color=INK, weight="bold")
     _draw_scores(ax, cells)
-    figure.text(0.15 / width, 1 - 0.32 / height, title, fontsize=13, color=INK, weight="bold")
-    _legend(figure, cells)
+    words = "\n".join(head)
+    figure.text(0.15 / width, 1 - 0.15 / height, words, fontsize=_TITLE, color=INK, weight="bold", va="top")
+    _legend(figure, cells, used, across, below + legend - 0.2)
+    words = "\n".join(foot)
+    figure.text(0.15 / width, 0.15 / height, words, fontsize=_NOTE, color=MUTED, linespacing=1.5, va="bottom")
     figure.savefig(path, facecolor=PAGE)
 
 
@@ -103,15 +124,21 @@ _BARS = ("#8fcbad", "#c4ccd6")
 """Of the shares that are right and finite."""
 
 
-def _legend(figure: Figure, cells: Sequence[Cell]) -> None:
+def _legend(figure: Figure, cells: Sequence[Cell], used: Sequence[Outcome], across: int, top: float) -> None:
+    """The outcomes that the map has, so many in a row, from `top` [inches] down."""
     width, height = figure.get_size_inches()
-    for k, outcome in enumerate(OUTCOMES):
-        x, y = 0.15 + _ACROSS * (k % 4), 1.12 - 0.26 * (k // 4)
+    for k, outcome in enumerate(used):
+        row, column = divmod(k, across)
+        x, y = 0.15 + _ACROSS * column, top - _LEGEND * row
         words = f"{outcome.words} ({sum(cell.outcome == outcome for cell in cells)})"
         box = Rectangle((x / width, y / height), 0.2 / width, 0.16 / height, facecolor=outcome.color)
         figure.add_artist(box)
         figure.text((x + 0.27) / width, (y + 0.08) / height, words, fontsize=9, va="center", color=INK)
-    figure.text(0.15 / width, 0.2 / height, NOTE, fontsize=8, color=MUTED, linespacing=1.5)
+
+
+def _fitted(words: str, width: float, size: float) -> list[str]:
+    """The words in lines that fit into a width [inches] in type of a size [points]."""
+    return wrap(words, int(72.0 * (width - 0.3) / (_LETTER * size)))
 
 
 def _family(case: str) -> str:
@@ -127,12 +154,15 @@ def _ink(outcome: Outcome) -> str:
     return INK if 0.3 * red + 0.6 * green + 0.1 * blue > 120 else PAGE
 
 
-def draw_maps(results: Path) -> Iterator[tuple[Path, list[Cell]]]:
-    """Draw the maps of those sweeps in a folder of results, or of one sweep, whose runs were judged."""
+def draw_maps(results: Path, older: Callable[[Path], Collection[str]]) -> Iterator[tuple[Path, list[Cell]]]:
+    """Draw the maps of those sweeps in a folder of results, or of one sweep, whose runs were judged.
+
+    older: tells the ids of those runs in a sweep's folder that other code than today's did.
+    """
     for rows in shelf.folders(results, "rows"):
         with suppress(InputError):
             cells = read_cells(rows.parent)
             picture = rows.parent / "pictures" / "robustness.png"
             picture.parent.mkdir(exist_ok=True)
-            draw_map(cells, picture, headline(cells, rows.parent.resolve().name))
+            draw_map(cells, picture, headline(cells, rows.parent.resolve().name), older(rows.parent))
             yield picture, cells

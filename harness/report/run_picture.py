@@ -1,10 +1,17 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs say nothing of most keywords.
-"""The picture of one run: its final frame large, five earlier ones beside it, the scale of strain above."""
+"""The picture of one run: its final frame large, five earlier ones beside it, the scale of strain above.
+
+The scale is that of the strains that are seen: most of a mesh would be grey on one that a pin's neighbours set, and
+all of it one colour on one that is too short.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from math import ceil
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -26,13 +33,57 @@ from harness.report.page import (
     strain_scale,
     text,
 )
-from harness.report.render import Studio, area_vectors, drawable_frames, frame_all, natural_angles
+from harness.report.render import (
+    Studio,
+    area_vectors,
+    drawable_frames,
+    frame_all,
+    natural_angles,
+    shape,
+    shown_limit,
+    spring_strain,
+)
 from harness.report.solids import seen
 from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, RULE, WIDTH
 
-_MAIN = (36, 114, 1244, 750)  # left, top, width, height of the final frame [pixels from the top left]
-_STRIP_LEFT, _STRIP_WIDTH, _GAP = 1320, 244, 6
+_LEFT, _TOP, _RIGHT, _HEIGHT = 36, 114, WIDTH - 36, 750
+_WIDEST, _SLIMMEST = 1180, 420  # of the final frame; the earlier ones have the rest
+_RULE, _GAP, _CAPTION = 44, 12, 24
 _EARLIER = 5
+
+
+class Box(NamedTuple):
+    """A place on the page [pixels from the top left]."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+def layout(final: float, whole: float, earlier: int) -> tuple[Box, list[Box]]:
+    """Where the final frame goes and where the earlier ones, so that scenes of these shapes fill their places.
+
+    final, whole: width over height of the final frame and of all of them, as they are seen.
+    """
+    if not earlier:
+        return Box(_LEFT, _TOP, _RIGHT - _LEFT, _HEIGHT), []
+    main = Box(_LEFT, _TOP, int(min(max(_HEIGHT * final, _SLIMMEST), _WIDEST)), _HEIGHT)
+    start = main.left + main.width + _RULE
+    room = _RIGHT - start
+
+    def tile(columns: int) -> tuple[float, int, int]:
+        rows = ceil(earlier / columns)
+        width = (room - (columns - 1) * _GAP) // columns
+        height = (_HEIGHT - rows * _CAPTION) // rows
+        return min(float(width), whole * height), width, min(height, int(width / min(whole, 1.0)))
+
+    columns = max(range(1, earlier + 1), key=lambda c: tile(c)[0])
+    _, width, height = tile(columns)
+    places = [divmod(k, columns) for k in range(earlier)]
+    return main, [
+        Box(start + column * (width + _GAP), _TOP + row * (height + _CAPTION), width, height) for row, column in places
+    ]
 
 
 def draw_run(replay: Replay, path: Path, *, camera: tuple[float, float] | None = None) -> None:
@@ -44,9 +95,11 @@ def draw_run(replay: Replay, path: Path, *, camera: tuple[float, float] | None =
     """
     good = drawable_frames(replay)
     shown = np.unique(np.linspace(0, len(good) - 1, _EARLIER + 1).round().astype(int)) if len(good) else good
+    if len(shown):
+        replay = replace(replay, strain_range=shown_limit([replay] * len(shown), shown.tolist()))
     with matplotlib.rc_context(RC):
         page = new_page()
-        header(page, headline(replay), _facts(replay))
+        header(page, headline(replay), [*_facts(replay), *_strain(replay, shown)])
         strain_scale(page, replay.strain_range, pins=len(replay.pinned) > 0)
         if len(shown):
             _frames(page, replay, shown, camera)
@@ -65,33 +118,40 @@ def _facts(replay: Replay) -> list[str]:
     return facts
 
 
+def _strain(replay: Replay, shown: NDArray[np.int64]) -> list[str]:
+    """What the scale may not reach, in words."""
+    if not len(shown) or not len(replay.springs):
+        return []
+    largest = max(float(np.abs(spring_strain(replay, int(k))).max()) for k in shown)
+    return [f"largest strain shown {100 * largest:.3g} %"]
+
+
 def _frames(page: Figure, replay: Replay, shown: NDArray[np.int64], camera: tuple[float, float] | None) -> None:
-    left, top, width, height = _MAIN
     *earlier, final = (int(k) for k in shown)
     points = replay.positions[shown].reshape(-1, 3)
     angles = natural_angles(points, area_vectors(replay, final)) if camera is None else camera
-    close = frame_all(seen(replay, [final]), aspect=width / height, angles=angles)
-    with Studio(width, height) as studio:
-        paste(page, studio.draw(replay, final, close), left, top)
-    text(page, left + 4, top + height - 4, clock(replay, final), size=11.5)
-    if not earlier:
+    last, every = seen(replay, [final]), seen(replay, (*earlier, final))
+    main, tiles = layout(shape(last, angles), shape(every, angles), len(earlier))
+    close = frame_all(last, aspect=main.width / main.height, angles=angles)
+    with Studio(main.width, main.height) as studio:
+        paste(page, studio.draw(replay, final, close), main.left, main.top)
+    text(page, main.left + 4, main.top + main.height - 4, clock(replay, final), size=11.5)
+    if not tiles:
         return
-    tile = (height - (_EARLIER - 1) * _GAP) // _EARLIER
-    whole = frame_all(seen(replay, (*earlier, final)), aspect=_STRIP_WIDTH / tile, angles=angles)
-    x, ends = (_STRIP_LEFT - 20) / WIDTH, (top + 4, top + height - 4)
+    whole = frame_all(every, aspect=tiles[0].width / tiles[0].height, angles=angles)
+    x, ends = (tiles[0].left - _RULE / 2) / WIDTH, (main.top + 4, main.top + main.height - 4)
     page.add_artist(Line2D([x, x], [1 - y / HEIGHT for y in ends], color=RULE, linewidth=0.8))
-    with Studio(_STRIP_WIDTH, tile) as studio:
-        for row, frame in enumerate(earlier):
-            at = top + row * (tile + _GAP)
-            paste(page, studio.draw(replay, frame, whole), _STRIP_LEFT, at)
-            text(page, _STRIP_LEFT + 4, at + tile - 4, clock(replay, frame), size=9, color=MUTED)
+    with Studio(tiles[0].width, tiles[0].height) as studio:
+        for frame, tile in zip(earlier, tiles, strict=True):
+            paste(page, studio.draw(replay, frame, whole), tile.left, tile.top)
+            words = clock(replay, frame)
+            text(page, tile.left + 4, tile.top + tile.height + 14, words, size=10, color=MUTED)
 
 
 def _notice(page: Figure, replay: Replay, good: int) -> None:
     """Say in words from where on the positions cannot be drawn."""
     words = f"not finite from frame {int(replay.frames[good])} on"
     below = f"shown: up to the last finite frame, {int(replay.frames[good - 1])}" if good else "no frame can be drawn"
-    left, top, width, height = _MAIN
-    middle, y = left + width / 2, top + 40 if good else top + height / 2
+    middle, y = WIDTH / 2, _TOP + 40 if good else _TOP + _HEIGHT / 2
     box = {"facecolor": PAGE, "edgecolor": INK, "linewidth": 1.0, "boxstyle": "round,pad=0.6"}
     text(page, middle, y, f"Positions are {words}\n{below}", size=13, ha="center", va="center", bbox=box)

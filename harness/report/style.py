@@ -59,28 +59,36 @@ _MARKERS: tuple[Any, ...] = ("s", "o", "D", "^", "v", "P", "X", "p", "*", "<", "
 
 # Okabe and Ito's palette, less its yellow and black, and four more: for families in the order of the registry.
 _FAMILIES = ("#0072b2", "#00a878", "#e69f00", "#d55e00", "#9a86e0", "#cc79a7", "#a8326e", "#858585")
-_MEMBERS: tuple[tuple[float, Any], ...] = ((0.0, "-"), (-0.25, DASHED), (0.4, "-"), (0.2, DASH_DOTTED))
+_MEMBERS: tuple[tuple[float, Any], ...] = ((0.0, "-"), (-0.36, DASHED), (0.42, "-"), (0.2, DASH_DOTTED))
 """How much lighter the members of a family are drawn, or darker where negative, and in which line style."""
 _MANY: tuple[tuple[float, Any], ...] = (
-    *((0.0, "-"), (-0.25, DOTTED), (0.3, (0, (10, 3))), (-0.4, (0, (3, 1, 1, 1, 1, 1)))),
-    *((0.15, (0, (8, 2, 2, 2, 2, 2))), (-0.15, (0, (1, 3))), (0.3, (0, (12, 2, 1, 2)))),
+    *((0.0, "-"), (-0.3, DOTTED), (0.3, (0, (10, 3))), (-0.48, (0, (3, 1, 1, 1, 1, 1)))),
+    *((0.15, (0, (8, 2, 2, 2, 2, 2))), (-0.16, (0, (1, 3))), (0.42, (0, (12, 2, 1, 2)))),
 )
 """The same for a family of more than four, in line styles that no other has."""
-_STRANGERS = ("#8a8a00", "#00a0a0", "#8c564b", "#4c6ef5", "#5a9e2f", "#c9506b")
+_VARIANTS: tuple[Any, ...] = (*_DASHES, *(dash for _, dash in _MANY[2:]))
+"""The line styles of what differs from a solver in its settings alone."""
+_STRANGERS = (
+    *("#8a8a00", "#00a0a0", "#8c564b", "#4c6ef5", "#5a9e2f", "#c9506b", "#b8860b", "#6a3d9a", "#1f8a70", "#e377c2"),
+    *("#3b7a9e", "#d97b66", "#7a9a01", "#9c4f96"),
+)
 
 
 def marks(solvers: Iterable[str] = ()) -> dict[str, Mark]:
     """The mark of each of the registry's solvers, and of these others: always the same, and nobody else's.
 
-    What other solvers get follows from their names; where two would get the same, the later by alphabet gets the next.
+    What other solvers get follows from their names; where two would get the same colour, the later by alphabet gets the
+    next that is free, and once there is none the next free mark.
     """
     looks = dict(_shipped((*SOLVERS, *OPTIONAL)))
     free = [Mark(color, marker, dash) for dash in _DASHES for color in _STRANGERS for marker in _MARKERS]
-    taken: set[Mark] = set()
+    taken: set[str | Mark] = set()
     for name in sorted({*SOLVERS, *OPTIONAL, *solvers} - set(looks)):
         place = int(sha256(name.encode()).hexdigest(), 16) % (len(free) // len(_DASHES))
-        looks[name] = next(look for look in free[place:] if look not in taken)
-        taken.add(looks[name])
+        order = [*free[place:], *free[:place]]
+        unused = (look for look in order if look.color not in taken)
+        looks[name] = next(unused, None) or next(look for look in order if look not in taken)
+        taken |= {looks[name].color, looks[name]}
     return looks
 
 
@@ -107,29 +115,32 @@ def shade(color: str, by: float) -> str:
 
 
 def looks(labelled: Iterable[tuple[str, str]]) -> dict[str, Mark]:
-    """A mark for each label of (label, solver); further labels of a solver keep its colour and marker."""
+    """A mark for each label of (label, solver); all labels of a solver have its colour and its marker, the first its
+    line style too."""
 
-    def dashed(own: Mark, k: int, _: int) -> Mark:
-        return own._replace(dash=[own.dash, *(dash for dash in _DASHES if dash != own.dash)][k % len(_DASHES)])
+    def dashed(own: Mark, k: int) -> Mark:
+        styles = [own.dash, *(dash for dash in _VARIANTS if dash != own.dash)]
+        return own._replace(dash=styles[k % len(styles)])
 
     return _varied(labelled, dashed)
 
 
 def shades(labelled: Iterable[tuple[str, str]]) -> dict[str, Mark]:
-    """The same where labels are many: those of a solver differ in how light its colour is."""
+    """The same where there are no line styles: the first label has its solver's colour, others lie around it."""
 
-    def shaded(own: Mark, k: int, count: int) -> Mark:
-        return own._replace(color=shade(own.color, 1.1 * k / count - 0.45) if count > 1 else own.color)
+    def shaded(own: Mark, k: int) -> Mark:
+        step = 0.22 * ((k + 1) // 2) * (1.0 if k % 2 else -1.0)
+        return own._replace(color=shade(own.color, max(-0.7, min(step, 0.7))) if k else own.color)
 
     return _varied(labelled, shaded)
 
 
-def _varied(labelled: Iterable[tuple[str, str]], vary: Callable[[Mark, int, int], Mark]) -> dict[str, Mark]:
+def _varied(labelled: Iterable[tuple[str, str]], vary: Callable[[Mark, int], Mark]) -> dict[str, Mark]:
     pairs = sorted(set(labelled))
     own, found = marks(solver for _, solver in pairs), dict[str, Mark]()
     for solver, mark in own.items():
         labels = [label for label, its in pairs if its == solver]
-        found |= {label: vary(mark, k, len(labels)) for k, label in enumerate(labels)}
+        found |= {label: vary(mark, k) for k, label in enumerate(labels)}
     return found
 
 

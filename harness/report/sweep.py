@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,10 +40,12 @@ def draw_sweep(
     say: Callable[[str], None],
     *,
     at_once: int = 1,
+    older: Collection[str] = (),
 ) -> None:
     """Pictures of runs, and what compares runs, where it is missing or older than a recording that it shows.
 
-    table: the rows of all of them; say: prints a remark; at_once: how many processes draw.
+    table: the rows of all of them; say: prints a remark; at_once: how many processes draw; older: the ids of the runs
+    that other code than today's did.
     """
     write_bibtex(folder / "references.bib", table["reference"].to_pylist())
     drawn = [p for p in pictured if p.run.record and p.recording.exists()]
@@ -70,7 +72,7 @@ def draw_sweep(
         if group[0].run.pictures and not missing and _stale(picture, recordings.values()):
             draw_comparison({key: read_replay(path) for key, path in recordings.items()}, picture)
     if any(p.run.pictures for p in pictured):
-        draw_timing(table, folder / "pictures" / "timing.png", name)
+        draw_timing(table, folder / "pictures" / "timing.png", name, older)
 
 
 def _drawn(wanting: Sequence[Pictured], at_once: int) -> Iterator[str]:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
 from harness.report.labels import LINE, End, direct_labels
 from harness.report.page import axes, count, header, new_page, quantity, save, shorten, text, ticks
 from harness.report.style import DASH_DOTTED, DASHED, DOTTED, HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark, marks
+from harness.report.timing_rows import draw_rows
 from harness.report.timing_table import RunTimes, labels, runs
 
 _LEFT, _TOP, _RIGHT, _BOTTOM = 40, 118, WIDTH - 40, HEIGHT - 30
@@ -35,10 +36,12 @@ def timing(rows: pa.Table, folder: Path) -> list[Path]:
     return [path]
 
 
-def draw_timing(table: pa.Table, path: Path, title: str) -> None:
-    """Draw the times of a sweep's runs to `path`, WIDTH x HEIGHT pixels, PNG.
+def draw_timing(table: pa.Table, path: Path, title: str, older: Collection[str] = ()) -> None:
+    """Draw the times of a sweep's runs to `path`, WIDTH pixels wide and HEIGHT at most, PNG.
 
-    table: rows (schema: `harness.base.columns.SCHEMA`). Runs that failed are crosses at the upper edge, and words.
+    table: rows (schema: `harness.base.columns.SCHEMA`); older: the ids of the runs that other code than today's did,
+    whose marks are hollow. Runs that failed are crosses at the upper edge, and words; a scene of one size has a row for
+    each solver instead of a point in an empty frame.
     """
     found = runs(table)
     names = labels(found)
@@ -47,16 +50,20 @@ def draw_timing(table: pa.Table, path: Path, title: str) -> None:
     failed = [run for run in found if run.status != "ok"]
     with matplotlib.rc_context(RC):
         page = new_page()
-        header(page, title, _facts(table), letters=84)
+        hollow = ["hollow: by other code than today's"] if any(run.run_id in older for run in found) else []
+        header(page, title, [*_facts(table), *hollow], letters=84)
         bottom = _BOTTOM - LINE * min(len(failed), _NOTES + 1)
         columns = min(len(scenes), _COLUMNS) or 1
         width, height = (_RIGHT - _LEFT) / columns, (bottom - _TOP) / (ceil(len(scenes) / columns) or 1)
+        used = float(HEIGHT) if failed or not scenes else 0.0
         for k, scene in enumerate(scenes):
             row, column = divmod(k, columns)
             box = (_LEFT + column * width, _TOP + row * height, width - 20, height - 12)
-            _scene(page, scene, found, names, looks, box)
+            one = len({run.vertices for run in found if run.scene == scene and run.vertices}) == 1
+            drawn = (draw_rows if one else _scene)(page, scene, found, names, looks, box, older)
+            used = max(used, drawn)
         _notes(page, failed, names, bottom)
-        save(page, path)
+        save(page, path, used=min(used, HEIGHT))
 
 
 def _facts(table: pa.Table) -> list[str]:
@@ -76,9 +83,10 @@ def _scene(
     names: Mapping[str, str],
     looks: Mapping[str, Mark],
     box: tuple[float, float, float, float],
-) -> None:
+    older: Collection[str],
+) -> float:
     """The two panels of one scene within a box (left, top, width, height) in pixels; all scenes have the same
-    scales of time."""
+    scales of time. Returns how far down they reach."""
     left, top, width, height = box
     text(page, left, top + 14, shorten(scene, int(width / 10)), size=12.5, weight="bold")
     room = height - 56 - 64 - 44  # less the headings and the ticks of both panels
@@ -104,12 +112,13 @@ def _scene(
     ends: list[End] = []
     for (name, members), dash in zip(series.items(), _variants(series, looks), strict=True):
         look = looks[members[0].solver]
-        ends += _draw_steps(step, name, members, look, dash)
+        ends += _draw_steps(step, name, members, look, dash, older)
         _draw_prepare(prepare, members, look)
     direct_labels(step, ends)
     _crosses(step, failed, looks)
     if not series:
         step.text(0.5, 0.5, "no run succeeded", transform=step.transAxes, ha="center", color=MUTED)
+    return float(HEIGHT)
 
 
 def _variants(series: Mapping[str, Sequence[RunTimes]], looks: Mapping[str, Mark]) -> list[Any]:
@@ -164,7 +173,9 @@ def _apart(ax: Axes, sizes: Sequence[int]) -> list[int]:
     return kept
 
 
-def _draw_steps(ax: Axes, name: str, members: Sequence[RunTimes], look: Mark, dash: Any) -> list[End]:
+def _draw_steps(
+    ax: Axes, name: str, members: Sequence[RunTimes], look: Mark, dash: Any, older: Collection[str]
+) -> list[End]:
     """One line with its quartile band; returns where its direct label belongs, with its words and colour."""
     timed = sorted((run for run in members if run.step), key=lambda run: run.vertices or 0)
     if not timed:
@@ -175,6 +186,8 @@ def _draw_steps(ax: Axes, name: str, members: Sequence[RunTimes], look: Mark, da
     ax.fill_between(n, low, high, color=look.color, alpha=0.16, linewidth=0)
     ax.vlines(n, low, high, color=look.color, alpha=0.5, linewidth=1.2)
     ax.plot(n, middle, color=look.color, linestyle=dash, linewidth=1.8, marker=look.marker, markersize=6, mec=PAGE)
+    hollow = [run.run_id in older for run in timed]
+    ax.plot(n[hollow], middle[hollow], look.marker, mfc=PAGE, mec=look.color, mew=1.5, markersize=6, zorder=4)
     solver, comma, settings = name.partition(", ")
     words = shorten(shorten(solver, 20) + comma + settings, _LETTERS)
     if len(set(n)) > 1:

@@ -81,7 +81,7 @@ def test_doubtful_references_and_failures_are_told_on_the_picture(drawn) -> None
     (doubtful,) = (page for name, page in pages.items() if "violent" in name)
     said = written(doubtful)
     assert "reference not certified" in said
-    assert "× lbfgs, from the current positions, time-limit: the limit of 5 s was reached" in said
+    assert "× ended early (time-limit): lbfgs" in said
     assert "unsupported" in said
     crosses = [line for ax in doubtful.axes for line in ax.lines if line.get_marker() == "x"]
     assert {line.get_color() for line in crosses} == {marks([])["lbfgs"].color}
@@ -91,7 +91,7 @@ def test_doubtful_references_and_failures_are_told_on_the_picture(drawn) -> None
 
 def test_another_minimum_is_labelled_with_its_branch(drawn) -> None:
     (other,) = (page for name, page in drawn[1].items() if "net-12-early" in name)
-    assert "newton, from the inertial target, ended in minimum 1" in written(other)
+    assert "in minimum 1, higher than the lowest known; vertex errors refer to it: newton" in written(other)
     assert sum(text.get_text() == "minimum 1" for ax in other.axes for text in ax.texts) == 4, "in each panel of gaps"
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,17 +19,18 @@ from harness.base.errors import RunFailed
 from harness.record.base import Replay
 from harness.record.shading import STRAIN_COLOURS
 from harness.report import comparison, opengl, page, run_picture
-from harness.report.comparison import draw_comparison
+from harness.report.comparison import draw_comparison, reference
 from harness.report.render import (
     Studio,
     area_vectors,
     drawable_frames,
     frame_all,
     natural_angles,
+    shown_limit,
     spring_strain,
     vertex_strain,
 )
-from harness.report.run_picture import draw_run
+from harness.report.run_picture import Box, draw_run, layout
 from harness.report.style import HEIGHT, PAGE, WIDTH
 
 needs_opengl = pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
@@ -100,17 +103,55 @@ def words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return written
 
 
+@pytest.fixture
+def boxes(monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[Box, list[Box]]]:
+    """Where the frames of the last run were drawn."""
+    found: list[tuple[Box, list[Box]]] = []
+
+    def kept(*given: Any) -> tuple[Box, list[Box]]:
+        found.append(layout(*given))
+        return found[-1]
+
+    monkeypatch.setattr(run_picture, "layout", kept)
+    return lambda: found[-1]
+
+
+@pytest.mark.parametrize("shape", [0.2, 1.0, 1.3, 4.0])
+def test_frames_of_any_shape_fill_the_page_and_do_not_meet(shape: float) -> None:
+    main, tiles = layout(shape, shape, 5)
+    boxes = [main, *tiles]
+    assert all(box.left >= 0 and box.left + box.width <= WIDTH and box.top + box.height <= HEIGHT for box in boxes)
+    for a, b in combinations(boxes, 2):
+        assert a.left + a.width <= b.left or b.left + b.width <= a.left or a.top + a.height <= b.top
+    # What is seen of a scene: the largest rectangle of its shape that fits into its place. Of the page's height and
+    # the width of one column beside it, squares had a fourth, and what lies flat less.
+    seen = sum(min(box.width, box.height * shape) * min(box.height, box.width / shape) for box in boxes)
+    assert seen > 0.38 * 1528 * 750
+
+
+def test_the_scale_is_that_of_the_strains_that_are_seen() -> None:
+    # All springs at 5 % but one at 40 %: a scale to 40 % would show one grey cloth.
+    one = cloth(12, frames=1)
+    stretched = one.positions.copy()
+    stretched[0, 0] += np.array([-0.4 / 11, 0.0, 0.0], np.float32)
+    assert shown_limit([replace(one, positions=stretched)], [0]) == pytest.approx(0.4, abs=0.35)
+    assert shown_limit([one], [0]) == pytest.approx(0.05)
+    assert shown_limit([cloth(stretch=1.39, frames=1)], [0]) == pytest.approx(0.4)
+
+
 @needs_opengl
 @pytest.mark.parametrize("make", [cloth, lambda: cloth(triangles=False), chain], ids=["cloth", "net", "chain"])
-def test_a_run_is_drawn_large_and_in_a_strip_of_five(make: Callable[[], Replay], tmp_path: Path) -> None:
+def test_a_run_is_drawn_large_and_five_frames_before_it(
+    make: Callable[[], Replay], boxes: Callable[[], tuple[Box, list[Box]]], tmp_path: Path
+) -> None:
     draw_run(make(), tmp_path / "run.png")
     image = pixels(tmp_path / "run.png")
     assert image.shape == (HEIGHT, WIDTH, 3)
     # A chain covers the fewest pixels: a rod of about 10 x 400 of 1244 x 750.
-    assert drawn(image, *run_picture._MAIN) > 0.002
-    tile = run_picture._MAIN[3] // 5
-    for row in range(5):
-        assert drawn(image, run_picture._STRIP_LEFT, run_picture._MAIN[1] + row * tile, 244, tile - 30) > 0.0005
+    main, tiles = boxes()
+    assert drawn(image, *main) > 0.002
+    for tile in tiles:
+        assert drawn(image, *tile) > 0.0005
     assert [file.name for file in tmp_path.iterdir()] == ["run.png"], "no partial file is left"
 
 
@@ -118,7 +159,7 @@ def test_a_run_is_drawn_large_and_in_a_strip_of_five(make: Callable[[], Replay],
 def test_the_title_names_scene_size_solver_counts_and_cost(words: list[str], tmp_path: Path) -> None:
     draw_run(cloth(), tmp_path / "run.png")
     text = "\n".join(words)
-    for said in ("cloth, size 6", "sparse", "36 vertices, 60 springs", "1.25 ms a step", "+10 %", "−10 %", "pinned"):
+    for said in ("cloth, size 6", "sparse", "36 vertices, 60 springs", "1.25 ms a step", "+5 %", "−5 %", "pinned"):
         assert said in text
 
 
@@ -230,10 +271,12 @@ def test_frames_are_drawn_up_to_the_first_that_is_not_finite(value: float) -> No
 
 
 @needs_opengl
-def test_positions_that_are_not_finite_are_told_in_words(words: list[str], tmp_path: Path) -> None:
+def test_positions_that_are_not_finite_are_told_in_words(
+    words: list[str], boxes: Callable[[], tuple[Box, list[Box]]], tmp_path: Path
+) -> None:
     draw_run(broken(cloth(), 5), tmp_path / "run.png")
     assert "not finite from frame 10 on" in "\n".join(words)
-    assert drawn(pixels(tmp_path / "run.png"), *run_picture._MAIN) > 0.01, "the last finite frame is drawn"
+    assert drawn(pixels(tmp_path / "run.png"), *boxes()[0]) > 0.01, "the last finite frame is drawn"
 
 
 @needs_opengl
@@ -250,13 +293,24 @@ def test_a_comparison_shows_solvers_side_by_side_with_their_distance(words: list
     second = replace(first, positions=moved, properties={**first.properties, "solver": "dense"})
     third = replace(broken(first, 4), properties={**first.properties, "solver": "xpbd"})
     draw_comparison({"a": first, "b": second, "c": third}, tmp_path / "side.png")
-    for said in ("cloth, size 6", "sparse", "dense", "xpbd", "first", "1.0e-06", "not finite\nfrom frame 8 on"):
+    for said in ("cloth, size 6", "sparse", "dense", "xpbd", "reference", "1.0e-06", "not finite\nfrom frame 8 on"):
         assert said in words
     assert "0.5" in words, "0.1 m are half a rest length of 0.2 m"
     image = pixels(tmp_path / "side.png")
-    assert image.shape == (HEIGHT, WIDTH, 3)
-    assert drawn(image, 40, 118, 480, 600) > 0.01
-    assert drawn(image, 540, 118, 480, 600) > 0.01
+    assert image.shape[1:] == (WIDTH, 3)
+    assert drawn(image, 40, 118, 480, image.shape[0] - 118) > 0.01
+    assert drawn(image, 540, 118, 480, image.shape[0] - 118) > 0.01
+    assert drawn(image, 0, image.shape[0] - 60, WIDTH, 60) > 0.0, "nothing is left empty below"
+
+
+def test_distances_are_taken_from_the_lowest_residual_that_ends_finite() -> None:
+    def ending(residual: float) -> Replay:
+        return replace(cloth(), scalars={"/residual": (np.array([1]), np.array([residual]))})
+
+    assert reference([ending(1e-2), ending(1e-9), ending(1e-6)]) == 1
+    assert reference([ending(1e-2), broken(ending(1e-9), 3)]) == 0
+    assert reference([replace(cloth(), scalars={}), ending(1e-2)]) == 1
+    assert reference([ending(np.nan), ending(1e-2)]) == 1
 
 
 @needs_opengl

@@ -156,10 +156,11 @@ def test_labels_name_only_the_settings_in_which_a_solvers_runs_differ() -> None:
         pytest.param(SCHEMA.empty_table(), id="no rows"),
     ],
 )
-def test_every_table_gives_a_plot_of_the_page_s_size(table: pa.Table, tmp_path: Path) -> None:
+def test_every_table_gives_a_plot_of_the_page_s_width(table: pa.Table, tmp_path: Path) -> None:
     draw_timing(table, tmp_path / "time.png", "A title that is too long for the page " * 5)
     with Image.open(tmp_path / "time.png") as image:
-        assert image.size == (WIDTH, HEIGHT)
+        assert image.width == WIDTH
+        assert 200 < image.height <= HEIGHT
         assert np.asarray(image.convert("L")).std() > 3, "an empty page has no variance"
     assert [file.name for file in tmp_path.iterdir()] == ["time.png"], "no partial file is left"
 

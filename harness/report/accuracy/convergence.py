@@ -67,6 +67,24 @@ def draw_convergence(table: Measurements, folder: Path) -> list[Path]:
     return drawn
 
 
+def _grouped(curves: Sequence[Curve]) -> list[str]:
+    """The same in few sentences: one for each way to end early and each minimum, with all whom it befell."""
+    ends: dict[str, list[str]] = {}
+    for curve in curves:
+        cause = f"{curve.status}: {curve.reason}" if curve.status in ("failed", "unsupported") else curve.status
+        if curve.status != "ok":
+            ends.setdefault(f"× ended early ({cause})", []).append(_who(curve, curves))
+        if curve.branch:
+            words = f"in minimum {curve.branch}, higher than the lowest known; vertex errors refer to it"
+            ends.setdefault(words, []).append(_who(curve, curves))
+    return [f"{words}: {', '.join(dict.fromkeys(who))}" for words, who in ends.items()]
+
+
+def _who(curve: Curve, curves: Sequence[Curve]) -> str:
+    several = len({one.first_guess for one in curves}) > 1
+    return f"{curve.label} ({GUESSES.get(curve.first_guess, curve.first_guess)})" if several else curve.label
+
+
 def remarks(curves: Sequence[Curve]) -> list[str]:
     """What did not go well, in words: a sentence for each failure and each other minimum."""
     words: list[str] = []
@@ -90,7 +108,7 @@ def _draw(stem: Path, problem: Problem, curves: list[Curve], marked: dict[str, M
         "median and quartiles of all rounds",
         *machine,
     ]
-    words = ([f"Reference not certified: {problem.doubt}"] if problem.doubt else []) + remarks(curves)
+    words = ([f"Reference not certified: {problem.doubt}"] if problem.doubt else []) + _grouped(curves)
     guesses = [guess for guess in GUESSES if any(curve.first_guess == guess for curve in curves)]
     timed = [curve.seconds[:, 1:].ravel() for curve in curves]
     first, last = limits(np.concatenate([*timed, [np.nan]]))

@@ -145,7 +145,7 @@ def _steps(ax: Axes, found: Mapping[str, Values], marked: Mapping[str, Mark]) ->
     for label, values in found.items():
         if np.isfinite(values).any():
             x = np.unique([low, *values[np.isfinite(values)], high])
-            line(ax, x, share(values, x), marked[label], drawstyle="steps-post")
+            line(ax, x, share(values, x), marked[label], drawstyle="steps-post", markevery=0.3)
     log_axis(ax.xaxis, low, high, unit="plain")
     ax.set_ylim(-0.02, 1.03)
     ax.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")

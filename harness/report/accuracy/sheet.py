@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import matplotlib
@@ -27,7 +28,7 @@ from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark
 LEFT, TOP, RIGHT, BOTTOM = 40, 118, 1384, HEIGHT - 34
 """Where panels may be, in pixels; right of it stands the legend."""
 
-_LINE, _NOTES = 17, 4
+_LINE, _NOTES, _LETTERS, _WIDE = 17, 5, 21, 220
 
 
 @contextmanager
@@ -52,7 +53,7 @@ def files(stem: Path) -> list[Path]:
 def line(ax: Axes, x: ArrayLike, y: ArrayLike, look: Mark, *, spaced: bool = True, **more: Any) -> None:
     """A solver's line; `spaced` markers keep a distance, as iterates lie dense."""
     more = {"linewidth": 1.5, "markersize": 5 * size(look)} | more
-    more |= {"markevery": 0.12} if spaced and np.size(x) > 3 else {}
+    more = ({"markevery": 0.12} if spaced and np.size(x) > 3 else {}) | more
     ax.plot(x, y, color=look.color, linestyle=look.dash, marker=look.marker, mec=PAGE, mew=0.5, **more)
 
 
@@ -73,12 +74,12 @@ def legend(page: Figure, entries: Mapping[str, Mark], *, below: Sequence[tuple[L
             lw=1.6,
             ms=7 * size(m),
             mec=PAGE,
-            label=shorten(name, 30),
+            label="\n".join(wrap(name, _LETTERS)),
         )
         for name, m in entries.items()
     ]
     for handle, meaning in below:
-        handle.set_label(meaning)
+        handle.set_label("\n".join(wrap(meaning, _LETTERS)))
         handles.append(handle)
     place = ((RIGHT + 10) / WIDTH, 1 - (TOP + 14) / HEIGHT)
     page.legend(
@@ -89,15 +90,23 @@ def legend(page: Figure, entries: Mapping[str, Mark], *, below: Sequence[tuple[L
 
 def notes(page: Figure, words: Sequence[str]) -> None:
     """What failed or is doubtful, in words at the foot: as many lines as fit, and how many more there are."""
-    shown = list(words) if len(words) <= _NOTES else [*words[: _NOTES - 1], f"and {len(words) - _NOTES + 1} more"]
+    shown = _lines(words)
     for k, sentence in enumerate(shown):
         y = HEIGHT - 16 - _LINE * (len(shown) - 1 - k)
-        text(page, LEFT, y, shorten(sentence, 230), size=9, color=MUTED)
+        text(page, LEFT, y, sentence, size=9, color=MUTED)
 
 
 def foot(words: Sequence[str]) -> float:
     """The height [pixels] above which panels and their axes' labels must stay for these notes."""
-    return BOTTOM - _LINE * min(len(words), _NOTES)
+    return BOTTOM - _LINE * len(_lines(words))
+
+
+def _lines(words: Sequence[str]) -> list[str]:
+    """The sentences in lines of the page's width, the first of them in two where there is room."""
+    lines = [line for sentence in words for line in wrap(sentence, _WIDE, max_lines=2, placeholder=" …")]
+    if len(lines) > _NOTES:
+        lines = [shorten(sentence, _WIDE) for sentence in words]
+    return lines if len(lines) <= _NOTES else [*lines[: _NOTES - 1], f"and {len(lines) - _NOTES + 1} more"]
 
 
 def panel(page: Figure, left: float, top: float, width: float, height: float, title: str = "") -> Axes:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import inf
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
+from numpy.typing import NDArray
 
 from harness.report.accuracy.convergence import GUESSES
 from harness.report.accuracy.measured import Curve, Measurements, Problem
@@ -50,6 +51,34 @@ def draw_times(table: Measurements, folder: Path) -> list[Path]:
     return drawn
 
 
+_ALIKE = 2.0
+"""A factor between times below which two panels would look the same."""
+
+
+def differing(series: Mapping[str, Mapping[str, Sequence[Curve]]]) -> tuple[dict[int | None, str], str]:
+    """The columns in which some time differs from the one shown before it, and a sentence about the others.
+
+    series: curves by first guess, then by label.
+    """
+    groups = [curves for group in series.values() for curves in group.values()]
+
+    def found(steps: int | None) -> NDArray[np.float64]:
+        return np.array([middle(curves, target, steps) for curves in groups for target in TARGETS])
+
+    # From many steps to few: set-up adds least where it is spread over most.
+    kept, last, alike = [None], found(None), list[int]()
+    for steps in sorted(STEPS, reverse=True):
+        times = found(steps)
+        both = np.isfinite(times) & np.isfinite(last) & (last > 0.0)
+        if (times[both] > _ALIKE * last[both]).any():
+            kept, last = [*kept, steps], times
+        else:
+            alike.append(steps)
+    listed = ", ".join(count(steps) for steps in sorted(alike))
+    same = f"Not shown, as no time doubles: set-up over {listed} step{'s' if alike != [1] else ''}" if alike else ""
+    return {steps: _COLUMNS[steps] for steps in kept}, same
+
+
 def middle(curves: Sequence[Curve], target: float, steps: int | None = None) -> float:
     """The median over a solver's problems that can be judged [s]; infinite where half of them are not solved."""
     times = [seconds_to(curve, target, steps) for curve in curves if askable(curve.problem, target)]
@@ -80,13 +109,15 @@ def _draw(
     times = [middle(c, t, n) for group in series.values() for c in group.values() for t in TARGETS for n in _COLUMNS]
     low, high = limits([*times, *(curve.warm for curve in curves)])
     facts = [f"{count(problems[0].vertices)} vertices", over, "gap of the energy", *machine]
+    shown, same = differing(series)
+    words += [same] if same else []
     with sheet(stem, f"Time to accuracy: {mesh}", facts) as page:
-        width, gap = (RIGHT - LEFT - 62) / len(_COLUMNS) - 16, 84
+        width, gap = (RIGHT - LEFT - 62) / len(shown) - 16, 84
         height = (foot(words) - TOP - len(guesses) * gap) / max(len(guesses), 1)
         for row, guess in enumerate(guesses):
             top = TOP + 42 + row * (height + gap)
             text(page, LEFT + 62, top - 32, GUESSES[guess], size=11, weight="bold")
-            for column, (steps, name) in enumerate(_COLUMNS.items()):
+            for column, (steps, name) in enumerate(shown.items()):
                 ax = panel(page, LEFT + 62 + column * (width + 16), top, width, height, name)
                 _panel(ax, series[guess], marked, steps, (low, high * (high / low) ** 0.12))
                 if column:

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, LogLocator, MultipleLocator, NullLocator
 
 from harness.report.page import axes, count, header, new_page, quantity, save, shorten, ticks
-from harness.report.style import HEIGHT, PAGE, RC, WIDTH, shades
+from harness.report.style import HEIGHT, PAGE, RC, WIDTH, looks
 
 _LEFT, _TOP, _NAMES, _BELOW = 110, 130, 400, 70
 
@@ -33,25 +33,25 @@ class Series(NamedTuple):
 def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[Series], *, share: bool) -> None:
     """Draw to `path`, WIDTH x HEIGHT pixels, PNG; `share`: values are parts of a whole, drawn in percent.
 
-    Candidates have the colour and the marker of their solver, in shades where there are several of one; with more
-    threads than one they are dashed. A series without values is not drawn; it keeps its shade free, so that pictures
-    of the same candidates have the same colours.
+    Candidates have the colour and the marker of their solver, and a line style of their own; with more threads than one
+    they are thinner. A series without values is not drawn; it keeps its line style free, so that pictures of the same
+    candidates look alike.
     """
     drawn = [line for line in series if line.values]
-    looks = shades((line.alone, line.solver) for line in series)
+    marked = looks((line.alone, line.solver) for line in series)
     with matplotlib.rc_context(RC):
         page = new_page()
         header(page, title, facts, letters=84)
         ax = axes(page, _LEFT, _TOP, WIDTH - _LEFT - _NAMES, HEIGHT - _TOP - _BELOW)
         handles: list[tuple[float, Line2D]] = []
         for line in drawn:
-            look = looks[line.alone]
+            look = marked[line.alone]
             (handle,) = ax.plot(
                 line.vertices,
                 line.values,
                 color=look.color,
-                linestyle="-" if line.name == line.alone else (0, (4, 2)),
-                linewidth=1.8,
+                linestyle=look.dash,
+                linewidth=2.0 if line.name == line.alone else 0.9,
                 marker=look.marker,
                 markersize=6,
                 markeredgecolor=PAGE,

@@ -93,9 +93,9 @@ class Contribution:
 class Effect(Protocol):
     """A pydantic model with a literal `kind`.
 
-    Its class may state `damps`, a class variable, True where it takes energy out of any motion; `usual`, True where
-    nearly every scene has it; and `called_for(seen: Seen) -> str`, a class method: by what evidence the motion of a
-    scene that does not list it asks for it, "" where it does not.
+    Its class may state `damps`, a class variable, True where it takes energy out of any motion; and
+    `called_for(seen: Seen) -> str`, a class method: by what evidence the motion of a scene that does not list it asks
+    for it, "" where it does not.
     """
 
     @property

@@ -1,6 +1,6 @@
 """Gravity: f_i = m_i g."""
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,6 @@ from harness.scenes.mesh.base import Mesh
 
 class Gravity(Model):
     """Weight on every vertex: its mass times one acceleration."""
-
-    usual: ClassVar[bool] = True
 
     kind: Literal["gravity"] = "gravity"
     acceleration: Vector = (0.0, -9.81, 0.0)

@@ -1,0 +1,143 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
+"""Names at the ends of curves, right of the frame, where they fit: a legend that needs no looking up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.text import Annotation, Text
+
+from harness.report.figures.asked import Asked
+from harness.report.figures.panel import Panel, Plot, Series
+
+_MOST, _SHARE = 9, 0.3
+"""Names of a frame, and the part of the width that they may take."""
+_BESIDE = 7.0
+"""Points from the frame to the names."""
+
+
+def label_directly(axes: Sequence[Axes], panels: Sequence[Panel], asked: Asked) -> bool:
+    """Whether the curves could be named at their ends, or the points beside them, so that no legend is needed."""
+    panel = panels[0]
+    if len(panels) > 1 or not isinstance(panel, Plot):
+        return False
+    if panel.y.kind == "names":
+        return True
+    known = [series for series in panel.series if len(_end(series))]
+    letters = max((len(series.label) for series in known), default=0)
+    wide = 0.6 * asked.small * letters + _BESIDE
+    tall = asked.width / 25.4 * 72.0 * panel.aspect * 0.8
+    named = any(series.named for series in panel.series)
+    fits = len(known) * 1.3 * asked.small <= tall and wide <= _SHARE * asked.width / 25.4 * 72.0
+    if named and not fits:
+        _name_points(axes[0], panel.series, asked)
+        return True
+    if not fits or not known or (not named and (panel.bands or len(known) > _MOST)):
+        return False
+    _Names(axes[0], known, asked)
+    return True
+
+
+def _end(series: Series) -> list[float]:
+    known = np.isfinite(series.x) & np.isfinite(series.y)
+    return [float(series.x[known][-1]), float(series.y[known][-1])] if known.any() else []
+
+
+class _Names:
+    """The names of one frame: made before the layout, so that it leaves them room; put in place after it."""
+
+    def __init__(self, ax: Axes, known: Sequence[Series], asked: Asked) -> None:
+        self._ax, self._gap = ax, 1.25 * asked.small
+        self._ends = [_end(series) for series in known]
+        self._names: list[Text] = []
+        for series, (x, y) in zip(known, self._ends, strict=True):
+            line = {"arrowstyle": "-", "color": series.look.color, "alpha": 0.5, "linewidth": 0.5, "shrinkA": 0}
+            name = ax.annotate(
+                series.label, (x, y), (1.0, 0.5), textcoords="axes fraction", va="center", fontsize=asked.small,
+                color=_dark(series.look.color), arrowprops=line | {"shrinkB": 2.5, "relpos": (0.0, 0.5)},
+                annotation_clip=False,
+            )  # fmt: skip
+            name.set_position((1.0 + _BESIDE / (ax.bbox.width / ax.figure.dpi * 72.0), 0.5))  # type: ignore[union-attr]
+            self._names.append(name)
+        setattr(self._names[0], "settle", self.settle)  # noqa: B010  what only the layout knows is done after it
+
+    def settle(self) -> None:
+        """Move the names to the heights of their ends, and apart."""
+        ax = self._ax
+        points = ax.bbox.height / ax.figure.dpi * 72.0  # type: ignore[union-attr]
+        wanted = [ax.transAxes.inverted().transform(ax.transData.transform(end))[1] * points for end in self._ends]
+        order = np.argsort(wanted)
+        at = apart([wanted[k] for k in order], self._gap, points)
+        beside = 1.0 + _BESIDE / (ax.bbox.width / ax.figure.dpi * 72.0)  # type: ignore[union-attr]
+        for k, height in zip(order, at, strict=True):
+            self._names[k].set_position((beside, height / points))
+
+
+def apart(wanted: Sequence[float], gap: float, top: float) -> list[float]:
+    """The sorted heights, at least `gap` apart and from 0 to `top` where there is room: moved as little as it takes."""
+    at = list(wanted)
+    for _ in range(60):
+        for k in range(1, len(at)):
+            short = gap - (at[k] - at[k - 1])
+            if short > 0.0:
+                at[k - 1], at[k] = at[k - 1] - short / 2.0, at[k] + short / 2.0
+    shift = max(0.0, -at[0]) - max(0.0, at[-1] - top)
+    at = [height + shift for height in at]
+    for k in range(1, len(at)):
+        at[k] = max(at[k], at[k - 1] + gap)
+    return at
+
+
+def _dark(color: str) -> str:
+    """A colour in which small type can be read on white."""
+    from matplotlib.colors import to_rgb
+
+    from harness.report.style import shade
+
+    while sum(w * part for w, part in zip((0.3, 0.6, 0.1), to_rgb(color), strict=True)) > 0.5:
+        color = shade(color, -0.12)
+    return color
+
+
+def _name_points(ax: Axes, series: Sequence[Series], asked: Asked) -> None:
+    """The names of single points, each on that side of its point where it meets no other name and no other point."""
+    for one in series:
+        for x, y in zip(one.x, one.y, strict=True):
+            name = ax.annotate(
+                one.label, (x, y), (5, 0), textcoords="offset points", va="center", fontsize=asked.small,
+                annotation_clip=False,
+            )  # fmt: skip
+            setattr(name, "settle", lambda name=name: _place(ax, name))  # noqa: B010
+
+
+_SIDES: tuple[tuple[float, float, Any], ...] = tuple(
+    (dx * far, dy * far, ha)
+    for far in (1.0, 2.0, 3.0)
+    for dx, dy, ha in (
+        (5, 0, "left"),
+        (-5, 0, "right"),
+        (4, 6, "left"),
+        (4, -6, "left"),
+        (-4, 6, "right"),
+        (-4, -6, "right"),
+    )
+)
+
+
+def _place(ax: Axes, name: Annotation) -> None:
+    """The first side on which a name is within the frame and meets none that was placed before it."""
+    before = [other for other in ax.texts[: ax.texts.index(name)] if isinstance(other, Annotation)]
+    taken = [other.get_window_extent() for other in before]
+    points = [ax.transData.transform(line.get_xydata()) for line in ax.lines if line.get_marker() not in ("None", "")]
+    marks = np.concatenate([np.zeros((0, 2)), *points])
+    for dx, dy, ha in _SIDES:
+        name.set_position((dx, dy))
+        name.set_horizontalalignment(ha)
+        box = name.get_window_extent()
+        met = any(box.overlaps(other) for other in taken) or any(box.contains(x, y) for x, y in marks)
+        if not met and box.x0 >= ax.bbox.x0 and box.x1 <= ax.bbox.x1 and box.y0 >= ax.bbox.y0 and box.y1 <= ax.bbox.y1:
+            return

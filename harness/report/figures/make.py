@@ -1,0 +1,53 @@
+"""A figure made: its panels chosen, put together, checked and written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from harness.base.errors import InputError, Mistake
+from harness.report.figures import entry, writing
+from harness.report.figures.asked import Asked
+from harness.report.figures.canvas import compose
+from harness.report.figures.faults import faults
+from harness.report.figures.kinds import Kind
+from harness.report.figures.of_runs import Older
+
+_TOLD = 3
+"""Faults that a message lists."""
+
+
+class Made(NamedTuple):
+    """A figure that was written. others: how many panels more there are, and the name of one of them."""
+
+    paths: list[Path]
+    panels: list[str]
+    millimetres: tuple[float, float]
+    others: int
+    example: str
+
+
+def make(name: str, kind: Kind, results: Path, older: Older, folder: Path, asked: Asked) -> Made:
+    """Write the figure of a kind to files in `folder`, of the results in another one.
+
+    older: see `Kind.panels`. Raises InputError where the results hold nothing of the kind, where no panel has the names
+    that were asked for, and where the type does not fit into the width.
+    """
+    entries = kind.panels(results, older)
+    if not entries:
+        raise InputError(Mistake(f"holds nothing to draw as {name}; wanted {kind.wanted}", results))
+    picked = entry.chosen(entries, asked.selectors or kind.usual)
+    panels = kind.draw(picked)
+    figure = compose(panels, kind.title, asked)
+    wrong = faults(figure)
+    if wrong:
+        more = f" and {len(wrong) - _TOLD} more" if len(wrong) > _TOLD else ""
+        why = f"came {asked.width:g} mm for type of {asked.size:g} points, in which {'; '.join(wrong[:_TOLD])}{more}"
+        raise InputError(Mistake(f"{why}; wanted a wider figure, smaller type or fewer panels", key="--width"))
+    parts = [part for selector in asked.selectors for part in selector]
+    stem = folder / "-".join(dict.fromkeys([name, *parts]))
+    paths = writing.write(figure, panels, stem, kind.title, asked)
+    rest = [one for one in entries if one not in picked]
+    example = ":".join(rest[0].parts) if rest else ""
+    shown = [":".join(one.parts) for one in picked]
+    return Made(paths, shown, writing.millimetres(figure), len(rest), example)

@@ -1,0 +1,68 @@
+"""The panels of judged runs: each solver's shares, and the map of hard cases, a grid for each family of them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from harness.report.figures.entry import Entry, ready
+from harness.report.figures.of_runs import OLDER, Older, measured_on, sweep_rows
+from harness.report.figures.panel import Cell, Grid, Panel, Plot, Scale, Series
+from harness.report.robustness import OUTCOMES, RIGHT, read_cells, scores
+from harness.report.robustness import Cell as Judged
+from harness.report.style import Mark, marks
+
+_DOTTED = "Dot: measured by other code than today's."
+
+
+def hard(folder: Path, older: Older) -> list[Entry]:
+    """Shares of the cases that each solver gets right, and of those it survives; then a map for each family."""
+    table = sweep_rows(folder)
+    cells, other = read_cells(folder), older(table)
+    told = measured_on(table.select(["cpu", "threads", "commit", "code"]).to_pylist())
+    panels: list[Panel] = [_shares(cells, other, told)]
+    for family in dict.fromkeys(cell.case.partition("-")[0] for cell in cells):
+        mine = [cell for cell in cells if cell.case.partition("-")[0] == family]
+        drawn = [_cell(cell, older=cell.run_id in other) for cell in mine]
+        notes = [_DOTTED] if any(cell.older for cell in drawn) else []
+        outcomes = [(outcome.words, outcome.color) for outcome in OUTCOMES]
+        panels.append(Grid(("map",), (family,), "", family, drawn, outcomes, notes, told))
+    return ready(panels)
+
+
+def _cell(cell: Judged, *, older: bool) -> Cell:
+    row = cell.case.partition("-")[2] or cell.case
+    return Cell(row, cell.solver, cell.outcome.words, cell.outcome.color, cell.figure, older)
+
+
+def together(grids: Sequence[Grid]) -> Grid:
+    """One map of several families, whose rows then name their family."""
+    if len(grids) == 1:
+        return grids[0]
+    cells = [cell._replace(row=f"{grid.title}: {cell.row}") for grid in grids for cell in grid.cells]
+    notes = list(dict.fromkeys(note for grid in grids for note in grid.notes))
+    return replace(grids[0], name=tuple(grid.name[0] for grid in grids), title="", cells=cells, notes=notes)
+
+
+def _shares(cells: Sequence[Judged], other: Collection[str], told: str) -> Plot:
+    found = sorted(scores(cells), key=lambda score: -(score.right or 0.0))
+    looks = marks(score.solver.split()[0] for score in found)
+    mixed = {cell.solver for cell in cells if cell.run_id in other}
+    series: list[Series] = []
+    for k, score in enumerate(found):
+        look, y, older = looks[score.solver.split()[0]], np.array([float(k)]), np.array([score.solver in mixed])
+        right, finite = (np.array([np.nan if s is None else s]) for s in (score.right, score.finite))
+        series.append(Series(score.solver, look, right, y, right, finite, True, older, joined=False, setting="right"))
+        ring = Mark(look.color, "|")
+        series.append(Series(score.solver, ring, finite, y, older=older, joined=False, setting="finite"))
+    notes = [f"Marks: runs that are {RIGHT.words}; lines reach to the share that stayed finite. Of runs not refused."]
+    return Plot(
+        *(("shares",), ("right",), f"{len({cell.case for cell in cells})} of them", ""),
+        *(Scale("share of the cases", "linear", "percent"), Scale("", "names", names=tuple(s.solver for s in found))),
+        series,
+        notes=[*notes, *([OLDER] if mixed else [])],
+        machine=told,
+    )

@@ -1,0 +1,144 @@
+"""Pictures of recorded meshes: one run at its last frame, or the solvers of a scene side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.base.errors import InputError, Mistake
+from harness.record.base import Replay
+from harness.report.comparison import distance_words, reference
+from harness.report.figures.entry import Entry
+from harness.report.figures.of_runs import measured_on, sweep_rows
+from harness.report.figures.panel import Picture, Renderer
+from harness.report.page import clock, count, quantity
+from harness.report.render import (
+    Studio,
+    View,
+    area_vectors,
+    drawable_frames,
+    frame_all,
+    natural_angles,
+    shape,
+    shown_limit,
+    spring_strain,
+    vertex_strain,
+)
+from harness.report.solids import seen
+from harness.report.style import Mark, marks
+from harness.report.timing_table import labels, runs
+
+_LEAST, _MOST = 0.6, 1.9
+"""Width over height of a picture."""
+
+
+def run(folder: Path) -> list[Entry]:
+    """The last frame of each run that was recorded."""
+    return _entries(folder, alone=True)
+
+
+def comparison(folder: Path) -> list[Entry]:
+    """The last frames of all solvers of a scene and size, by one camera and one scale."""
+    return _entries(folder, alone=False)
+
+
+def _entries(folder: Path, *, alone: bool) -> list[Entry]:
+    """alone: whether each run is something of its own, or one of those of its scene and size."""
+    table = sweep_rows(folder)
+    found = runs(table)
+    names, looks = labels(found), marks(run.solver for run in found)
+    told = {row["run_id"]: row for row in table.select(["run_id", "cpu", "threads", "commit", "code"]).to_pylist()}
+    entries: list[Entry] = []
+    for one in sorted(found, key=lambda run: -(run.vertices or 0)):
+        path = next(iter((folder / "recordings").glob(f"*-{one.run_id}.rrd")), None)
+        if path is not None:
+            label = names[one.run_id]
+            scene, parts = (one.scene, str(one.size)), tuple(label.split(", "))
+            of, name = ((*scene, *parts), ("mesh",)) if alone else (scene, parts)
+            made = partial(_made, of, name, path, label, looks[one.solver], measured_on([told[one.run_id]]))
+            entries.append(Entry(of, name, made))
+    if not entries:
+        raise InputError(Mistake("holds no recordings; run a sweep with `record: true`", folder))
+    return entries
+
+
+def _made(of: tuple[str, ...], name: tuple[str, ...], path: Path, label: str, look: Mark, told: str) -> Picture:
+    replay = _replay(path)
+    frames = drawable_frames(replay)
+    if not len(frames):
+        raise InputError(Mistake("holds no frame whose positions are finite; choose another run", path))
+    frame = int(frames[-1])
+    lost = f", the last that is finite, of {len(replay.frames)}" if frame + 1 < len(replay.frames) else ""
+    points = seen(replay, [frame])
+    angles = natural_angles(replay.positions[frame], area_vectors(replay, frame))
+    aspect = min(max(shape(points, angles), _LEAST), _MOST)
+    size = f"{count(replay.positions.shape[1])} vertices"
+    title = [label, size, f"at {clock(replay, frame)}{lost}"]
+    limit = shown_limit([replay], [frame])
+    return Picture(
+        *(of, name, _subject(replay), ", ".join(title), replay.positions[frame].astype(float), replay.springs),
+        *(replay.triangles, vertex_strain(replay, frame), limit, aspect),
+        render=_Render(replace(replay, strain_range=limit), frame, frame_all(points, aspect=aspect, angles=angles)),
+        facts=(f"largest strain {100 * np.abs(spring_strain(replay, frame)).max(initial=0.0):.3g} %",),
+        look=look,
+        machine=told,
+        mesh=str(path),
+    )
+
+
+@cache
+def _replay(path: Path) -> Replay:
+    from harness.record.reader import read_replay  # slow to load
+
+    return read_replay(path)
+
+
+def _subject(replay: Replay) -> str:
+    scene, size = replay.properties.get("scene", replay.title), replay.properties.get("size")
+    return f"{scene}, size {size}" if size else str(scene)
+
+
+class _Render(Renderer):
+    """Renders one frame by one camera (`panel.Renderer`)."""
+
+    def __init__(self, replay: Replay, frame: int, view: View) -> None:
+        self.replay, self.frame, self.view, self.aspect = replay, frame, view, 1.0
+
+    def __call__(self, width: int, background: str | None) -> NDArray[np.uint8]:
+        """See `panel.Renderer`."""
+        with Studio(width, max(1, round(width / self.aspect)), background=background) as studio:
+            return studio.draw(self.replay, self.frame, self.view)
+
+
+def alike(pictures: Sequence[Picture]) -> list[Picture]:
+    """Pictures of one scene by one camera, one scale of strain and one shape, with the distance from the best."""
+    renders: list[Any] = [picture.render for picture in pictures]
+    replays = [render.replay for render in renders]
+    limit = shown_limit(replays, [render.frame for render in renders])
+    points = np.concatenate([seen(r.replay, [r.frame]) for r in renders])
+    one = replays[0].positions[renders[0].frame]
+    angles = natural_angles(one, area_vectors(replays[0], renders[0].frame))
+    aspect = min(max(shape(points, angles), _LEAST), _MOST)
+    view = frame_all(points, aspect=aspect, angles=angles)
+    best = reference(replays) if len(replays) > 1 else None
+    out: list[Picture] = []
+    for picture, render in zip(pictures, renders, strict=True):
+        facts = list(picture.facts)
+        cost = render.replay.properties.get("milliseconds_per_step")
+        facts += [] if cost is None else [f"{quantity(float(cost))} ms a step"]
+        if best is not None:
+            facts.append(f"distance: {distance_words(render.replay, replays[best])}")
+        made = _Render(replace(render.replay, strain_range=limit), render.frame, view)
+        made.aspect = aspect
+        notes = [_FROM] if best is not None else []
+        out.append(replace(picture, limit=limit, aspect=aspect, render=made, facts=facts, notes=notes))
+    return out
+
+
+_FROM = "Distance: of the farthest vertex from the reference, the run of the lowest residual, in mean rest lengths."

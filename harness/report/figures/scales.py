@@ -1,0 +1,173 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs say nothing of most keywords.
+"""The axes of figures for print: limits, ticks that do not meet, numbers without small type in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
+from matplotlib.transforms import Bbox
+
+from harness.report.accuracy.times import duration
+from harness.report.figures.panel import Plot, Scale, Values
+from harness.report.page import count, quantity, ticks
+
+_SUPERSCRIPTS = str.maketrans("-0123456789.", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹·")
+_ROOM = 0.06
+"""Of the axis, left free at each end."""
+
+
+def superscript(words: str) -> str:
+    """A number as an exponent, of letters of the full size: mathematics would set it in 0.7 of it."""
+    return words.translate(_SUPERSCRIPTS)
+
+
+def power(value: float) -> str:
+    """A power of ten, or a number where an exponent would not help."""
+    if 0.01 < value < 1000.0:
+        return f"{value:g}"
+    exponent = int(np.floor(np.log10(value) + 1e-9))
+    mantissa = value / 10.0**exponent
+    front = "" if abs(mantissa - 1.0) < 1e-6 else f"{mantissa:g}·"
+    return f"{front}10{superscript(str(exponent))}"
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.3g} %".replace("-", "−")
+
+
+_WRITTEN: dict[str, Callable[[float], str]] = {
+    "power": power,
+    "time": lambda value: duration(value) if value else "0",
+    "plain": lambda value: quantity(value) if abs(value) < 1000 else count(round(value)),
+    "percent": _percent,
+    "strain": _percent,
+}
+
+
+def set_scales(ax: Axes, panel: Plot) -> None:
+    """Limits and ticks of both axes, from what the panel holds."""
+    points = _extent(panel)
+    for axis, scale, values in zip((ax.xaxis, ax.yaxis), (panel.x, panel.y), points, strict=True):
+        _SET[scale.kind](axis, scale, values)
+    ax.tick_params(length=2.5, width=0.5, pad=2)
+
+
+def _extent(panel: Plot) -> tuple[Values, Values]:
+    """All values along x and along y, the ends of intervals and the lines across included."""
+    found: tuple[list[Values], list[Values]] = ([], [])
+    for series in panel.series:
+        ends = [end for end in (series.low, series.high) if end is not None]
+        found[0].extend([series.x, *(ends if series.across else [])])
+        found[1].extend([series.y, *([] if series.across else ends)])
+    found[1].append(np.array([line.y for line in panel.lines], float))
+    x, y = (np.concatenate([np.zeros(0), *values]) for values in found)
+    return x[np.isfinite(x)], y[np.isfinite(y)]
+
+
+def _log(axis: Axis, scale: Scale, values: Values) -> None:
+    values = values[values > 0.0]
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.1, 10.0)
+    if high < 8.0 * low:  # at least most of a decade, so that noise looks like noise
+        low, high = (np.sqrt(low * high / 8.0), np.sqrt(low * high * 8.0))
+    room = (high / low) ** _ROOM
+    _limits(axis, "log", low / room, high * room)
+    decades = np.log10(high / low)
+    subs = (1.0,) if decades > 2.0 else (1.0, 3.0) if decades > 1.3 else (1.0, 2.0, 5.0)
+    axis.set_major_locator(LogLocator(subs=subs, numticks=9 if decades > 2.0 else 12))
+    _written(axis, scale)
+
+
+def _sizes(axis: Axis, scale: Scale, values: Values) -> None:
+    """By logarithms, with a tick at each value."""
+    _log(axis, scale, values)
+    axis.set_major_locator(FixedLocator(np.unique(values).tolist()))
+
+
+def _linear(axis: Axis, scale: Scale, values: Values) -> None:
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
+    if scale.unit == "percent" and low >= 0.0 and high <= 1.0:
+        low, high = 0.0, 1.0
+    room = _ROOM * ((high - low) or 1.0)
+    _limits(axis, "linear", low - room, high + room)
+    axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+    _written(axis, scale)
+
+
+def _iterations(axis: Axis, scale: Scale, values: Values) -> None:
+    last = max(float(values.max(initial=10.0)), 10.0)
+    axis.axes.set_xscale("symlog", linthresh=1.0, linscale=0.35)
+    axis.axes.set_xlim(-0.08, 1.2 * last)
+    axis.set_major_locator(FixedLocator([0.0, *(10.0**k for k in range(7) if 10.0**k <= last)]))
+    _written(axis, scale)
+
+
+def _names(axis: Axis, scale: Scale, values: Values) -> None:
+    last = len(scale.names) - 0.5
+    if axis is axis.axes.xaxis:
+        axis.axes.set_xlim(-0.5, last)
+    else:
+        axis.axes.set_ylim(last, -0.5)
+    axis.set_major_locator(FixedLocator(range(len(scale.names))))
+    axis.set_major_formatter(ticks(lambda value: scale.names[round(value)] if 0 <= value < len(scale.names) else ""))
+    axis.set_minor_locator(NullLocator())
+
+
+_SET: dict[str, Callable[[Axis, Scale, Values], None]] = {
+    "log": _log,
+    "sizes": _sizes,
+    "linear": _linear,
+    "iterations": _iterations,
+    "names": _names,
+}
+
+
+def _limits(axis: Axis, kind: Any, low: float, high: float) -> None:
+    if axis is axis.axes.xaxis:
+        axis.axes.set_xscale(kind)
+        axis.axes.set_xlim(low, high)
+    else:
+        axis.axes.set_yscale(kind)
+        axis.axes.set_ylim(low, high)
+
+
+def _written(axis: Axis, scale: Scale) -> None:
+    axis.set_major_formatter(ticks(_WRITTEN[scale.unit]))
+    axis.set_minor_locator(NullLocator())
+
+
+def thin(ax: Axes) -> None:
+    """Take away ticks until their labels do not meet: every second one, every third. To be called once drawn."""
+    for axis in (ax.xaxis, ax.yaxis):
+        places = [float(at) for at in np.asarray(axis.get_majorticklocs()) if _seen(axis, float(at))]
+        for every in range(1, max(2, len(places))):
+            axis.set_major_locator(FixedLocator(places[::every]))
+            if not _meet(_boxes(axis)):
+                break
+
+
+def _seen(axis: Axis, at: float) -> bool:
+    low, high = sorted(axis.get_view_interval())
+    return low <= at <= high
+
+
+def _boxes(axis: Axis) -> list[Bbox]:
+    return [label.get_window_extent() for label in axis.get_ticklabels() if label.get_text() and label.get_visible()]
+
+
+def _meet(boxes: Sequence[Bbox]) -> bool:
+    """Whether two neighbours are nearer than a space."""
+    gap = 2.0
+    return any(_near(a, b, gap) for a, b in pairwise(boxes))
+
+
+def _near(a: Bbox, b: Bbox, gap: float) -> bool:
+    across = min(a.x1, b.x1) - max(a.x0, b.x0)
+    up = min(a.y1, b.y1) - max(a.y0, b.y0)
+    return bool(across > -gap and up > 0.0)

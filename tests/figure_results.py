@@ -1,0 +1,122 @@
+"""Results of every kind for figures of known looks: rows that nobody measured."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from harness.base import rows as base_rows
+from harness.base.columns import SCHEMA
+from harness.experiments.ablation.rows import SCHEMA as ABLATION
+from tests import accuracy_rows as made
+from tests.recordings import info, record
+
+HERE = {"cpu": "A processor", "threads": 1, "commit": "0" * 40, "code": "abc", "status": "ok"}
+SOLVERS = ("dense", "sparse", "numba", "newton", "hybrid", "xpbd")
+EFFECTS = ("springs", "gravity", "pins", "bending", "wind", "dashpots", "contact", "air-drag")
+
+
+def write(path: Path, rows: Any, schema: pa.Schema = SCHEMA) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    base_rows.write(path, rows, schema)
+
+
+def accuracy(folder: Path) -> Path:
+    """Two scenes from both first guesses, one of three sizes, and simulations."""
+    rows: list[dict[str, Any]] = []
+    for size in (10, 24, 48):
+        rows += made.problem("net", size, "early")
+        for solver in ("sparse", "numba", "lbfgs", "newton", "hybrid"):
+            for guess in ("current", "inertial"):
+                rows += made.curve("net", size, "early", solver, guess=guess)
+    rows += made.problem("block", 8, "violent")
+    rows += made.curve("block", 8, "violent", "lbfgs", status="time-limit", reason="the limit of 5 s was reached")
+    return made.write(folder, [*rows, *made.work("net", 10), *made.paper(1.3)])
+
+
+def sweep(folder: Path, sizes: tuple[int, ...] = (8, 16, 32)) -> Path:
+    """Runs of all solvers at these sizes, judged, of four cases of two families; one of them failed."""
+    cases = ("geometry-flat", "geometry-line", "numbers-large", "numbers-small")
+    for case in cases:
+        for place, solver in enumerate(SOLVERS):
+            for size in sizes if case == cases[0] else sizes[:1]:
+                write(folder / "rows" / f"{case}-{solver}-{size}.parquet", _run(case, solver, place, size))
+    return folder
+
+
+def _run(case: str, solver: str, place: int, size: int) -> list[dict[str, Any]]:
+    known = HERE | {"run_id": f"{case}-{solver}-{size}", "scene": case, "size": size, "solver": solver}
+    known |= {
+        "parameters": "{}",
+        "vertices": size**2,
+        "springs": 4 * size**2,
+        "started": "2026",
+        "frame": 1,
+        "round": 0,
+    }
+    if (case, solver) == ("numbers-large", "xpbd"):
+        return [known | {"phase": "run", "status": "diverged", "reason": "not finite", "frame": None}]
+    second = 1e-7 * (place + 1) * size ** (2.0 + place / 4)
+    judged = {"stationarity": 1e-7, "beyond": 10.0 ** (place - 8), "minimum": place != 3, "flat": False}
+    judged |= {"distance": 1e-5, "stopped": "iterations"}
+    steps = [
+        known | judged | {"phase": "step", "seconds": second * f, "frame": k + 1} for k, f in enumerate((0.9, 1, 1.2))
+    ]
+    return [*steps, *(known | {"phase": "prepare", "round": k, "seconds": (9 - 3 * k) * second} for k in range(2))]
+
+
+def ablation(folder: Path) -> Path:
+    """Effects of all costs and changes, some of which nothing can measure."""
+    whole = HERE | {"scene": "cloth", "size": 16, "solver": "hybrid", "vertices": 256, "frames": 10, "rounds": 5}
+    whole |= {"time_step": 0.01, "seconds": 1.0}
+    rows: list[dict[str, Any]] = [whole | {"kind": "whole", "name": ""}]
+    for k, name in enumerate(EFFECTS):
+        cost = {"cost": 0.05 * k, "cost_low": 0.05 * k - 0.04, "cost_high": 0.05 * k + 0.03}
+        rows.append(whole | cost | {"kind": "without", "name": name, "largest": 10.0 ** (1 - k), "extent": 20.0})
+    rows += [whole | {"kind": "error", "name": n, "largest": e} for n, e in (("solver", 3e-5), ("time-step", 2e-2))]
+    for solver in ("numba", "newton"):
+        for k, name in enumerate(EFFECTS):
+            price = {"price": 1.0 + 0.2 * k, "price_low": 1.0 + 0.18 * k, "price_high": 1.0 + 0.25 * k}
+            rows.append(whole | price | {"kind": "price", "name": name, "solver": solver})
+    write(folder / "ablation" / "cloth.parquet", rows, ABLATION)
+    return folder
+
+
+def speed(folder: Path) -> Path:
+    """A speed report: the machine's limits and three candidates at three sizes."""
+    for size in (8, 16, 32):
+        known = HERE | {"scene": "cloth", "size": size, "vertices": size**2, "springs": 4 * size**2, "load": 0.5}
+        machine = known | {"run_id": f"m{size}", "solver": "machine", "parameters": "{}", "phase": "read", "bytes": 1e3}
+        limits = [machine | {"seconds": 1e-6, "working_set": 1e3, "flops": None}]
+        limits += [
+            machine | {"phase": f"fma {k}", "seconds": 1e-6, "bytes": None, "flops": 1e4}
+            for k in ("float64", "float32")
+        ]
+        limits = [row | {"working_set": row.get("working_set") or 0.0} for row in limits]
+        write(folder / "rows" / f"machine-{size}.parquet", limits)
+        for place, (solver, linear) in enumerate((("sparse", None), ("numba", "auto"), ("numba", "supernodal"))):
+            parameters = json.dumps({"linear": linear} if linear else {})
+            one = known | {"run_id": f"{solver}{linear}{size}", "solver": solver, "parameters": parameters}
+            rows = [
+                one | {"phase": phase, "round": k, "seconds": share * 1e-6 * (4 - place) * size**2, "iterations": 10}
+                for phase, share in (("prepare", 5.0), ("local", 0.3), ("global", 0.7), ("step", 1.0))
+                for k in range(3)
+            ]
+            write(folder / "rows" / f"{solver}-{linear}-{size}.parquet", rows)
+    return folder
+
+
+def recorded(folder: Path) -> Path:
+    """Two runs of one scene with their recordings, of different residuals."""
+    (folder / "recordings").mkdir(parents=True)
+    for solver, amplitude in (("numba", 0.1), ("newton", 0.05)):
+        for row in (rows := _run("cloth", solver, 1, 6)):
+            row["vertices"] = 36
+        write(folder / "rows" / f"{solver}.parquet", rows)
+        properties = {"scene": "cloth", "size": 6, "solver": solver, "milliseconds_per_step": 1.25}
+        of = info(run_id=rows[0]["run_id"], properties=properties)
+        record(folder / "recordings" / f"cloth-6-{solver}-{rows[0]['run_id']}.rrd", of, count=4, amplitude=amplitude)
+    return folder

@@ -1,0 +1,332 @@
+"""Figures for print: what they hold, that nothing of them is small, cut or covered, and that they look as they did."""
+
+from __future__ import annotations
+
+import csv
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from PIL import Image
+from skimage.metrics import structural_similarity
+from typer.testing import CliRunner
+
+from harness.cli import app
+from harness.report import opengl
+from harness.report.figures import canvas, kinds, of_runs
+from harness.report.figures.asked import LEAST, Asked
+from harness.report.figures.canvas import INCH, compose, ordered, texts
+from harness.report.figures.drawing import mark
+from harness.report.figures.entry import chosen, ready
+from harness.report.figures.faults import faults
+from harness.report.figures.panel import Plot, Scale, Series
+from harness.report.style import Mark
+from tests import figure_results as made
+
+LOOKS = Path(__file__).parents[1] / "looks" / "figures.png"
+ALIKE = 0.985
+"""Structural similarity (Wang et al. 2004) that two sheets of one look have: letters that are drawn a pixel aside leave
+0.99, and a curve in another colour, or a legend elsewhere, does not."""
+TALL = 1080
+
+RESULTS: dict[str, tuple[str, Callable[[Path], Path]]] = {
+    "convergence": ("block:gap", made.accuracy),
+    "times": ("net:10:current:alone", made.accuracy),
+    "work": ("bdf2", made.accuracy),
+    "profiles": ("performance:1e-3", made.accuracy),
+    "growth": ("net:current", made.accuracy),
+    "liu2013": ("figure-2", made.accuracy),
+    "timing": ("step", made.sweep),
+    "hard": ("map", made.sweep),
+    "ablation": ("", made.ablation),
+    "prices": ("numba", made.ablation),
+    "speed": ("step", made.speed),
+}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A folder of results for each kind."""
+    folder = tmp_path_factory.mktemp("results")
+    written = {make: make(folder / make.__name__) for _, make in RESULTS.values()}
+    return {kind: written[make] for kind, (_, make) in RESULTS.items()}
+
+
+def composed(kind: str, results: Path, asked: Asked, older: Any = ()) -> tuple[Figure, list[Any]]:
+    found = kinds.kind(kind)
+    selectors = asked.selectors or tuple(tuple(one.split(":")) for one in [RESULTS[kind][0]] if one) or found.usual
+    panels = found.draw(chosen(found.panels(results, lambda _: older), selectors))
+    return compose(panels, found.title, asked), panels
+
+
+@pytest.fixture(scope="module")
+def figures(results: dict[str, Path]) -> dict[str, Figure]:
+    """One figure of each kind, 85 mm wide."""
+    return {kind: composed(kind, results[kind], Asked())[0] for kind in RESULTS}
+
+
+def pixels(figure: Figure) -> Image.Image:
+    agg = FigureCanvasAgg(figure)
+    agg.draw()
+    return Image.fromarray(np.asarray(agg.buffer_rgba())).convert("RGB")
+
+
+def similarity(one: Image.Image, other: Image.Image) -> float:
+    return float(structural_similarity(np.asarray(one), np.asarray(other), channel_axis=-1))
+
+
+def sheet(figures: dict[str, Figure]) -> Image.Image:
+    """All figures below and beside each other."""
+    pictures = [pixels(figure) for figure in figures.values()]
+    whole = Image.new("RGB", (1400, TALL), "white")
+    x = y = 0
+    for picture in pictures:
+        if y + picture.height > TALL:
+            x, y = x + picture.width + 10, 0
+        whole.paste(picture, (x, y))
+        y += picture.height + 10
+    return whole
+
+
+def test_the_sheet_of_all_figures_looks_as_it_did(figures: dict[str, Figure], tmp_path: Path) -> None:
+    now = sheet(figures)
+    now.save(tmp_path / "figures.png")
+    then = Image.open(LOOKS)
+    told = f"look at {tmp_path / 'figures.png'} beside {LOOKS}, and where it is better, put it there"
+    assert now.size == then.size, told
+    assert similarity(now, then) > ALIKE, told
+
+
+def test_a_curve_of_another_look_is_found_out(figures: dict[str, Figure]) -> None:
+    line = figures["timing"].axes[0].lines[0]
+    look, now = (line.get_linestyle(), line.get_color()), pixels(figures["timing"])
+    line.set(linestyle=":", color="#d55e00")
+    other = pixels(figures["timing"])
+    line.set(linestyle=look[0], color=look[1])
+    assert similarity(now, other) < ALIKE
+
+
+@pytest.mark.parametrize("kind", RESULTS)
+def test_no_type_of_a_figure_is_small_cut_or_covered(figures: dict[str, Figure], kind: str) -> None:
+    figure = figures[kind]
+    assert faults(figure) == []
+    assert len(texts(figure)) > 5
+    assert figure.get_size_inches()[0] * INCH == pytest.approx(85.0)
+
+
+@pytest.mark.parametrize(("width", "size"), [(60.0, 6.0), (180.0, 10.0)])
+def test_nor_at_other_widths(results: dict[str, Path], width: float, size: float) -> None:
+    for kind in ("timing", "ablation"):
+        figure, _ = composed(kind, results[kind], Asked(width=width, size=size))
+        assert faults(figure) == []
+        assert min(float(text.get_fontsize()) for text in texts(figure)) >= LEAST
+
+
+def test_faults_are_found() -> None:
+    figure = Figure((3.0, 2.0))
+    FigureCanvasAgg(figure)
+    ax = figure.add_axes((0.3, 0.3, 0.4, 0.4))
+    ax.plot([0, 1], [0, 1], label="a")
+    figure.text(0.9, 0.9, "beyond the edge")
+    figure.text(0.1, 0.9, "tiny", fontsize=5.0)
+    figure.text(0.1, 0.5, "one name")
+    figure.text(0.12, 0.5, "another")
+    figure.legend(loc="center")
+    told = "\n".join(faults(figure))
+    for said in ("'beyond the edge' is cut", "'tiny' is of 5.0 points", "'one name' meets 'another'", "lies over data"):
+        assert said in told
+
+
+def test_the_legend_has_the_order_of_the_curves(results: dict[str, Path]) -> None:
+    asked = Asked(selectors=(("net", "10", "gap", "time"), ("net", "10", "current", "gap", "iterations")))
+    figure, _ = composed("convergence", results["convergence"], asked)
+    (legend,) = figure.legends
+    lines = {str(line.get_label()): line for line in figure.axes[0].lines}
+    names = [text.get_text() for text in legend.get_texts() if text.get_text() in lines]
+    ends = [float(np.asarray(lines[name].get_ydata())[-1]) for name in names]
+    assert len(ends) == 5
+    assert ends == sorted(ends, reverse=True)
+
+
+def test_names_at_the_ends_of_curves_have_their_order_and_need_no_legend(figures: dict[str, Figure]) -> None:
+    figure = figures["timing"]
+    assert not figure.legends
+    names = sorted(figure.axes[0].texts, key=lambda text: -text.get_position()[1])
+    series = [one.label for one in ordered(composed_timing(figure))]
+    assert [name.get_text() for name in names] == series
+
+
+def composed_timing(figure: Figure) -> list[Series]:
+    lines = [line for line in figure.axes[0].lines if not str(line.get_label()).startswith("_")]
+    return [
+        Series(
+            str(one.get_label()), Mark("k", "o"), np.asarray(one.get_xdata(), float), np.asarray(one.get_ydata(), float)
+        )
+        for one in lines
+    ]
+
+
+def test_one_size_has_a_row_for_each_solver_the_fastest_first(tmp_path: Path) -> None:
+    folder = made.sweep(tmp_path, sizes=(8,))
+    figure, _ = composed("timing", folder, Asked(selectors=(("geometry-flat", "step"),)))
+    ax = figure.axes[0]
+    assert [label.get_text() for label in ax.get_yticklabels()] == list(made.SOLVERS)
+    assert faults(figure) == []
+
+
+def test_what_other_code_measured_is_hollow_and_told(results: dict[str, Path]) -> None:
+    older = {f"geometry-flat-newton-{size}" for size in (8, 16, 32)}
+    figure, (panel,) = composed("timing", results["timing"], Asked(), older)
+    faces = {one.get_markerfacecolor() for one in figure.axes[0].lines if one.get_marker() == mark_of("newton")}
+    assert "white" in faces
+    assert of_runs.OLDER in "\n".join(text.get_text() for text in texts(figure))
+    assert {row["series"] for row in panel.rows() if row["other_code"]} == {"newton"}
+    _, (grid,) = composed("hard", results["hard"], Asked(), older)
+    assert {cell.column for cell in grid.cells if cell.older} == {"newton"}
+    assert "other code" in grid.notes[0]
+
+
+def mark_of(solver: str) -> Any:
+    from harness.report.style import marks
+
+    return marks()[solver].marker
+
+
+def test_the_command_writes_each_format_the_data_and_a_script_that_draws_them(
+    results: dict[str, Path], tmp_path: Path
+) -> None:
+    words = ["figure", "timing", str(results["timing"]), "--width", "8.5cm", "--panels", "step", "-o", str(tmp_path)]
+    told = CliRunner().invoke(app, words)
+    assert told.exit_code == 0, told.output
+    stem = tmp_path / "timing-step"
+    pdf, svg = stem.with_suffix(".pdf").read_bytes(), stem.with_suffix(".svg").read_text()
+    box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+)", pdf)
+    assert box
+    assert float(box[1]) == pytest.approx(85.0 / INCH * 72.0, abs=0.1)
+    assert b"/FontFile2" in pdf or b"/FontFile" in pdf
+    assert "<text" not in svg.partition("</metadata>")[2], "letters are paths, which need no font"
+    with Image.open(stem.with_suffix(".png")) as image:
+        assert image.width == round(85.0 / INCH * 300.0) or image.width == int(85.0 / INCH * 300.0)
+    assert "A processor" in svg, "whose data it is stays in the file"
+    rows = list(csv.DictReader(line for line in stem.with_suffix(".csv").read_text().splitlines() if line[0] != "#"))
+    assert {row["series"] for row in rows} == set(made.SOLVERS)
+    with matplotlib.rc_context():
+        done = subprocess.run([sys.executable, stem.with_suffix(".py")], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert stem.with_name("timing-step-again.pdf").stat().st_size > 3000
+    assert len(stem.with_suffix(".py").read_text().splitlines()) < 110
+
+
+def test_without_a_title_its_words_and_the_origin_are_left_to_the_caption(results: dict[str, Path]) -> None:
+    figure, _ = composed("timing", results["timing"], Asked(titled=False, transparent=True))
+    said = "\n".join(text.get_text() for text in texts(figure))
+    assert "Time a step" not in said
+    assert "A processor" not in said
+    assert np.asarray(FigureCanvasAgg(figure).figure.get_facecolor())[3] == 0.0
+
+
+@pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
+def test_meshes_side_by_side_have_one_camera_one_scale_and_the_distance_from_the_lowest_residual(
+    tmp_path: Path,
+) -> None:
+    folder = made.recorded(tmp_path)
+    figure, pictures = composed_meshes("comparison", folder)
+    assert faults(figure) == []
+    assert len({picture.limit for picture in pictures}) == len({picture.aspect for picture in pictures}) == 1
+    assert len({picture.render.view for picture in pictures}) == 1
+    shown = [np.asarray(ax.images[0].get_array()) for ax in figure.axes[:2]]
+    assert all((picture.min(axis=-1) < 200).mean() > 0.1 for picture in shown), "the mesh fills its place"
+    alone, (one,) = composed_meshes("run", folder)
+    assert len(one.rows()) == 36
+    assert faults(alone) == []
+
+
+def composed_meshes(kind: str, folder: Path) -> tuple[Figure, list[Any]]:
+    found = kinds.kind(kind)
+    panels = found.draw(chosen(found.panels(folder, lambda _: ()), ()))
+    return canvas.compose(panels, found.title, Asked(width=60.0)), panels
+
+
+BAD = {
+    "unknown kind": (["timin"], "KIND: came 'timin'; wanted one of", "did you mean 'timing'?"),
+    "a width without a unit": (["timing", "--width", "85"], "--width: came '85'; wanted a length such as 85mm", ""),
+    "a width of no figure": (["timing", "--width", "3mm"], "--width: came 3mm; wanted from 40mm to 400mm", ""),
+    "an unknown format": (["timing", "--format", "pdf,gif"], "--format: came 'gif'; wanted one of pdf, png, svg", ""),
+    "no format": (["timing", "--format", ","], "--format: came ''; wanted one of pdf, png, svg", ""),
+    "small type": (["timing", "--font-size", "5"], "--font-size: came 5; wanted from 6 to 24 points", ""),
+    "no such panel": (
+        ["timing", "--panels", "gap:tine"],
+        "--panels: came 'gap:tine'; wanted parts of",
+        "geometry-flat:step",
+    ),
+    "nothing of that kind": (["convergence"], "holds no accuracy rows; run `springbench accuracy CONFIG`", ""),
+    "no ablation": (["ablation"], "wanted the rows of `springbench ablate SCENE`", ""),
+    "no speed": (["speed"], "wanted the rows of `springbench speed CONFIG`", ""),
+    "no recordings": (["run"], "holds no recordings; run a sweep with `record: true`", ""),
+    "type that does not fit": (["timing", "--width", "40mm", "--font-size", "20"], "wanted a wider figure", "is cut"),
+    "a report without panels": (["medians"], "KIND: came 'medians'; wanted one of", ""),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_mistake_is_answered_with_what_was_wanted(results: dict[str, Path], name: str, tmp_path: Path) -> None:
+    (kind, *more), *wanted = BAD[name]
+    told = CliRunner().invoke(app, ["figure", kind, str(results["timing"]), *more, "-o", str(tmp_path)])
+    assert told.exit_code == 2, told.output
+    assert all(words in told.output for words in wanted), told.output
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_report_from_outside_is_a_kind_if_it_has_panels(
+    results: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def report(rows: Any, folder: Path) -> list[Path]:
+        return []
+
+    def panels(rows: Any) -> list[Plot]:
+        x = np.arange(3.0)
+        series = [Series("mine", Mark("#123456", "o"), x, x + 1.0)]
+        scales = Scale("frame", "linear"), Scale("rows of " + str(len(rows)), "linear")
+        return [Plot(("mine",), ("rows",), "all", "", *scales, series)]
+
+    report.panels = panels
+    monkeypatch.setattr(type(kinds.EVERY_REPORT), "_installed", lambda _: {"mine": None})
+    monkeypatch.setattr(type(kinds.EVERY_REPORT), "__getitem__", lambda self, name: "tests:mine")
+    monkeypatch.setattr(kinds, "load", lambda _: report)
+    found = kinds.kind("mine")
+    (entry,) = found.panels(results["timing"], lambda _: ())
+    assert entry.parts == ("mine", "rows")
+    assert isinstance(compose([entry.make()], found.title, Asked()).axes[0].lines[0], Line2D)
+    report.panels = lambda rows: 1 / 0
+    with pytest.raises(kinds.RunFailed, match="the report mine failed: ZeroDivisionError"):
+        found.panels(results["timing"], lambda _: ())
+
+
+def test_panels_are_named_by_parts() -> None:
+    def plot(*parts: str) -> Plot:
+        return Plot(parts[:1], parts[1:], "", "", Scale(""), Scale(""), [])
+
+    entries = ready(
+        [plot(a, b, c) for a in ("net", "block") for b in ("gap", "largest") for c in ("time", "iterations")]
+    )
+
+    def picked(*selectors: str) -> list[str]:
+        return [":".join(one.parts) for one in chosen(entries, [tuple(one.split(":")) for one in selectors])]
+
+    assert picked("gap:time") == ["net:gap:time"], "of the first, where it is not said of what"
+    assert picked("block:gap:time", "net:time") == ["block:gap:time", "net:gap:time", "net:largest:time"]
+    assert picked("net:gap", "gap:net") == ["net:gap:time", "net:gap:iterations"]
+
+
+def test_a_hollow_mark_keeps_its_colour() -> None:
+    filled, hollow = mark(Mark("#0072b2", "o")), mark(Mark("#0072b2", "o"), hollow=True)
+    assert (filled["mfc"], hollow["mfc"], hollow["mec"]) == ("#0072b2", "white", "#0072b2")
