@@ -64,7 +64,8 @@ def _converging(
             series.append(Series(curve.label, marked[curve.label], curve.iterations, y))
         else:
             series.append(Series(curve.label, marked[curve.label], x, y, early, late, across=True))
-    shaded = what == "gap" and np.isfinite(problem.round_off)
+    lowest = min((float(np.nanmin(one.y)) for one in series if np.isfinite(one.y).any()), default=np.inf)
+    shaded = what == "gap" and lowest < problem.round_off < np.inf
     doubt = [f"Reference not certified: {problem.doubt}."] if problem.doubt else []
     shares = ["Curves: median over the rounds, shaded between the quartiles."] if against == "time" else []
     return Plot(
