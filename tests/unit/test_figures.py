@@ -83,8 +83,9 @@ def pixels(figure: Figure) -> Image.Image:
 
 def similarity(one: Image.Image, other: Image.Image) -> float:
     """Of the part of the pictures that differs most: the mean over a whole sheet would be that of its white."""
-    _, local = structural_similarity(np.asarray(one), np.asarray(other), channel_axis=-1, full=True)
-    return float(block_reduce(local.mean(axis=-1), (PART, PART), np.mean, cval=1.0).min())
+    found: Any = structural_similarity(np.asarray(one), np.asarray(other), channel_axis=-1, full=True)
+    parts: Any = (PART, PART)
+    return float(block_reduce(found[1].mean(axis=-1), parts, np.mean, cval=1).min())
 
 
 def sheet(figures: dict[str, Figure]) -> Image.Image:
@@ -302,7 +303,7 @@ def test_a_report_from_outside_is_a_kind_if_it_has_panels(
         scales = Scale("frame", "linear"), Scale("rows of " + str(len(rows)), "linear")
         return [Plot(("mine",), ("rows",), "all", "", *scales, series)]
 
-    report.panels = panels
+    monkeypatch.setattr(report, "panels", panels, raising=False)
     monkeypatch.setattr(type(kinds.EVERY_REPORT), "_installed", lambda _: {"mine": None})
     monkeypatch.setattr(type(kinds.EVERY_REPORT), "__getitem__", lambda self, name: "tests:mine")
     monkeypatch.setattr(kinds, "load", lambda _: report)
@@ -310,7 +311,7 @@ def test_a_report_from_outside_is_a_kind_if_it_has_panels(
     (entry,) = found.panels(results["timing"], lambda _: ())
     assert entry.parts == ("mine", "rows")
     assert isinstance(compose([entry.make()], found.title, Asked()).axes[0].lines[0], Line2D)
-    report.panels = lambda rows: 1 / 0
+    monkeypatch.setattr(report, "panels", lambda rows: 1 / 0)
     with pytest.raises(kinds.RunFailed, match="the report mine failed: ZeroDivisionError"):
         found.panels(results["timing"], lambda _: ())
 
