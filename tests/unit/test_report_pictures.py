@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +18,13 @@ from harness.base.errors import RunFailed
 from harness.record.base import Replay
 from harness.record.shading import STRAIN_COLOURS
 from harness.report import comparison, opengl, page, run_picture
-from harness.report.comparison import draw_comparison, reference
+from harness.report.comparison import draw_comparison
 from harness.report.render import (
     Studio,
     area_vectors,
     drawable_frames,
     frame_all,
     natural_angles,
-    shown_limit,
     spring_strain,
     vertex_strain,
 )
@@ -94,9 +92,9 @@ def words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """All that is written on the pages that a test draws."""
     written: list[str] = []
 
-    def save(sheet: Figure, path: Path) -> None:
+    def save(sheet: Figure, path: Path, **more: Any) -> None:
         written.extend(text.get_text() for text in sheet.texts)
-        page.save(sheet, path)
+        page.save(sheet, path, **more)
 
     for module in (run_picture, comparison):
         monkeypatch.setattr(module, "save", save)
@@ -114,29 +112,6 @@ def boxes(monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[Box, list[Box]]
 
     monkeypatch.setattr(run_picture, "layout", kept)
     return lambda: found[-1]
-
-
-@pytest.mark.parametrize("shape", [0.2, 1.0, 1.3, 4.0])
-def test_frames_of_any_shape_fill_the_page_and_do_not_meet(shape: float) -> None:
-    main, tiles = layout(shape, shape, 5)
-    boxes = [main, *tiles]
-    assert all(box.left >= 0 and box.left + box.width <= WIDTH and box.top + box.height <= HEIGHT for box in boxes)
-    for a, b in combinations(boxes, 2):
-        assert a.left + a.width <= b.left or b.left + b.width <= a.left or a.top + a.height <= b.top
-    # What is seen of a scene: the largest rectangle of its shape that fits into its place. Of the page's height and
-    # the width of one column beside it, squares had a fourth, and what lies flat less.
-    seen = sum(min(box.width, box.height * shape) * min(box.height, box.width / shape) for box in boxes)
-    assert seen > 0.38 * 1528 * 750
-
-
-def test_the_scale_is_that_of_the_strains_that_are_seen() -> None:
-    # All springs at 5 % but one at 40 %: a scale to 40 % would show one grey cloth.
-    one = cloth(12, frames=1)
-    stretched = one.positions.copy()
-    stretched[0, 0] += np.array([-0.4 / 11, 0.0, 0.0], np.float32)
-    assert shown_limit([replace(one, positions=stretched)], [0]) == pytest.approx(0.4, abs=0.35)
-    assert shown_limit([one], [0]) == pytest.approx(0.05)
-    assert shown_limit([cloth(stretch=1.39, frames=1)], [0]) == pytest.approx(0.4)
 
 
 @needs_opengl
@@ -301,16 +276,6 @@ def test_a_comparison_shows_solvers_side_by_side_with_their_distance(words: list
     assert drawn(image, 40, 118, 480, image.shape[0] - 118) > 0.01
     assert drawn(image, 540, 118, 480, image.shape[0] - 118) > 0.01
     assert drawn(image, 0, image.shape[0] - 60, WIDTH, 60) > 0.0, "nothing is left empty below"
-
-
-def test_distances_are_taken_from_the_lowest_residual_that_ends_finite() -> None:
-    def ending(residual: float) -> Replay:
-        return replace(cloth(), scalars={"/residual": (np.array([1]), np.array([residual]))})
-
-    assert reference([ending(1e-2), ending(1e-9), ending(1e-6)]) == 1
-    assert reference([ending(1e-2), broken(ending(1e-9), 3)]) == 0
-    assert reference([replace(cloth(), scalars={}), ending(1e-2)]) == 1
-    assert reference([ending(np.nan), ending(1e-2)]) == 1
 
 
 @needs_opengl

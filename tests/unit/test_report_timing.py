@@ -105,9 +105,9 @@ def sheets(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     """The pages that a test draws."""
     drawn: list[Figure] = []
 
-    def save(sheet: Figure, path: Path) -> None:
+    def save(sheet: Figure, path: Path, **more: Any) -> None:
         drawn.append(sheet)
-        page.save(sheet, path)
+        page.save(sheet, path, **more)
 
     monkeypatch.setattr(timing_plot, "save", save)
     return drawn

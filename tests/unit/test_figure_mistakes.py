@@ -1,0 +1,47 @@
+"""What `springbench figure` answers to mistakes: exit code 2, what was wanted, and no file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from harness.cli import app
+from tests import figure_results as made
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a sweep."""
+    return made.sweep(tmp_path_factory.mktemp("sweep"))
+
+
+BAD = {
+    "unknown kind": (["timin"], "KIND: came 'timin'; wanted one of", "did you mean 'timing'?"),
+    "a width without a unit": (["timing", "--width", "85"], "--width: came '85'; wanted a length such as 85mm", ""),
+    "a width of no figure": (["timing", "--width", "3mm"], "--width: came 3mm; wanted from 40mm to 400mm", ""),
+    "an unknown format": (["timing", "--format", "pdf,gif"], "--format: came 'gif'; wanted one of pdf, png, svg", ""),
+    "no format": (["timing", "--format", ","], "--format: came ''; wanted one of pdf, png, svg", ""),
+    "small type": (["timing", "--font-size", "5"], "--font-size: came 5; wanted from 6 to 24 points", ""),
+    "no such panel": (
+        ["timing", "--panels", "gap:tine"],
+        "--panels: came 'gap:tine'; wanted parts of",
+        "geometry-flat:step",
+    ),
+    "nothing of that kind": (["convergence"], "holds no accuracy rows; run `springbench accuracy CONFIG`", ""),
+    "no ablation": (["ablation"], "wanted the rows of `springbench ablate SCENE`", ""),
+    "no speed": (["speed"], "wanted the rows of `springbench speed CONFIG`", ""),
+    "no recordings": (["run"], "holds no recordings; run a sweep with `record: true`", ""),
+    "type that does not fit": (["timing", "--width", "40mm", "--font-size", "20"], "wanted a wider figure", "is cut"),
+    "a report without panels": (["medians"], "KIND: came 'medians'; wanted one of", ""),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_mistake_is_answered_with_what_was_wanted(results: Path, name: str, tmp_path: Path) -> None:
+    (kind, *more), *wanted = BAD[name]
+    told = CliRunner().invoke(app, ["figure", kind, str(results), *more, "-o", str(tmp_path)])
+    assert told.exit_code == 2, told.output
+    assert all(words in told.output for words in wanted), told.output
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,49 @@
+"""Where the frames of a run's picture go, what its scale shows, and what distances are taken from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from harness.record.base import Replay
+from harness.report.comparison import reference
+from harness.report.render import shown_limit
+from harness.report.run_picture import layout
+from harness.report.style import HEIGHT, WIDTH
+from tests.unit.test_report_pictures import broken, cloth
+
+
+@pytest.mark.parametrize("shape", [0.2, 1.0, 1.3, 4.0])
+def test_frames_of_any_shape_fill_the_page_and_do_not_meet(shape: float) -> None:
+    main, tiles = layout(shape, shape, 5)
+    boxes = [main, *tiles]
+    assert all(box.left >= 0 and box.left + box.width <= WIDTH and box.top + box.height <= HEIGHT for box in boxes)
+    for a, b in combinations(boxes, 2):
+        assert a.left + a.width <= b.left or b.left + b.width <= a.left or a.top + a.height <= b.top
+    # What is seen of a scene: the largest rectangle of its shape that fits into its place. Of the page's height and
+    # the width of one column beside it, squares had a fourth, and what lies flat less.
+    seen = sum(min(box.width, box.height * shape) * min(box.height, box.width / shape) for box in boxes)
+    assert seen > 0.38 * 1528 * 750
+
+
+def test_the_scale_is_that_of_the_strains_that_are_seen() -> None:
+    # All springs at 5 % but one at 40 %: a scale to 40 % would show one grey cloth.
+    one = cloth(12, frames=1)
+    stretched = one.positions.copy()
+    stretched[0, 0] += np.array([-0.4 / 11, 0.0, 0.0], np.float32)
+    assert shown_limit([replace(one, positions=stretched)], [0]) == pytest.approx(0.4, abs=0.35)
+    assert shown_limit([one], [0]) == pytest.approx(0.05)
+    assert shown_limit([cloth(stretch=1.39, frames=1)], [0]) == pytest.approx(0.4)
+
+
+def test_distances_are_taken_from_the_lowest_residual_that_ends_finite() -> None:
+    def ending(residual: float) -> Replay:
+        return replace(cloth(), scalars={"/residual": (np.array([1]), np.array([residual]))})
+
+    assert reference([ending(1e-2), ending(1e-9), ending(1e-6)]) == 1
+    assert reference([ending(1e-2), broken(ending(1e-9), 3)]) == 0
+    assert reference([replace(cloth(), scalars={}), ending(1e-2)]) == 1
+    assert reference([ending(np.nan), ending(1e-2)]) == 1
