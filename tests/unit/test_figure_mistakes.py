@@ -1,4 +1,4 @@
-"""What `springbench figure` answers to mistakes: exit code 2, what was wanted, and no file."""
+"""Which panels names lead to, and what mistakes are answered with: exit code 2, what was wanted, and no file."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from harness.cli import app
+from harness.report.figures.entry import chosen, ready
+from harness.report.figures.panel import Plot, Scale
 from tests import figure_results as made
 
 
@@ -45,3 +47,19 @@ def test_a_mistake_is_answered_with_what_was_wanted(results: Path, name: str, tm
     assert told.exit_code == 2, told.output
     assert all(words in told.output for words in wanted), told.output
     assert not list(tmp_path.iterdir())
+
+
+def test_panels_are_named_by_parts() -> None:
+    def plot(*parts: str) -> Plot:
+        return Plot(parts[:1], parts[1:], "", "", Scale(""), Scale(""), [])
+
+    entries = ready(
+        [plot(a, b, c) for a in ("net", "block") for b in ("gap", "largest") for c in ("time", "iterations")]
+    )
+
+    def picked(*selectors: str) -> list[str]:
+        return [":".join(one.parts) for one in chosen(entries, [tuple(one.split(":")) for one in selectors])]
+
+    assert picked("gap:time") == ["net:gap:time"], "of the first, where it is not said of what"
+    assert picked("block:gap:time", "net:time") == ["block:gap:time", "net:gap:time", "net:largest:time"]
+    assert picked("net:gap", "gap:net") == ["net:gap:time", "net:gap:iterations"]

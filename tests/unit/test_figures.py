@@ -27,7 +27,7 @@ from harness.report.figures import canvas, kinds, of_runs
 from harness.report.figures.asked import LEAST, Asked
 from harness.report.figures.canvas import INCH, compose, ordered, texts
 from harness.report.figures.drawing import mark
-from harness.report.figures.entry import chosen, ready
+from harness.report.figures.entry import chosen
 from harness.report.figures.faults import faults
 from harness.report.figures.panel import Plot, Scale, Series
 from harness.report.style import Mark
@@ -284,22 +284,6 @@ def test_a_report_from_outside_is_a_kind_if_it_has_panels(
     monkeypatch.setattr(report, "panels", lambda rows: 1 / 0)
     with pytest.raises(kinds.RunFailed, match="the report mine failed: ZeroDivisionError"):
         found.panels(results["timing"], lambda _: ())
-
-
-def test_panels_are_named_by_parts() -> None:
-    def plot(*parts: str) -> Plot:
-        return Plot(parts[:1], parts[1:], "", "", Scale(""), Scale(""), [])
-
-    entries = ready(
-        [plot(a, b, c) for a in ("net", "block") for b in ("gap", "largest") for c in ("time", "iterations")]
-    )
-
-    def picked(*selectors: str) -> list[str]:
-        return [":".join(one.parts) for one in chosen(entries, [tuple(one.split(":")) for one in selectors])]
-
-    assert picked("gap:time") == ["net:gap:time"], "of the first, where it is not said of what"
-    assert picked("block:gap:time", "net:time") == ["block:gap:time", "net:gap:time", "net:largest:time"]
-    assert picked("net:gap", "gap:net") == ["net:gap:time", "net:gap:iterations"]
 
 
 def test_a_hollow_mark_keeps_its_colour() -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from harness.base.errors import RunFailed
 from harness.record.base import Replay
-from harness.report.comparison import reference
+from harness.report import opengl
+from harness.report.comparison import draw_comparison, reference
 from harness.report.render import shown_limit
-from harness.report.run_picture import layout
+from harness.report.run_picture import draw_run, layout
 from harness.report.style import HEIGHT, WIDTH
 from tests.unit.test_report_pictures import broken, cloth
 
@@ -47,3 +50,15 @@ def test_distances_are_taken_from_the_lowest_residual_that_ends_finite() -> None
     assert reference([ending(1e-2), broken(ending(1e-9), 3)]) == 0
     assert reference([replace(cloth(), scalars={}), ending(1e-2)]) == 1
     assert reference([ending(np.nan), ending(1e-2)]) == 1
+
+
+def test_without_opengl_the_message_names_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(opengl, "_TRY", "import os; os.kill(os.getpid(), 11)")  # as VTK ends without the libraries
+    opengl.problem.cache_clear()
+    try:
+        for draw in (lambda at: draw_run(cloth(), at), lambda at: draw_comparison({"a": cloth()}, at)):
+            with pytest.raises(RunFailed, match="apt-get install libegl1 libgl1-mesa-dri"):
+                draw(tmp_path / "run.png")
+    finally:
+        opengl.problem.cache_clear()
+    assert not list(tmp_path.iterdir())

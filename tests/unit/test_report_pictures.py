@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from harness.base.errors import RunFailed
 from harness.record.base import Replay
 from harness.record.shading import STRAIN_COLOURS
 from harness.report import comparison, opengl, page, run_picture
@@ -295,15 +294,3 @@ def test_a_comparison_has_a_panel_for_each_scene_and_size(words: list[str], tmp_
         "net, size 6",
     ]
     assert "1 thread, net 6" in words, "runs of one solver go by their labels"
-
-
-def test_without_opengl_the_message_names_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(opengl, "_TRY", "import os; os.kill(os.getpid(), 11)")  # as VTK ends without the libraries
-    opengl.problem.cache_clear()
-    try:
-        for draw in (lambda at: draw_run(cloth(), at), lambda at: draw_comparison({"a": cloth()}, at)):
-            with pytest.raises(RunFailed, match="apt-get install libegl1 libgl1-mesa-dri"):
-                draw(tmp_path / "run.png")
-    finally:
-        opengl.problem.cache_clear()
-    assert not list(tmp_path.iterdir())
