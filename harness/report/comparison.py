@@ -17,18 +17,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from harness.record.base import Replay
+from harness.report.frames import drawable_frames, shown_limit
 from harness.report.page import count, header, headline, new_page, paste, quantity, save, shorten, strain_scale, text
-from harness.report.render import (
-    Studio,
-    area_vectors,
-    drawable_frames,
-    frame_all,
-    natural_angles,
-    shape,
-    shown_limit,
-    spacing,
-    spring_strain,
-)
+from harness.report.render import Studio, area_vectors, frame_all, natural_angles, shape, spacing, spring_strain
 from harness.report.solids import seen
 from harness.report.style import HEIGHT, MUTED, RC, RULE, WIDTH, Mark, marks
 

@@ -32,7 +32,6 @@ _JOINT = "#8a8d92"  # vertices of a network without triangles
 _SOLID = "#c9c3b8"  # obstacles
 _SHADE = "#d3d0ca"  # where the ground is fully in shadow
 _MATERIAL: dict[str, Any] = {"ambient": 0.62, "diffuse": 0.44, "specular": 0.06, "specular_power": 18.0}
-_BLOWN_UP = 1e4  # coordinates this many times larger than the start's are drawn as if not finite
 
 
 def spring_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
@@ -60,15 +59,6 @@ def vertex_strain(replay: Replay, frame: int) -> NDArray[np.float64]:
 def spacing(replay: Replay) -> float:
     """The mean rest length [m], or 1 where there are no springs."""
     return float(replay.rest_lengths.mean()) if len(replay.rest_lengths) else 1.0
-
-
-def drawable_frames(replay: Replay) -> NDArray[np.int64]:
-    """The recorded frames before the first that is not finite (or has blown up beyond drawing)."""
-    start = replay.positions[0]
-    limit = _BLOWN_UP * max(float(np.abs(start).max(initial=0.0)), 1.0)
-    with np.errstate(invalid="ignore"):
-        good = np.abs(replay.positions).max(axis=(1, 2), initial=0.0) <= limit  # not so for a NaN
-    return np.arange(len(good) if good.all() else int(np.argmin(good)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,16 +139,6 @@ def shape(points: Points, angles: tuple[float, float]) -> float:
     whole = np.concatenate([points, _cast(points, _ground(points))])
     across, up, _ = np.ptp(_camera_axes(angles) @ whole.astype(np.float64).T, axis=1)
     return float(across / max(up, 1e-30))
-
-
-def shown_limit(replays: Sequence[Replay], frames: Sequence[int]) -> float:
-    """The end of a scale that shows the strains of these frames, one of each recording: the round number above what
-    99 % of the vertices have, so that a few at a pin do not leave all others grey."""
-    strains = np.concatenate([np.abs(vertex_strain(r, k)) for r, k in zip(replays, frames, strict=True)])
-    strains = strains[np.isfinite(strains)]
-    wanted = max(float(np.quantile(strains, 0.99)) if len(strains) else 0.0, 1e-3)
-    decade = 10.0 ** np.floor(np.log10(wanted) + 1e-9)
-    return float(next(step * decade for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * decade >= 0.999 * wanted))
 
 
 def _extent(p: Points) -> float:

@@ -20,6 +20,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from harness.record.base import Replay
+from harness.report.frames import drawable_frames, shown_limit
 from harness.report.page import (
     clock,
     count,
@@ -33,16 +34,7 @@ from harness.report.page import (
     strain_scale,
     text,
 )
-from harness.report.render import (
-    Studio,
-    area_vectors,
-    drawable_frames,
-    frame_all,
-    natural_angles,
-    shape,
-    shown_limit,
-    spring_strain,
-)
+from harness.report.render import Studio, area_vectors, frame_all, natural_angles, shape, spring_strain
 from harness.report.solids import seen
 from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, RULE, WIDTH
 

@@ -13,7 +13,7 @@ from harness.base.errors import RunFailed
 from harness.record.base import Replay
 from harness.report import opengl
 from harness.report.comparison import draw_comparison, reference
-from harness.report.render import shown_limit
+from harness.report.frames import shown_limit
 from harness.report.run_picture import draw_run, layout
 from harness.report.style import HEIGHT, WIDTH
 from tests.unit.test_report_pictures import broken, cloth

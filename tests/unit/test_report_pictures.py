@@ -18,15 +18,8 @@ from harness.record.base import Replay
 from harness.record.shading import STRAIN_COLOURS
 from harness.report import comparison, opengl, page, run_picture
 from harness.report.comparison import draw_comparison
-from harness.report.render import (
-    Studio,
-    area_vectors,
-    drawable_frames,
-    frame_all,
-    natural_angles,
-    spring_strain,
-    vertex_strain,
-)
+from harness.report.frames import drawable_frames
+from harness.report.render import Studio, area_vectors, frame_all, natural_angles, spring_strain, vertex_strain
 from harness.report.run_picture import Box, draw_run, layout
 from harness.report.style import HEIGHT, PAGE, WIDTH
 

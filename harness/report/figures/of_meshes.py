@@ -17,16 +17,15 @@ from harness.report.comparison import distance_words, reference
 from harness.report.figures.entry import Entry
 from harness.report.figures.of_runs import measured_on, sweep_rows
 from harness.report.figures.panel import Picture, Renderer
+from harness.report.frames import drawable_frames, shown_limit
 from harness.report.page import clock, count, quantity
 from harness.report.render import (
     Studio,
     View,
     area_vectors,
-    drawable_frames,
     frame_all,
     natural_angles,
     shape,
-    shown_limit,
     spring_strain,
     vertex_strain,
 )
