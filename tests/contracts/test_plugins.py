@@ -17,6 +17,7 @@ from harness.config.load import load_any
 from harness.experiments.code import code, parts
 from solvers.plugins import Refused
 from solvers.registry import EVERY
+from tests.often import often
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -137,7 +138,7 @@ def beside(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", often(WAYS, ["beside", "entry-point"]))
 def test_a_sweep_runs_own_code_and_says_whose_it_is(way: str, beside: Path, installed: Path):
     (beside / "installed").symlink_to(installed)
     for mark in [*beside.rglob("*.was-run"), *installed.rglob("*.was-run")]:

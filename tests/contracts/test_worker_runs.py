@@ -19,6 +19,7 @@ from harness.base import rows
 from harness.cli import app
 from harness.config.load import load_any
 from harness.experiments.plan import Files
+from tests.often import often
 from tests.own_solvers import OPTIONS, Own, own
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -70,8 +71,9 @@ def first_rows(made: Own) -> dict[str, dict[str, Any]]:
     return {row["solver"]: row for row in found if isinstance(row, dict)}
 
 
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_a_sweep_survives_its_solvers(case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("name", often(CASES, ["a crash", "an exit by Python", "a loop", "too much memory"]))
+def test_a_sweep_survives_its_solvers(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    case = CASES[name]
     made = own(tmp_path, monkeypatch, solving=case.does)
     runs = limited(made, case.limit)
     told = ran(made)
@@ -115,7 +117,7 @@ def test_a_debugger_can_have_the_runs_in_its_own_process(tmp_path: Path, monkeyp
 LONG = "scenes: [scene.yaml]\nsolvers: [sparse]\noptions: {frames: 100000, rounds: 1, iterations: 50, record: false}\n"
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("how", often([signal.SIGKILL, signal.SIGTERM, signal.SIGINT], [signal.SIGKILL]))
 def test_no_worker_stays_behind(how: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     made = own(tmp_path, monkeypatch)
     made.sweep.write_text(LONG)

@@ -1,0 +1,16 @@
+"""Cases of which some are tried in every run of the tests, and the others with `-m long`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import pytest
+
+
+def often(cases: Iterable[Any], kept: Sequence[Any]) -> list[Any]:
+    """The cases, all but the kept ones marked as long. Raises ValueError for one that is kept and is no case."""
+    cases = list(cases)
+    if unknown := [case for case in kept if case not in cases]:
+        raise ValueError(f"no such cases: {unknown}")
+    return [case if case in kept else pytest.param(case, marks=pytest.mark.long) for case in cases]
