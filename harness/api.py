@@ -23,13 +23,16 @@ from numpy.typing import NDArray
 from harness.base.document import Document
 from harness.base.errors import InputError
 from harness.config import load
+from harness.config.solvers import solvers_of
 from harness.record.base import Replay
 from harness.scenes.bind import build
 from harness.scenes.effects.base import Effect
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.spec import FirstGuess, MeshSource, SceneSpec
 from harness.simulation.step import Step, prepare, simulate, start
+from solvers import plugins
 from solvers.problem import Positions, Solver, StopRule
+from solvers.registry import EVERY
 
 
 def load_scene(path: str | Path) -> SceneSpec:
@@ -125,10 +128,10 @@ class Simulation:
 
 def _solver(name: str, parameters: Mapping[str, Any], path: Path) -> Solver:
     document = Document(path, {"solvers": [{"name": name, **parameters}]})
-    found = load.solvers_of(document)
+    found = solvers_of(document)
     if document.mistakes:
         raise document.error()
-    return load.load(load.EVERY[found[0].name])(**found[0].parameters)
+    return plugins.load(EVERY[found[0].name])(**found[0].parameters)
 
 
 def run(
@@ -159,7 +162,7 @@ def run(
         path = Path(config)
         sweep = load.load_any(path)
     place = claimed(Path(results) / sweep.name, path)
-    table = run_sweep(sweep.name, sweep.runs(), place, Lines(err), lambda line: None, again=again)
+    table = run_sweep(sweep.name, sweep.runs(), place, Lines(err()), lambda line: None, again=again)
     draw_reports(sweep.reports, table, place)
     return _frame(table)
 

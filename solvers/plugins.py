@@ -134,7 +134,7 @@ def _written(name: str, folder: Path) -> Plugin:
 def _of_module(name: str, target: str, distribution: str | None) -> Plugin:
     """distribution: its version; None to look for it."""
     module = target.partition(":")[0]
-    source = _source(module)
+    source = source_of(module)
     if source is None:
         raise Refused(f"{name!r} names the module {module}, which Python does not find; install it beside springbench")
     if distribution is None:
@@ -144,7 +144,7 @@ def _of_module(name: str, target: str, distribution: str | None) -> Plugin:
     return Plugin(name, target, module, "+".join(filter(None, (distribution, code))), source)
 
 
-def _source(module: str) -> str | None:
+def source_of(module: str) -> str | None:
     """The file of a module, found without importing what it lies in; None where there is none."""
     first, *rest = module.split(".")
     try:

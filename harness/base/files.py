@@ -32,6 +32,11 @@ def replacing(path: Path) -> Generator[Path]:
             partial.unlink(missing_ok=True)
 
 
+def users_cache(name: str) -> Path:
+    """Where a kind of file is kept for the user, between commands; the folder may not be there."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "springbench" / name
+
+
 MISTAKES = {
     *(errno.EACCES, errno.EEXIST, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENODEV, errno.ENOENT),
     *(errno.ENOTDIR, errno.ENXIO, errno.EOPNOTSUPP, errno.EPERM, errno.EROFS),

@@ -23,7 +23,7 @@ from typing import Any
 import typer
 
 from harness.base.errors import InputError, Mistake, RunFailed
-from harness.base.files import replacing
+from harness.base.files import replacing, users_cache
 
 _BATCH = 500
 """So many files travel at once."""
@@ -80,8 +80,7 @@ class Place:
         except (ValueError, ImportError, TypeError) as error:
             hint = "; pip install 'springbench[s3]'" if url.startswith("s3:") else ""
             raise InputError(Mistake(f"{error}{hint}", key=url)) from error
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "springbench" / "places"
-        folder = cache / hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
+        folder = users_cache("places") / hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
         folder.mkdir(parents=True, exist_ok=True)
         place = cls(url, folder, system, str(root).rstrip("/"))
         with suppress(OSError, ValueError):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from harness.base.model import Many, Model
-from harness.config.options import Iterations, Rounds, Threads, lists
+from harness.config.options import OF_STEPS, Iterations, Rounds, Threads, lists
 from harness.config.sweep import SolverSpec, in_file_name
 from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, Size
 from solvers.plugins import identity
@@ -57,7 +58,7 @@ class CurveStudy(Study):
     """Whether the solve from the first of the guesses is recorded, to scrub through its iterates beside the mesh."""
 
 
-class WorkStudy(Study, lists("first_guess", "iterations", "tolerance")):
+class WorkStudy(Study, lists(*OF_STEPS)):
     """Error and wall time of whole trajectories."""
 
     horizon: Annotated[float, Field(gt=0, le=1e4)] = 1.0
@@ -141,19 +142,17 @@ class CurveSpec:
 
 @dataclass(frozen=True, slots=True)
 class WorkSpec:
-    """One simulation up to the horizon [s]."""
+    """One simulation up to the horizon [s]; options: those of `OF_STEPS`, in their order."""
 
     case: Case
     horizon: float
     solver: SolverSpec
-    first_guess: FirstGuess
-    iterations: int
-    tolerance: float | None
+    options: Mapping[str, Any]
     how: How
 
     def point(self) -> list[Any]:
         """What is measured, however it is; plain data."""
-        stop = [self.first_guess, self.iterations, self.tolerance, self.how.threads]
+        stop = [*self.options.values(), self.how.threads]
         solver = [identity(self.solver.name), dict(self.solver.parameters)]
         return ["work", *self.case.identity(), self.horizon, *solver, *stop]
 

@@ -13,7 +13,9 @@ from harness.base.errors import InputError, Mistake, did_you_mean
 from harness.base.yaml import read_yaml
 from harness.config.accuracy import AccuracyFields, Case, CurveSpec, CurveStudy, How, Study, WorkSpec, WorkStudy
 from harness.config.expand import check_size
-from harness.config.load import check_name, misfits, scenes_of, solvers_of
+from harness.config.load import check_name, misfits, scenes_of
+from harness.config.options import OF_STEPS
+from harness.config.solvers import solvers_of
 from harness.config.sweep import SolverSpec
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
@@ -104,10 +106,11 @@ class _Expansion:
             if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:  # round-off of the quotient, and no more
                 problem = f"{study.horizon:g} s is no multiple of the time step {dt:.6g} s of {case.scene_name}"
                 self.document.report(problem, (*at, "horizon"))
-            lists: Any = study.first_guess, study.iterations, study.tolerance
-            for solver, (guess, *options) in product(self._solvers(study, at), product(*lists)):
-                first_guess = guess or case.scene.guess(case.integrator)
-                yield WorkSpec(case, study.horizon, solver, first_guess, *options, how=how)
+            lists = [getattr(study, name) for name in OF_STEPS]
+            for solver, values in product(self._solvers(study, at), product(*lists)):
+                options = dict(zip(OF_STEPS, values, strict=True))
+                options["first_guess"] = options["first_guess"] or case.scene.guess(case.integrator)
+                yield WorkSpec(case, study.horizon, solver, options, how)
 
     def _cases(self, study: Study, at: Key) -> list[Case]:
         found: list[Case] = []

@@ -5,20 +5,19 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_type_hints
+from typing import Any, Literal
 
-from pydantic import create_model
-
-from harness.base.document import Document, Key, is_list, is_mapping, key_text, quote
+from harness.base.document import Document, Key, is_list, key_text, quote
 from harness.base.errors import InputError, Mistake
 from harness.base.model import Model
 from harness.base.yaml import read_yaml
 from harness.config.expand import Expansion
 from harness.config.options import AUTO
 from harness.config.own import UnopenedEffect, UnopenedMesh, chosen, given, opened
-from harness.config.sweep import Options, RunSpec, SolverSpec, SweepFields
+from harness.config.solvers import solvers_of
+from harness.config.sweep import Options, RunSpec, SweepFields
 from harness.scenes.assignment import FORCE, PIN_WEIGHT, TIME_STEP, read_assignment
 from harness.scenes.bind import build
 from harness.scenes.effects import table as effect_table
@@ -27,7 +26,6 @@ from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import NAME, SceneFile, SceneSpec
 from solvers.plugins import Plugin, found, load
-from solvers.registry import EVERY
 
 ASSIGNMENT_FRAMES = 30
 DEFAULT_SOLVER = "numba"
@@ -214,17 +212,6 @@ def scenes_of(document: Document) -> dict[str, SceneSpec]:
     return scenes
 
 
-def solvers_of(document: Document) -> list[SolverSpec]:
-    """The solvers that the config lists under `solvers`, with all of their parameters; mistakes are noted."""
-    listed: Any = document.data.get("solvers")
-    found = [
-        _solver(document, entry, ("solvers", i))
-        for i, entry in enumerate(listed if is_list(listed) else [])
-        if isinstance(entry, str) or is_mapping(entry)  # the check of the whole config reports others
-    ]
-    return [solver for solver in found if solver]
-
-
 def _expanded(document: Document, scenes: dict[str, SceneSpec]) -> Sweep:
     check_name(document)
     sweep = document.check(SweepFields, document.data)
@@ -253,36 +240,6 @@ def misfits(scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:
     except InputError as error:
         return [replace(m, file=m.file or scene.path, line=m.line or scene.lines.get(m.key)) for m in error.mistakes]
     return []
-
-
-def _solver(document: Document, entry: str | dict[str, Any], at: Key) -> SolverSpec | None:
-    """A solver with all of its parameters; they are the fields of its dataclass."""
-    data = {"name": entry} if isinstance(entry, str) else entry
-    named = chosen(document, EVERY, data, "name", at)
-    if named is None:
-        return None
-    name, asked = named
-    own = isinstance(name, Plugin)
-    if own and not document.opens:
-        return SolverSpec(name, asked)
-    solver = opened(document, name, "solver", at) if own else load(EVERY[name])
-    parameters = solver and document.check(parameters_model(name, solver), asked, at)
-    if parameters is None:
-        return None
-    try:
-        solver(**vars(parameters))
-    except ValueError as error:
-        document.report(str(error), at)
-    return SolverSpec(name, asked if own else parameters.model_dump(mode="json"))  # own code's are those of `list` too
-
-
-def parameters_model(name: str, solver: type) -> type[Model]:
-    """The model of a solver's parameters, made of the fields of its frozen dataclass."""
-    hints = get_type_hints(solver, include_extras=True)
-    given: dict[str, Any] = {
-        f.name: (hints[f.name], ... if f.default is MISSING else f.default) for f in fields(solver)
-    }
-    return create_model(name, __base__=Model, __doc__=solver.__doc__, **given)
 
 
 def _is_assignment(path: Path) -> bool:

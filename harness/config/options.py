@@ -77,6 +77,10 @@ OF_SCENE = tuple(name for name, option in OPTIONS.items() if option.null)
 """Those that the scene says where nobody else does."""
 
 
+OF_STEPS: tuple[str, ...] = ("first_guess", "iterations", "tolerance")
+"""Those that say how a step is solved, whatever it is."""
+
+
 def meaning(name: str) -> str:
     """What an option is, in a sentence."""
     said, null = (Chosen.model_fields[name].description or "").removesuffix("."), OPTIONS[name].null

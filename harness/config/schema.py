@@ -11,7 +11,7 @@ from pydantic.json_schema import models_json_schema
 
 from harness.base.model import Model
 from harness.config.accuracy import AccuracyFields
-from harness.config.load import parameters_model
+from harness.config.solvers import parameters_model
 from harness.config.sweep import SweepFields
 from harness.scenes.effects.table import EFFECTS
 from harness.scenes.mesh.table import MESHES

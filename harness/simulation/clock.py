@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from time import CLOCK_MONOTONIC_RAW, clock_gettime, process_time, thread_time
+from time import CLOCK_MONOTONIC_RAW, clock_gettime, perf_counter, process_time, thread_time
 from typing import Any, cast
 
 import numpy as np
@@ -81,6 +81,21 @@ class Watch:
             "cpu_seconds": self.process,
             "interrupted": self.lost > max(SHARE * self.wall, LEAST),
         }
+
+
+class Clock:
+    """Times one piece of work after the other, each of which its watch sees as well; seconds: of the last one."""
+
+    def __init__(self, watch: Watch) -> None:
+        self.watch, self.seconds, self._began = watch, 0.0, 0.0
+
+    def __enter__(self) -> None:
+        self.watch.__enter__()
+        self._began = perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds = perf_counter() - self._began
+        self.watch.__exit__()
 
 
 def working(prepared: Prepared, problem: StepProblem) -> dict[str, Callable[[], object]]:

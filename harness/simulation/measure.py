@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from itertools import pairwise
 from time import perf_counter
@@ -18,7 +18,7 @@ import numba
 import numpy as np
 
 from harness.scenes.bind import Scene
-from harness.simulation.clock import Watch, working
+from harness.simulation.clock import Clock, Watch, working
 from harness.simulation.contract import Contract
 from harness.simulation.step import Step, prepare, simulate, start
 from solvers.problem import Positions, Prepared, Solver, StopRule
@@ -28,6 +28,8 @@ PHASE_REPEATS = 3
 
 ITERATION = "iteration"
 """The phase that the others should add up to: the time of a whole solve over its iterations, taken next to theirs."""
+
+NO_CLOCK: AbstractContextManager[None] = nullcontext()
 
 LARGEST = 1e150
 """Coordinates [m] from this one on count as not finite: their squares, and so all energies, are infinite."""
@@ -122,20 +124,22 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
 
     final = start(scene).now.positions
     for round in range(settings.rounds):
-        for step in steps(scene, prepared, settings, watch("step", round)):
-            timings.append(Timing("step", step.index, round, step.seconds))
+        clock = Clock(watch("step", round))
+        for step in steps(scene, prepared, settings, clock):
+            timings.append(Timing("step", step.index, round, clock.seconds))
             final = step.positions
             tick("timed pass")
     return Measured(prepared, timings, watches, final)
 
 
-def steps(scene: Scene, prepared: Prepared, settings: Settings, watch: Watch | None = None) -> Iterator[Step]:
-    """The run's steps, each done under the watch; raises StepFailed, from Diverged where a position is not finite."""
+def steps(
+    scene: Scene, prepared: Prepared, settings: Settings, clock: AbstractContextManager[None] = NO_CLOCK
+) -> Iterator[Step]:
+    """The run's steps, each done within the clock; raises StepFailed, from Diverged where a position is not finite."""
     run = simulate(scene, prepared, settings.stop, first_guess=settings.first_guess, frames=settings.frames)
-    watched = watch or nullcontext()
     for frame in range(1, settings.frames + 1):
         try:
-            with watched:
+            with clock:
                 step = next(run)
             if not np.abs(step.positions).max(initial=0.0) < LARGEST:  # so that NaN counts too
                 raise Diverged(f"positions are not finite from frame {frame} on")

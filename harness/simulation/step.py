@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import reduce
-from time import perf_counter
 
 from harness.scenes.bind import Scene
 from harness.simulation.stages import Stages, require_mass
@@ -26,7 +25,7 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """A step that was done: its problem, its solution, the state after it, its wall seconds and all of its iterations.
+    """A step that was done: its problem, its solution, the state after it and all of its iterations.
 
     A step of several unknowns has the problem and the solution of the last one; stages: those of all, in their order.
     """
@@ -34,7 +33,6 @@ class Step:
     problem: StepProblem
     solution: Solution
     state: State
-    seconds: float
     iterations: int
     stages: tuple[tuple[StepProblem, Solution], ...]
 
@@ -99,19 +97,17 @@ def simulate(
     scene: Scene, prepared: Prepared, stop: StopRule, *, first_guess: str, frames: int, state: State | None = None
 ) -> Iterator[Step]:
     """The steps from a state (the scene's start if it is left out), one more each time it is asked, up to the frame
-    `frames`; the clock stands still in between. prepared: by `prepare`."""
+    `frames`. prepared: by `prepare`."""
     state = state or start(scene)
+    step = _single if isinstance(scene.integrator, Integrator) else _staged
     while state.index < frames:
-        began = perf_counter()
-        step = _single if isinstance(scene.integrator, Integrator) else _staged
         done = step(scene, prepared, stop, first_guess, state)
-        seconds = perf_counter() - began
         state = done.state
-        yield replace(done, seconds=seconds)
+        yield done
 
 
 def _single(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, state: State) -> Step:
-    """The step of an integrator of one unknown; its seconds are not known."""
+    """The step of an integrator of one unknown."""
     stated = problem(scene, state, first_guess)
     solution = prepared.solve(stated, stop)
     usual = scene.integrator
@@ -119,15 +115,15 @@ def _single(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, 
     method = IMPLICIT_EULER if usual.history and state.before is None else usual
     before = Motion(stated.start.positions, stated.start.velocity)
     after = State(method.advance(stated.start, solution), before, state.index + 1)
-    return Step(stated, solution, after, 0.0, solution.iterations, ((stated, solution),))
+    return Step(stated, solution, after, solution.iterations, ((stated, solution),))
 
 
 def _staged(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, state: State) -> Step:
-    """The step of an integrator of several unknowns; its seconds are not known."""
+    """The step of an integrator of several unknowns."""
     begun = _stages(scene, state)
     done = begun.done(prepared, stop, FIRST_GUESSES[first_guess])
     after = State(done.end.motion, begun.now, state.index + 1, done.end.acceleration)
-    return Step(*done.stages[-1], after, 0.0, done.iterations, done.stages)
+    return Step(*done.stages[-1], after, done.iterations, done.stages)
 
 
 def _stages(scene: Scene, state: State) -> Stages:

@@ -18,7 +18,7 @@ from harness.experiments.run import execute
 from harness.record.base import Frame
 from harness.record.rerun import RerunRecorder
 from harness.record.shading import Shading
-from harness.simulation import step as simulate
+from harness.simulation import clock as clocks
 from solvers.integrators import Integrator, Motion
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Positions, Prepared, Solution, Start, StepProblem, StopRule, System
@@ -112,7 +112,7 @@ CLOCKS = {
 
 @pytest.mark.parametrize("clock", CLOCKS.values(), ids=CLOCKS)
 def test_a_run_whose_steps_do_not_add_up_to_the_wall_time_fails(ran, monkeypatch: pytest.MonkeyPatch, clock):
-    monkeypatch.setattr(simulate, "perf_counter", clock)
+    monkeypatch.setattr(clocks, "perf_counter", clock)
     (row,), files = ran()
     assert row["status"] == "failed"
     assert "the times of step add up to" in row["reason"]

@@ -22,7 +22,7 @@ from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.chain import Chain
 from harness.scenes.spec import SceneSpec
-from harness.simulation import step as simulate_module
+from harness.simulation import clock as clock_module
 from harness.simulation.step import prepare, simulate
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule
@@ -40,9 +40,7 @@ UNIT = WorkSpec(
     Case("chain", CHAIN, 5, "implicit-euler"),
     HORIZON,
     SolverSpec("sparse", {}),
-    "current",
-    iterations=20,
-    tolerance=None,
+    {"first_guess": "current", "iterations": 20, "tolerance": None},
     how=How(threads=1, rounds=2, time_limit=60.0),
 )
 
@@ -89,7 +87,7 @@ def test_each_round_has_a_time_and_their_median_is_the_cost(trajectory: Trajecto
 def test_seconds_that_another_clock_does_not_bear_out_are_a_failure(
     trajectory: Trajectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(simulate_module, "perf_counter", lambda: perf_counter() / 1000)
+    monkeypatch.setattr(clock_module, "perf_counter", lambda: perf_counter() / 1000)
     found = row(UNIT, trajectory)
     assert (found["status"], "seconds" in found) == ("failed", False)
     assert "the times of step add up to" in found["reason"]

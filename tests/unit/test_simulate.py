@@ -15,6 +15,8 @@ from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.chain import Chain
+from harness.simulation.clock import Clock, Watch
+from harness.simulation.measure import Settings, steps
 from harness.simulation.step import FIRST_GUESSES, State, problem, simulate, start
 from solvers.integrators import Motion
 from solvers.problem import Positions, Solution, StepProblem, StopRule
@@ -131,15 +133,15 @@ def test_filters_change_the_velocity_before_inertia_and_forces_see_it():
 
 def test_each_step_starts_from_the_two_before_it():
     prepared, rule = Pushed(), StopRule(9, 0.1)
-    steps = list(simulate(MADE, prepared, rule, first_guess="assignment", frames=3))
-    assert [step.index for step in steps] == [1, 2, 3]
+    done = list(simulate(MADE, prepared, rule, first_guess="assignment", frames=3))
+    assert [step.index for step in done] == [1, 2, 3]
     rest = MADE.mesh.rest
     for k, (stated, stop) in enumerate(prepared.asked):
         np.testing.assert_allclose(stated.first_guess, rest + k, rtol=1e-15)
         moved = np.array(VELOCITY) * DT if k == 0 else 1.0
         np.testing.assert_allclose(stated.target, rest + k + moved, rtol=0, atol=1e-14)
         assert stop == rule
-    assert all(step.problem is stated for step, (stated, _) in zip(steps, prepared.asked, strict=True))
+    assert all(step.problem is stated for step, (stated, _) in zip(done, prepared.asked, strict=True))
 
 
 class Slow(Pushed):
@@ -153,20 +155,20 @@ class Slow(Pushed):
 
 
 def test_a_steps_seconds_hold_its_solve_and_nothing_between_steps():
-    prepared = Slow()
-    steps = simulate(MADE, prepared, StopRule(), first_guess="current", frames=3)
+    prepared, clock = Slow(), Clock(Watch())
+    run = steps(MADE, prepared, Settings(StopRule(), "current", 3, 1), clock)
     for _ in range(3):
         began = perf_counter()
-        step = next(steps)
+        next(run)
         around = perf_counter() - began
-        assert prepared.slept <= step.seconds <= around  # intervals on one clock, each within the next
+        assert prepared.slept <= clock.seconds <= around  # intervals on one clock, each within the next
         sleep(0.01)
 
 
 def test_steps_are_done_only_when_asked_for():
     prepared = Pushed()
-    steps = simulate(MADE, prepared, StopRule(), first_guess="current", frames=1000)
-    next(steps)
+    run = simulate(MADE, prepared, StopRule(), first_guess="current", frames=1000)
+    next(run)
     assert len(prepared.asked) == 1
 
 

@@ -21,7 +21,9 @@ from harness.base.errors import InputError, Mistake, RunFailed
 from harness.base.progress import Display
 from harness.config.accuracy import AccuracyFields, Case, How, WorkSpec
 from harness.config.accuracy_load import Accuracy, expand
-from harness.config.load import load_scene, solvers_of
+from harness.config.load import load_scene
+from harness.config.options import OF_STEPS
+from harness.config.solvers import solvers_of
 from harness.config.sweep import SolverSpec
 from harness.experiments.accuracy.rows import SCHEMA
 from harness.experiments.accuracy.studies import run_accuracy
@@ -62,7 +64,8 @@ class Way:
 
     def __str__(self) -> str:
         u = self.spec
-        stop = f"{u.iterations} iterations" if u.tolerance is None else f"tolerance {u.tolerance:g}"
+        tolerance = u.options["tolerance"]
+        stop = f"{u.options['iterations']} iterations" if tolerance is None else f"tolerance {tolerance:g}"
         return f"{u.case.integrator}, time step {u.case.scene.time_step:.6g} s, {stop}, solver {u.solver.name}"
 
 
@@ -158,7 +161,7 @@ def _spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSpec:
     case = Case(name, scene.stepped(row["time_step"]), row["size"], row["integrator"])
     solver = SolverSpec(row["solver"], json.loads(row["parameters"]))
     how = How(row["threads"], rounds=1, time_limit=float("inf"))
-    return WorkSpec(case, row["horizon"], solver, row["first_guess"], row["iterations"], row["tolerance"], how)
+    return WorkSpec(case, row["horizon"], solver, {name: row[name] for name in OF_STEPS}, how)
 
 
 def _check(best: Way, store: Store) -> Way:

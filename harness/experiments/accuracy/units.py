@@ -205,9 +205,8 @@ class WorkUnit:
     def lost(self, lost: Lost) -> str:
         """See Unit."""
         spec = self.spec
-        row = {"kind": "work", "status": lost.status, "reason": str(lost), "horizon": spec.horizon}
-        row |= {key: getattr(spec, key) for key in ("first_guess", "iterations", "tolerance")}
-        return _written(self.home, spec, [row])
+        row: Row = {"kind": "work", "status": lost.status, "reason": str(lost), "horizon": spec.horizon}
+        return _written(self.home, spec, [row | dict(spec.options)])
 
 
 def _written(home: Home, spec: CurveSpec | WorkSpec, found: Sequence[Row]) -> str:

@@ -19,7 +19,7 @@ from harness.experiments.accuracy.failures import OverTime, lost
 from harness.reference.frozen import bind
 from harness.reference.trajectory import Trajectory
 from harness.scenes.bind import Scene
-from harness.simulation.clock import Watch
+from harness.simulation.clock import Clock, Watch
 from harness.simulation.measure import Diverged
 from harness.simulation.step import prepare, simulate
 from solvers.problem import Positions, Prepared, Solver, StopRule
@@ -36,14 +36,7 @@ def work_rows(spec: WorkSpec, trajectory: Trajectory | Exception, tick: Callable
 
     trajectory: the reference up to the horizon, or why there is none; tick: called after each round.
     """
-    shared: Row = {
-        "kind": "work",
-        "status": "ok",
-        "first_guess": spec.first_guess,
-        "iterations": spec.iterations,
-        "tolerance": spec.tolerance,
-        "horizon": spec.horizon,
-    }
+    shared: Row = {"kind": "work", "status": "ok", **spec.options, "horizon": spec.horizon}
     try:
         if isinstance(trajectory, Exception):
             raise trajectory
@@ -78,14 +71,15 @@ def _run(spec: WorkSpec, scene: Scene, prepared: Prepared, frames: int) -> tuple
 
     Raises RunFailed where another clock saw other seconds go by.
     """
-    stop, seconds, iterations = StopRule(spec.iterations, spec.tolerance), 0.0, 0
-    p, watch = scene.mesh.rest, Watch(spec.how.threads)
-    run = simulate(scene, prepared, stop, first_guess=spec.first_guess, frames=frames)
+    seconds, iterations, p, watch = 0.0, 0, scene.mesh.rest, Watch(spec.how.threads)
+    clock = Clock(watch)
+    stop = StopRule(spec.options["iterations"], spec.options["tolerance"])
+    run = simulate(scene, prepared, stop, first_guess=spec.options["first_guess"], frames=frames)
     for _ in range(frames):
-        with watch:
+        with clock:
             step = next(run)
         p = step.positions
-        seconds += step.seconds
+        seconds += clock.seconds
         iterations += step.iterations
         if not np.isfinite(p).all():
             raise Diverged(f"positions are not finite from frame {step.index} on")

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.base.errors import InputError
+from harness.base.files import users_cache
 from harness.experiments.gates.pair import Side
 
 KEPT = 6
@@ -26,7 +27,7 @@ KEPT = 6
 
 def cache() -> Path:
     """Where worktrees are kept."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "springbench" / "revisions"
+    return users_cache("revisions")
 
 
 def root(folder: Path) -> Path:

@@ -1,0 +1,96 @@
+"""The solvers of a config, with all of their parameters; they are the fields of a solver's dataclass.
+
+A solver brings Numba and its kernels along, most of what `springbench list` would take. So what a shipped one said of
+its parameters is kept in the user's cache, by the digest of all sources that it depends on: a change of any asks anew.
+"""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from pydantic import create_model
+
+from harness.base.document import Document, Key, is_list, is_mapping
+from harness.base.files import CannotWrite, replacing, users_cache
+from harness.base.model import Model
+from harness.config.own import chosen, opened
+from harness.config.sweep import SolverSpec
+from solvers import sources
+from solvers.plugins import Plugin, load, source_of
+from solvers.registry import EVERY
+
+
+def solvers_of(document: Document) -> list[SolverSpec]:
+    """The solvers that the config lists under `solvers`, with all of their parameters; mistakes are noted."""
+    listed: Any = document.data.get("solvers")
+    found = [
+        _solver(document, entry, ("solvers", i))
+        for i, entry in enumerate(listed if is_list(listed) else [])
+        if isinstance(entry, str) or is_mapping(entry)  # the check of the whole config reports others
+    ]
+    return [solver for solver in found if solver]
+
+
+def _solver(document: Document, entry: str | dict[str, Any], at: Key) -> SolverSpec | None:
+    data = {"name": entry} if isinstance(entry, str) else entry
+    named = chosen(document, EVERY, data, "name", at)
+    if named is None:
+        return None
+    name, asked = named
+    own = isinstance(name, Plugin)
+    if own and not document.opens:
+        return SolverSpec(name, asked)
+    kept = None if own or asked or document.opens else _kept_file(name)
+    if kept is not None and (known := _read(kept)) is not None:
+        return SolverSpec(name, known)
+    solver = opened(document, name, "solver", at) if own else load(EVERY[name])
+    parameters = solver and document.check(parameters_model(name, solver), asked, at)
+    if parameters is None:
+        return None
+    try:
+        solver(**vars(parameters))
+    except ValueError as error:
+        document.report(str(error), at)
+    if own:
+        return SolverSpec(name, asked)  # as `list` has them
+    found: dict[str, Any] = parameters.model_dump(mode="json")
+    if kept is not None:
+        _keep(kept, found)
+    return SolverSpec(name, found)
+
+
+def parameters_model(name: str, solver: type) -> type[Model]:
+    """The model of a solver's parameters, made of the fields of its frozen dataclass."""
+    hints = get_type_hints(solver, include_extras=True)
+    given: dict[str, Any] = {
+        f.name: (hints[f.name], ... if f.default is MISSING else f.default) for f in fields(solver)
+    }
+    return create_model(name, __base__=Model, __doc__=solver.__doc__, **given)
+
+
+def _kept_file(name: str) -> Path | None:
+    """Where the parameters of a shipped solver that a config names alone are kept."""
+    source = source_of(EVERY[name].partition(":")[0])
+    return users_cache("parameters") / f"{name}-{sources.digest([source])[:16]}.json" if source else None
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        found: Any = json.loads(path.read_text())
+    except (OSError, ValueError):  # nothing is kept, or nothing that can be read
+        return None
+    return found if is_mapping(found) else None
+
+
+def _keep(path: Path, parameters: dict[str, Any]) -> None:
+    """Keep parameters in the place of those by other sources, where there is a place."""
+    with suppress(OSError, CannotWrite):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for older in path.parent.glob(path.stem[:-16] + "?" * 16 + ".json"):
+            older.unlink(missing_ok=True)
+        with replacing(path) as partial:
+            partial.write_text(json.dumps(parameters))

@@ -1,0 +1,119 @@
+"""The way of a run, as `harness/README.md` tells it: traced, call by call, for two frames."""
+
+from __future__ import annotations
+
+import sys
+from types import FrameType
+from typing import Any, NamedTuple
+
+import pytest
+from typer.testing import CliRunner
+
+from harness.cli import app
+
+ROWS = ("cli", "experiments", "report", "config", "reference", "simulation", "record", "scenes", "base", "solvers")
+"""The rows of the page, the uppermost first."""
+
+GIVEN = {
+    ("harness.base.commands", "harness.config.command_line"): "Typer asks for a command's options",
+    ("harness.config.command_line", "harness.cli"): "and calls the command",
+    ("harness.base.document", "harness.scenes.selection"): "the models of what a document says check their fields",
+    ("harness.base.document", "harness.scenes.spec"): "the same",
+    ("harness.base.rows", "harness.experiments.sweep"): "paths, one after the other",
+    ("harness.simulation.step", "harness.reference.grade"): "a solver whose residuals are graded",
+    ("harness.simulation.observe", "harness.experiments.run"): "who is told of each step",
+}
+"""The calls that lead up, each to what was given on the way down."""
+
+STATIONS = (
+    "harness.config.load",
+    "harness.config.expand",
+    "harness.experiments.plan",
+    "harness.experiments.run",
+    "harness.simulation.measure",
+    "harness.simulation.step",
+    "harness.record.rerun",
+    "harness.simulation.observe",
+    "harness.record.verify",
+    "harness.report.timing_table",
+)
+
+SCENE = """
+mesh: {kind: grid}
+mass: 1
+time_step: 1/30
+frames: 2
+default_size: 4
+effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
+"""
+SWEEP = "scenes: [scene.yaml]\nsolvers: [sparse]\noptions: {rounds: 1, iterations: 3, pictures: false}\n"
+
+
+class Call(NamedTuple):
+    """A call of one module's function by another module's, which may have gone through a library."""
+
+    by: str
+    of: str
+    name: str
+
+
+def row(module: str) -> int:
+    first, _, rest = module.partition(".")
+    return ROWS.index("solvers" if first == "solvers" else rest.partition(".")[0])
+
+
+def ours(frame: FrameType | None) -> FrameType | None:
+    """The nearest frame of the project's, from this one on upwards."""
+    while frame and not frame.f_globals.get("__name__", "").startswith(("harness.", "solvers.")):
+        frame = frame.f_back
+    return frame
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> list[Call]:
+    """All calls from one module to another, in their order, of a run whose libraries were loaded before."""
+    folder, calls = tmp_path_factory.mktemp("walk"), list[Call]()
+    (folder / "scene.yaml").write_text(SCENE)
+    (folder / "sweep.yaml").write_text(SWEEP)
+
+    def run() -> None:
+        asked = ["run", str(folder / "sweep.yaml"), "--here", "--again", "--results", str(folder / "results")]
+        told = CliRunner().invoke(app, asked)
+        assert told.exit_code == 0, told.output
+
+    def trace(frame: FrameType, event: str, argument: Any) -> None:
+        if event != "call" or ours(frame) is not frame or frame.f_code.co_name == "<module>":
+            return
+        above = ours(frame.f_back)
+        if above and (by := above.f_globals["__name__"]) != (of := frame.f_globals["__name__"]):
+            calls.append(Call(by, of, frame.f_code.co_name))
+
+    run()
+    sys.setprofile(trace)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return calls
+
+
+def test_calls_lead_down_the_rows_and_up_to_what_was_given_on_the_way(walk: list[Call]):
+    assert {(call.by, call.of) for call in walk if row(call.of) < row(call.by)} == set(GIVEN)
+
+
+def test_a_solve_takes_nothing_of_the_harness_along(walk: list[Call]):
+    assert not [call for call in walk if call.by.startswith("solvers.") and call.of.startswith("harness.")]
+
+
+def test_a_run_comes_by_its_stations_in_the_order_of_the_page(walk: list[Call]):
+    assert [module for module in dict.fromkeys(call.of for call in walk) if module in STATIONS] == list(STATIONS)
+    # A config is bound once to be checked, and a run once.
+    assert [call.by for call in walk if (call.of, call.name) == ("harness.scenes.bind", "build")] == [
+        "harness.config.load",
+        "harness.experiments.run",
+    ]
+
+
+def test_a_run_enters_few_modules_and_seldom_changes_them(walk: list[Call]):
+    assert len({call.of for call in walk}) <= 90, "86 when this was written"
+    assert len(walk) <= 1350, "1,253 when this was written"
