@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from harness.base.commands import Again, Changed, Check, Commands, Error, Horizon, InThisProcess, Peers, Results, Rows
 from harness.base.console import err, out
@@ -93,8 +93,8 @@ def run(
     runs = sweep.runs()
     how: dict[str, Any] = {"again": again, "changed": changed, "positions": positions, "isolated": not here}
     how |= {"at_once": workers, "on": on}
-    table = run_sweep(sweep.name, runs, folder, display(err), _say, **how)
-    out.print(summary_table(table, of_other_code(runs, table)))
+    table = run_sweep(sweep.name, runs, folder, display(err()), _say, **how)
+    out().print(summary_table(table, of_other_code(runs, table)))
     _say(f"rows, recordings and pictures are in {folder}")
     for path in draw_reports(sweep.reports, table, folder):
         _say(f"reported in {path}")
@@ -131,8 +131,8 @@ def speed(
     sweep = load_sweep(config)
     folder = claimed(results / sweep.name, config)
     how = {"again": again, "changed": changed, "isolated": not here}
-    found = figures(run_speed(sweep, folder, display(err), _say, budget=budget, **how))
-    out.print(speed_table(found))
+    found = figures(run_speed(sweep, folder, display(err()), _say, budget=budget, **how))
+    out().print(speed_table(found))
     for line in remarks(found):
         _say(line)
     draw(found, folder / "pictures")
@@ -159,7 +159,7 @@ def accuracy(
 
     asked = load_accuracy(config)
     folder = claimed(results / asked.name, config)
-    files = run_accuracy(asked, folder, display(err), _say, again=again, changed=changed, isolated=not here)
+    files = run_accuracy(asked, folder, display(err()), _say, again=again, changed=changed, isolated=not here)
     drawn = draw(folder, files)
     _say(f"rows are in {folder / 'accuracy'}; {len(drawn)} pictures and tables tell of them")
     keep(results, folder, _say)
@@ -184,7 +184,7 @@ def report(
 
     page = update(results, recorded=True, viewer=viewer, say=_say)
     for picture, cells in draw_maps(results, older_of):
-        out.print(summary(cells))
+        out().print(summary(cells))
         _say(f"the map is {picture}")
     _say(f"the page is {page}; a browser opens it, and needs no network for it")
 
@@ -205,6 +205,8 @@ app.add_typer(study, name="gate-study")
 @app.command("list")
 def list_runs(config: Config, results: Results = Path("results")) -> None:
     """Check a config, and show what would run and what is there already."""
+    from rich.table import Table
+
     from harness.config.load import load_any
     from harness.experiments.plan import plan
 
@@ -224,7 +226,7 @@ def list_runs(config: Config, results: Results = Path("results")) -> None:
             state,
         )
         table.add_row(*map(str, cells))
-    out.print(table)
+    out().print(table)
 
 
 @app.command()
@@ -244,7 +246,7 @@ def query(
     if csv:
         found.write_csv(sys.stdout)
     else:
-        out.print(found.table())
+        out().print(found.table())
 
 
 @app.command()
@@ -265,7 +267,7 @@ def inspect(
     """Print what is in recordings, without a viewer; two are compared."""
     from harness.report.inspect import inspect as inspect_recordings
 
-    inspect_recordings(recordings, frame=frame, export=export, csv=csv, console=out)
+    inspect_recordings(recordings, frame=frame, export=export, csv=csv, console=out())
 
 
 @app.command()
@@ -283,6 +285,7 @@ def _check_positions(path: Path | None) -> None:
 
 def main() -> None:
     """The console script."""
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for some in every installed package
     app()
 
 

@@ -14,9 +14,8 @@ from collections.abc import Iterable, Iterator
 from functools import reduce
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array, csc_array, csr_array, dia_array
-from scipy.sparse.csgraph import connected_components
 
 from solvers.problem import Energy, LaggedEnergy, NotPositiveDefinite, ProjectiveEnergy, Start, System
 
@@ -32,13 +31,13 @@ def signed_incidence_matrix_dense(springs: NDArray[np.int64], n: int) -> Dense:
     return A
 
 
-def signed_incidence_matrix_sparse(springs: NDArray[np.int64], n: int) -> csr_array:
+def signed_incidence_matrix_sparse(springs: NDArray[np.int64], n: int) -> scipy.sparse.csr_array:
     """A for springs (m, 2) over n vertices, shape (m, n), with 2 entries a row."""
     i, j = springs.T
     rows = np.flatnonzero(i != j)
     values = np.concatenate([np.ones(len(rows)), -np.ones(len(rows))])
     entries = np.concatenate([rows, rows]), np.concatenate([i[rows], j[rows]])
-    return csr_array(coo_array((values, entries), shape=(len(springs), n)))
+    return scipy.sparse.csr_array(scipy.sparse.coo_array((values, entries), shape=(len(springs), n)))
 
 
 def mass_matrix_dense(mass: ArrayLike) -> Dense:
@@ -46,7 +45,7 @@ def mass_matrix_dense(mass: ArrayLike) -> Dense:
     return np.diag(np.asarray(mass, float))
 
 
-def mass_matrix_sparse(mass: ArrayLike) -> csr_array:
+def mass_matrix_sparse(mass: ArrayLike) -> scipy.sparse.csr_array:
     """M from masses (n,) [kg], shape (n, n), with one entry for each vertex that has mass."""
     return diagonal(np.asarray(mass, float))
 
@@ -58,10 +57,10 @@ def selection_matrix_dense(pinned: NDArray[np.int64], n: int) -> Dense:
     return C
 
 
-def selection_matrix_sparse(pinned: NDArray[np.int64], n: int) -> csr_array:
+def selection_matrix_sparse(pinned: NDArray[np.int64], n: int) -> scipy.sparse.csr_array:
     """C for pinned vertices (q,), shape (q, n), with one entry a row."""
     q = len(pinned)
-    return csr_array(coo_array((np.ones(q), (np.arange(q), pinned)), shape=(q, n)))
+    return scipy.sparse.csr_array(scipy.sparse.coo_array((np.ones(q), (np.arange(q), pinned)), shape=(q, n)))
 
 
 def rest_lengths(rest: Dense, springs: NDArray[np.int64]) -> Dense:
@@ -79,15 +78,20 @@ def system_matrix_dense(
 
 
 def system_matrix_sparse(
-    A: csr_array, stiffness: ArrayLike, M: csr_array, time_step: float, C: csr_array, weight: ArrayLike
-) -> csr_array:
+    A: scipy.sparse.csr_array,
+    stiffness: ArrayLike,
+    M: scipy.sparse.csr_array,
+    time_step: float,
+    C: scipy.sparse.csr_array,
+    weight: ArrayLike,
+) -> scipy.sparse.csr_array:
     """Q [N/m], shape (n, n), as `system_matrix_dense`, with an entry for each vertex and two for each spring."""
     K = diagonal(np.broadcast_to(np.asarray(stiffness, float), len(A.indptr) - 1))
     W = diagonal(np.broadcast_to(np.asarray(weight, float), len(C.indptr) - 1))
     return without_zeros(A.T @ K @ A + M / time_step**2 + C.T @ W @ C)
 
 
-def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> csr_array:
+def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> scipy.sparse.csr_array:
     """Q of a system, shape (n, n): the energies' stiffness, masses and penalty pins.
 
     Exact pins put nothing into Q; the caller takes the rows of `system.free`. Raises NotPositiveDefinite.
@@ -100,7 +104,7 @@ def assemble(system: System, energies: Iterable[ProjectiveEnergy]) -> csr_array:
     return Q
 
 
-def shares(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[csr_array]:
+def shares(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[scipy.sparse.csr_array]:
     """Each energy's share A'KA [N/m] of Q, (n, n): lagged ones know it from the rate of the steps alone."""
     nowhere = np.zeros((system.vertices, 3))
     start = Start(nowhere, nowhere, 0.0, nowhere, system.rate, 0.0)
@@ -110,11 +114,13 @@ def shares(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[csr
             yield begun.stiffness_matrix(system.vertices)
 
 
-def require_determined(system: System, Q: csr_array) -> None:
+def require_determined(system: System, Q: scipy.sparse.csr_array) -> None:
     """Raise NotPositiveDefinite, with the vertices at fault, where nothing determines their positions.
 
     Every component of the graph of Q needs a mass or a pin.
     """
+    from scipy.sparse.csgraph import connected_components  # brings scipy.linalg along
+
     _, component = connected_components(Q, directed=False)
     anchor = system.mass.copy()
     anchor[system.pins.vertices] = 1.0
@@ -127,21 +133,21 @@ def require_determined(system: System, Q: csr_array) -> None:
         )
 
 
-def energy_norm(Q: Dense | csr_array, e: Dense) -> float:
+def energy_norm(Q: Dense | scipy.sparse.csr_array, e: Dense) -> float:
     """|e|_Q = sqrt(tr(e'Qe)) [J^(1/2)] of a displacement (n, 3) [m]."""
     # Where stiffness outweighs inertia by all of float64's digits, round-off can make a sum of zero negative.
     return float(np.sqrt(np.maximum(0.0, np.einsum("ij,ij->", e, Q @ e))))
 
 
-def diagonal(values: Dense) -> csr_array:
+def diagonal(values: Dense) -> scipy.sparse.csr_array:
     """A diagonal matrix [any unit], shape (n, n), without entries for zeros."""
     n = len(values)
-    return without_zeros(csr_array(dia_array((values[None, :], np.array([0])), shape=(n, n))))
+    return without_zeros(scipy.sparse.csr_array(scipy.sparse.dia_array((values[None, :], np.array([0])), shape=(n, n))))
 
 
-def without_zeros(matrix: csr_array | csc_array) -> csr_array:
+def without_zeros(matrix: scipy.sparse.csr_array | scipy.sparse.csc_array) -> scipy.sparse.csr_array:
     """The matrix with duplicates summed, columns sorted and explicit zeros dropped."""
-    matrix = csr_array(matrix)
+    matrix = scipy.sparse.csr_array(matrix)
     matrix.sum_duplicates()
     matrix.eliminate_zeros()
     return matrix

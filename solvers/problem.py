@@ -16,8 +16,8 @@ from functools import cached_property
 from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 Positions = NDArray[np.float64]
 """Positions [m], shape (n, 3), float64, C-contiguous."""
@@ -44,7 +44,7 @@ class Energy(Protocol):
         """Add the gradient [N], shape (n, 3), to `out`."""
         ...
 
-    def hessian(self, p: Positions) -> csr_array:
+    def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """The Hessian [N/m], shape (3n, 3n), the coordinates of a vertex side by side."""
         ...
 
@@ -53,7 +53,7 @@ class Energy(Protocol):
 class ProjectiveEnergy(Energy, Protocol):
     """min over d of sum_e w_e/2 |(A p)_e - d_e|^2 with each d_e on a manifold (Bouaziz et al. 2014)."""
 
-    def stiffness_matrix(self, n: int) -> csr_array:
+    def stiffness_matrix(self, n: int) -> scipy.sparse.csr_array:
         """The energy's share A'KA [N/m] of the system matrix, shape (n, n)."""
         ...
 

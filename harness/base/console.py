@@ -1,42 +1,71 @@
-"""Where the command line writes: tables to standard output; messages, and what the log tells, to standard error."""
+"""Where the command line writes: tables to standard output; messages, and what the log tells, to standard error.
+
+Rich is loaded when something is written: no command has to wait for it before.
+"""
 
 from __future__ import annotations
 
 import logging
+from functools import cache
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.logging import RichHandler
-from rich.markup import escape
-
-out, err = Console(), Console(stderr=True)
-if not out.is_terminal:
-    out.width = 240  # a pipe or a file has no width of its own, and no cell should be cut there
-
+if TYPE_CHECKING:
+    from rich.console import Console
 
 _LONGEST = 4_000
 """Characters of a line: names in foreign files may have millions."""
+_PIPE = 240
+"""Columns of a pipe or a file, which has no width of its own, and where no cell should be cut."""
+
+
+@cache
+def out() -> Console:
+    """Standard output."""
+    from rich.console import Console
+
+    made = Console()
+    if not made.is_terminal:
+        made.width = _PIPE
+    return made
+
+
+@cache
+def err() -> Console:
+    """Standard error."""
+    from rich.console import Console
+
+    return Console(stderr=True)
 
 
 def say(line: str) -> None:
     """Print a line to standard error, as it stands; no more of it than fits a screen."""
-    err.print(escape(line if len(line) <= _LONGEST else line[:_LONGEST] + " ..."), highlight=False, soft_wrap=True)
+    from rich.markup import escape
+
+    err().print(escape(line if len(line) <= _LONGEST else line[:_LONGEST] + " ..."), highlight=False, soft_wrap=True)
 
 
 def show_log() -> None:
     """Show what the project's modules log, such as effects that were left out, each message once."""
     log = logging.getLogger("springbench")
     if not log.handlers:
-        handler = RichHandler(console=err, show_time=False, show_path=False, show_level=False, markup=False)
+        handler = _Saying()
         handler.addFilter(_Once())
         log.addHandler(handler)
         log.setLevel(logging.INFO)
 
 
-def log_plainly() -> None:
-    """In a copy of this process: show the log on its own standard error, whatever is drawn on this one's."""
-    for handler in logging.getLogger("springbench").handlers:
-        if isinstance(handler, RichHandler):
-            handler.console = Console(stderr=True, width=err.width)
+def write_plainly() -> None:
+    """In a copy of this process: write to its own standard error, whatever is drawn on this one's."""
+    width = err().width
+    err.cache_clear()
+    err().width = width
+
+
+class _Saying(logging.Handler):
+    """Says each message."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        say(record.getMessage())
 
 
 class _Once(logging.Filter):

@@ -14,11 +14,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-
-import pyarrow as pa
-import pyarrow.parquet as pq
+from typing import TYPE_CHECKING
 
 from harness.base.errors import InputError, Mistake
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 FILE = "file"
 """The column of a packed file that names the unit."""
@@ -59,6 +60,9 @@ def packed_units(folder: Path) -> frozenset[str]:
 
 @lru_cache(maxsize=16)
 def _packed(path: Path, *state: int) -> frozenset[str]:
+    import pyarrow as pa  # for those who have packed rows
+    import pyarrow.parquet as pq
+
     try:
         if not path.is_file():
             raise OSError("it is no plain file")
@@ -115,6 +119,8 @@ def parts(asked: Iterable[Path]) -> tuple[list[Part], list[int]]:
 
 def schema(part: Part) -> pa.Schema:
     """The schema of a part's rows."""
+    import pyarrow.parquet as pq
+
     found = pq.read_schema(part.files[0])
     return found if part.packed is None else found.remove(found.get_field_index(FILE))
 

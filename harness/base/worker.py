@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from harness.base.blame import where
 from harness.base.child import data, limit
-from harness.base.console import log_plainly
+from harness.base.console import write_plainly
 from harness.base.errors import SpringbenchError
 
 Tick = Callable[[str], None]
@@ -59,7 +59,7 @@ def serve(
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.dup2(said.fileno(), 2)
     sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", closefd=False)
-    log_plainly()
+    write_plainly()
     faulthandler.enable(dump.fileno(), all_threads=False)
     faulthandler.register(DUMP, dump.fileno(), all_threads=True)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -7,8 +7,11 @@ from typing import Any
 
 from harness.config.sweep import RunSpec
 from solvers import sources
-from solvers.plugins import Plugin
-from solvers.registry import EVERY, SOLVERS, load
+from solvers.plugins import Plugin, source_of
+from solvers.registry import EVERY, load
+
+Part = Path | type | Plugin
+"""The file of a solver; the class of a mesh or an effect, which is there already; somebody's own code."""
 
 _RUN = Path(__file__).with_name("run.py")
 """What does a run, whatever its parts."""
@@ -19,22 +22,30 @@ def solver_class(run: RunSpec) -> Any:
     return load(EVERY[run.solver.name])
 
 
-def parts(run: RunSpec) -> frozenset[type | Plugin]:
-    """What a run is put together from by name: the classes of the solver, the mesh, the effects, a judge's reference.
-    Somebody's own code is named and not imported."""
+def parts(run: RunSpec) -> frozenset[Part]:
+    """What a run is put together from by name: the solver's file, the classes of the mesh and the effects, the file of
+    a judge's reference. Neither solvers nor somebody's own code are imported."""
     named = {"mesh": run.scene.mesh, **{f"effects[{i}]": effect for i, effect in enumerate(run.scene.effects)}}
     shipped = [type(part) for place, part in named.items() if place not in run.scene.own]
-    solver = [] if isinstance(run.solver.name, Plugin) else [solver_class(run)]
-    judge = (load(SOLVERS["newton"]),) if run.judge else ()
-    return frozenset([*solver, *shipped, *run.own(), *judge])
+    solver = [] if isinstance(run.solver.name, Plugin) else [run.solver.name]
+    judge = ["newton"] if run.judge else []
+    return frozenset([*map(_file_of, [*solver, *judge]), *shipped, *run.own()])
 
 
-def code(parts: frozenset[type | Plugin]) -> str:
+def code(parts: frozenset[Part]) -> str:
     """12 hexadecimal digits of SHA-256 over all sources that a run of these parts depends on."""
-    return sources.digest([_RUN, *(file for part in parts for file in _files(part))])[:12]
+    return sources.digest([_RUN, *(file for part in parts for file in files(part))])[:12]
 
 
-def _files(part: type | Plugin) -> set[Path]:
+def _file_of(name: str) -> Path:
+    """The file of a shipped solver; what its class inherits is imported there."""
+    return Path(source_of(EVERY[name].partition(":")[0]) or _RUN)
+
+
+def files(part: Part) -> set[Path]:
+    """The files that a part is written in."""
+    if isinstance(part, Path):
+        return {part}
     if isinstance(part, Plugin):
         return {Path(part.source)} if part.source.endswith(".py") else set()
     return sources.of_class(part)

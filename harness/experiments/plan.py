@@ -9,15 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import pyarrow as pa
-
-from harness.base import machine, rows
+from harness.base import machine, shelf
 from harness.config.sweep import RunSpec
-from harness.experiments.code import code, parts
+from harness.experiments.code import Part, code, parts
 from harness.experiments.resume import DONE, MISSING, Standing
 from harness.record.sound import whole_messages
-from solvers.plugins import Plugin
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 NEEDED = ("run_id", "scene", "size", "solver", "status", "code")
 """Columns without which a row tells nothing of a run."""
@@ -64,10 +65,10 @@ class PlannedRun:
 
 def plan(runs: Iterable[RunSpec], folder: Path, machines: Sequence[str | None] = (None,)) -> list[PlannedRun]:
     """Each run with its files and what is there already; machines: the ids of those on which it may have been done."""
-    codes: dict[frozenset[type | Plugin], str] = {}
+    codes: dict[frozenset[Part], str] = {}
     planned: list[PlannedRun] = []
     placed = [(run, [Files.of(run, folder, on) for on in machines]) for run in runs]
-    heads = rows.heads((files.rows for _, some in placed for files in some), _TOLD, needed=NEEDED)
+    heads = _heads([files.rows for _, some in placed for files in some])
     for run, some in placed:
         files = next((files for files in some if files.rows in heads), some[0])
         state, older, damage = MISSING, False, ""
@@ -87,6 +88,14 @@ def plan(runs: Iterable[RunSpec], folder: Path, machines: Sequence[str | None] =
             state = MISSING if damage or not files.recording.exists() else DONE
         planned.append(PlannedRun(run, files, Standing(state, older, damage)))
     return planned
+
+
+def _heads(paths: Sequence[Path]) -> dict[Path, dict[str, Any] | str]:
+    if not any(map(shelf.there, paths)):
+        return {}
+    from harness.base import rows  # brings pyarrow along
+
+    return rows.heads(paths, _TOLD, needed=NEEDED)
 
 
 def _unfit(recording: Path) -> str:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
-import pyarrow as pa
+from harness.base import machine
 
-from harness.base import machine, rows
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 DONE, MISSING = "done", "missing"
 
@@ -47,6 +48,8 @@ def standings(
 ) -> dict[Path, Standing]:
     """How units stand, by the path of their rows. asked: whether these columns of a unit's first row, and `code`, are
     of what is asked for now. Raises InputError for a packed file that is damaged."""
+    from harness.base import rows  # brings pyarrow along, for which those who only ask what there is need not wait
+
     heads, today = rows.heads(asked, [*columns, "code"], schema), machine.code_hash()
     found: dict[Path, Standing] = {}
     for path, as_asked in asked.items():

@@ -38,8 +38,8 @@ from collections.abc import Callable
 from typing import cast
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
 
 from harness.base.errors import InputError, Mistake, did_you_mean
 from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
@@ -91,8 +91,8 @@ def _overlaps(mesh: Mesh) -> NDArray[np.int64]:
     """Under how many BEND springs each STRETCH spring lies: one or two. A BEND spring spans two of them."""
     (i, j), (a, b) = (mesh.springs[mesh.families[family]].T for family in (STRETCH, BEND))
     n, name = len(mesh.rest), np.arange(1, len(i) + 1)
-    spring = coo_array((np.tile(name, 2), (np.r_[i, j], np.r_[j, i])), shape=(n, n)).tocsr()
-    bend, middle = cast(csr_array, spring[a] * spring[b]).nonzero()
+    spring = scipy.sparse.coo_array((np.tile(name, 2), (np.r_[i, j], np.r_[j, i])), shape=(n, n)).tocsr()
+    bend, middle = cast(scipy.sparse.csr_array, spring[a] * spring[b]).nonzero()
     under = [np.asarray(spring[end[bend], middle]) for end in (a, b)]
     return np.bincount(np.concatenate(under) - 1, minlength=len(i))
 

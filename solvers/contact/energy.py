@@ -21,8 +21,8 @@ from functools import cached_property
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, csr_array
 
 from solvers.contact import planes as contact_planes
 from solvers.contact.law import LAW
@@ -192,7 +192,7 @@ class Contact:
         friction = planes.grip[grips] / np.maximum(self.slip, length) * (size[grips] + np.sqrt(_dots(anchor, anchor)))
         np.add.at(out, planes.vertices[grips], friction)
 
-    def hessian(self, p: Positions) -> csr_array:
+    def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """The Hessian [N/m], shape (3n, 3n): blocks of vertices that press or grip."""
         rows, n = self.rows(p, p, cautious=False), len(p)
         blocks = np.zeros((n, 3, 3))
@@ -201,7 +201,7 @@ class Contact:
         held[rows.vertices] = True
         columns = np.flatnonzero(held)
         indptr = np.concatenate([[0], np.cumsum(held)])
-        return csr_array(bsr_array((blocks[columns], columns, indptr), shape=(3 * n, 3 * n)))
+        return scipy.sparse.csr_array(scipy.sparse.bsr_array((blocks[columns], columns, indptr), shape=(3 * n, 3 * n)))
 
     def rows(self, p: Positions, trial: Positions, *, cautious: bool) -> Rows:
         """The stiffnesses at p (n, 3) of what presses there or at the trial position, and of friction.

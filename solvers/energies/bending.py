@@ -19,8 +19,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array, vstack
 
 from solvers.energies.quadratic import Quadratic
 from solvers.problem import Positions
@@ -41,7 +41,7 @@ class Bending(Quadratic):
         The triangles have areas, and at most two of them share an edge.
         """
         parts = [_stencils(rest, flaps(cut)) for cut in _cuts(rest, triangles)]
-        A = csr_array(vstack([K for K, _ in parts]))
+        A = scipy.sparse.csr_array(scipy.sparse.vstack([K for K, _ in parts]))
         weight = np.concatenate([stiffness / len(parts) / area for _, area in parts])
         return cls(A, weight, np.zeros((len(weight), 3)))
 
@@ -71,14 +71,14 @@ def _cuts(rest: Positions, triangles: Indices) -> Iterator[Indices]:
         yield np.concatenate([kept, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1)])
 
 
-def _stencils(rest: Positions, flap: Indices) -> tuple[csr_array, NDArray[np.float64]]:
+def _stencils(rest: Positions, flap: Indices) -> tuple[scipy.sparse.csr_array, NDArray[np.float64]]:
     """K of each flap (h, 4) as rows (h, n), and the areas A0 + A1 (h,) [m^2]."""
     x0, x1, x2, x3 = (rest[corner] for corner in flap.T)
     c01, c02 = _cotangent(x1 - x0, x2 - x0), _cotangent(x1 - x0, x3 - x0)
     c03, c04 = _cotangent(x0 - x1, x2 - x1), _cotangent(x0 - x1, x3 - x1)
     K = np.stack([c03 + c04, c01 + c02, -c01 - c03, -c02 - c04], axis=1)
     entries = np.repeat(np.arange(len(flap)), 4), flap.ravel()
-    rows = csr_array(coo_array((K.ravel(), entries), shape=(len(flap), len(rest))))
+    rows = scipy.sparse.csr_array(scipy.sparse.coo_array((K.ravel(), entries), shape=(len(flap), len(rest))))
     return rows, _area(x1 - x0, x2 - x0) + _area(x1 - x0, x3 - x0)
 
 

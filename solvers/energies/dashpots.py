@@ -17,8 +17,8 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from solvers.compiling import inner
 from solvers.energies.edges import Edges, directions, rest_directions
@@ -104,7 +104,7 @@ class Dashpots(Edges):
         """Add k (|p_i| + |p_j| + |offset|) [N] to `out` (n,) at both ends (`solvers.round_off`)."""
         self._add_absolute(self._reach(p) + np.abs(self.offset), out)
 
-    def hessian(self, p: Positions) -> csr_array:
+    def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """The Hessian [N/m], shape (3n, 3n): k nn' an edge."""
         return self._blocks(np.zeros(len(self.edges)), self.direction, len(p))
 

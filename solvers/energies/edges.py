@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, coo_array, csr_array
 
 from solvers.matrices import diagonal, signed_incidence_matrix_sparse, without_zeros
 from solvers.problem import Positions
@@ -30,7 +30,7 @@ class Edges:
         """The length of each edge [m] at p (n, 3), shape (m,)."""
         return lengths(self._along(p))
 
-    def stiffness_matrix(self, n: int) -> csr_array:
+    def stiffness_matrix(self, n: int) -> scipy.sparse.csr_array:
         """A'KA [N/m], shape (n, n), its share of Q."""
         A = signed_incidence_matrix_sparse(self.edges, n)
         return without_zeros(A.T @ diagonal(self.stiffness) @ A)
@@ -40,10 +40,10 @@ class Edges:
         return int(self.edges.max(initial=-1)) + 1
 
     @cached_property
-    def _incidence(self) -> tuple[csr_array, csr_array]:
+    def _incidence(self) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
         """A over as many vertices as the edges name, and A'K."""
         A = signed_incidence_matrix_sparse(self.edges, self._named)
-        return A, csr_array(A.T @ diagonal(self.stiffness))
+        return A, scipy.sparse.csr_array(A.T @ diagonal(self.stiffness))
 
     def _along(self, p: Positions) -> Positions:
         """v = A p, (m, 3)."""
@@ -65,7 +65,9 @@ class Edges:
         size = lengths(p)
         return size[self.edges[:, 0]] + size[self.edges[:, 1]]
 
-    def _blocks(self, lateral: NDArray[np.float64], unit: Positions, n: int, along: float | NDArray = 1.0) -> csr_array:
+    def _blocks(
+        self, lateral: NDArray[np.float64], unit: Positions, n: int, along: float | NDArray = 1.0
+    ) -> scipy.sparse.csr_array:
         """The Hessian (3n, 3n) of edges that resist by k (along nn' + lateral (I - nn')), n their unit directions."""
         nn = unit[:, :, None] * unit[:, None, :]
         full = np.reshape(along, (-1, 1, 1)) * nn + lateral[:, None, None] * (np.eye(3) - nn)
@@ -74,8 +76,8 @@ class Edges:
         blocks = np.concatenate([H, H, -H, -H])
         order = np.lexsort((columns, rows))
         indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
-        whole = bsr_array((blocks[order], columns[order], indptr), shape=(3 * n, 3 * n))
-        return without_zeros(csr_array(coo_array(whole)))
+        whole = scipy.sparse.bsr_array((blocks[order], columns[order], indptr), shape=(3 * n, 3 * n))
+        return without_zeros(scipy.sparse.csr_array(scipy.sparse.coo_array(whole)))
 
 
 def lengths(v: Positions) -> NDArray[np.float64]:

@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
 
 from solvers.matrices import without_zeros
 from solvers.problem import Positions
@@ -86,7 +86,7 @@ class Gas:
         off = float(areas @ relative) / 3.0 + float(slope @ size)
         out += pressure * (areas + off / volume * slope)
 
-    def hessian(self, p: Positions) -> csr_array:
+    def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """The Hessian [N/m], shape (3n, 3n): p/V grad V grad V' - p grad^2 V.
 
         The first part is dense and positive semidefinite. Meshes of more than LARGEST_DENSE vertices get the second,
@@ -94,13 +94,13 @@ class Gas:
         """
         pressure, volume = self._pressure_at(p)
         n = len(p)
-        H = csr_array(-pressure * self._volume_hessian(p))
+        H = scipy.sparse.csr_array(-pressure * self._volume_hessian(p))
         if n <= LARGEST_DENSE:
             g = self._volume_gradient(p).ravel()
-            H = csr_array(H + csr_array(pressure / volume * np.outer(g, g)))
+            H = scipy.sparse.csr_array(H + scipy.sparse.csr_array(pressure / volume * np.outer(g, g)))
         return without_zeros(H)
 
-    def _volume_hessian(self, p: Positions) -> csr_array:
+    def _volume_hessian(self, p: Positions) -> scipy.sparse.csr_array:
         n = len(p)
         cross = [np.einsum("fk,kij->fij", x, _LEVI_CIVITA) / 6.0 for x in self._corners(p)]
         rows, columns, blocks = [], [], []
@@ -112,4 +112,6 @@ class Gas:
         row, column = (3 * np.concatenate(part)[:, None, None] for part in (rows, columns))
         row, column = np.broadcast_arrays(row + np.arange(3)[:, None], column + np.arange(3))
         values = np.concatenate(blocks)
-        return csr_array(coo_array((values.ravel(), (row.ravel(), column.ravel())), shape=(3 * n, 3 * n)))
+        return scipy.sparse.csr_array(
+            scipy.sparse.coo_array((values.ravel(), (row.ravel(), column.ravel())), shape=(3 * n, 3 * n))
+        )

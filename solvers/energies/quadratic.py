@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, kron
 
 from solvers.matrices import diagonal, without_zeros
 from solvers.problem import Positions, Start
@@ -25,7 +25,7 @@ class Quadratic:
     A: (m, n), sparse; weight: w (m,) [N/m] in the unit of A squared, not negative; d: (m, 3) [m] in the unit of A.
     """
 
-    A: csr_array
+    A: scipy.sparse.csr_array
     weight: NDArray[np.float64]
     d: Positions
 
@@ -51,13 +51,15 @@ class Quadratic:
         """A'W x, (n, 3), of x (m, 3)."""
         return self.A.T @ (self.weight[:, None] * x)
 
-    def stiffness_matrix(self, n: int) -> csr_array:
+    def stiffness_matrix(self, n: int) -> scipy.sparse.csr_array:
         """A'WA [N/m], shape (n, n)."""
         return without_zeros(self.A.T @ diagonal(self.weight) @ self.A)
 
-    def hessian(self, p: Positions) -> csr_array:
+    def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """The Hessian [N/m], shape (3n, 3n), the same for any p."""
-        return without_zeros(csr_array(kron(self.stiffness_matrix(len(p)), np.eye(3), format="csr")))
+        return without_zeros(
+            scipy.sparse.csr_array(scipy.sparse.kron(self.stiffness_matrix(len(p)), np.eye(3), format="csr"))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +70,10 @@ class Viscous(Quadratic):
     """
 
     @classmethod
-    def of(cls, A: csr_array, damping: NDArray[np.float64]) -> Viscous:
+    def of(cls, A: scipy.sparse.csr_array, damping: NDArray[np.float64]) -> Viscous:
         """Damping of A v, A: (m, n), with coefficients c (m,) [N s/m]; rows without damping are left out."""
         damped = np.flatnonzero(damping)
-        return cls(csr_array(A[damped]), damping[damped], np.zeros((len(damped), 3)))
+        return cls(scipy.sparse.csr_array(A[damped]), damping[damped], np.zeros((len(damped), 3)))
 
     @classmethod
     def of_vertices(cls, damping: NDArray[np.float64]) -> Viscous:

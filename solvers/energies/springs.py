@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from solvers.energies.edges import TINY, Edges, directions, rest_directions
 from solvers.problem import Positions
@@ -76,7 +76,7 @@ class Springs(Edges):
         turned = np.minimum(np.maximum(1.0, np.where(r > 0.0, lateral, 1.0)) * reach, reach + 2.0 * r / EPS)
         self._add_absolute(turned + length + r, out)
 
-    def hessian(self, p: Positions) -> csr_array:
+    def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """The Hessian [N/m], shape (3n, 3n): k (nn' + (1 - r/l)(I - nn')) a spring, n its direction, l its length.
 
         A spring of zero length and positive rest length has no lateral curvature; it is given none.

@@ -13,8 +13,8 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from solvers.compiling import inner
 from solvers.energies.edges import TINY, Edges, directions
@@ -122,7 +122,7 @@ class StrainLimits(Edges):
         turned = np.minimum(np.maximum(1.0, lateral) * reach, reach + 2.0 * np.abs(beyond) / EPS)
         self._add_absolute(np.where(near, turned + 2.0 * length, 0.0), out)
 
-    def hessian(self, p: Positions) -> csr_array:
+    def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """The Hessian [N/m], shape (3n, 3n): that of springs beyond the limits, nothing within."""
         _, length, beyond, unit = self._beyond(p)
         lateral = np.divide(beyond, length, out=np.zeros_like(length), where=length > TINY)

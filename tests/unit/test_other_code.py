@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from harness.cli import app
 from harness.config.load import load_any
 from harness.experiments import run as run_module
-from harness.experiments.code import code, parts
+from harness.experiments.code import code, files, parts
 from harness.experiments.plan import Files
 from solvers import sources
 from solvers.registry import OPTIONAL, SOLVERS, load
@@ -75,8 +75,7 @@ def test_the_code_of_a_row_covers_the_solver_s_module_wherever_it_lives(done: Ow
 def test_a_run_depends_on_its_own_solver_and_effects_and_on_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     made = own(tmp_path, monkeypatch)
     run = made.run()
-    classes = [part for part in parts(run) if isinstance(part, type)]
-    reached = {path for part in classes for file in sources.of_class(part) for path in sources.reached(str(file))}
+    reached = {path for part in parts(run) for file in files(part) for path in sources.reached(str(file))}
     reached |= sources.reached(run_module.__file__)
     names = {"/".join(Path(path).parts[-2:]) for path in reached}
     assert str(made.solver) in reached

@@ -41,7 +41,7 @@ def cloth(tmp_path: Path) -> Path:
 
 def test_every_solver_has_a_price_of_each_effect_or_says_why_not(cloth: Path, tmp_path: Path):
     sweep = load_any(cloth, solvers=["newton", "dense"], rounds=4, tolerance=1e-6, threads=1)
-    paths = price_all(sweep, tmp_path, display(err), say, isolated=False)
+    paths = price_all(sweep, tmp_path, display(err()), say, isolated=False)
     told = {(row["name"], row["solver"]): row for path in paths for row in read(path)}
     assert set(told) == {(e, s) for e in ("bending", "air-drag", "all") for s in ("newton", "dense")}
     for (effect, solver), row in told.items():

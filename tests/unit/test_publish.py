@@ -71,7 +71,7 @@ def test_what_was_published_comes_out_again(home: Path, name: str, tmp_path: Pat
         assert verify.checksums(folder) == []
         runs = verify.published(folder, print, own_code=False)
         assert [one.title for one in runs] == ["cloth 4 dense", "cloth 4 sparse"]
-        claims = verify.again(verify.chosen(runs, seed=1), tmp_path, Lines(err))
+        claims = verify.again(verify.chosen(runs, seed=1), tmp_path, Lines(err()))
         listed = command("list", folder / "configs" / "sweep" / "sweep.yaml", "--results", folder / "results")
         assert listed.output.count("done") == 2
     assert sorted(map(str, claims[:2])) == [

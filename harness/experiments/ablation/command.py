@@ -50,12 +50,12 @@ def ablate(
     sweep = load_any(scene, solvers=[solver or SOLVER], sizes=[size] if size else [], **usual | given.obj)
     folder = claimed(results / sweep.name, scene)
     how = {"pairs": pairs, "again": again, "changed": changed, "isolated": not here}
-    path = run_ablation(sweep, folder, display(err), say, **how)
+    path = run_ablation(sweep, folder, display(err()), say, **how)
     rows, picture = read(path), folder / "pictures" / f"ablation-{path.stem}.png"
     if rows[0]["status"] != "ok":  # of the whole scene, with which all others are compared
         say(f"{sweep.name}: {rows[0]['status']}: {rows[0]['reason']}")
         raise typer.Exit(1)
-    out.print(ablation_table(rows))
+    out().print(ablation_table(rows))
     for line in sentences(rows):
         say(line)
     picture.parent.mkdir(parents=True, exist_ok=True)
@@ -91,7 +91,7 @@ def _prices(
     usual = {"rounds": ROUNDS, "threads": 1, "tolerance": PRICED}
     sweep = load_any(scene, solvers=minimising, sizes=[size] if size else [], **usual | given.obj)
     folder = claimed(results / sweep.name, scene)
-    paths = price_all(sweep, folder, display(err), say, again=again, changed=changed, isolated=not here)
-    out.print(price_table([row for path in paths for row in read(path)]))
+    paths = price_all(sweep, folder, display(err()), say, again=again, changed=changed, isolated=not here)
+    out().print(price_table([row for path in paths for row in read(path)]))
     say(f"rows are in {paths[0].parent}")
     keep(results, folder, say)

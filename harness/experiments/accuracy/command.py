@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from harness.base.commands import Results
 from harness.base.console import err, out, say
@@ -21,6 +20,8 @@ def recommend(
     results: Results = Path("results"),
 ) -> None:
     """Find the cheapest integrator, time step, tolerance and solver that keep to an error, and check them."""
+    from rich.table import Table
+
     from harness.base.progress import display
     from harness.experiments.accuracy.recommend import recommend as find
 
@@ -31,10 +32,10 @@ def recommend(
         horizon=horizon,
         time_limit=time_limit,
         results=results,
-        display=display(err),
+        display=display(err()),
         say=say,
     )
     table = Table("", "error", "wall s per simulated s", "way")
     for name, way in (("predicted", found.best), ("measured", found.checked)):
         table.add_row(name, f"{way.error:.3g}", f"{way.cost:.4g}", str(way))
-    out.print(table)
+    out().print(table)

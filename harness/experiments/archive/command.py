@@ -82,7 +82,7 @@ def verify(
         chance = randbelow(10**6) if seed is None else seed
         taken = checks.chosen(runs, chance)
         say(f"{len(taken)} of {len(runs)} runs are done again (--seed {chance})")
-        claims = checks.again(taken, Path(scratch), display(err))
+        claims = checks.again(taken, Path(scratch), display(err()))
     for claim in claims:
         say(str(claim))
     states = {claim.holds for claim in claims}

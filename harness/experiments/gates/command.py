@@ -64,10 +64,10 @@ def _stored(old: Path, new: Path, yardstick: str | None) -> int:
     if ours[0] != ours[1]:
         raise InputError(f"{old} and {new} cannot be compared: one is of pytest-benchmark, the other is not")
     if all(ours):
-        return stored.compare(old, new, out, yardstick)
+        return stored.compare(old, new, out(), yardstick)
     if yardstick:
         raise InputError("--yardstick: compares results of sweeps; a file of pytest-benchmark has its own ratios")
-    return benchmarks.compare(old, new, out)
+    return benchmarks.compare(old, new, out())
 
 
 def _table(path: Path, budget: float) -> int:

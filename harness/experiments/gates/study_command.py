@@ -7,7 +7,6 @@ from statistics import median
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from harness.base.console import out, say
 from harness.base.errors import InputError
@@ -49,6 +48,8 @@ def replay(
     budget: Annotated[float, typer.Option(help="Seconds of a gate; 300 for slowdowns of 2 %.")] = 120.0,
 ) -> None:
     """Print how often gates would have failed, held and not known, beside what others would have said."""
+    from rich.table import Table
+
     from harness.experiments.gates import study as of
     from harness.experiments.gates.sequential import Rule
 
@@ -66,4 +67,4 @@ def replay(
             load = f"{median(start.load for start in starts):.1f}"
             cells = [gate, condition, load, f"{slower - 1:.0%}", f"{limit - 1:.0%}", *parts, f"{found.seconds:.1f}"]
             table.add_row(*cells, *(f"{part:.1%}" for part in others))
-    out.print(table)
+    out().print(table)
