@@ -115,5 +115,8 @@ def test_a_run_comes_by_its_stations_in_the_order_of_the_page(walk: list[Call]):
 
 
 def test_a_run_enters_few_modules_and_seldom_changes_them(walk: list[Call]):
-    assert len({call.of for call in walk}) <= 90, "86 when this was written"
-    assert len(walk) <= 1350, "1,253 when this was written"
+    """Pages and tables apart, which are of all results."""
+    before = [call for call in walk if "harness.report" not in call.by and "harness.report" not in call.of]
+    modules = {call.of for call in before}
+    assert len(modules) <= 88, "81 when this was written"
+    assert len(before) <= 1350, "1,251 when this was written"
