@@ -19,7 +19,7 @@ from harness.report.site.marks import drawn
 from harness.report.site.script import column
 from harness.report.style import looks
 from harness.report.timing_table import labels, runs
-from solvers.registry import EVERY, load
+from solvers.registry import OPTIONAL, SOLVERS, load
 
 Run = dict[str, Any]
 
@@ -129,11 +129,14 @@ def _more(table: pa.Table) -> dict[str, Run]:
 
 
 def _is_plain(solver: str, parameters: str | None) -> bool:
-    """Whether a solver has its parameters' usual values, so that its name alone calls it."""
-    given = json.loads(parameters or "{}")
-    if solver not in EVERY or not given:
+    """Whether a solver has its parameters' usual values, so that its name alone calls it.
+
+    Of shipped ones alone is that known: a report imports nobody's own code.
+    """
+    given, shipped = json.loads(parameters or "{}"), SOLVERS | OPTIONAL
+    if solver not in shipped or not given:
         return not given
-    usual = {f.name: f.default for f in fields(load(EVERY[solver])) if f.default is not MISSING}
+    usual = {f.name: f.default for f in fields(load(shipped[solver])) if f.default is not MISSING}
     return all(name in usual and usual[name] == value for name, value in given.items())
 
 
