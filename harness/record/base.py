@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -17,11 +17,16 @@ if TYPE_CHECKING:
     from harness.scenes.obstacles import AnyObstacle
 
 
+LAYOUT = 2
+"""Of entities and columns: recordings of another one are not read."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """One simulated step, as recorded: frame 0 is the start, before any step.
 
-    index; time [s]; positions (n, 3) [m]; energies [J] by name; residual [J^(1/2)]; iterations.
+    index; time [s]; positions (n, 3) [m]; energies [J] by name; residual [J^(1/2)]; iterations; forces (n, 3) [N] by
+    name, to be seen as arrows.
     """
 
     index: int
@@ -30,6 +35,7 @@ class Frame:
     energies: Mapping[str, float]
     residual: float
     iterations: int
+    forces: Mapping[str, Positions] = field(default_factory=dict[str, Positions])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk, LazyStore, RrdReader
 
 from harness.base.errors import InputError, Mistake
-from harness.record.base import Replay
+from harness.record.base import LAYOUT, Replay
 from harness.record.sound import require_sound, trust, whole_messages
 
 _MAGIC = b"RRF2"
@@ -195,6 +195,9 @@ def network(source: Source) -> dict[str, NDArray[Any]]:
         names = [name for name in batch.schema.names if name != _ROW_ID]
         # Rerun writes no column for an empty array: a mesh without springs, or without pins.
         none = dict.fromkeys(("springs", "rest_lengths", "pinned"), np.empty(0))
+        if "layout" not in names or int(cell(batch, "layout")[0]) != LAYOUT:
+            problem = "is laid out as another version of springbench did it; do its run again, with --again"
+            raise InputError(Mistake(problem, file=source.path))
         return none | {name: cell(batch, name) for name in names}
     names = f"application {source.application!r}"
     problem = f"is a Rerun recording ({names}) but not of one run: it has no /network and /scene/mesh"
@@ -234,20 +237,38 @@ def properties(source: Source) -> tuple[str, dict[str, Any]]:
     return title, facts
 
 
+def residuals(source: Source) -> dict[int, list[float]]:
+    """How the frames converged that were looked at: frame -> the residual [J^(1/2)] after each iteration."""
+    found: dict[int, list[float]] = {}
+    for chunk in source.chunks(content="/convergence/residual", components=[_SCALAR]):
+        frames, _ = _looked_at(source, "/convergence/residual")
+        values = _column(chunk.to_record_batch(), _SCALAR).flatten().to_numpy().reshape(-1, len(frames))
+        found = {int(frame): of[~np.isnan(of)].tolist() for frame, of in zip(frames, values.T, strict=True)}
+    return found
+
+
 def _scalars(source: Source) -> pa.Table:
     tables = [SCALARS.empty_table()]
     for chunk in source.chunks(content="/**", components=[_SCALAR]):
         batch = chunk.to_record_batch()
-        known = {name: _times(batch, name) for name in chunk.timeline_names if name in SCALARS.names}
+        known: dict[str, Any] = {name: _times(batch, name) for name in chunk.timeline_names if name in SCALARS.names}
+        values = _column(batch, _SCALAR).flatten()
+        if chunk.entity_path.rpartition("/")[0].endswith("/convergence"):  # a value for each of the frames
+            frames, times = _looked_at(source, chunk.entity_path)
+            known = {
+                "frame": np.tile(frames, batch.num_rows),
+                "iteration": np.repeat(known["iteration"], len(frames)),
+                "time": np.tile(times, batch.num_rows),
+            }
         columns: dict[str, Any] = {
-            "entity": [chunk.entity_path] * batch.num_rows,
+            "entity": [chunk.entity_path] * len(values),
             "frame": known.get("frame"),
             "iteration": known.get("iteration"),
             "time": known.get("time"),
-            "value": _column(batch, _SCALAR).flatten(),
+            "value": values,
         }
         arrays: list[Any] = [
-            pa.nulls(batch.num_rows, SCALARS.field(name).type)
+            pa.nulls(len(values), SCALARS.field(name).type)
             if columns[name] is None
             else pa.array(columns[name], SCALARS.field(name).type)
             for name in SCALARS.names
@@ -255,6 +276,14 @@ def _scalars(source: Source) -> pa.Table:
         tables.append(pa.Table.from_arrays(arrays, schema=SCALARS))
     order: Any = [(name, "ascending") for name in ("entity", "frame", "iteration")]
     return pa.concat_tables(tables).sort_by(order)
+
+
+def _looked_at(source: Source, entity: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The frames whose convergence was recorded, and when they were [s], in the order of the values."""
+    for chunk in source.chunks(content=entity.rpartition("/")[0]):
+        batch = chunk.to_record_batch()
+        return cell(batch, "frames").astype(np.int64), cell(batch, "times").astype(float)
+    raise InputError(Mistake(f"does not say which frames {entity} is of", file=source.path))
 
 
 def _by_frame(table: pa.Table) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:

@@ -7,8 +7,10 @@ of its own, so a killed run leaves all but the last few frames. The file has a p
 end has been found.
 
 Entities: `/scene/mesh` (positions, exact to float32), `/scene/pins`, `/scene/springs`, `/scene/obstacles/*`;
-`/energy/*`, `/residual`, `/iterations`, `/strain/largest`, `/milliseconds/*` by `frame` and `time`;
-`/convergence/*/frame_*` also by `iteration`; `/network` (springs, rest lengths, pins), `/run` (Markdown) and the
+`/scene/forces/*`, arrows that are hidden at first; `/scene/scale`, of strain; `/energy/*`, `/residual`, `/iterations`,
+`/strain/largest`, `/milliseconds/*` by `frame` and `time`, `/energy_change/*` as a share of its largest;
+`/convergence/residual`, `log10_residual` and `objective` by `iteration`, a value for each of the frames that
+`/convergence` names, and drawn in `/curves/*`; `/network` (springs, rest lengths, pins), `/run` (Markdown) and the
 recording's properties. Where frames are the iterates of a solve, everything is by `iteration`, and `/solve/*` tells
 how it converges.
 """
@@ -25,17 +27,23 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from harness.record import blueprint
-from harness.record.base import Frame, RecordingInfo
+from harness.record import blueprint, curves
+from harness.record.base import LAYOUT, Frame, RecordingInfo
+from harness.record.camera import Box
 from harness.record.obstacles import Obstacles, declared
 from harness.record.partial import PartialFile
-from harness.record.shading import Shading
+from harness.record.shading import PIN_COLOUR, Shading
 
 FLUSH = 5
 """Frames between flushes: what a kill may cost, against a fixed cost of about 0.4 ms and 1.5 kB a flush."""
 
 SCALARS = 25
 """Frames between batches of scalars, which cost about 1.2 kB each per entity."""
+
+ARROWS = 200
+"""Of a force, at most."""
+_LONGEST = 0.15
+"""The longest arrow of the first frame that has any, in the mesh's size."""
 
 _STRIPS: Any = rr.components.LineStrip3DBatch([]).as_arrow_array().type
 
@@ -50,7 +58,7 @@ class RerunRecorder:
     def __init__(self, path: Path, info: RecordingInfo) -> None:
         self._info = info
         self._shading = Shading(info)
-        self._box = blueprint.Box(info.mesh.rest)
+        self._box = Box(info.mesh.rest)
         self._scalars: dict[str, list[tuple[int, float]]] = {}
         self._styled: dict[str, list[str]] = {}
         self._frames = 0
@@ -59,6 +67,9 @@ class RerunRecorder:
         self._pins: NDArray[np.float32] | None = None
         self._unseen = 1e-6 * info.mesh.size
         self._springs_shown = False
+        self._curves: dict[int, tuple[Sequence[float], Sequence[float]]] = {}  # residual and objective, by frame
+        self._energies: dict[str, dict[int, float]] = {}
+        self._arrow: dict[str, float] = {}  # metres a newton
         application = blueprint.application(info)
         self._file = PartialFile(path, application, info.run_id, info.title)
         self._stream = self._file.stream
@@ -84,7 +95,10 @@ class RerunRecorder:
         self._obstacles.at(frame.time)
         self._log_pins(p)
         self._log_springs(p, strain)
+        self._log_forces(frame, p)
         self._add(frame.index, {f"/energy/{name}": value for name, value in frame.energies.items()})
+        for name, value in frame.energies.items():
+            self._energies.setdefault(name, {})[frame.index] = value
         largest = float(np.abs(strain).max(initial=0.0))
         self._add(frame.index, {"/strain/largest": largest, "/iterations": frame.iterations})
         self._add(frame.index, {"/residual": frame.residual, "/residual/log10": _log10(frame.residual)})
@@ -98,19 +112,7 @@ class RerunRecorder:
 
     def convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
         """Record the residual [J^(1/2)] and the objective [J] after each iteration of one frame, from the first."""
-        curves = {
-            "residual": residuals,
-            "log10_residual": [_log10(value) for value in residuals],
-            "objective": objective,
-        }
-        for name, values in curves.items():
-            entity = f"/convergence/{name}/frame_{frame:04d}"
-            self._style(entity, f"frame {frame}")
-            index = [
-                rr.TimeColumn("iteration", sequence=range(1, len(values) + 1)),
-                *self._times(np.full(len(values), frame)),
-            ]
-            self._stream.send_columns(entity, index, rr.Scalars.columns(scalars=np.asarray(values, float)))
+        self._curves[frame] = residuals, objective
 
     def solve(self, numbers: Sequence[int], curves: Mapping[str, Sequence[float]]) -> None:
         """Record log10 of curves by name over the iterates with these numbers; of a recording of iterates."""
@@ -128,14 +130,16 @@ class RerunRecorder:
         for phase, values in milliseconds.items():
             self._scalars[f"/milliseconds/{phase}"] = list(enumerate(values, start=1))
         self._send_scalars()
-        return self._file.finish(blueprint.blueprint(self._info, self._box))
+        self._send_convergence()
+        self._send_changes()
+        self._log_scale()
+        return self._file.finish(blueprint.blueprint(self._info, self._box, max(self._clock, default=0)))
 
     def abandon(self) -> None:
         """Stop, and remove the partial file; nothing happens after `close`."""
         self._file.abandon()
 
     def _begin(self) -> None:
-        self._file.lay_out(blueprint.blueprint(self._info, self._box))  # for what a kill leaves
         self._log_once()
         self._obstacles = Obstacles(self._stream, self._info.obstacles, self._info.mesh.rest)
 
@@ -145,6 +149,7 @@ class RerunRecorder:
         facts: dict[str, Any] = {key: [value] for key, value in known.items()}
         self._stream.send_property("run", rr.AnyValues(**facts))
         network: dict[str, Any] = {
+            "layout": LAYOUT,
             "time_step": info.time_step,
             "strain_range": info.strain_range,
             "springs": info.springs.ravel().astype(np.uint32),
@@ -155,7 +160,6 @@ class RerunRecorder:
         document = rr.TextDocument(blueprint.run_document(info), media_type=rr.MediaType.MARKDOWN)
         self._stream.log("/run", document, static=True)
         self._stream.log("/scene", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
-        self._stream.log("/legend", rr.Image(blueprint.scale_image()), static=True)
         if len(mesh.triangles):
             triangles = mesh.triangles.astype(np.uint32)
             self._stream.log("/scene/mesh", rr.Mesh3D.from_fields(triangle_indices=triangles), static=True)
@@ -186,7 +190,7 @@ class RerunRecorder:
         with np.errstate(invalid="ignore"):
             moved = np.inf if self._pins is None else np.abs(pins - self._pins).max(initial=0.0)
         if not moved <= self._unseen:  # a penalty lets its vertices move by less; what is not a number is recorded
-            points = rr.Points3D(pins, radii=rr.Radius.ui_points(5), colors=(255, 200, 40))
+            points = rr.Points3D(pins, radii=rr.Radius.ui_points(5), colors=int(PIN_COLOUR[1:] + "ff", 16))
             self._stream.log("/scene/pins", points)
             self._pins = pins
 
@@ -199,6 +203,64 @@ class RerunRecorder:
         elif self._springs_shown:  # else they would stay where they were, over a mesh that moves on
             self._stream.log("/scene/springs", rr.Clear(recursive=False))
         self._springs_shown = due
+
+    def _log_forces(self, frame: Frame, p: NDArray[np.float32]) -> None:
+        """Arrows from where forces act, of a length that stays in proportion; of many vertices, those of some."""
+        for name, force in frame.forces.items():
+            acting = np.flatnonzero(np.abs(force).max(axis=1) > 0.0)
+            acting = acting[:: -(-len(acting) // ARROWS) or 1]
+            if len(acting) and name not in self._arrow:
+                longest = float(np.linalg.norm(force[acting], axis=1).max())
+                self._arrow[name] = _LONGEST * self._info.mesh.size / longest
+            if name in self._arrow:
+                vectors = (self._arrow[name] * force[acting]).astype(np.float32)
+                arrows = rr.Arrows3D(
+                    origins=p[acting],
+                    vectors=vectors,
+                    colors=blueprint.FORCES[name],
+                    radii=rr.Radius.ui_points(1.25),
+                )
+                self._stream.log(f"/scene/forces/{name}", arrows)
+
+    def _log_scale(self) -> None:
+        strip, numbers = self._box.scale(self._info.strain_range)
+        self._stream.log("/scene/scale", strip, static=True)
+        self._stream.log("/scene/scale/numbers", numbers, static=True)
+
+    def _send_convergence(self) -> None:
+        frames = sorted(self._curves)
+        if not frames:
+            return
+        longest = max(len(self._curves[frame][0]) for frame in frames)
+        table = np.full((2, longest, len(frames)), np.nan)
+        for k, frame in enumerate(frames):
+            for which, values in enumerate(self._curves[frame]):
+                table[which, : len(values), k] = values
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logarithms = np.where(table[0] > 0, np.log10(table[0]), np.nan)
+        names, times = [f"frame {frame}" for frame in frames], [self._clock[frame] for frame in frames]
+        colours = [blueprint.COLOURS[k % len(blueprint.COLOURS)] for k in range(len(frames))]
+        self._stream.log("/convergence", rr.AnyValues(frames=frames, times=times), static=True)
+        for name, values in {"residual": table[0], "log10_residual": logarithms, "objective": table[1]}.items():
+            self._stream.log(f"/convergence/{name}", rr.SeriesLines(names=names, colors=colours), static=True)
+            columns = rr.Scalars.columns(scalars=values.ravel()).partition([len(frames)] * longest)
+            index = rr.TimeColumn("iteration", sequence=range(1, longest + 1))
+            self._stream.send_columns(f"/convergence/{name}", [index], columns)
+        residuals = {name: table[0, :, k].tolist() for k, name in enumerate(names)}
+        above = {name: (table[1, :, k] - np.nanmin(table[1, :, k])).tolist() for k, name in enumerate(names)}
+        curves.draw(self._stream, "/curves/residual", residuals, colours)
+        curves.draw(self._stream, "/curves/objective", above, colours)
+
+    def _send_changes(self) -> None:
+        """Each energy's change from the start as a share of its largest, so that none hides the others."""
+        for name, by_frame in self._energies.items():
+            frames, values = np.array(list(by_frame)), np.array(list(by_frame.values()))
+            change = values - values[0]
+            largest = float(np.nanmax(np.abs(change))) if np.isfinite(change).any() else 0.0
+            if largest > 0.0:
+                self._style(f"/energy_change/{name}", f"{name}, of {largest:.2g} J")
+                scaled = rr.Scalars.columns(scalars=change / largest)
+                self._stream.send_columns(f"/energy_change/{name}", self._times(frames), scaled)
 
     def _add(self, frame: int, values: Mapping[str, float]) -> None:
         for entity, value in values.items():
@@ -228,8 +290,6 @@ class RerunRecorder:
             colour = blueprint.COLOURS[len(names) % len(blueprint.COLOURS)]
             names.append(name)
             self._stream.log(entity, rr.SeriesLines(names=label, colors=colour, widths=1.5), static=True)
-            if group.startswith("/convergence"):  # a frame has but one place on the timeline `frame`
-                self._stream.log(entity, rr.SeriesPoints(names=label, colors=colour, marker_sizes=3), static=True)
 
 
 def _segments(ends: NDArray[np.float32]) -> Any:

@@ -22,6 +22,9 @@ STRAIN_COLOURS = ("#125490", "#64a2d6", "#d9d7d2", "#e5863b", "#943404")
 """Strain at -range, -range/2, 0, range/2, range: blue compressed, grey at rest, orange stretched; safe for the
 colour-blind, and grey enough in the middle that light and shadow still show."""
 
+PIN_COLOUR = "#c5299b"
+"""Of what is pinned, here and in pictures: on no scale of strain, clear on light and on dark."""
+
 LEVELS = 65
 NORMAL_STEPS = 32
 NEUTRAL = (128, 128, 128, 255)

@@ -19,6 +19,7 @@ from PIL import Image
 
 from harness.base.files import replacing
 from harness.record.base import Replay
+from harness.record.shading import PIN_COLOUR
 from harness.report.style import DPI, HEIGHT, INK, MUTED, PAGE, STRAIN_MAP, WIDTH
 
 
@@ -87,7 +88,7 @@ def strain_scale(page: Figure, limit: float, *, pins: bool) -> None:
         text(page, left + place * width, top + 31, label, size=9, color=MUTED, ha=align)
     if pins:
         text(page, left - 36, top + 12, "pinned", size=10, ha="right")
-        text(page, left - 96, top + 11, "●", size=11, ha="right")
+        text(page, left - 96, top + 11, "●", size=11, color=PIN_COLOUR, ha="right")
 
 
 def headline(replay: Replay) -> str:

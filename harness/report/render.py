@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
 
 from harness.record.base import Replay
+from harness.record.shading import PIN_COLOUR
 from harness.report import opengl
 from harness.report.solids import solids
 from harness.report.style import INK, PAGE, STRAIN_MAP
@@ -268,7 +269,7 @@ class Studio:
             spaced = min(0.3 * spacing(replay), 0.009 * _extent(p))
             radius = max(spaced, 0.004 * _extent(p), 0.0 if len(replay.triangles) else 2.2 * self._tube(replay, p))
             pins = _balls(p[replay.pinned], radius)
-            self._plotter.add_mesh(pins, color=INK, smooth_shading=True, **_MATERIAL)
+            self._plotter.add_mesh(pins, color=PIN_COLOUR, smooth_shading=True, **_MATERIAL)
 
     def _shadow(self, replay: Replay, p: NDArray[np.float32], ground: float, behind: str) -> None:
         """A soft shadow on the ground: the scene seen from the light, as a blurred picture on an unlit plane."""

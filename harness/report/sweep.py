@@ -67,7 +67,7 @@ def draw_sweep(
                 recording,
                 recordings,
                 label.replace("-", " "),
-                {name: Look(mark.color, mark.marker) for name, mark in found.items()},
+                {name: Look(mark.color) for name, mark in found.items()},
             )
         if group[0].run.pictures and not missing and _stale(picture, recordings.values()):
             draw_comparison({key: read_replay(path) for key, path in recordings.items()}, picture)

@@ -88,16 +88,20 @@ def runs(table: pa.Table) -> list[RunTimes]:
 
 
 def labels(found: Sequence[RunTimes]) -> dict[str, str]:
-    """By run id, the solver's name and those of its settings in which the solver's runs differ."""
+    """By run id, the solver's name and those of its settings in which the solver's runs of the scene differ."""
     settings = {run.run_id: {**json.loads(run.settings), **json.loads(run.parameters or "{}")} for run in found}
-    values: dict[tuple[str, str], set[str]] = defaultdict(set)
+    values: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     for run in found:
         for key, value in settings[run.run_id].items():
-            values[run.solver, key].add(str(value))
+            values[run.scene, run.solver, key].add(str(value))
     return {
         run.run_id: ", ".join(
             [run.solver]
-            + [f"{key} {value}" for key, value in settings[run.run_id].items() if len(values[run.solver, key]) > 1]
+            + [
+                f"{key} {value}"
+                for key, value in settings[run.run_id].items()
+                if len(values[run.scene, run.solver, key]) > 1
+            ]
         )
         for run in found
     }

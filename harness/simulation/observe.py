@@ -70,7 +70,8 @@ def observe(
         if stored is not None:
             stored[step.index - 1] = p
         if recorder:
-            recorder.frame(Frame(step.index, scene.time(step.index), p, terms, residual, step.iterations))
+            time, forces = scene.time(step.index), acting(step)
+            recorder.frame(Frame(step.index, time, p, terms, residual, step.iterations, forces))
 
     with ThreadPoolExecutor(1) as beside:
         looked: Future[None] | None = None
@@ -89,6 +90,18 @@ def observe(
             tick()
         if looked:
             looked.result()
+    return found
+
+
+def acting(step: Step) -> dict[str, Positions]:
+    """The forces (n, 3) [N] that a step's end is in balance with, by name: external ones, and those of contact."""
+    found, p = {"external": step.problem.force}, step.solution.positions
+    contacts = [energy for energy in step.problem.energies if isinstance(energy, Contact)]
+    if contacts:
+        downhill = np.zeros_like(p)
+        for contact in contacts:
+            contact.add_gradient(p, downhill)
+        found["contact"] = -downhill
     return found
 
 

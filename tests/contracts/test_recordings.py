@@ -14,9 +14,9 @@ from rerun.chunk import RrdReader
 
 from harness.base.errors import InputError
 from harness.base.files import CannotWrite
-from harness.record.base import Frame
+from harness.record.base import LAYOUT, Frame
 from harness.record.compare import Look, side_by_side
-from harness.record.reader import open_recording, read_replay, summary
+from harness.record.reader import cell, open_recording, read_replay, residuals, summary
 from harness.record.rerun import SCALARS, RerunRecorder
 from harness.record.shading import LEVELS, palette
 from harness.scenes.mesh.grid import Grid
@@ -154,11 +154,61 @@ def test_the_scalars_of_a_replay_have_one_value_a_frame(tmp_path: Path):
     assert not any("convergence" in entity for entity in scalars)
 
 
-def test_convergence_is_on_the_timelines_of_frames_and_of_iterations(tmp_path: Path):
-    table = summary(record(tmp_path / "a.rrd")).scalars
-    rows = [row for row in table.to_pylist() if row["entity"] == "/convergence/residual/frame_0003"]
-    found = [(row["frame"], row["iteration"], row["value"]) for row in rows]
-    assert found == [(3, 1, 1.0), (3, 2, 0.1), (3, 3, 0.0)]
+def test_convergence_is_one_entity_by_iteration_with_a_value_for_each_frame(tmp_path: Path):
+    recorder = RerunRecorder(tmp_path / "a.rrd", info())
+    for frame in waving(info(), 8):
+        recorder.frame(frame)
+    recorder.convergence(3, [1.0, 0.1, 0.0], [5.0, 4.0, 4.0])
+    recorder.convergence(7, [2.0, 0.2], [3.0, 2.0])
+    found = summary(recorder.close({}))
+    rows = [row for row in found.scalars.to_pylist() if row["entity"] == "/convergence/residual"]
+    told = {(row["frame"], row["iteration"], row["time"]): row["value"] for row in rows}
+    expected = {(3, 1, 0.03): 1.0, (3, 2, 0.03): 0.1, (3, 3, 0.03): 0.0, (7, 1, 0.07): 2.0, (7, 2, 0.07): 0.2}
+    assert {key: value for key, value in told.items() if not np.isnan(value)} == expected
+    entities = [entity for entity in found.entities if "convergence" in entity]
+    assert entities == [
+        "/convergence",
+        *(f"/convergence/{name}" for name in ("log10_residual", "objective", "residual")),
+    ]
+    with open_recording(tmp_path / "a.rrd") as source:
+        assert residuals(source) == {3: [1.0, 0.1, 0.0], 7: [2.0, 0.2]}
+        curves = list(source.chunks(content="/curves/residual/curves"))
+    assert [chunk.is_static for chunk in curves] == [True], "it is drawn on every timeline"
+
+
+def test_each_energy_is_seen_by_its_change_and_none_hides_another(tmp_path: Path):
+    scalars = read_replay(record(tmp_path / "a.rrd", count=12)).scalars
+    for name in ("springs", "inertia"):
+        np.testing.assert_allclose(scalars[f"/energy_change/{name}"][1], np.arange(11) / 10)
+
+
+def test_forces_are_arrows_in_proportion_at_no_more_than_some_vertices(tmp_path: Path):
+    mesh = Grid().build(20)
+    of = replace(info(), mesh=mesh, springs=mesh.springs, rest_lengths=mesh.rest_lengths)
+    recorder = RerunRecorder(tmp_path / "a.rrd", of)
+    for frame in waving(of, 3):
+        recorder.frame(replace(frame, forces={"external": np.full((400, 3), -1.0 - frame.index)}))
+    recorder.close({})
+    found = []
+    with open_recording(tmp_path / "a.rrd") as source:
+        for chunk in source.chunks(content="/scene/forces/external", components=["Arrows3D:vectors"]):
+            batch = chunk.to_record_batch()
+            found += [cell(batch, "Arrows3D:vectors", k).reshape(-1, 3) for k in range(batch.num_rows)]
+    assert [len(vectors) for vectors in found] == [200] * 3
+    lengths = [np.linalg.norm(vectors[0]) for vectors in found]
+    np.testing.assert_allclose(lengths, 0.15 * mesh.size * np.array([1, 2, 3]), rtol=1e-5)  # float32
+
+
+def test_a_small_recording_is_small(tmp_path: Path):
+    size = record(tmp_path / "a.rrd", count=13).stat().st_size
+    assert size < 350_000, "of 36 vertices; the index of what the file holds takes four tenths of it"
+
+
+def test_a_recording_of_another_layout_is_refused_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("harness.record.rerun.LAYOUT", LAYOUT - 1)
+    path = record(tmp_path / "a.rrd")
+    with pytest.raises(InputError, match=r"laid out as another version .* do its run again, with --again"):
+        read_replay(path)
 
 
 def test_springs_of_a_large_mesh_do_not_stay_over_a_mesh_that_moves_on(tmp_path: Path):
@@ -218,7 +268,7 @@ def test_solvers_stand_side_by_side_in_one_file(tmp_path: Path):
     paths = {"dense, 5 x": tmp_path / "a.rrd", "dense 5 x": tmp_path / "b.rrd"}
     for k, path in enumerate(paths.values()):
         record(path, amplitude=0.1 * (k + 1))
-    side_by_side(tmp_path / "both.rrd", paths, "cloth 6", dict.fromkeys(paths, Look("#0072b2", "s")))
+    side_by_side(tmp_path / "both.rrd", paths, "cloth 6", dict.fromkeys(paths, Look("#0072b2")))
     found = summary(tmp_path / "both.rrd")
     assert found.complete
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.rrd", "b.rrd", "both.rrd"]
@@ -235,7 +285,7 @@ def test_nothing_is_left_of_a_comparison_with_a_stranger(tmp_path: Path):
     foreign(tmp_path / "b.rrd")
     paths = {name: tmp_path / f"{name}.rrd" for name in "ab"}
     with pytest.raises(InputError, match="not of one run"):
-        side_by_side(tmp_path / "both.rrd", paths, "both", dict.fromkeys(paths, Look("#0072b2", "h")))
+        side_by_side(tmp_path / "both.rrd", paths, "both", dict.fromkeys(paths, Look("#0072b2")))
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.rrd", "b.rrd"]
 
 

@@ -8,11 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.record.blueprint import Box, run_document, scale_name, spring_cadence
+from harness.record.blueprint import run_document, scale_name, spring_cadence
+from harness.record.camera import Box
 from harness.scenes.mesh.grid import Grid
 from tests.recordings import info
 
 CORNER = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 2.0]])
+
+
+def listed(batch: Any) -> np.ndarray:
+    return np.array(batch.as_arrow_array().to_pylist())
 
 
 def numbers(component: Any) -> np.ndarray:
@@ -22,7 +27,7 @@ def numbers(component: Any) -> np.ndarray:
 
 def seen(box: Box, points: np.ndarray, aspect: float) -> np.ndarray:
     """How far points are from the middle of the picture, 1 at its edge, (n, 2): across, up."""
-    controls = box.eye(aspect)
+    controls = box.eye()
     eye, target = numbers(controls.position), numbers(controls.look_target)
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, numbers(controls.eye_up))
@@ -33,15 +38,32 @@ def seen(box: Box, points: np.ndarray, aspect: float) -> np.ndarray:
     return np.abs(np.stack([(points - eye) @ right / aspect, (points - eye) @ up], axis=1) / depth[:, None] / tangent)
 
 
+def height(box: Box, points: np.ndarray) -> np.ndarray:
+    """How high points are seen, 1 at the upper edge of the view, -1 at the lower."""
+    controls = box.eye()
+    eye, target = numbers(controls.position), numbers(controls.look_target)
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, numbers(controls.eye_up))
+    up = np.cross(right / np.linalg.norm(right), forward)
+    return (points - eye) @ up / ((points - eye) @ forward) / np.tan(np.radians(55 / 2))
+
+
 @pytest.mark.parametrize("aspect", [0.6, 1.0])
 @pytest.mark.parametrize("fall", [0.0, -1.0, -5.0])
 def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: float):
-    box = Box(CORNER)
-    box.add(CORNER + np.array([0.0, fall, 0.0]))
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, fall) for z in (0, 2)])
-    places = seen(box, corners, aspect)
+    points = np.vstack([CORNER, CORNER + np.array([0.0, fall, 0.0])])
+    box = Box(CORNER, aspect)
+    box.add(points)
+    places = seen(box, points, aspect)
     assert places.max() <= 1.0
-    assert places.max() > 0.9  # the margin is 5 %
+    if fall:  # else the nearest camera is nearer than any that has room around it
+        assert places.max() > 0.65, "of half the view; the rest of the lower half is the scale's, and 4 % margin"
+    strip, numbers_below = box.scale(0.1)
+    below = listed(strip.vertex_positions)
+    assert seen(box, below, aspect).max() <= 1.0
+    assert listed(numbers_below.labels).tolist() == ["-10 %", "-5 %", "strain 0", "+5 %", "+10 %"]
+    lowest = height(box, points).min()
+    assert height(box, below).max() < lowest, "the scale covers no data"
 
 
 @pytest.mark.parametrize("bad", [1e6, np.nan, np.inf])

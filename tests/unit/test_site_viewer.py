@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from harness.record.reader import read_replay
 from harness.report.site import viewer
 from tests.browser import chromium
 from tests.recordings import record
@@ -33,13 +34,37 @@ def test_a_script_holds_its_recording_and_is_written_once(tmp_path: Path):
     name, value = script.read_text().removesuffix(";\n").split(" = ", 1)
     told = json.loads(value)
     assert (name, told["title"]) == ("springbench.taken", 'cloth "6"')
-    assert gzip.decompress(b64decode(told["rrd"])) == recording.read_bytes()
+    assert gzip.decompress(b64decode(told["rrd"])) == viewer.layout_first(recording.read_bytes())
     made = script.stat().st_mtime_ns
     viewer.write_recording(recording, script, "other")
     assert script.stat().st_mtime_ns == made
     os.utime(recording, ns=(made + 1, made + 1))
     viewer.write_recording(recording, script, "newer")
     assert '"newer"' in script.read_text()
+
+
+def messages(data: bytes) -> list[bytes]:
+    found, place = [], 12
+    while place < len(data):
+        length = int.from_bytes(data[place + 8 : place + 16], "little")
+        found.append(data[place : place + 16 + length])
+        place += 16 + length
+        if not found[-1][0]:
+            break
+    return found
+
+
+def test_a_script_has_the_layout_first_all_that_was_recorded_and_no_index(tmp_path: Path):
+    whole = record(tmp_path / "a.rrd", count=12).read_bytes()
+    *parts, index = messages(whole)
+    turned = messages(viewer.layout_first(whole))
+    assert sorted(turned) == sorted(parts)
+    assert index[0] == 0
+    complete = next(k for k, message in enumerate(turned) if message[0] == 3)
+    assert all(b"scene/mesh" not in message[:600] for message in turned[:complete])
+    (tmp_path / "b.rrd").write_bytes(viewer.layout_first(whole))
+    a, b = (read_replay(tmp_path / name) for name in ("a.rrd", "b.rrd"))
+    np.testing.assert_array_equal(a.positions, b.positions)
 
 
 def site(folder: Path) -> Path:

@@ -12,6 +12,7 @@ import gzip
 import json
 import os
 import socket
+import struct
 import subprocess
 import time
 import urllib.error
@@ -35,6 +36,10 @@ VIEWER = "viewer.js"
 """The name of the viewer's script, which lies beside `replay.js`."""
 
 _SCRIPT, _WASM = "re_viewer.js", "re_viewer_bg.wasm"
+_HEADER, _END, _STORE, _DATA, _LAID_OUT = 12, 0, 1, 2, 3
+"""A recording is a header and messages, each a kind and a length of 8 bytes, then its bytes: the end, a store of a
+recording's or a layout's, a part of one, and that a layout is complete."""
+
 _PATIENCE = 30.0
 """Seconds that the viewer's server may take to answer."""
 
@@ -81,10 +86,31 @@ def write_recording(recording: Path, script: Path, title: str) -> Path:
     made = recording.stat().st_mtime_ns
     if not script.is_file() or script.stat().st_mtime_ns < made:
         script.parent.mkdir(parents=True, exist_ok=True)
-        value = {"title": title, "rrd": _packed(recording.read_bytes())}
+        value = {"title": title, "rrd": _packed(layout_first(recording.read_bytes()))}
         with replacing(script) as partial:
             partial.write_text(_TAKEN.format(json.dumps(value)), encoding="utf-8")
     return script
+
+
+def layout_first(data: bytes) -> bytes:
+    """A recording's messages with those of its layout before the others, so that the viewer opens with it at once.
+
+    The index at the file's end, which may be half of it, is left out: nothing is looked for in a stream.
+    """
+    messages, place = list[tuple[int, bytes]](), _HEADER
+    while place + 16 <= len(data):
+        kind, length = struct.unpack_from("<QQ", data, place)
+        if kind == _END:
+            break
+        messages.append((kind, data[place : place + 16 + length]))
+        place += 16 + length
+    kinds = [kind for kind, _ in messages]
+    if _LAID_OUT not in kinds:
+        return data
+    last = len(kinds) - kinds[::-1].index(_LAID_OUT)
+    first = next((k for k in range(1, last) if kinds[k - 1] == _DATA and kinds[k] == _STORE), 0)
+    order = [*messages[first:last], *messages[:first], *messages[last:]]
+    return data[:_HEADER] + b"".join(message for _, message in order)
 
 
 def _begins(path: Path, head: str) -> bool:
