@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 _WIDTH, _HEIGHT = 150.0, 100.0
-_GREY, _RULE = (150, 152, 158), (70, 73, 80)
+_PALE, _RULE = (255, 255, 255), (70, 73, 80)
 _LINE = 7.0
 """The height of a word, by which those at the ends of curves are kept apart."""
 
@@ -67,7 +67,7 @@ def _axes(stream: rr.RecordingStream, entity: str, bottom: int, top: int, last: 
     stream.log(f"{entity}/rules", rr.LineStrips2D(rules, colors=_RULE, radii=rr.Radius.ui_points(0.5)), static=True)
     places = [(-9.0, y) for y in rows] + [(x, _HEIGHT + 5.0) for x in columns]
     words = [f"1e{decade}" for decade in decades] + [str(max(1, number)) for number in numbers]
-    _words(stream, f"{entity}/numbers", np.array(places), words, [_GREY] * len(words))
+    _words(stream, f"{entity}/numbers", np.array(places), words, [_PALE] * len(words))
 
 
 def _words(stream: rr.RecordingStream, entity: str, at: NDArray[np.float64], words: list[str], colours: object) -> None:

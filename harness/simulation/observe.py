@@ -70,8 +70,8 @@ def observe(
         if stored is not None:
             stored[step.index - 1] = p
         if recorder:
-            time, forces = scene.time(step.index), acting(step)
-            recorder.frame(Frame(step.index, time, p, terms, residual, step.iterations, forces))
+            forces = acting(step)
+            recorder.frame(Frame(step.index, scene.time(step.index), p, terms, residual, step.iterations, forces))
 
     with ThreadPoolExecutor(1) as beside:
         looked: Future[None] | None = None
