@@ -10,14 +10,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from harness.record import curves
+from harness.record import cells, curves
 from harness.record.blueprint import panels, plot, scene_view
 from harness.record.camera import Box
 from harness.record.partial import PartialFile
-from harness.record.reader import Source, network, open_recording, positions, properties, residuals, triangles
+from harness.record.reader import Source, looked_at, network, open_recording, positions, properties, triangles
 
 _QUANTITIES = {
     "/residual/log10": "log10 residual [J^(1/2)]",
@@ -91,6 +92,17 @@ def _copy(file: PartialFile, path: Path, name: str, k: int, look: Look, aspect: 
         file.stream.log(f"{run.root}/scene/scale/numbers", numbers, static=True)
     file.flush()
     return run
+
+
+def residuals(source: Source) -> dict[int, list[float]]:
+    """How the frames converged that were looked at: frame -> the residual [J^(1/2)] after each iteration."""
+    found: dict[int, list[float]] = {}
+    for chunk in source.chunks(content="/convergence/residual", components=["Scalars:scalars"]):
+        frames, _ = looked_at(source, "/convergence/residual")
+        values = cells.column(chunk.to_record_batch(), "Scalars:scalars").flatten().to_numpy()
+        for frame, of in zip(frames.tolist(), values.reshape(-1, len(frames)).T, strict=True):
+            found[frame] = of[~np.isnan(of)].tolist()
+    return found
 
 
 def _colour(look: Look) -> int:

@@ -16,7 +16,7 @@ from collections.abc import Collection, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -24,7 +24,9 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk, LazyStore, RrdReader
 
 from harness.base.errors import InputError, Mistake
+from harness.record import cells
 from harness.record.base import LAYOUT, Replay
+from harness.record.cells import cell
 from harness.record.sound import require_sound, trust, whole_messages
 
 _MAGIC = b"RRF2"
@@ -126,7 +128,7 @@ def summary(path: Path) -> Summary:
             entities.add(chunk.entity_path)
             batch = chunk.to_record_batch()
             for name in chunk.timeline_names:
-                values = _times(batch, name)
+                values = cells.counted(batch, name)
                 times.setdefault(name, []).extend((values.min(), values.max()))
         title, facts = properties(source)
         frames = {index for index, _, _ in positions(source)}
@@ -211,9 +213,9 @@ def positions(
     for chunk in source.chunks(content="/scene/mesh", components=_POSITIONS):
         batch = chunk.to_record_batch()
         (name,) = set(_POSITIONS) & set(batch.schema.names)
-        for k, index in enumerate(_times(batch, "frame")):
+        for k, index in enumerate(cells.counted(batch, "frame")):
             if wanted is None or index in wanted:
-                yield int(index), float(_times(batch, "time")[k]), cell(batch, name, k).reshape(-1, 3)
+                yield int(index), float(cells.counted(batch, "time")[k]), cell(batch, name, k).reshape(-1, 3)
 
 
 def triangles(source: Source) -> NDArray[np.int64]:
@@ -229,7 +231,7 @@ def properties(source: Source) -> tuple[str, dict[str, Any]]:
     for chunk in source.chunks(content="/__properties/**"):
         batch = chunk.to_record_batch()
         values: dict[str, Any] = {
-            name: _scalar(batch, name, 0).as_py()[0] for name in batch.schema.names if name != _ROW_ID
+            name: cells.scalar(batch, name, 0).as_py()[0] for name in batch.schema.names if name != _ROW_ID
         }
         if chunk.entity_path == "/__properties/run":
             facts = values
@@ -237,24 +239,16 @@ def properties(source: Source) -> tuple[str, dict[str, Any]]:
     return title, facts
 
 
-def residuals(source: Source) -> dict[int, list[float]]:
-    """How the frames converged that were looked at: frame -> the residual [J^(1/2)] after each iteration."""
-    found: dict[int, list[float]] = {}
-    for chunk in source.chunks(content="/convergence/residual", components=[_SCALAR]):
-        frames, _ = _looked_at(source, "/convergence/residual")
-        values = _column(chunk.to_record_batch(), _SCALAR).flatten().to_numpy().reshape(-1, len(frames))
-        found = {int(frame): of[~np.isnan(of)].tolist() for frame, of in zip(frames, values.T, strict=True)}
-    return found
-
-
 def _scalars(source: Source) -> pa.Table:
     tables = [SCALARS.empty_table()]
     for chunk in source.chunks(content="/**", components=[_SCALAR]):
         batch = chunk.to_record_batch()
-        known: dict[str, Any] = {name: _times(batch, name) for name in chunk.timeline_names if name in SCALARS.names}
-        values = _column(batch, _SCALAR).flatten()
+        known: dict[str, Any] = {
+            name: cells.counted(batch, name) for name in chunk.timeline_names if name in SCALARS.names
+        }
+        values = cells.column(batch, _SCALAR).flatten()
         if chunk.entity_path.rpartition("/")[0].endswith("/convergence"):  # a value for each of the frames
-            frames, times = _looked_at(source, chunk.entity_path)
+            frames, times = looked_at(source, chunk.entity_path)
             known = {
                 "frame": np.tile(frames, batch.num_rows),
                 "iteration": np.repeat(known["iteration"], len(frames)),
@@ -278,7 +272,7 @@ def _scalars(source: Source) -> pa.Table:
     return pa.concat_tables(tables).sort_by(order)
 
 
-def _looked_at(source: Source, entity: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def looked_at(source: Source, entity: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """The frames whose convergence was recorded, and when they were [s], in the order of the values."""
     for chunk in source.chunks(content=entity.rpartition("/")[0]):
         batch = chunk.to_record_batch()
@@ -292,30 +286,6 @@ def _by_frame(table: pa.Table) -> dict[str, tuple[NDArray[np.int64], NDArray[np.
     once = table["iteration"].is_null().to_numpy()
     entities, frames, values = entities[once], frames[once].astype(np.int64), values[once]
     return {str(entity): (frames[of], values[of]) for entity in np.unique(entities) for of in [entities == entity]}
-
-
-def cell(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:
-    """All numbers of one row of a component, flat."""
-    values = _scalar(batch, name, row).values
-    while pa.types.is_nested(values.type):
-        values = values.flatten()
-    return values.to_numpy()
-
-
-def _times(batch: pa.RecordBatch, timeline: str) -> NDArray[Any]:
-    """The frames or iterations, or the times [s]."""
-    column = _column(batch, timeline)
-    counts: NDArray[np.int64] = column.cast(pa.int64()).to_numpy()
-    return counts / 1e9 if pa.types.is_duration(column.type) else counts
-
-
-def _column(batch: pa.RecordBatch, name: str) -> Any:
-    """A column; pyarrow's stubs know no kind of array that is told by its schema alone."""
-    return cast(Any, batch[name])
-
-
-def _scalar(batch: pa.RecordBatch, name: str, row: int) -> Any:
-    return _column(batch, name)[row]
 
 
 def _chosen(path: Path, frame: int, known: NDArray[np.int64]) -> int:

@@ -214,12 +214,8 @@ class RerunRecorder:
                 self._arrow[name] = _LONGEST * self._info.mesh.size / longest
             if name in self._arrow:
                 vectors = (self._arrow[name] * force[acting]).astype(np.float32)
-                arrows = rr.Arrows3D(
-                    origins=p[acting],
-                    vectors=vectors,
-                    colors=blueprint.FORCES[name],
-                    radii=rr.Radius.ui_points(1.25),
-                )
+                thin, colour = rr.Radius.ui_points(1.25), blueprint.FORCES[name]
+                arrows = rr.Arrows3D(origins=p[acting], vectors=vectors, colors=colour, radii=thin)
                 self._stream.log(f"/scene/forces/{name}", arrows)
 
     def _log_scale(self) -> None:

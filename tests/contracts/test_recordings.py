@@ -15,8 +15,8 @@ from rerun.chunk import RrdReader
 from harness.base.errors import InputError
 from harness.base.files import CannotWrite
 from harness.record.base import LAYOUT, Frame
-from harness.record.compare import Look, side_by_side
-from harness.record.reader import cell, open_recording, read_replay, residuals, summary
+from harness.record.compare import Look, residuals, side_by_side
+from harness.record.reader import cell, open_recording, read_replay, summary
 from harness.record.rerun import SCALARS, RerunRecorder
 from harness.record.shading import LEVELS, palette
 from harness.scenes.mesh.grid import Grid

@@ -130,7 +130,7 @@ MEASURING = (
         ("tests/unit/test_record_shading.py",),
         ("sparse", "other colours"),
     ),
-    Mutation("times-in-microseconds", "harness/record/reader.py", "counts / 1e9", "counts / 1e6", (_RECORDINGS,)),
+    Mutation("times-in-microseconds", "harness/record/cells.py", "counts / 1e9", "counts / 1e6", (_RECORDINGS,)),
     Mutation(
         "recording-not-compared",
         "harness/record/verify.py",
