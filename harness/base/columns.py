@@ -155,6 +155,13 @@ COLUMNS = (
         "m",
         "how deep the deepest vertex is inside an obstacle after the step, 0 where none is; null without obstacles",
     ),
+    Column(
+        "intersections",
+        _INT,
+        "",
+        "edges that pass through triangles of the mesh after the step, told exactly by code that no solver shares; "
+        "null without self-contact",
+    ),
     Column("digest", _TEXT, "", "SHA-256 of the positions after the step (float64 bytes)"),
     Column(
         "recorded",

@@ -26,7 +26,7 @@ class Frame:
     """One simulated step, as recorded: frame 0 is the start, before any step.
 
     index; time [s]; positions (n, 3) [m]; energies [J] by name; residual [J^(1/2)]; iterations; forces (n, 3) [N] by
-    name, to be seen as arrows.
+    name, to be seen as arrows; intersections: of the mesh with itself, None where nobody looked.
     """
 
     index: int
@@ -36,6 +36,7 @@ class Frame:
     residual: float
     iterations: int
     forces: Mapping[str, Positions] = field(default_factory=dict[str, Positions])
+    intersections: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -36,6 +36,7 @@ class Scene:
     pin_targets: (q, 3) [m], in the order of `system.pins`; moving: which of them move, and how;
     velocity: of every vertex at the start [m/s], less the start's spin; integrator: its factor and speed are the
     system's;
+    apart: edges (m, 2) and triangles (f, 3) that may not pass through each other, none without self-contact;
     alternate: the same in every second step, where that is of another length.
     """
 
@@ -49,6 +50,7 @@ class Scene:
     integrator: integrators.Any = IMPLICIT_EULER
     moving: tuple[tuple[NDArray[np.int64], Motion], ...] = ()
     start: Rest = AT_REST
+    apart: tuple[NDArray[np.int64], ...] = ()
     alternate: Scene | None = None
 
     def at(self, index: int) -> Scene:
@@ -92,6 +94,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
     mass = _mass(spec, mesh)
     parts = [_bound(spec, i, mesh, mass).by(method) for i in range(len(spec.effects))]
     _single(spec, parts)
+    _ends(parts, method, integrator)
     pins, targets, moving = _pins(parts)
     energies = tuple(energy for part in parts for energy in part.energies)
     energies += tuple(energy for part in parts for derive in part.derived for energy in derive(energies))
@@ -118,6 +121,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
         integrator=method,
         moving=moving,
         start=start,
+        apart=next((part.apart for part in parts if part.apart), ()),
         alternate=None if other in (None, spec.time_step) else build(spec.stepped(other), size, integrator),
     )
 
@@ -151,6 +155,15 @@ def _single(spec: SceneSpec, parts: list[Contribution]) -> None:
             if first.setdefault(what, i) != i:
                 problem = f"{what} is there already, as effects[{first[what]}]; the two would add up, so keep one"
                 raise InputError(Mistake(problem, key=f"effects[{i}]"))
+
+
+def _ends(parts: list[Contribution], method: integrators.Any, name: str) -> None:
+    """Raise InputError where an effect asks for unknowns at the step's end, and the integrator has others."""
+    there = [n for n, known in integrators.INTEGRATORS.items() if getattr(known, "when", 0.0) == 1.0 and n != "own"]
+    for i, part in enumerate(parts):
+        if part.ends and getattr(method, "when", 0.0) != 1.0:
+            problem = f"{part.ends[0]}, and {name} has other unknowns; take {' or '.join(there)}"
+            raise InputError(Mistake(problem, key=f"effects[{i}]"))
 
 
 def _doubt(spec: SceneSpec) -> None:

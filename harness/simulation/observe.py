@@ -50,6 +50,7 @@ def observe(
 
     def look(step: Step, residual: float) -> None:
         p, s = step.positions, step.solution
+        crossed = intersections(scene, p)
         terms = step.problem.terms(s.positions)
         found[step.index] = {
             **{f"energy_{name}": terms[name] for name in _OWN if name in terms},
@@ -57,6 +58,7 @@ def observe(
             "objective": sum(terms.values()),
             **strain_of(scene, p),
             "penetration": penetration(scene, p, scene.time(step.index)),
+            "intersections": crossed,
             "iterations": step.iterations,
             "stages": len(step.stages),
             "stopped": stopped(step),
@@ -71,7 +73,8 @@ def observe(
             stored[step.index - 1] = p
         if recorder:
             forces = acting(step)
-            recorder.frame(Frame(step.index, scene.time(step.index), p, terms, residual, step.iterations, forces))
+            told = terms, residual, step.iterations, forces, crossed
+            recorder.frame(Frame(step.index, scene.time(step.index), p, *told))
 
     with ThreadPoolExecutor(1) as beside:
         looked: Future[None] | None = None
@@ -110,6 +113,15 @@ def penetration(scene: Scene, p: Positions, time: float) -> float | None:
     contacts = [energy for energy in scene.system.energies if isinstance(energy, Contact)]
     inside = [-one.distance(p, time).min(initial=0.0) for contact in contacts for one in contact.obstacles]
     return float(max(inside)) if inside else None
+
+
+def intersections(scene: Scene, p: Positions) -> int | None:
+    """How often the mesh passes through itself at p (n, 3) [m], by edges and triangles; None without self-contact."""
+    if not scene.apart:
+        return None
+    from harness.scenes.intersections import crossings  # for those who need it
+
+    return len(crossings(p, *scene.apart))
 
 
 def returned_residual(prepared: Prepared, step: Step) -> float:

@@ -8,6 +8,7 @@ from functools import reduce
 
 from harness.scenes.bind import Scene
 from harness.simulation.stages import Stages, require_mass
+from solvers.core.bounds import begun_free
 from solvers.integrators import IMPLICIT_EULER, Integrator, Motion
 from solvers.problem import Positions, Prepared, Solution, Solver, Start, StepProblem, StopRule, System, Unsupported
 
@@ -79,7 +80,7 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
         held = now.positions[system.pins.vertices] + method.when * (held - now.positions[system.pins.vertices])
     current = _pinned(system, now.positions, held)
     stated = StepProblem(system, target, force, held, current, current, begun)
-    return FIRST_GUESSES[first_guess](stated)
+    return begun_free(FIRST_GUESSES[first_guess](stated))
 
 
 def prepare(scene: Scene, solver: Solver) -> Prepared:

@@ -88,6 +88,8 @@ class Interpreted(Accelerating):
         accelerate.propose(window)
         verdict = accelerate.AGAIN
         while verdict == accelerate.AGAIN:
+            if not self._free():
+                return False
             self._look()
             now["rise"], now["noise"] = self._objective.rise(self.positions, self._trial)
             verdict = accelerate.judge(window)
@@ -108,6 +110,15 @@ class Interpreted(Accelerating):
     def gradient(self) -> Positions:
         """See Accelerating."""
         return -self._window.descent.reshape(-1, 3)
+
+    def _free(self) -> bool:
+        """Shorten the trial to where the way to it is free; whether any of it is."""
+        if self._objective.bounded:
+            most = self._objective.reach(self.positions, self._trial - self.positions)
+            if most < 1.0:
+                accelerate.shorten(self._window, most)
+            return most > 0.0
+        return True
 
     def _look(self) -> None:
         np.negative(self._objective.gradient(self._trial), out=self._there)

@@ -66,12 +66,13 @@ def search(
 ) -> Point | None:
     """The first point of those at `first`, first/2, first/4, ... of a direction that descends enough; None for none.
 
-    curvature [J]: the second derivative along the direction, where it is what promises a descent; settled: what else
-    lowers the objective from positions on, tried first at each point.
+    No point is beyond what the step may pass through (`solvers.core.bounds`). curvature [J]: the second derivative
+    along the direction, where it is what promises a descent; settled: what else lowers the objective from positions on,
+    tried first at each point.
     """
     slope = dot(at.gradient, direction)
-    t = first
-    for _ in range(_HALVINGS if slope + curvature < 0.0 else 0):
+    t = step.reach(at.positions, direction, first)
+    for _ in range(_HALVINGS if slope + curvature < 0.0 < t else 0):
         p = step.placed(at.positions + t * direction)
         lower = settled(p) if settled else p
         if lower is not p and step.rise(at.positions, lower)[0] <= DECREASE * t * (slope + 0.5 * t * curvature):

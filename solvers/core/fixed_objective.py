@@ -85,6 +85,14 @@ class Objective:
         number[self.system.free] = np.arange(len(self.system.free))
         return number
 
+    def between(self, vertices: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Every two different vertices of each row (a, k), as numbers of free ones, each pair once, the lower first."""
+        number = self.number[vertices]
+        one, two = np.triu_indices(vertices.shape[1], 1)
+        i, j = number[:, one].ravel(), number[:, two].ravel()
+        low, high, size = np.minimum(i, j), np.maximum(i, j), len(self.system.free)
+        return np.divmod(np.unique((low * size + high)[low >= 0]), size)
+
     def _matrix(self, graph: csr_array, i: NDArray[np.int64], j: NDArray[np.int64]) -> Matrix:
         return Matrix.of(self.system, self.terms, self.form, self.number, graph, i, j)
 

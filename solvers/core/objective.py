@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from solvers.core.bounds import Bounded, PairBlocks, is_bounded, reach
 from solvers.core.fixed_objective import Objective
 from solvers.core.pattern import Matrix
 from solvers.energies.elements import Elements, Joined, Law, add_blocks
@@ -41,7 +42,8 @@ class Stated(NamedTuple):
 class StepObjective:
     """The objective g of one step: all positions are (n, 3) [m], exactly pinned vertices on their targets.
 
-    stated: energies by their elements, less those that have none in this step; own: those that state nothing.
+    stated: energies by their elements, less those that have none in this step; own: those that state nothing; bounded:
+    of these, what no step may pass through.
     """
 
     def __init__(self, whole: Objective, problem: StepProblem) -> None:
@@ -52,6 +54,7 @@ class StepObjective:
         self.given = objective.Given.of(problem)
         self.stated: list[Stated] = []
         self.own: list[Energy] = []
+        self.bounded: list[Bounded] = []
         if whole.form is not None or whole.stated or whole.own:
             begun: Any = problem.energies
             for k in whole.moving:
@@ -59,6 +62,7 @@ class StepObjective:
             found = (Stated(k, k in whole.projective, begun[k].law, begun[k].elements) for k in whole.stated)
             self.stated = [one for one in found if len(one.elements.vertices)]
             self.own = [begun[k] for k in whole.own]
+            self.bounded = [energy for energy in self.own if is_bounded(energy)]
         self._constant: tuple[Matrix, NDArray[np.float64]] | None = None
         pins = problem.system.pins
         self._exact, self._held = pins.vertices[pins.exact], problem.pin_targets[pins.exact]
@@ -67,6 +71,10 @@ class StepObjective:
     def touched(self) -> bool:
         """Whether elements act that are in no Q: those of contact, where something may be touched in this step."""
         return any(not one.projective for one in self.stated)
+
+    def reach(self, p: Positions, direction: Positions, first: float = 1.0) -> float:
+        """The largest t up to `first` by which p may go along a direction, both (n, 3); see `solvers.core.bounds`."""
+        return first * reach(self.bounded, p, first * direction) if self.bounded else first
 
     def placed(self, p: Positions) -> Positions:
         """A copy of p with the exactly pinned vertices on their targets."""
@@ -162,22 +170,28 @@ class Hessian:
     def __init__(self, step: StepObjective, p: Positions) -> None:
         self._step, self._p = step, p
         self._terms, self._free = step.whole.terms, step.whole.system.free
-        parts = [csr_array(energy.hessian(p)) for energy in step.own]
+        parts = [csr_array(energy.hessian(p)) for energy in step.own if energy not in step.bounded]
         self._others = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
         self._curvature = step.curvature(p)
+        self.pairs: list[PairBlocks] = [energy.blocks(p) for energy in step.bounded]
 
     @cached_property
     def _placed(self) -> tuple[Matrix, NDArray[np.int64], NDArray[np.float64]]:
         """The matrix, and where in it which entries of the energies that state nothing go."""
         whole = self._step.whole
-        if self._others is None:
-            return whole.matrix, np.empty(0, np.int64), np.empty(0)
-        total = self._others.tocoo()
-        rows, columns = (3 * whole.number[x // 3] + x % 3 for x in total.coords)
-        inside = (rows >= 0) & (columns >= 0)
-        rows, columns = rows[inside], columns[inside]
-        matrix = whole.matrix_for(rows, columns)
-        return matrix, matrix.entries(rows, columns), np.asarray(total.data[inside], np.float64)
+        rows = columns = np.empty(0, np.int64)
+        entries = np.empty(0)
+        if self._others is not None:
+            total = self._others.tocoo()
+            rows, columns = (3 * whole.number[x // 3] + x % 3 for x in total.coords)
+            inside = (rows >= 0) & (columns >= 0)
+            rows, columns, entries = rows[inside], columns[inside], np.asarray(total.data[inside], np.float64)
+        met = [whole.between(blocks.vertices) for blocks in self.pairs if len(blocks.vertices)]
+        if not (met or len(rows)):
+            return whole.matrix, rows, entries
+        i, j = (3 * np.concatenate([ends[:0], *ends]) for ends in zip(*met, strict=True)) if met else (rows[:0],) * 2
+        matrix = whole.matrix_for(np.append(rows, i), np.append(columns, j))
+        return matrix, matrix.entries(rows, columns), entries
 
     def factorise(
         self,
@@ -218,6 +232,10 @@ class Hessian:
             if not one.law.constant:
                 at = matrix.of_elements(one.number, one.elements.vertices)
                 add_blocks(one.elements, at, curvature, matrix.values)
+        for k, blocks in enumerate(self.pairs):
+            if len(blocks.vertices):
+                bent = blocks if keep == 1.0 else step.bounded[k].blocks(self._p, keep)
+                bent.add(matrix.of_elements(-1 - k, blocks.vertices), matrix.values)
         values = matrix.values.reshape(-1)
         values[places] += entries
         values[matrix.diagonal] += shift
@@ -257,6 +275,12 @@ class Hessian:
                 places[:, :: k + 1] = one.elements.vertices
                 add_blocks(one.elements, places, curvature, blocks)
                 acted[one.elements.vertices] = True
+        for pairs in self.pairs:
+            k = pairs.vertices.shape[1]
+            places = np.full((len(pairs.vertices), k * k), -1)
+            places[:, :: k + 1] = pairs.vertices
+            pairs.add(places, blocks)
+            acted[pairs.vertices] = True
         acted &= blocks.any(axis=(1, 2))
         return np.flatnonzero(acted), blocks[acted]
 
@@ -266,5 +290,7 @@ class Hessian:
         hessian.multiply(*self.compiled, x, product)
         if self._others is not None:
             product += (self._others @ x.ravel()).reshape(-1, 3)
+        for pairs in self.pairs:
+            pairs.add_product(x, product)
         out[self._free] = product[self._free]
         return out

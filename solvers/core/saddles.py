@@ -46,7 +46,7 @@ def leave(step: StepObjective, at: Point, hessian: Hessian, diagonal: NDArray[np
         return None
     fall = step.fall()
     rise, noise = step.rise(at.positions, fall)
-    if -rise > noise:
+    if -rise > noise and step.reach(at.positions, fall - at.positions) == 1.0:
         return Point(fall, step.gradient(fall), left=True)
     x = -x if dot(at.gradient, x) > 0.0 else x
     reach = float(np.ptp(at.positions, axis=0).max(initial=0.0)) or 1.0

@@ -105,6 +105,12 @@ def propose(window):
 
 
 @kernel
+def shorten(window, part):
+    """The trial at a part of its length."""
+    _try(window, part * window.now[0].length)
+
+
+@kernel
 def judge(window):
     """What to do about a trial whose rise, noise and gradient are known."""
     now = window.now[0]

@@ -16,19 +16,22 @@ exact method takes over when the Hessian is positive definite as it is and the s
 method converges quadratically. The start is the lower one of first guess and free fall.
 
 Where something is touched, the exact method does it all: contact is in no Q, so that L-BFGS begins anew whenever
-another vertex is touched, and its stiffness is beyond what tensions predict.
+another vertex is touched, and its stiffness is beyond what tensions predict. What a mesh may touch of itself L-BFGS is
+not told of: it goes as if nothing were there, and where a round's way is not free, or ends in range of something, that
+round never was and the exact method goes on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from solvers.about import About, Reference
 from solvers.core.acceleration import Accelerating
+from solvers.core.bounds import without_bounded
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import Hessian, StepObjective
@@ -83,7 +86,7 @@ class Hybrid:
     def prepare(self, system: System) -> PreparedDescent:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
         metric, objective = Metric(system), Objective(system)
-        lbfgs = Lbfgs(precision="float32").prepare(system)
+        lbfgs = Lbfgs(precision="float32").prepare(without_bounded(system))
         method = HybridMethod(objective, metric, lbfgs)
         factor = objective.matrix.factor
         facts = metric.facts | {"nnz_hessian_factor": float(factor.nonzeros)}
@@ -105,7 +108,9 @@ class HybridMethod:
         """The points after `start`; where a saddle was left, all begins anew."""
         point = _lower(step, start)
         while not point.stalled:
-            for following in () if step.touched else self._approach(step, point):
+            for following in () if step.touched or _nearly(step, point.positions) else self._approach(step, point):
+                if not _clear(step, point, following):
+                    break
                 point = following
                 yield point
             for following in self._newton.points(step, point):
@@ -118,7 +123,7 @@ class HybridMethod:
         """The points after `start`, until the exact method does better."""
         point = start
         predicting = _Predicting(self, step, start)
-        run: Accelerating | None = self._lbfgs.begin(step.problem, point.positions)
+        run: Accelerating | None = self._begun(step, point.positions)
         before = run.residual()
         _, residual, _ = run.iterate(at_most(_PROBE))
         gain, newton_gain = (np.inf, 0.0) if residual <= _QUICK * before else (0.0, np.inf)
@@ -126,7 +131,7 @@ class HybridMethod:
         while not ended:
             if gain > newton_gain:
                 if run is None:
-                    run, fallen = self._lbfgs.begin(step.problem, point.positions), 0.0
+                    run, fallen = self._begun(step, point.positions), 0.0
                 _, residual, verdict = run.iterate(at_most(iterations))
                 following, iterations = _reached(run), _ROUND
                 ended = verdict == STALLED or residual**2 <= self.metric.round_off(following.positions)
@@ -142,6 +147,13 @@ class HybridMethod:
                 point = following
                 yield point
 
+    def _begun(self, step: StepObjective, p: Positions) -> Accelerating:
+        """L-BFGS from p, which knows of nothing that a step may not pass through."""
+        problem = step.problem
+        if step.bounded:
+            problem = replace(problem, system=without_bounded(problem.system))
+        return self._lbfgs.begin(problem, p)
+
     def certifies(self, step: StepObjective, at: Point) -> bool:
         """See Method."""
         return self._newton.certifies(step, at)
@@ -152,7 +164,7 @@ class HybridMethod:
 
     def relaxed(self, step: StepObjective, p: Positions) -> Point:
         """Where some iterations of L-BFGS lead from p."""
-        run = self._lbfgs.begin(step.problem, p)
+        run = self._begun(step, p)
         run.iterate(Limits(_RELAXED, 0.0, 0.0, NEVER))
         return _reached(run)
 
@@ -226,7 +238,22 @@ def _gain(step: StepObjective, before: Point, after: Point) -> float:
 def _lower(step: StepObjective, start: Point) -> Point:
     """The lower one of a point and of free fall."""
     fall = step.fall()
+    if step.bounded and step.reach(start.positions, fall - start.positions) < 1.0:
+        return start
     return Point(fall, step.gradient(fall)) if step.rise(start.positions, fall)[0] < 0.0 else start
+
+
+def _nearly(step: StepObjective, p: Positions) -> bool:
+    """Whether something is in range at p that a step may not pass through."""
+    return any(energy.value(p) > 0.0 for energy in step.bounded)
+
+
+def _clear(step: StepObjective, before: Point, after: Point) -> bool:
+    """Whether the way between two points is free, and nothing is in range at its end."""
+    if not step.bounded:
+        return True
+    way = after.positions - before.positions
+    return step.reach(before.positions, way) == 1.0 and not _nearly(step, after.positions)
 
 
 def _reached(run: Accelerating) -> Point:

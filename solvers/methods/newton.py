@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from solvers.about import About, Reference
 from solvers.contact.touching import is_contact
+from solvers.core.bounds import is_bounded
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
@@ -122,9 +123,11 @@ class NewtonMethod:
 
 
 def settling_for(metric: Metric) -> Settling | None:
-    """What Newton's methods do about contact between their steps; None for a system without."""
-    if not any(is_contact(energy) for energy in metric.system.energies):
-        return None
+    """What Newton's methods do about contact between their steps; None for a system without,
+    and where a step may not pass through something else."""
+    energies = metric.system.energies
+    if not any(is_contact(energy) for energy in energies) or any(is_bounded(energy) for energy in energies):
+        return None  # its sweeps know of no bounds
     from solvers.contact.settling import Settling  # for those who need it
 
     return Settling(metric)

@@ -140,7 +140,8 @@ class Method:
     def _at(self, step: StepObjective, at: Point) -> tuple[Hessian, Preconditioner]:
         """The Hessian at a point, and what preconditions it there."""
         hessian = step.hessian(at.positions)
-        return hessian, Scaled(self._metric, *hessian.beyond()) if step.touched else self._metric.solve
+        beyond = step.touched or any(len(blocks.vertices) for blocks in hessian.pairs)
+        return hessian, Scaled(self._metric, *hessian.beyond()) if beyond else self._metric.solve
 
     def certifies(self, step: StepObjective, at: Point) -> bool:
         """It has no factor to tell by."""

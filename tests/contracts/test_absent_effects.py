@@ -25,6 +25,7 @@ ABSENT = sorted(set(EFFECTS) - LISTED)
 ENERGIES = {
     "bending": ["solvers.energies.bending", "solvers.energies.quadratic"],
     "contact": ["solvers.contact.energy", "solvers.contact.planes", "harness.scenes.obstacles"],
+    "self-contact": ["solvers.contact.self_contact", "solvers.contact.barrier", "harness.scenes.intersections"],
     "strain-limits": ["solvers.energies.strain_limits"],
     "dashpots": ["solvers.energies.dashpots"],
     "air-drag": ["solvers.energies.quadratic"],

@@ -38,5 +38,5 @@ def test_a_scene_has_the_effects_that_its_motion_calls_for_and_no_others(name: s
     rows = read(run_ablation(sweep, tmp_path, Quiet(), lambda line: None, pairs=False, isolated=False))
     told = {row["name"]: verdict(row, rows) for row in of_kind(rows, "without")}
     assert {name: words for name, words in told.items() if not any(called in words for called in CALLED)} == {}
-    # Contact of a mesh with itself is no effect yet: no scene can list it.
+    # Scenes that all solvers take leave out contact of a mesh with itself, which few solvers know.
     assert {row["name"]: row["reason"] for row in of_kind(rows, "suggestion") if row["name"] != "self-contact"} == {}

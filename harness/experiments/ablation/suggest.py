@@ -1,7 +1,7 @@
 """Effects that a scene does not list and its motion calls for, each with the evidence.
 
 An effect's class says itself by what evidence a motion calls for it (`harness.scenes.effects.base.Effect`); here
-stands what calls for an effect that there is not.
+stands what calls for self-contact.
 """
 
 from __future__ import annotations
@@ -51,7 +51,9 @@ def seen(scene: Scene, kinds: Collection[str], positions: NDArray[np.float64], v
 def suggestions(found: Seen, kinds: Collection[str]) -> list[Suggestion]:
     """What the motion calls for, less the `kinds` that the scene lists; in a fixed order."""
     absent = [kind for kind in EFFECTS if kind not in kinds and hasattr(_class(kind), "called_for")]
-    told = [(kind, _class(kind).called_for(found)) for kind in absent] + [("self-contact", _too_close(found))]
+    told = [(kind, _class(kind).called_for(found)) for kind in absent]
+    if "self-contact" not in kinds:
+        told.append(("self-contact", _too_close(found)))
     return [Suggestion(effect, evidence) for effect, evidence in told if evidence]
 
 
@@ -77,7 +79,7 @@ def _too_close(seen: Seen) -> str:
     return (
         f"{most} pairs of vertices without a spring between them are closer than {NEAR:g} mean rest lengths at "
         f"{seen.time(at):.2f} s, two come as close as {closest / seen.length:.2g}; contact with obstacles "
-        "does not keep them apart, and contact of a mesh with itself is not among the effects yet"
+        "does not keep them apart"
     )
 
 

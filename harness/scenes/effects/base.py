@@ -77,6 +77,10 @@ class Contribution:
     checks: tuple[Check, ...] = field(default=())
     once: tuple[str, ...] = field(default=())
     """What a scene can have but once, in words; a second one would be added to the first."""
+    apart: tuple[NDArray[np.int64], ...] = ()
+    """Edges (m, 2) and triangles (f, 3) of the mesh that may not pass through each other, for whoever looks."""
+    ends: tuple[str, ...] = ()
+    """Why each unknown has to be where a step ends, in words."""
     continuous: tuple[Contribution, ...] = field(default=())
     """What does the same by forces and energies alone: for integrators that take forces at their unknowns."""
 

@@ -14,6 +14,7 @@ EFFECTS = {
     "gravity": "harness.scenes.effects.gravity:Gravity",
     "pins": "harness.scenes.effects.pins:Pins",
     "rayleigh": "harness.scenes.effects.rayleigh:Rayleigh",
+    "self-contact": "harness.scenes.effects.self_contact:SelfContact",
     "springs": "harness.scenes.effects.springs:Springs",
     "strain-limits": "harness.scenes.effects.strain_limits:StrainLimits",
     "wind": "harness.scenes.effects.wind:Wind",

@@ -17,6 +17,7 @@ from harness.simulation.opinion.contact import nearest, radius
 from harness.simulation.opinion.declared import Array, Declared
 from harness.simulation.opinion.derivatives import wide
 from harness.simulation.opinion.motion import place
+from harness.simulation.opinion.self_contact import gathered
 from harness.simulation.step import State, start
 
 POINTS = 20
@@ -39,6 +40,7 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[Point]:
     rng, rest = np.random.default_rng(0), scene.mesh.rest
     begun = start(scene).now
     touching = [(effect, one) for effect in declared.of_kind("contact") for one in effect.obstacles]
+    apart = declared.of_kind("self-contact")
     # What forces may do in a step is limited where there are obstacles (`margin` of `solvers.contact.energy`).
     limit = 0.05 * scene.mesh.size if touching else np.inf
     for k in range(POINTS):
@@ -46,6 +48,8 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[Point]:
         of = scene.at(index)
         dt, some = of.system.time_step, FRACTIONS[k % len(FRACTIONS)] * scene.mesh.spacing
         p = (begun.positions if k // len(FRACTIONS) % 2 == 0 else rest) + some * rng.normal(size=rest.shape)
+        if apart:
+            p = gathered(apart[0], declared, p)
         v = begun.velocity + some / dt * rng.normal(size=rest.shape)
         if touching:
             effect, one = touching[k % len(touching)]

@@ -1,0 +1,129 @@
+"""Whether a mesh passes through itself: edges against triangles, told exactly, by code that no solver shares.
+
+Two convex bodies are apart where an axis separates them. For an edge and a triangle the axes to try are the normal,
+the products of the edge with the sides, and in the plane those across the sides and across the edge: where one of them
+shows a gap beyond round-off, they are apart. What is left is decided in rational numbers, by signs of determinants
+(Guigue and Devillers 2003); to touch is to intersect. Pairs that share a vertex are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from itertools import pairwise, product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Crossing = tuple[tuple[int, int], tuple[int, int, int]]
+
+_ROUND = 64.0 * np.finfo(np.float64).eps
+"""Of the coordinates about the pair: a gap beyond this along a unit axis is no round-off."""
+
+_AT_ONCE = 200_000
+"""Pairs that are looked at together."""
+
+
+def crossings(p: Array, edges: Indices, triangles: Indices) -> list[Crossing]:
+    """The edges (m, 2) that meet triangles (f, 3) at positions p (n, 3) [m], and with which, in their order."""
+    found: list[Crossing] = []
+    if not (len(edges) and len(triangles)):
+        return found
+    if not np.isfinite(p).all():
+        raise ValueError("positions should be finite to tell whether they intersect")
+    for e, t in _near(p, edges, triangles):
+        open_ = np.flatnonzero(~_apart(p, edges[e], triangles[t]))
+        for k in open_.tolist():
+            edge, corners = edges[e[k]].tolist(), triangles[t[k]].tolist()
+            if meets([_exact(p[i]) for i in edge], [_exact(p[i]) for i in corners]):
+                found.append(((edge[0], edge[1]), (corners[0], corners[1], corners[2])))
+    return sorted(found)
+
+
+def _near(p: Array, edges: Indices, triangles: Indices) -> Iterator[tuple[Indices, Indices]]:
+    """Edges and triangles that share no vertex and whose boxes overlap, by their numbers, some at a time."""
+    a, b = p[edges], p[triangles]
+    middle, centre = a.mean(axis=1), b.mean(axis=1)
+    half = np.linalg.norm(a - middle[:, None], axis=2).max(axis=1)
+    wide = np.linalg.norm(b - centre[:, None], axis=2).max(axis=1)
+    tree: Any = cKDTree(centre)
+    reach = (half + float(wide.max())) * (1.0 + 1e-9) + _ROUND * float(np.abs(p).max())
+    low, high, below, above = a.min(axis=1), a.max(axis=1), b.min(axis=1), b.max(axis=1)
+    step = max(1, _AT_ONCE // 64)
+    for first in range(0, len(edges), step):
+        part = slice(first, first + step)
+        lists: list[list[int]] = tree.query_ball_point(middle[part], reach[part]).tolist()
+        e = np.repeat(np.arange(first, first + len(lists)), [len(x) for x in lists])
+        t = np.array([one for found in lists for one in found], np.int64)
+        over = ((low[e] <= above[t]) & (below[t] <= high[e])).all(axis=1)
+        over &= (edges[e][:, :, None] != triangles[t][:, None, :]).all(axis=(1, 2))
+        yield e[over], t[over]
+
+
+def _apart(p: Array, edges: Indices, triangles: Indices) -> NDArray[np.bool_]:
+    """Which pairs (k, 2) and (k, 3) an axis separates, beyond round-off."""
+    if not len(edges):
+        return np.empty(0, bool)
+    origin = p[triangles[:, 0]]
+    a, b = p[edges] - origin[:, None], p[triangles] - origin[:, None]
+    along = a[:, 1] - a[:, 0]
+    sides = np.stack([b[:, 1] - b[:, 0], b[:, 2] - b[:, 1], b[:, 0] - b[:, 2]])
+    normal = np.cross(sides[0], sides[1])
+    axes = [normal, np.cross(along, normal), *np.cross(along, sides), *np.cross(normal, sides)]
+    size = np.abs(p[edges]).max(axis=(1, 2)) + np.abs(p[triangles]).max(axis=(1, 2))
+    apart = np.zeros(len(edges), bool)
+    for axis in axes:
+        length = np.linalg.norm(axis, axis=1)
+        unit = axis / np.where(length > 0.0, length, 1.0)[:, None]
+        one, two = np.einsum("kij,kj->ki", a, unit), np.einsum("kij,kj->ki", b, unit)
+        gap = np.maximum(one.min(axis=1) - two.max(axis=1), two.min(axis=1) - one.max(axis=1))
+        apart |= gap > _ROUND * size
+    return apart
+
+
+Point = tuple[Fraction, Fraction, Fraction]
+
+
+def _exact(x: Array) -> Point:
+    return Fraction(float(x[0])), Fraction(float(x[1])), Fraction(float(x[2]))
+
+
+def meets(edge: list[Point], triangle: list[Point]) -> bool:
+    """Whether an edge of two points and a triangle of three have a point in common, in rational numbers."""
+    a, b = edge
+    u, v, w = triangle
+    above, below = _volume(u, v, w, a), _volume(u, v, w, b)
+    if above * below > 0:
+        return False
+    if above != 0 or below != 0:
+        turns = [_volume(a, b, one, two) for one, two in ((u, v), (v, w), (w, u))]
+        return min(turns) >= 0 or max(turns) <= 0
+    # All in one plane, or a triangle without area: seen along each axis they overlap if they do.
+    return all(_flat_meet(_seen(edge, k), _seen(triangle, k)) for k in range(3))
+
+
+def _volume(a: Point, b: Point, c: Point, d: Point) -> Fraction:
+    (u0, u1, u2), (v0, v1, v2), (w0, w1, w2) = (tuple(x - y for x, y in zip(q, a, strict=True)) for q in (b, c, d))
+    return u0 * (v1 * w2 - v2 * w1) - u1 * (v0 * w2 - v2 * w0) + u2 * (v0 * w1 - v1 * w0)
+
+
+Flat = tuple[Fraction, Fraction]
+
+
+def _seen(points: list[Point], axis: int) -> list[Flat]:
+    return [(q[axis - 1], q[axis - 2]) for q in points]
+
+
+def _flat_meet(edge: list[Flat], triangle: list[Flat]) -> bool:
+    """Whether convex figures in the plane overlap: no line along a side has them on different sides of it."""
+    sides = [*pairwise([*triangle, triangle[0]]), (edge[0], edge[1])]
+    for (a, b), swap in product(sides, (False, True)):
+        n = (b[0] - a[0], b[1] - a[1]) if swap else (a[1] - b[1], b[0] - a[0])
+        one, two = ([n[0] * q[0] + n[1] * q[1] for q in figure] for figure in (edge, triangle))
+        if any(n) and (max(one) < min(two) or max(two) < min(one)):
+            return False
+    return True

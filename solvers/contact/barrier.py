@@ -1,0 +1,295 @@
+"""The barrier of pairs: a function of positions, zero from a range on, infinite where the gap closes.
+
+    E(p) = sum over pairs of m k r^2 b((d - t)/r),     b(x) = -(1 - x)^2 ln x  for 0 < x < 1
+
+d is the distance of a point and a triangle, or of two edges; t the thickness, r the range, k a stiffness [N/m] (Li et
+al. 2020, "Incremental potential contact", with the offset of Li, Kaufman and Jiang 2021, "Codimensional incremental
+potential contact"; there b is of d^2). The distance of two edges has a kink where they are parallel, which their
+mollifier takes away, e = 1e-3 |u|^2 |v|^2 at rest:
+
+    m(c) = (2 - c/e) c/e  for c < e, else 1;     c = |u x v|^2
+
+Second derivatives in closed form: with z = sum_i c_i x_i and its free places (`contact.closest`), D = |z|^2/2,
+
+    D'' = c c' (x) I - B G^-1 B',     B_ia = c_i z_a + c_ia z,     G_ab = z_a z_b
+
+so that f(d)'' = f'' g g' + f'/d (c c' (x) (I - n n') - B G^-1 B'), and f' is negative: only the first part of the
+bracket bends downwards. `keep` says how much of what bends downwards is kept: with 1 the blocks are exact, with 0 they
+are positive semidefinite, and never less than exact ones.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.compiling import inner, kernel
+from solvers.contact.closest import WAYS, between, closest, distance
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+MOLLIFIED = 1e-3
+"""Of |u|^2 |v|^2 at rest, the |u x v|^2 up to which edges count as nearly parallel (Li et al. 2020)."""
+
+
+class Pairs(NamedTuple):
+    """Pairs of points and triangles, then of edges. vertices (k, 4); points: how many are of the first kind; scale
+    (k,): of thickness and range; stiffness (k,) [N/m]; parallel (k,): e [m^4], 0 of a point and a triangle; thickness,
+    reach: t and r [m]."""
+
+    vertices: Indices
+    points: int
+    scale: Array
+    stiffness: Array
+    parallel: Array
+    thickness: float
+    reach: float
+
+
+@inner
+def law(x):
+    """b and its first two derivatives, for 0 < x < 1."""
+    y, log = 1.0 - x, np.log(x)
+    return -y * y * log, y * (2.0 * log - y / x), 4.0 * y / x + y * y / (x * x) - 2.0 * log
+
+
+@inner
+def _crossed(p, x):
+    """u, v, |u|^2, u v, |v|^2 and |u x v|^2 of two edges x (4,)."""
+    a, b, c, d = x[0], x[1], x[2], x[3]
+    u0, u1, u2 = p[b, 0] - p[a, 0], p[b, 1] - p[a, 1], p[b, 2] - p[a, 2]
+    v0, v1, v2 = p[d, 0] - p[c, 0], p[d, 1] - p[c, 1], p[d, 2] - p[c, 2]
+    w0, w1, w2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+    uu, uv, vv = u0 * u0 + u1 * u1 + u2 * u2, u0 * v0 + u1 * v1 + u2 * v2, v0 * v0 + v1 * v1 + v2 * v2
+    return u0, u1, u2, v0, v1, v2, uu, uv, vv, w0 * w0 + w1 * w1 + w2 * w2
+
+
+@inner
+def _mollifier(c, e):
+    """m and its first two derivatives by c."""
+    if not c < e:
+        return 1.0, 0.0, 0.0
+    return (2.0 - c / e) * c / e, 2.0 * (1.0 - c / e) / e, -2.0 / (e * e)
+
+
+@inner
+def _gap(pairs, e, p):
+    """(d - t)/r of pair e."""
+    d = distance(p, pairs.vertices[e], e >= pairs.points)
+    return (d / pairs.scale[e] - pairs.thickness) / pairs.reach
+
+
+@kernel
+def value(pairs, p):
+    """The energy [J] at p (n, 3); infinite where a gap is closed."""
+    total = 0.0
+    for e in range(len(pairs.vertices)):
+        x = _gap(pairs, e, p)
+        if not x < 1.0:
+            continue
+        if not x > 0.0:
+            return np.inf
+        r, m = pairs.scale[e] * pairs.reach, 1.0
+        if pairs.parallel[e] > 0.0:
+            m = _mollifier(_crossed(p, pairs.vertices[e])[9], pairs.parallel[e])[0]
+        total += m * pairs.stiffness[e] * r * r * law(x)[0]
+    return total
+
+
+@kernel
+def add_gradient(pairs, p, out):
+    """Add the gradient [N] at p (n, 3) to `out`; pairs whose gap is closed push as if a millionth of it were left."""
+    for e in range(len(pairs.vertices)):
+        x = pairs.vertices[e]
+        edges = e >= pairs.points
+        c0, c1, c2, c3, _, _ = closest(p, x, edges)
+        z0, z1, z2 = between(p, x, c1, c2, c3)
+        d = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2)
+        gap = (d / pairs.scale[e] - pairs.thickness) / pairs.reach
+        if not gap < 1.0:
+            continue
+        b, first, _ = law(max(gap, 1e-6))
+        r, m = pairs.scale[e] * pairs.reach, 1.0
+        f, f1 = pairs.stiffness[e] * r * r * b, pairs.stiffness[e] * r * first
+        if pairs.parallel[e] > 0.0:
+            u0, u1, u2, v0, v1, v2, uu, uv, vv, c = _crossed(p, x)
+            m, m1, _ = _mollifier(c, pairs.parallel[e])
+            if m1 != 0.0:
+                w = 2.0 * f * m1
+                a0, a1, a2 = w * (vv * u0 - uv * v0), w * (vv * u1 - uv * v1), w * (vv * u2 - uv * v2)
+                b0, b1, b2 = w * (uu * v0 - uv * u0), w * (uu * v1 - uv * u1), w * (uu * v2 - uv * u2)
+                _add(out, x[0], -1.0, a0, a1, a2)
+                _add(out, x[1], 1.0, a0, a1, a2)
+                _add(out, x[2], -1.0, b0, b1, b2)
+                _add(out, x[3], 1.0, b0, b1, b2)
+        w = m * f1 / max(d, 1e-300)
+        _add(out, x[0], w * c0, z0, z1, z2)
+        _add(out, x[1], w * c1, z0, z1, z2)
+        _add(out, x[2], w * c2, z0, z1, z2)
+        _add(out, x[3], w * c3, z0, z1, z2)
+
+
+@inner
+def _add(out, i, c, g0, g1, g2):
+    out[i, 0] += c * g0
+    out[i, 1] += c * g1
+    out[i, 2] += c * g2
+
+
+@kernel
+def active(pairs, p, reach, out):
+    """Write which pairs have a gap below `reach` times the range at p (n, 3) to `out`; how many they are."""
+    count = 0
+    for e in range(len(pairs.vertices)):
+        if _gap(pairs, e, p) < reach:
+            out[count] = e
+            count += 1
+    return count
+
+
+@kernel
+def curve(pairs, which, p, keep, work, out):
+    """Write the second derivatives [N/m] of the pairs `which` (a,) at p (n, 3) to `out` (a, 12, 12); work (9, 12):
+    scratch. keep: of what bends downwards."""
+    for k in range(len(which)):
+        _curve(pairs, which[k], p, keep, work, out[k])
+
+
+@inner
+def _curve(pairs, e, p, keep, work, H):
+    x = pairs.vertices[e]
+    edges = e >= pairs.points
+    c0, c1, c2, c3, one, two = closest(p, x, edges)
+    z0, z1, z2 = between(p, x, c1, c2, c3)
+    d = max(np.sqrt(z0 * z0 + z1 * z1 + z2 * z2), 1e-300)
+    gap = (d / pairs.scale[e] - pairs.thickness) / pairs.reach
+    if not gap < 1.0:
+        H[:, :] = 0.0
+        return
+    n, c, g, dc, first, second = work[0], work[1], work[2], work[3], work[4], work[5]
+    n[0], n[1], n[2] = z0 / d, z1 / d, z2 / d
+    c[0], c[1], c[2], c[3] = c0, c1, c2, c3
+    b, b1, b2 = law(max(gap, 1e-6))
+    r, m, m1, m2 = pairs.scale[e] * pairs.reach, 1.0, 0.0, 0.0
+    f, f1, f2 = pairs.stiffness[e] * r * r * b, pairs.stiffness[e] * r * b1, pairs.stiffness[e] * b2
+    u0 = u1 = u2 = v0 = v1 = v2 = uu = uv = vv = crossed = 0.0
+    if pairs.parallel[e] > 0.0:
+        u0, u1, u2, v0, v1, v2, uu, uv, vv, crossed = _crossed(p, x)
+        m, m1, m2 = _mollifier(crossed, pairs.parallel[e])
+    across = f1 / d
+    lag, hold = _rows(p, x, c, z0, z1, z2, one, two, first, second)
+    for i in range(4):
+        for a in range(3):
+            g[3 * i + a] = c[i] * n[a]
+    along = m * (f2 - keep * across)
+    for i in range(12):
+        for j in range(12):
+            H[i, j] = along * g[i] * g[j] - m * across * (lag * first[i] * first[j] + hold * second[i] * second[j])
+    side = keep * m * across
+    for i in range(4):
+        for j in range(4):
+            for a in range(3):
+                H[3 * i + a, 3 * j + a] += side * c[i] * c[j]
+    if m1 != 0.0:
+        u, v = work[6], work[7]
+        u[0], u[1], u[2], v[0], v[1], v[2] = u0, u1, u2, v0, v1, v2
+        _mollified(u, v, uu, uv, vv, crossed, m, m1, m2, f, f1, f2, keep, g, dc, H)
+
+
+@inner
+def _rows(p, x, c, z0, z1, z2, one, two, first, second):
+    """The columns of B, made orthogonal by G: the weights of their squares in B G^-1 B'."""
+    first[:], second[:] = 0.0, 0.0
+    if one < 0:
+        return 0.0, 0.0
+    a0, a1, a2 = _way(p, x, one, c, z0, z1, z2, first)
+    length = a0 * a0 + a1 * a1 + a2 * a2
+    if two < 0:
+        return 1.0 / length, 0.0
+    b0, b1, b2 = _way(p, x, two, c, z0, z1, z2, second)
+    mixed = (a0 * b0 + a1 * b1 + a2 * b2) / length
+    n0, n1, n2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    for i in range(12):
+        second[i] -= mixed * first[i]
+    return 1.0 / length, length / (n0 * n0 + n1 * n1 + n2 * n2)
+
+
+@inner
+def _way(p, x, way, c, z0, z1, z2, out):
+    """z_a, and its column of B in `out` (12,)."""
+    w0, w1, w2, w3 = WAYS[way, 0], WAYS[way, 1], WAYS[way, 2], WAYS[way, 3]
+    a0, a1, a2 = between(p, x, w1, w2, w3)
+    for i in range(4):
+        w = w0 if i == 0 else w1 if i == 1 else w2 if i == 2 else w3
+        out[3 * i] = c[i] * a0 + w * z0
+        out[3 * i + 1] = c[i] * a1 + w * z1
+        out[3 * i + 2] = c[i] * a2 + w * z2
+    return a0, a1, a2
+
+
+@inner
+def _mollified(u, v, uu, uv, vv, crossed, m, m1, m2, f, f1, f2, keep, g, dc, H):
+    """Add what the mollifier's derivatives bring. What bends downwards of it: f m'' and, with a = grad f, b = grad m,
+
+    a b' + b a' <= s a a' + b b'/s,     4 w (du x dv) <= 2 |w| (|du|^2 |v|/|u| + |dv|^2 |u|/|v|),     w = u x v.
+    """
+    for a in range(3):
+        bu, bv = 2.0 * (vv * u[a] - uv * v[a]), 2.0 * (uu * v[a] - uv * u[a])
+        dc[a], dc[3 + a], dc[6 + a], dc[9 + a] = -bu, bu, -bv, bv
+    mixed, bent = keep * f1 * m1, keep * f * m2
+    share, rest = 0.0, 1.0 - keep
+    if m > 0.0 and rest > 0.0 and f1 != 0.0:
+        share = m * f2 / (f1 * f1)
+        bent += rest * m1 * m1 / share
+        share *= rest * f1 * f1
+    for i in range(12):
+        for j in range(12):
+            H[i, j] += mixed * (g[i] * dc[j] + dc[i] * g[j]) + bent * dc[i] * dc[j] + share * g[i] * g[j]
+    w, weight = np.sqrt(crossed), 2.0 * f * m1
+    more_u, more_v = rest * w * np.sqrt(vv / uu), rest * w * np.sqrt(uu / vv)
+    for a in range(3):
+        for b in range(3):
+            same = 1.0 if a == b else 0.0
+            huu = weight * ((vv + more_u) * same - v[a] * v[b])
+            hvv = weight * ((uu + more_v) * same - u[a] * u[b])
+            huv = weight * ((1.0 + keep) * u[a] * v[b] - uv * same - keep * v[a] * u[b])
+            _four(H, a, b, 0, 0, huu)
+            _four(H, a, b, 6, 6, hvv)
+            _four(H, a, b, 0, 6, huv)
+            _four(H, b, a, 6, 0, huv)
+
+
+@inner
+def _four(H, a, b, i, j, h):
+    """A block by edges in the four blocks of their ends."""
+    H[i + a, j + b] += h
+    H[i + a, j + 3 + b] -= h
+    H[i + 3 + a, j + b] -= h
+    H[i + 3 + a, j + 3 + b] += h
+
+
+@kernel
+def scatter(blocks, places, values):
+    """Add blocks (a, 12, 12) to `values` (b, 3, 3), at places (a, 16); -1 for none."""
+    for k in range(len(blocks)):
+        for i in range(4):
+            for j in range(4):
+                at = places[k, 4 * i + j]
+                if at >= 0:
+                    for a in range(3):
+                        for b in range(3):
+                            values[at, a, b] += blocks[k, 3 * i + a, 3 * j + b]
+
+
+@kernel
+def multiply(vertices, blocks, x, out):
+    """Add the product of blocks (a, 12, 12) with x (n, 3) to `out`."""
+    for k in range(len(blocks)):
+        for i in range(12):
+            total = 0.0
+            for j in range(12):
+                total += blocks[k, i, j] * x[vertices[k, j // 3], j % 3]
+            out[vertices[k, i // 3], i % 3] += total

@@ -1,0 +1,188 @@
+"""The barrier's parts against brute force and differences: distances, candidates, derivatives, safe steps."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from harness.scenes.intersections import crossings
+from solvers.contact.barrier import Pairs
+from solvers.contact.self_contact import SelfContact
+from solvers.contact.surface import Surface
+from tests.self_contacts import RANGE, THICKNESS, sides, touching, way
+
+
+def pair(edges: bool) -> Pairs:
+    one = np.ones(1)
+    return Pairs(np.arange(4)[None], 0 if edges else 1, one, one, 0 * one, THICKNESS, RANGE)
+
+
+def sampled(p: np.ndarray, edges: bool) -> float:
+    """The least distance among a few thousand places on both."""
+    s, t = np.meshgrid(np.linspace(0, 1, 81), np.linspace(0, 1, 81))
+    s, t = s.ravel(), t.ravel()
+    if edges:
+        z = np.outer(1 - s, p[0]) + np.outer(s, p[1]) - np.outer(1 - t, p[2]) - np.outer(t, p[3])
+    else:
+        inside = s + t <= 1.0
+        s, t = s[inside], t[inside]
+        z = p[0] - np.outer(1 - s - t, p[1]) - np.outer(s, p[2]) - np.outer(t, p[3])
+    return float(np.linalg.norm(z, axis=1).min())
+
+
+FLAT = (1.0, 1.0, 1e-9)
+SHAPES = {"any": (1.0, 1.0, 1.0), "in a plane": FLAT, "needles": (1.0, 1e-6, 1e-6), "near a line": (1.0, 1e-3, 0.0)}
+
+
+@pytest.mark.parametrize("edges", [False, True], ids=["point-triangle", "edge-edge"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_distances_are_the_least_of_all_places(shape, edges):
+    for seed in range(40):
+        p = np.random.default_rng(seed).normal(size=(4, 3)) * SHAPES[shape]
+        found, least = Surface.distances(pair(edges), p)[0], sampled(p, edges)
+        # A place of the finest sampling is at most a cell of 1/80 from the nearest: the lengths here are below 6 m.
+        assert least - 6.0 / 80 <= found <= least + 1e-12
+
+
+def test_parallel_and_coincident_edges_have_their_distance():
+    p = np.array([[0, 0, 0], [1, 0, 0], [0.5, 0.3, 0], [2, 0.3, 0]], float)
+    assert Surface.distances(pair(True), p)[0] == pytest.approx(0.3, rel=1e-14)
+    assert Surface.distances(pair(True), p[[0, 1, 0, 1]])[0] == 0.0
+    assert Surface.distances(pair(False), np.array([[0.2, 0.2, 0.1], [0, 0, 0], [1, 0, 0], [0, 1, 0.0]]))[0] == 0.1
+
+
+def test_gradients_and_second_derivatives_are_those_of_the_value():
+    contact, p, _ = touching()
+    gradient, h = np.zeros_like(p), 1e-6
+    contact.add_gradient(p, gradient)
+    hessian = contact.hessian(p)
+    pairs, which = contact.pairs(p), contact.blocks(p).vertices
+    assert len(which) > 300
+    assert (pairs.parallel > 0.0).any()
+    for seed in range(3):
+        d = way(seed, p, 1.0)
+        change = (contact.value(p + h * d) - contact.value(p - h * d)) / (2 * h)
+        # Central differences: the third derivative, 1/gap times the second, by h^2, and round-off over h.
+        assert change == pytest.approx(float((gradient * d).sum()), rel=1e-6, abs=1e-6)
+        ahead, behind = np.zeros_like(p), np.zeros_like(p)
+        contact.add_gradient(p + h * d, ahead)
+        contact.add_gradient(p - h * d, behind)
+        bent = (ahead - behind).ravel() / (2 * h)
+        np.testing.assert_allclose(hessian @ d.ravel(), bent, atol=1e-5 * np.abs(bent).max())
+
+
+def test_the_mollifier_is_part_of_the_derivatives():
+    contact, p, _ = touching(noise=2e-4)  # edges that run in parallel but for a hundredth
+    d, h, gradient = way(1, p, 1.0), 1e-7, np.zeros_like(p)
+    contact.add_gradient(p, gradient)
+    change = (contact.value(p + h * d) - contact.value(p - h * d)) / (2 * h)
+    assert change == pytest.approx(float((gradient * d).sum()), rel=1e-5)
+
+
+@pytest.mark.parametrize("noise", [2e-4, 4e-3])
+def test_clamped_blocks_are_positive_semidefinite_and_never_less_than_exact_ones(noise):
+    contact, p, _ = touching(noise=noise)
+    exact, half, clamped = (contact.blocks(p, keep).values for keep in (1.0, 0.5, 0.0))
+    size = np.abs(clamped).max(axis=(1, 2))
+    # Round-off of blocks of 12 x 12.
+    assert (np.linalg.eigvalsh(clamped)[:, 0] >= -1e-13 * size).all()
+    assert (np.linalg.eigvalsh(clamped - exact)[:, 0] >= -1e-13 * size).all()
+    np.testing.assert_allclose(half, 0.5 * (exact + clamped), atol=1e-13 * size.max())
+    assert np.linalg.eigvalsh(exact)[:, 0].min() < 0.0
+
+
+def test_forces_have_no_sum_and_no_moment():
+    contact, p, _ = touching()
+    g = np.zeros_like(p)
+    contact.add_gradient(p, g)
+    assert np.abs(g.sum(axis=0)).max() <= 1e-13 * np.abs(g).sum()
+    assert np.abs(np.cross(p, g).sum(axis=0)).max() <= 1e-13 * np.abs(g).sum()
+
+
+def test_candidates_are_all_that_are_near():
+    contact, p, triangles = touching()
+    surface, reach = contact.surface, 2 * contact.range
+    edges = sides(triangles)
+    wanted = [(i, *t) for i in range(len(p)) for t in triangles.tolist() if i not in t]
+    wanted += [(*e, *f) for e, f in combinations(edges.tolist(), 2) if not set(e) & set(f)]
+    first = sum(1 for _ in range(len(p)) for _ in triangles) - 3 * len(triangles)
+    every = Pairs(np.array(wanted), first, *np.ones((2, len(wanted))), np.zeros(len(wanted)), THICKNESS, RANGE)
+    near = surface.distances(every, p) < reach
+    found = surface.within(p, reach)
+    assert {tuple(x) for x in found.vertices.tolist()} == {tuple(x) for x in every.vertices[near].tolist()}
+    assert found.points == int(near[:first].sum())
+
+
+def test_what_was_kept_changes_no_bit():
+    contact, p, _ = touching()
+    fresh = SelfContact(contact.surface)
+    contact.value(p)
+    for seed in range(4):
+        q = p + way(seed, p, 1e-3)
+        assert contact.value(q) == SelfContact(contact.surface).value(q)
+        assert (contact.hessian(q) != fresh.hessian(q)).nnz == 0
+
+
+@pytest.mark.parametrize("fast", [1e-3, 0.05, 1.0])
+def test_no_gap_closes_within_the_largest_step_and_none_would_be_much_larger(fast):
+    contact, p, triangles = touching(noise=1e-3)
+    edges, upper = sides(triangles), np.arange(len(p)) >= len(p) // 2
+    for seed in range(3):
+        d = way(seed, p, 0.2 * fast)
+        d[upper] -= (0.0, fast, 0.0)
+        most = contact.largest_step(p, d)
+        for t in np.linspace(0.0, most, 60):
+            assert not contact.closed(p + t * d)
+            assert not crossings(p + t * d, edges, triangles)
+        # It leaves a tenth of the gap, where the search ends: twice as far something is nearer than the thickness.
+        assert most == 1.0 or any(contact.closed(p + t * most * d) for t in np.linspace(1.0, 2.0, 40))
+
+
+def test_a_common_motion_bounds_no_step():
+    contact, p, _ = touching()
+    assert contact.largest_step(p, np.tile([1e3, 0.0, -1e3], (len(p), 1))) == 1.0
+
+
+def test_pairs_that_are_near_at_rest_keep_their_distance_in_proportion():
+    contact, _, triangles = touching()
+    fine = Surface.of(*_shrunk(0.05), sides(triangles), triangles, contact.surface.stiffness, THICKNESS, RANGE)
+    assert len(fine.near[0]) > 100
+    rest = _shrunk(0.05)[0]
+    assert SelfContact(fine).value(rest) == 0.0
+    assert SelfContact(fine).value(rest * (0.5, 1.0, 0.5)) > 0.0
+    assert not SelfContact(fine).closed(rest)
+
+
+def _shrunk(by: float):
+    _, p, _ = touching(noise=0.0)
+    return (p * (by, 1.0, by),)
+
+
+def test_values_are_infinite_where_a_gap_is_closed():
+    contact, p, _ = touching()
+    p[len(p) // 2 :, 1] -= 0.03
+    assert contact.value(p) == np.inf
+    assert contact.closed(p)
+    assert contact.largest_step(p, way(0, p, 1.0)) == 0.0
+
+
+def test_crossings_are_found_exactly_and_touching_counts():
+    square = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
+    one = np.array([[0, 1, 2]])
+    for low, meets in ((-0.5, True), (0.0, True), (1e-300, False)):
+        p = np.concatenate([square, [[0.25, 0.25, low], [0.25, 0.25, 1.0]]])
+        assert bool(crossings(p, np.array([[3, 4]]), one)) is meets
+    flat = np.concatenate([square, [[0.25, 0.25, 0], [2, 2, 0], [1.0, 1.0, 0], [2, 1, 0]]])
+    assert crossings(flat, np.array([[3, 4], [5, 6]]), one) == [((3, 4), (0, 1, 2))]
+    assert not crossings(flat, np.array([[0, 4]]), one)  # they share a vertex
+
+
+def test_crossings_agree_with_the_intersection_test_of_ipctk():
+    ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
+    for seed in range(12):
+        _, p, triangles = touching(seed, noise=0.002 * seed)
+        edges = sides(triangles)
+        mesh = ipctk.CollisionMesh(p, edges, triangles)
+        assert bool(crossings(p, edges, triangles)) == ipctk.has_intersections(mesh, p)
