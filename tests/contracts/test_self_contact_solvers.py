@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from harness.base.errors import InputError
-from harness.scenes.bind import Scene
+from harness.scenes.bind import Scene, build
+from harness.scenes.effects import self_contact
 from harness.scenes.effects.base import Effect
 from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins
@@ -19,8 +20,10 @@ from harness.scenes.effects.springs import Springs
 from harness.scenes.intersections import crossings
 from harness.scenes.mesh.grid import Grid
 from harness.scenes.motion import Key, Motion
+from harness.scenes.spec import SceneSpec
 from harness.scenes.start import Collapsed, Scaled
 from harness.simulation.observe import intersections
+from harness.simulation.opinion.second import second_opinion
 from harness.simulation.step import State, prepare, problem, simulate, start
 from solvers import integrators
 from solvers.contact.self_contact import SelfContact as Energy
@@ -164,9 +167,6 @@ def test_exact_pins_that_move_are_refused():
 
 @pytest.mark.parametrize("name", ["midpoint", "sdirk-2", "generalised-alpha"])
 def test_integrators_whose_unknowns_lie_elsewhere_are_refused(name):
-    from harness.scenes.bind import build
-    from harness.scenes.spec import SceneSpec
-
     given = {"mesh": Grid(), "mass": 1.0, "time_step": 0.02, "frames": 1, "path": "scene.yaml"}
     spec = SceneSpec.model_validate(given | {"effects": (Springs(stretch=1.0), APART)})
     with pytest.raises(InputError, match=f"end of a step, and {name} has other unknowns"):
@@ -180,3 +180,11 @@ def test_a_fine_mesh_with_edges_below_the_thickness_runs():
     assert made.mesh.spacing < fine.thickness
     for step in simulate(made, prepare(made, Newton()), StopRule(30, 1e-4), first_guess="current", frames=2):
         assert intersections(made, step.positions) == 0
+
+
+@pytest.mark.parametrize(("stiff", "told"), [(0.1, "agrees"), (0.1001, "disagrees: effects[1] self-contact")])
+def test_the_second_opinion_agrees_with_the_barrier_and_with_no_other(stiff, told, monkeypatch):
+    given = {"mesh": Grid(), "mass": 1.0, "time_step": 0.02, "frames": 3, "path": "scene.yaml"}
+    spec = SceneSpec.model_validate(given | {"effects": (Springs(stretch=100.0), SelfContact(thickness=0.4))})
+    monkeypatch.setattr(self_contact, "_STIFF", stiff)
+    assert second_opinion(spec, build(spec, 3), "implicit-euler").startswith(told)

@@ -78,7 +78,7 @@ class Touching:
         """The energies [J] of thickness t and range r [m], with stiffnesses k (n,) [N/m]."""
 
         def of(x: Wide) -> Wide:
-            real = np.asarray(x.real, float)
+            real = np.asarray(np.real(x), float)
             if not np.isfinite(real).all():
                 return wide([np.inf])
             parts = [
@@ -100,7 +100,7 @@ class Touching:
         energy = np.where(feels, wide(k[rows].mean(axis=1)) * (scale * r) ** 2 * b, 0)
         if edges:
             c, e = _crossed(rows, x), _sides(rows, wide(self.rest)) / 1000
-            energy = np.where(c.real < e, (2 - c / e) * (c / e), 1) * energy
+            energy = np.where(np.real(c) < e, (2 - c / e) * (c / e), 1) * energy
         return np.where(closed, np.inf, energy)
 
 
@@ -114,7 +114,7 @@ def _between(rows: Indices, x: Wide, edges: bool) -> Wide:
         corners = (a, b, c, d)
         found += [_to_side(a, corners[i], corners[j]) for i, j in _SIDES]
     all_ = np.stack(found)
-    best = (all_.real**2).sum(axis=2).argmin(axis=0)
+    best = np.argmin((np.real(all_) ** 2).sum(axis=2), axis=0)
     return all_[best, np.arange(len(rows))]
 
 
