@@ -101,9 +101,8 @@ class RerunRecorder:
             self._energies.setdefault(name, {})[frame.index] = value
         largest = float(np.abs(strain).max(initial=0.0))
         self._add(frame.index, {"/strain/largest": largest, "/iterations": frame.iterations})
-        if frame.intersections is not None:
-            self._add(frame.index, {"/intersections": frame.intersections})
-        self._add(frame.index, {"/residual": frame.residual, "/residual/log10": _log10(frame.residual)})
+        crossed = {} if frame.intersections is None else {"/intersections": frame.intersections}
+        self._add(frame.index, crossed | {"/residual": frame.residual, "/residual/log10": _log10(frame.residual)})
         self._frames += 1
         if self._frames % SCALARS == 0:
             self._send_scalars()

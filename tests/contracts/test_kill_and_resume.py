@@ -166,7 +166,7 @@ def assert_equal(sweep: Sweep, other: Sweep) -> None:
 def test_a_sweep_leaves_its_files_and_nothing_else(undisturbed: Undisturbed):
     runs = {path.stem for path in (undisturbed.sweep.folder / "rows").iterdir()}
     assert len(runs) == len(undisturbed.case.solvers.split())
-    expected = {".lock", ".config", "references.bib", "recordings/cloth-6-solvers.rrd"}
+    expected = {".lock", ".claims", ".config", "references.bib", "recordings/cloth-6-solvers.rrd"}
     expected |= {f"rows/{run}.parquet" for run in runs} | {f"recordings/{run}.rrd" for run in runs}
     if undisturbed.case.pictures:
         expected.add("pictures/timing.png")

@@ -109,8 +109,8 @@ MEASURING = (
     Mutation(
         "frame-of-the-start",
         "harness/simulation/observe.py",
-        "scene.time(step.index), p, terms",
-        "scene.time(step.index), step.problem.start.positions, terms",
+        "scene.time(step.index), p, *told",
+        "scene.time(step.index), step.problem.start.positions, *told",
         (_LIES,),
         ("sparse", "other positions"),
     ),

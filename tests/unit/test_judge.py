@@ -148,7 +148,7 @@ def test_a_solver_is_scored_by_the_cases_that_it_does_not_refuse():
     outcomes = {"a": [RIGHT, DIVERGED, REFUSED, SHORT], "b": [REFUSED, REFUSED]}
     worst = {RIGHT: 1e-7, SHORT: 1e-2}
     cells = [
-        Cell(f"case-{k}", solver, outcome, worst.get(outcome), "stationarity", "", None)
+        Cell(f"case-{k}", solver, outcome, worst.get(outcome), "stationarity", "")
         for solver, own in outcomes.items()
         for k, outcome in enumerate(own)
     ]
