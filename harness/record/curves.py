@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 _WIDTH, _HEIGHT = 150.0, 100.0
-_PALE, _RULE = (255, 255, 255), (70, 73, 80)
+_PALE, _RULE = 0xFFFFFFFF, (70, 73, 80)
 _LINE = 7.0
 """The height of a word, by which those at the ends of curves are kept apart."""
 
@@ -70,8 +70,12 @@ def _axes(stream: rr.RecordingStream, entity: str, bottom: int, top: int, last: 
     _words(stream, f"{entity}/numbers", np.array(places), words, [_PALE] * len(words))
 
 
-def _words(stream: rr.RecordingStream, entity: str, at: NDArray[np.float64], words: list[str], colours: object) -> None:
-    points = rr.Points2D(at, labels=words, show_labels=True, colors=colours, radii=rr.Radius.ui_points(0.1))  # pyright: ignore[reportArgumentType]
+def _words(
+    stream: rr.RecordingStream, entity: str, at: NDArray[np.float64], words: list[str], colours: Sequence[Colour]
+) -> None:
+    # As an array: Rerun takes three or four numbers in a list for the parts of one colour.
+    as_array = np.array(colours, np.uint32)
+    points = rr.Points2D(at, labels=words, show_labels=True, colors=as_array, radii=rr.Radius.ui_points(0.1))
     stream.log(entity, points, static=True)
 
 

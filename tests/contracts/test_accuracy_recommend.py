@@ -79,6 +79,7 @@ def test_what_was_measured_is_not_measured_again(scene: Path) -> None:
     assert again.best == first.best
 
 
+@pytest.mark.long
 def test_what_was_measured_of_another_scene_or_on_another_machine_is_no_answer(scene: Path) -> None:
     asked(scene, 0.1)
     scene.write_text(SCENE.replace("200", "210"))

@@ -190,6 +190,7 @@ def test_a_point_of_a_curve_leads_to_its_solve_by_keys(tab: Tab, page: str):
     assert not point.is_visible(), "the card goes when something else is shown"
 
 
+@pytest.mark.long
 def test_light_and_dark_are_a_choice(tab: Tab, page: str):
     shown = tab.open(page)
     ground = "getComputedStyle(document.documentElement).backgroundColor"

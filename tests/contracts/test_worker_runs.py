@@ -92,6 +92,7 @@ def test_a_sweep_survives_its_solvers(name: str, tmp_path: Path, monkeypatch: py
     assert first_rows(made) == found
 
 
+@pytest.mark.long
 def test_a_run_that_took_too_long_is_done_again_with_another_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     flag = tmp_path / "quick"
     hangs = f"import pathlib\n        while not pathlib.Path({str(flag)!r}).exists(): hang = 1"

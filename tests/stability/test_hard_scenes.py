@@ -150,8 +150,8 @@ COMPILED = [case for case in CASES if not case.startswith("effects-gas")]
 
 
 LOOSE = {"scales-cubes-1e6-m-apart": 1e-3}
-"""Where round-off of the gradient itself, 1e8 N/m times 1e-10 m, moves a free cube by some 1e-4 of the spacing a step, as
-processors add up."""
+"""Where round-off of the gradient itself, 1e8 N/m times 1e-10 m, moves a free cube by some 1e-4 of the spacing a
+step, as processors add up."""
 
 
 @pytest.mark.parametrize("case", COMPILED)

@@ -107,6 +107,7 @@ def test_a_revision_that_does_not_run_says_why_in_its_own_words(repository: Path
     assert "does not run: SyntaxError: '(' was never closed" in said
 
 
+@pytest.mark.long
 def test_a_revision_whose_libraries_cannot_be_had_does_not_build(repository: Path):
     project = '[project]\nname = "mine"\nversion = "{}"\ndependencies = [{}]\n'
     (repository / "pyproject.toml").write_text(project.format("0", '"no such thing !"'))

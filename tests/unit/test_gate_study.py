@@ -58,6 +58,7 @@ def test_others_compare_one_session_with_the_next():
         assert replay_other(rule, same, 0.7, seconds=20.0, replays=100) == 0.0
 
 
+@pytest.mark.long
 def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "cloth.yaml").write_text(CLOTH_FILE)
     (tmp_path / ".git").mkdir()
