@@ -36,8 +36,10 @@ CONTACT = (
         name="idle-contact-against-none-64",
         candidate=lambda: fallen(FAR, size=64, frames=10),
         yardstick=lambda: fallen(size=64, frames=10),
-        limit=1.02,
-        why="a promise: obstacles that are far away cost one test of a box, at most 2 % of a step; measured 1.003",
+        limit=1.05,
+        goal=1.02,
+        why="a promise: obstacles that are far away cost one test of a box, at most 2 % of a step; .97 to 1.03 from start "
+        "to start, one machine",
         guards=("test_idle_contact_allocates_no_array_more",),
         short=True,
     ),
