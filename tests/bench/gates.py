@@ -191,8 +191,8 @@ GATES = (
         limit=1.1,
         goal=1.02,
         guards=("test_a_step_allocates_as_many_arrays_as_stored",),
-        why="a promise: stating the problem of a step costs at most 2 % of solving it; measured 1.008 once, and 1.03 to "
-        "1.04 since integrators may have several unknowns",
+        why="a promise: stating the problem of a step costs at most 2 % of solving it; measured 1.008 once, and 1.03 "
+        "to 1.04 since integrators may have several unknowns",
     ),
     Gate(
         name="recording-against-simulating-alone-64",
