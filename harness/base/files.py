@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 
 from harness.base.errors import SpringbenchError
@@ -15,13 +16,27 @@ class CannotWrite(SpringbenchError):
     """The disk is full, or will not be written for another such reason: no fault of a run, which may be done again."""
 
 
+_STEM = 100
+"""So much of a file's name stands in its partial name, which may not be too long for the disk."""
+
+
+def partial_name(path: Path) -> Path:
+    """What a file is called while this process writes it."""
+    return path.with_name(f".{path.stem[:_STEM]}.{os.getpid()}.partial{path.suffix}")
+
+
+def half_written(path: Path) -> Iterator[Path]:
+    """What any process left half written of a file."""
+    return path.parent.glob(f".{escape(path.stem[:_STEM])}.*.partial{path.suffix}")
+
+
 @contextmanager
 def replacing(path: Path) -> Generator[Path]:
     """A partial name beside a file, for what takes the file's place where nothing goes wrong, and goes where it does.
 
     Raises CannotWrite from an OSError.
     """
-    partial = path.with_name(f".{path.stem[:100]}.{os.getpid()}.partial{path.suffix}")
+    partial = partial_name(path)
     try:
         yield partial
         os.replace(partial, path)

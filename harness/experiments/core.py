@@ -132,9 +132,9 @@ def do_all(
 
     try:
         if not isolated:
-            for number, unit in enumerate(todo):
+            for number in range(len(todo)):
                 if task := start(number):
-                    runs.pop(number).finished(watched(unit, task.tick))
+                    runs.pop(number).finished(task.piece(task.tick))
             return
         groups = [unit.group if isinstance(unit, Sharing) else None for unit in todo]
         tables = [dict(table) for table in TABLES]

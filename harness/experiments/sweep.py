@@ -6,7 +6,6 @@ from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
-from glob import escape
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,7 @@ import pyarrow as pa
 
 from harness.base import holding, machine, rows
 from harness.base.errors import InputError, Mistake
+from harness.base.files import half_written
 from harness.base.holding import Claims
 from harness.base.progress import Display
 from harness.base.workers import Limits, Lost, Tick
@@ -83,7 +83,7 @@ def _abandoned(run: RunSpec, files: Files, status: str, reason: str) -> list[dic
     """The rows of a run whose process gave no answer, written; what it left half written is removed."""
     for earlier in (files.recording, files.picture):
         earlier.unlink(missing_ok=True)
-        for half in earlier.parent.glob(f".{escape(earlier.stem[:100])}.*partial*"):
+        for half in half_written(earlier):
             half.unlink(missing_ok=True)
     found = [common(run) | {"code": code(parts(run))} | {"phase": "run", "status": status, "reason": reason}]
     rows.write(files.rows, found)
@@ -142,11 +142,8 @@ def run_sweep(
             do_together(units, claims, partial(away.do_all, folder, display))
             planned = plan(runs, folder, machines)
         else:
-
-            def do(units: Sequence[RunUnit], another: Callable[[RunUnit], str]) -> None:
-                do_all(units, display, isolated=isolated, at_once=many, another=another)
-
-            do_together(units, claims, do)
+            here = partial(do_all, display=display, isolated=isolated, at_once=many)
+            do_together(units, claims, lambda some, another: here(some, another=another))
         from harness.report.sweep import Pictured, draw_sweep  # takes a second, in which runs can be done already
 
         table = rows.read((p.files.rows for p in planned), needed=NEEDED)

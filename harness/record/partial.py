@@ -18,7 +18,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings
 
-from harness.base.files import CannotWrite, cannot_write
+from harness.base.files import CannotWrite, cannot_write, partial_name
 from harness.record.sound import trust, whole_messages
 
 _PATIENCE = 30
@@ -41,7 +41,7 @@ class PartialFile:
 
     def __init__(self, path: Path, application: str, recording_id: str, title: str) -> None:
         self._path, self._broken = path, False
-        self._partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.rrd")
+        self._partial = partial_name(path)
         if not _broken and os.getpid() == _LOADED_IN:  # else this would wait for ever, or refuse
             rerun_bindings.flush_and_cleanup_orphaned_recordings()  # the library keeps two threads of each until then
         rr.set_strict_mode(True)  # without it a wrong shape is swallowed and logged as nothing

@@ -6,11 +6,12 @@ Rows carry a solver's reference as JSON (authors as BibTeX has them, year, title
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+
+from harness.base.files import replacing
 
 
 def cited(reference: str | None) -> str:
@@ -39,10 +40,9 @@ def bibtex(references: Iterable[str | None]) -> str:
 
 
 def write_bibtex(path: Path, references: Iterable[str | None]) -> Path:
-    """Write the entries and return the path."""
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(bibtex(references), encoding="utf-8")
-    os.replace(partial, path)
+    """Write the entries and return the path. Raises CannotWrite."""
+    with replacing(path) as partial:
+        partial.write_text(bibtex(references), encoding="utf-8")
     return path
 
 

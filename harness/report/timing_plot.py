@@ -19,7 +19,7 @@ from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
 from harness.report.labels import LINE, End, direct_labels
 from harness.report.page import axes, count, header, new_page, quantity, save, shorten, text, ticks
 from harness.report.style import DASH_DOTTED, DASHED, DOTTED, HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark, marks
-from harness.report.timing_rows import draw_rows
+from harness.report.timing_rows import HEADINGS, draw_rows
 from harness.report.timing_table import RunTimes, labels, runs
 
 _LEFT, _TOP, _RIGHT, _BOTTOM = 40, 118, WIDTH - 40, HEIGHT - 30
@@ -91,10 +91,10 @@ def _scene(
     text(page, left, top + 14, shorten(scene, int(width / 10)), size=12.5, weight="bold")
     room = height - 56 - 64 - 44  # less the headings and the ticks of both panels
     upper, lower = 0.64 * room, 0.36 * room
-    text(page, left, top + 40, "milliseconds a step", size=9.5, color=MUTED)
+    text(page, left, top + 40, HEADINGS[0], size=9.5, color=MUTED)
     step = axes(page, left + 48, top + 52, width - 48, upper)
     below = top + 52 + upper + 64
-    text(page, left, below - 12, "milliseconds to prepare, once a run: filled warm, open cold", size=9.5, color=MUTED)
+    text(page, left, below - 12, HEADINGS[1], size=9.5, color=MUTED)
     prepare = axes(page, left + 48, below, width - 48, lower)
     here = [run for run in found if run.scene == scene and run.vertices]
     failed = [run for run in here if run.status != "ok"]

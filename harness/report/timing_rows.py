@@ -14,6 +14,9 @@ from harness.report.page import axes, count, quantity, shorten, text, ticks
 from harness.report.style import INK, MUTED, PAGE, Mark
 from harness.report.timing_table import RunTimes
 
+HEADINGS = "milliseconds a step", "milliseconds to prepare, once a run: filled warm, open cold"
+"""Of the two panels of a scene."""
+
 _ROW, _NAMES, _HEAD, _GAP, _LETTER = 42.0, 0.3, 96.0, 48.0, 8.2
 """Pixels of a row, part of the width for the solvers' names at most, pixels above, between panels, and of a letter."""
 
@@ -40,7 +43,7 @@ def draw_rows(
     tall = min(_ROW * len(here) + 14.0, height - _HEAD - 40.0)
     each = (width - start - _GAP) / 2.0
     panels = [axes(page, left + start + k * (each + _GAP), top + _HEAD, each, tall) for k in range(2)]
-    for k, words in enumerate(("milliseconds a step", "milliseconds to prepare, once a run: filled warm, open cold")):
+    for k, words in enumerate(HEADINGS):
         place = left + start + k * (each + _GAP)
         text(page, place, top + _HEAD - 18, shorten(words, int(each / 6.6)), size=9.5, color=MUTED)
     step, prepare = panels

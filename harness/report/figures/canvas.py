@@ -146,7 +146,7 @@ def _strain_scale(figure: Figure, axes: Sequence[Axes], panels: Sequence[Panel],
         ScalarMappable(Normalize(-limit, limit), STRAIN_MAP), ax=list(axes), location="bottom", shrink=0.8, aspect=45,
         pad=0.02, ticks=MaxNLocator(4, symmetric=True),
     )  # fmt: skip
-    bar.outline.set_visible(False)  # type: ignore[union-attr]
+    bar.outline.set_visible(False)
     bar.ax.xaxis.set_major_formatter(ticks(lambda e: f"{100 * e:+.3g} %".replace("-", "−") if e else "at rest"))
     bar.ax.tick_params(length=2.0, width=0.5, labelsize=asked.small)
     words = wrapped("strain of the most strained spring at each vertex", asked.width / INCH * 58.0, asked.small)

@@ -13,6 +13,7 @@ from matplotlib.text import Annotation, Text
 
 from harness.report.figures.asked import Asked
 from harness.report.figures.panel import Panel, Plot, Series
+from harness.report.figures.scales import in_points
 
 _MOST, _SHARE = 9, 0.3
 """Names of a frame, and the part of the width that they may take."""
@@ -61,18 +62,23 @@ class _Names:
                 color=_dark(series.look.color), arrowprops=line | {"shrinkB": 2.5, "relpos": (0.0, 0.5)},
                 annotation_clip=False,
             )  # fmt: skip
-            name.set_position((1.0 + _BESIDE / (ax.bbox.width / ax.figure.dpi * 72.0), 0.5))  # type: ignore[union-attr]
+            name.set_position((self._beside(), 0.5))
             self._names.append(name)
-        setattr(self._names[0], "settle", self.settle)  # noqa: B010  what only the layout knows is done after it
+        setattr(self._names[0], "settle", self.settle)  # noqa: B010 no attribute of Text: done after the layout
+
+    def _beside(self) -> float:
+        """Where the names begin, in parts of the frame's width."""
+        width, _ = in_points(self._ax)
+        return 1.0 + _BESIDE / width
 
     def settle(self) -> None:
         """Move the names to the heights of their ends, and apart."""
         ax = self._ax
-        points = ax.bbox.height / ax.figure.dpi * 72.0  # type: ignore[union-attr]
+        _, points = in_points(ax)
         wanted = [ax.transAxes.inverted().transform(ax.transData.transform(end))[1] * points for end in self._ends]
         order = np.argsort(wanted)
         at = apart([wanted[k] for k in order], self._gap, points)
-        beside = 1.0 + _BESIDE / (ax.bbox.width / ax.figure.dpi * 72.0)  # type: ignore[union-attr]
+        beside = self._beside()
         for k, height in zip(order, at, strict=True):
             self._names[k].set_position((beside, height / points))
 
@@ -111,7 +117,7 @@ def _name_points(ax: Axes, series: Sequence[Series], asked: Asked) -> None:
                 one.label, (x, y), (5, 0), textcoords="offset points", va="center", fontsize=asked.small,
                 annotation_clip=False,
             )  # fmt: skip
-            setattr(name, "settle", lambda name=name: _place(ax, name))  # noqa: B010
+            setattr(name, "settle", lambda name=name: _place(ax, name))  # noqa: B010 as above
 
 
 _SIDES: tuple[tuple[float, float, Any], ...] = tuple(

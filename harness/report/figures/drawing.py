@@ -15,7 +15,7 @@ from matplotlib.patches import Rectangle
 from harness.report.accuracy.sheet import size as enlarged
 from harness.report.figures.asked import Asked
 from harness.report.figures.panel import Grid, Picture, Plot, Series, Values
-from harness.report.figures.scales import set_scales
+from harness.report.figures.scales import in_points, set_scales
 from harness.report.style import INK, MUTED, RULE, Mark
 
 _LINE, _MARKER, _FEW = 1.1, 3.6, 12
@@ -110,8 +110,8 @@ def write_cells(ax: Axes, panel: Grid, asked: Asked) -> None:
     """The figures of all cells, where the longest fits. To be called once the frame has its size."""
     rows, columns = names(panel)
     longest = max((len(cell.figure) for cell in panel.cells), default=0)
-    letter = 0.64 * asked.small * ax.get_figure(root=True).dpi / 72.0  # type: ignore[union-attr]
-    if longest and longest * letter < 0.9 * ax.bbox.width / len(columns):
+    width, _ = in_points(ax)
+    if longest and longest * 0.64 * asked.small < 0.9 * width / len(columns):
         for cell in panel.cells:
             at = columns.index(cell.column) + 0.5, rows.index(cell.row) + 0.53
             ax.text(*at, cell.figure, ha="center", va="center", fontsize=asked.small, color=ink_on(cell.color))

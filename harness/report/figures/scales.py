@@ -23,6 +23,13 @@ _ROOM = 0.06
 """Of the axis, left free at each end."""
 
 
+def in_points(ax: Axes) -> tuple[float, float]:
+    """Width and height of a frame [points]."""
+    figure = ax.get_figure(root=True)
+    assert figure
+    return ax.bbox.width / figure.dpi * 72.0, ax.bbox.height / figure.dpi * 72.0
+
+
 def superscript(words: str) -> str:
     """A number as an exponent, of letters of the full size: mathematics would set it in 0.7 of it."""
     return words.translate(_SUPERSCRIPTS)

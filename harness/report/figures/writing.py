@@ -73,7 +73,8 @@ def script(figure: Figure, panels: Sequence[Panel], name: str, asked: Asked) -> 
     kind = type(panels[0])
     said = {"name": name, "width": asked.width, "size": asked.size, "small": asked.small}
     inches = tuple(round(float(side), 3) for side in figure.get_size_inches())
-    columns = max(ax.get_subplotspec().get_topmost_subplotspec().colspan.stop for ax in figure.axes[: len(panels)])  # type: ignore[union-attr]
+    places = [spec for ax in figure.axes[: len(panels)] if (spec := ax.get_subplotspec())]
+    columns = max(spec.get_topmost_subplotspec().colspan.stop for spec in places)
     shared: dict[str, Any] = said | {"inches": inches, "columns": columns, "rows": -(-len(panels) // columns)}
     head = scripts.HEAD.format(**shared)
     if kind is Plot:
