@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from harness.base.model import Many, Model
-from harness.config.options import OF_STEPS, Iterations, Rounds, Threads, lists
+from harness.config.options import OF_STEPS, Threads, lists, single
 from harness.config.sweep import SolverSpec, in_file_name
 from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, Size
 from solvers.plugins import identity
@@ -28,7 +28,7 @@ def moment_name(moment: str | int) -> str:
 TimeLimit = Annotated[float, Field(gt=0, le=1e5)]
 
 
-class Study(lists("integrator", "time_step")):
+class Study(lists("integrator", "time_step"), single(rounds=3)):
     """What every study says: of its lists, all combinations are measured."""
 
     scene: Many[str] = ()
@@ -38,22 +38,16 @@ class Study(lists("integrator", "time_step")):
     solver: Many[str] = ()
     """Names of solvers that the config lists; all of them if left out."""
     threads: Threads = 1
-    """Threads of Numba and of BLAS."""
-    rounds: Rounds = 3
-    """How often the timed part is repeated."""
+    """Threads of Numba and of BLAS: a number, for what is measured at another number is another measurement."""
     time_limit: TimeLimit = 5.0
     """Seconds that a solver may take for one curve, or one simulation."""
 
 
-class CurveStudy(Study):
-    """Convergence of the solvers that minimise, on frozen steps."""
+class CurveStudy(Study, lists(first_guess=("current", "inertial")), single(iterations=2000)):
+    """Convergence of the solvers that minimise, on frozen steps; a curve ends where it has converged."""
 
     moment: Many[Moment] = ("early", "middle", "violent")
     """Which steps are frozen: moments found from the scene's run, or numbers of frames."""
-    first_guess: Many[Literal["assignment", "current", "inertial"]] = ("current", "inertial")
-    """Where a solve starts: at the current positions (the assignment), at the inertial target (Liu et al. 2013)."""
-    iterations: Iterations = 2000
-    """Iteration limit; a curve ends before it where it has converged."""
     recordings: bool = False
     """Whether the solve from the first of the guesses is recorded, to scrub through its iterates beside the mesh."""
 

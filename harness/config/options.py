@@ -80,6 +80,8 @@ OF_SCENE = tuple(name for name, option in OPTIONS.items() if option.null)
 OF_STEPS: tuple[str, ...] = ("first_guess", "iterations", "tolerance")
 """Those that say how a step is solved, whatever it is."""
 
+_HINTS = get_type_hints(Chosen, include_extras=True)
+
 
 def meaning(name: str) -> str:
     """What an option is, in a sentence."""
@@ -92,12 +94,20 @@ def lists(*names: str, **usual: tuple[Any, ...]) -> Any:
 
     usual: more options, with other values than their own where they are left out.
     """
-    hints = get_type_hints(Chosen, include_extras=True)
     fields: dict[str, Any] = {}
     for name in dict.fromkeys((*names, *usual)):
         of_scene = name in OF_SCENE and name not in usual
         values = usual.get(name, (None if of_scene else Chosen.model_fields[name].default,))
-        item = hints[name] | None if of_scene else hints[name]
+        item = _HINTS[name] | None if of_scene else _HINTS[name]
         says = meaning(name) if of_scene else Chosen.model_fields[name].description
         fields[name] = (Many[item], Field(default=values, description=says))
     return create_model("Lists", __base__=Model, **fields)
+
+
+def single(**usual: Any) -> Any:
+    """A model that has one value of each of these options, and this one where it is left out."""
+    fields: dict[str, Any] = {
+        name: (_HINTS[name], Field(default=value, description=Chosen.model_fields[name].description))
+        for name, value in usual.items()
+    }
+    return create_model("Single", __base__=Model, **fields)

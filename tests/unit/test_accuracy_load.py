@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from harness.base.errors import InputError
 from harness.config.accuracy_load import Accuracy, load_accuracy
 from harness.config.load import load_any
+from harness.report.accuracy.convergence import GUESSES
 from harness.scenes.bind import build
+from harness.scenes.spec import FirstGuess
+from harness.simulation.step import FIRST_GUESSES
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SHIPPED = [path for path in sorted(CONFIGS.glob("*.yaml")) if "\ncurves:" in path.read_text()]
@@ -55,6 +59,13 @@ def test_a_study_of_curves_asks_for_each_moment_and_solver_that_minimises(folder
     assert {(u.case.scene_name, u.case.size, u.first_guesses, u.how.rounds) for u in units} == {
         ("cloth", 4, ("current", "inertial"), 7)
     }
+
+
+def test_studies_take_every_first_guess_and_reports_have_words_for_each(folder: Path) -> None:
+    guesses = get_args(FirstGuess)
+    asked = CONFIG.replace("rounds: 7", f"rounds: 7, first_guess: [{', '.join(guesses)}]")
+    assert {unit.first_guesses for unit in loaded(folder, asked).curves} == {guesses}
+    assert set(GUESSES) == set(FIRST_GUESSES) == set(guesses)
 
 
 def test_a_study_of_work_asks_for_all_combinations(folder: Path) -> None:

@@ -32,7 +32,12 @@ from harness.report.accuracy.sheet import (
 from harness.report.page import count, quantity, text
 from harness.report.style import INK, MUTED, PAGE, WARNING, WIDTH, Mark, looks
 
-GUESSES = {"current": "from the current positions", "inertial": "from the inertial target"}
+GUESSES: dict[str, str] = {
+    "current": "from the current positions",
+    "inertial": "from the inertial target",
+    "motion": "from where the motion leads",
+    "assignment": "as in the assignment",
+}
 """The first guesses, in words."""
 
 _LEAST = 1e-16  # what is smaller is drawn there: double precision knows nothing below
