@@ -12,7 +12,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,18 +124,41 @@ class Copy:
         return done.returncode, done.stdout + done.stderr
 
 
+def _run(copy: Copy, lie: Mutation, chosen: Iterable[str], limit: float) -> tuple[int, str]:
+    """The exit code of the tests with a lie in place, and the first that failed, or what was said last."""
+    with copy.planted(lie):
+        code, told = copy.told(lie, [*PYTEST, *chosen], limit)
+    lines = told.splitlines()
+    failures = (line.removeprefix("FAILED ").split(" - ")[0] for line in lines if line.startswith("FAILED "))
+    return code, next(failures, lines[-1] if lines else "")
+
+
+def _by_the_lie(copy: Copy, lie: Mutation, test: str) -> bool:
+    """Whether a test fails with the lie once more, and does not without: else chance found out what it did."""
+    again, _ = _run(copy, lie, [test], LONGEST)
+    truth, _ = copy.told(lie, [*PYTEST, test], LONGEST)
+    return again != 0 and truth == 0
+
+
+def _run_all(copy: Copy, lie: Mutation) -> tuple[int, str]:
+    """The exit code of the whole suite and the first test that the lie makes fail."""
+    by_chance: list[str] = []
+    while True:
+        code, failed = _run(copy, lie, ["tests", *(f"--deselect={test}" for test in by_chance)], WHOLE)
+        if code != 1 or _by_the_lie(copy, lie, failed):
+            return code, failed
+        by_chance.append(failed)
+
+
 def examine(copy: Copy, lie: Mutation, *, whole: bool = False) -> Outcome:
     """Plant a lie, and see who finds it out. Raises Stale."""
     began = monotonic()
-    with copy.planted(lie):
-        chosen = ["tests"] if whole else list(lie.tests)
-        code, told = copy.told(lie, [*PYTEST, *chosen], WHOLE if whole else LONGEST)
-        tests = {0: SURVIVED, 1: CAUGHT, -1: CAUGHT}.get(code, BROKEN)
-        product = ""
-        if lie.product and not whole:
-            solver, reason = lie.product
+    code, failed = _run_all(copy, lie) if whole else _run(copy, lie, lie.tests, LONGEST)
+    tests = {0: SURVIVED, 1: CAUGHT, -1: CAUGHT}.get(code, BROKEN)
+    product = ""
+    if lie.product and not whole:
+        solver, reason = lie.product
+        with copy.planted(lie):
             _, said = copy.told(lie, ["-m", "tests.mutations.product", solver], LONGEST)
-            product = CAUGHT if "failed:" in said and reason in said else SURVIVED
-    lines = told.splitlines()
-    failed = next((line.split(" ")[1] for line in lines if line.startswith("FAILED ")), lines[-1] if lines else "")
+        product = CAUGHT if "failed:" in said and reason in said else SURVIVED
     return Outcome(lie.name, tests, product, round(monotonic() - began, 1), lie.digest, sources(), failed)

@@ -5,13 +5,15 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from tests.mutations.base import ROOT, Mutation, Stale
-from tests.mutations.runner import PYTEST
+from tests.mutations.runner import PYTEST, Copy, examine
 from tests.mutations.table import TABLE
 
 
@@ -45,3 +47,29 @@ def test_what_stands_elsewhere_or_twice_is_refused(tmp_path: Path):
         (tmp_path / "here.py").write_text(text)
         with pytest.raises(Stale, match=f"stands {times} times in here.py"):
             lie.applied(tmp_path)
+
+
+class ByChance(Copy):
+    """Tests that are known beforehand: the first failure is chance's, the second the lie's."""
+
+    def __init__(self) -> None:
+        self.planted_now, self.whole = False, 0
+
+    @contextmanager
+    def planted(self, lie: Mutation) -> Iterator[None]:
+        self.planted_now = True
+        yield
+        self.planted_now = False
+
+    def told(self, lie: Mutation, command: list[str], limit: float) -> tuple[int, str]:
+        if "tests" in command:
+            self.whole += 1
+            failed = "test_found" if "--deselect=test_chance[a b]" in command else "test_chance[a b]"
+            return 1, f"FAILED {failed} - why"
+        return int(self.planted_now and "test_found" in command), "1 passed"
+
+
+def test_a_test_of_the_whole_suite_that_failed_by_chance_finds_nothing_out():
+    copy = ByChance()
+    found = examine(copy, TABLE[0], whole=True)
+    assert (found.tests, found.failed, copy.whole) == ("caught", "test_found", 2)
