@@ -23,6 +23,7 @@ from solvers.integrators import Integrator, Motion
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Positions, Prepared, Solution, Start, StepProblem, StopRule, System
 from solvers.registry import SOLVERS
+from tests.undisturbed import undisturbed
 
 FRAMES = 6
 SCENE = f"""
@@ -113,7 +114,7 @@ CLOCKS = {
 @pytest.mark.parametrize("clock", CLOCKS.values(), ids=CLOCKS)
 def test_a_run_whose_steps_do_not_add_up_to_the_wall_time_fails(ran, monkeypatch: pytest.MonkeyPatch, clock):
     monkeypatch.setattr(clocks, "perf_counter", clock)
-    (row,), files = ran()
+    (row,), files = undisturbed(ran)
     assert row["status"] == "failed"
     assert "the times of step add up to" in row["reason"]
     assert not files.recording.exists()

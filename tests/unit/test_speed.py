@@ -242,7 +242,7 @@ def test_a_time_that_another_clock_does_not_bear_out_is_a_failure(monkeypatch: p
         while thread_time() - began < 0.005:
             pass
 
-    assert average(candidates.repeated(busy)) >= 0.005
+    assert average(candidates.Repeated(busy)) >= 0.005
     monkeypatch.setattr(candidates, "perf_counter", lambda: perf_counter() / 1000)
     with pytest.raises(RunFailed, match="the times of calls add up to"):
-        average(candidates.repeated(busy))
+        average(candidates.Repeated(busy))

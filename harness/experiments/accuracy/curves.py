@@ -63,7 +63,7 @@ def kept(iteration: int) -> bool:
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
     """The graded iterates: numbers (k,), 0 is the first guess; positions (k, n, 3) [m]; g (k,) [J]; stationarity (k,);
-    status and reason of the curve as a whole; seconds (k, rounds) since the solve began."""
+    status and reason of the curve as a whole; seconds (k, rounds) since the solve began; interrupted: in any round."""
 
     numbers: list[int]
     positions: list[Positions]
@@ -72,6 +72,7 @@ class Curve:
     status: str
     reason: str
     seconds: NDArray[np.float64]
+    interrupted: bool
 
 
 def measure(
@@ -106,11 +107,10 @@ def measure(
             grading.judge(fixed, spent)
     if spent < SHORT:
         _timed(prepared, problem, number, p)
-    stamps = [_timed(prepared, problem, number, p) for _ in range(rounds)]
+    stamps, interrupted = zip(*(_timed(prepared, problem, number, p) for _ in range(rounds)), strict=True)
     seconds = np.stack([stamp[grading.numbers] for stamp in stamps], axis=1)
-    return Curve(
-        grading.numbers, grading.positions, grading.g, grading.stationarity, grading.status, grading.reason, seconds
-    )
+    g, stationarity, status, reason = grading.g, grading.stationarity, grading.status, grading.reason
+    return Curve(grading.numbers, grading.positions, g, stationarity, status, reason, seconds, any(interrupted))
 
 
 class _Grading:
@@ -170,8 +170,10 @@ class _Grading:
         return any(np.min(s[half:]) < (1 - PROGRESS) * np.min(s[:half]) for s in (gaps, stationarity))
 
 
-def _timed(prepared: Prepared, problem: StepProblem, count: int, expected: Positions) -> NDArray[np.float64]:
-    """Wall seconds (count + 1,) from the start to the first guess (0), and to each iterate."""
+def _timed(
+    prepared: Prepared, problem: StepProblem, count: int, expected: Positions
+) -> tuple[NDArray[np.float64], bool]:
+    """Wall seconds (count + 1,) from the start to the first guess (0), and to each iterate; whether interrupted."""
     stamps, watch = np.zeros(count + 1), Watch(numba.get_num_threads())
     p = problem.first_guess
     gc.disable()  # a collection in the middle would be counted as the solver's
@@ -186,5 +188,4 @@ def _timed(prepared: Prepared, problem: StepProblem, count: int, expected: Posit
     if not np.array_equal(p, expected, equal_nan=True):
         raise RunFailed("a timed pass ended at other positions than the graded one")
     stamps[1:] -= began
-    watch.columns("iterates", np.diff(stamps))
-    return stamps
+    return stamps, watch.columns("iterates", np.diff(stamps))["interrupted"]

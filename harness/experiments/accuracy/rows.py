@@ -63,6 +63,7 @@ COLUMNS = (
         "s",
         "one wall time a round: to prepare warm; since the solve began; of the whole horizon",
     ),
+    Column("interrupted", _YES, "", "whether more than 3 % and 1 ms of a round went by without computing"),
     Column("cold", _REAL, "s", "wall time of the first time that the solver was prepared"),
     Column("recording", _TEXT, "", "the solve as a recording, relative to the results of this config"),
     Column("iterations", _INT, "", "the iteration limit, of a step of work or of a curve"),

@@ -176,6 +176,7 @@ def _curve(spec: CurveSpec, prepared: Prepared, graded: GradedStep, first_guess:
         "iterations": spec.iterations,
         "status": curve.status,
         "reason": curve.reason or None,
+        "interrupted": curve.interrupted,
     }
     reference = graded.reference  # again: this solver may have found a minimum
     if not reference.minima and curve.status == "ok":

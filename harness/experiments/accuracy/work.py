@@ -51,23 +51,27 @@ def _simulated(spec: WorkSpec, trajectory: Trajectory, tick: Callable[[], None])
     scene = bind(case.scene, case.size, case.integrator)
     solver: Solver = load(EVERY[spec.solver.name])(**spec.solver.parameters)
     prepared = prepare(scene, solver)
-    row: Row = {"vertices": scene.system.vertices, "springs": len(scene.springs.edges), "seconds": []}
+    row: Row = {"vertices": scene.system.vertices, "springs": len(scene.springs.edges)}
     frames = round(spec.horizon / case.scene.time_step)
+    seconds: list[float] = []
+    row["interrupted"] = False
     p, *_ = _run(spec, scene, prepared, min(WARM_UP, frames))
     for _ in range(spec.how.rounds):
-        p, seconds, row["iterations_done"] = _run(spec, scene, prepared, frames)
-        row["seconds"].append(seconds)
+        p, iterations, watched = _run(spec, scene, prepared, frames)
+        seconds.append(watched["summed_seconds"])
+        row["interrupted"] |= watched["interrupted"]
+        row["iterations_done"] = iterations
         tick()
     away = (p - trajectory.positions[-1])[scene.system.free]
     row["error"] = trajectory.error(-1, p)
     row["error_rms_m"] = float(np.sqrt(np.einsum("ij,ij->i", away, away).mean()))
-    row["seconds_per_simulated"] = float(np.median(row["seconds"])) / spec.horizon
+    row |= {"seconds": seconds, "seconds_per_simulated": float(np.median(seconds)) / spec.horizon}
     trajectory.require(row["error"])
     return row
 
 
-def _run(spec: WorkSpec, scene: Scene, prepared: Prepared, frames: int) -> tuple[Positions, float, int]:
-    """The last positions (n, 3) [m], the wall seconds of all steps, and the iterations done in them.
+def _run(spec: WorkSpec, scene: Scene, prepared: Prepared, frames: int) -> tuple[Positions, int, Row]:
+    """The last positions (n, 3) [m], the iterations of all steps, and what their clocks say, as columns.
 
     Raises RunFailed where another clock saw other seconds go by.
     """
@@ -85,5 +89,4 @@ def _run(spec: WorkSpec, scene: Scene, prepared: Prepared, frames: int) -> tuple
             raise Diverged(f"positions are not finite from frame {step.index} on")
         if seconds > spec.how.time_limit and step.index < frames:
             raise OverTime(f"the limit of {spec.how.time_limit:g} s was reached in frame {step.index} of {frames}")
-    watch.columns("step", [seconds])
-    return p, seconds, iterations
+    return p, iterations, watch.columns("step", [seconds])

@@ -95,9 +95,9 @@ class SolverCandidate:
         """See Candidate."""
         prepared = self._prepared
         assert prepared is not None
-        readings = [Reading("step", average(repeated(self._step)), self._columns("iteration", self.run.iterations))]
+        readings = [reading("step", self._step, self._columns("iteration", self.run.iterations))]
         for phase, call in working(prepared, self._problem).items():
-            readings.append(Reading(phase, average(repeated(call)), self._columns(phase, 1)))
+            readings.append(reading(phase, call, self._columns(phase, 1)))
         return readings
 
     def close(self) -> Positions | None:
@@ -179,10 +179,11 @@ class MachineCandidate:
     def turn(self) -> list[Reading]:
         """See Candidate."""
         return [
-            Reading(
+            reading(
                 probe.name,
-                average(repeated(probe.call), 0.0),
+                probe.call,
                 {"bytes": probe.bytes, "flops": probe.flops, "working_set": probe.working_set},
+                0.0,
             )
             for probe in limits.probes()
         ]
@@ -191,20 +192,28 @@ class MachineCandidate:
         """See Candidate."""
 
 
-def repeated(call: Callable[[], object]) -> Callable[[int], float]:
-    """The seconds that some calls take, by their number. These raise RunFailed where another clock saw other ones."""
+class Repeated:
+    """The seconds that some calls take, by their number; interrupted: whether any of them were."""
 
-    def seconds(number: int) -> float:
+    def __init__(self, call: Callable[[], object]) -> None:
+        self._call, self.interrupted = call, False
+
+    def __call__(self, number: int) -> float:
+        """Wall seconds of so many calls. Raises RunFailed where another clock saw other ones."""
         watch = Watch(numba.get_num_threads())
         with watch:
             began = perf_counter()
             for _ in range(number):
-                call()
+                self._call()
             found = perf_counter() - began
-        watch.columns("calls", [found])
+        self.interrupted |= watch.columns("calls", [found])["interrupted"]
         return found
 
-    return seconds
+
+def reading(phase: str, call: Callable[[], object], columns: dict[str, Any], least: float = LEAST) -> Reading:
+    """A phase's seconds a call. Raises RunFailed where another clock saw other ones."""
+    seconds = Repeated(call)
+    return Reading(phase, average(seconds, least), columns | {"interrupted": seconds.interrupted})
 
 
 def average(seconds: Callable[[int], float], least: float = LEAST) -> float:
