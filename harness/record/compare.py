@@ -48,7 +48,7 @@ def side_by_side(out: Path, recordings: Mapping[str, Path], title: str, looks: M
         runs = [_copy(file, path, name, k, looks[name], aspect) for k, (name, path) in enumerate(recordings.items())]
         for frame in sorted(set[int]().union(*(run.curves for run in runs))):
             drawn = {run.name: run.curves[frame] for run in runs if frame in run.curves}
-            colours = [_colour(looks[name]) for name in drawn]
+            colours = curves.colours(_colour(looks[name]) for name in drawn)
             curves.draw(file.stream, f"/curves/frame_{frame}", drawn, colours)
         document = rr.TextDocument(_table(title, runs), media_type=rr.MediaType.MARKDOWN)
         file.stream.log("/runs", document, static=True)

@@ -7,7 +7,7 @@ logarithmic axis, whole decades and numbers; the words on a curve stand at its e
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import rerun as rr
@@ -22,12 +22,15 @@ _LINE = 7.0
 _DEEPEST = 18
 """Decades below the largest value that are drawn."""
 
-Colour = int
+Colours = NDArray[np.uint32]
 
 
-def draw(
-    stream: rr.RecordingStream, entity: str, curves: Mapping[str, Sequence[float]], colours: Sequence[Colour]
-) -> None:
+def colours(numbers: Iterable[int]) -> Colours:
+    """As an array, of 0xRRGGBBAA: Rerun takes three or four numbers in a list for the parts of one colour."""
+    return np.array(list(numbers), np.uint32)
+
+
+def draw(stream: rr.RecordingStream, entity: str, curves: Mapping[str, Sequence[float]], colours: Colours) -> None:
     """Log curves by name over the iterations 1, 2, ..., the logarithms of their values, as a drawing under `entity`."""
     found = {name: np.asarray(values, float) for name, values in curves.items()}
     known = np.concatenate([values[np.isfinite(values) & (values > 0)] for values in found.values()] or [np.empty(0)])
@@ -44,10 +47,10 @@ def draw(
         y = _HEIGHT * (top - np.log10(values[fine])) / (top - bottom)
         strips.append(np.column_stack([x, y]))
         ends.append((float(x[-1]), float(y[-1])) if len(x) else (0.0, _HEIGHT))
-    drawn = rr.LineStrips2D(strips, colors=list(colours), radii=rr.Radius.ui_points(1.25))
+    drawn = rr.LineStrips2D(strips, colors=colours, radii=rr.Radius.ui_points(1.25))
     stream.log(f"{entity}/curves", drawn, static=True)
     beside = np.column_stack([np.full(len(ends), _WIDTH + 14.0), _apart([y for _, y in ends])])
-    _words(stream, f"{entity}/names", beside, list(found), list(colours))
+    _words(stream, f"{entity}/names", beside, list(found), colours)
 
 
 def view(origin: str, name: str) -> rrb.Spatial2DView:
@@ -67,15 +70,13 @@ def _axes(stream: rr.RecordingStream, entity: str, bottom: int, top: int, last: 
     stream.log(f"{entity}/rules", rr.LineStrips2D(rules, colors=_RULE, radii=rr.Radius.ui_points(0.5)), static=True)
     places = [(-9.0, y) for y in rows] + [(x, _HEIGHT + 5.0) for x in columns]
     words = [f"1e{decade}" for decade in decades] + [str(max(1, number)) for number in numbers]
-    _words(stream, f"{entity}/numbers", np.array(places), words, [_PALE] * len(words))
+    _words(stream, f"{entity}/numbers", np.array(places), words, colours([_PALE] * len(words)))
 
 
 def _words(
-    stream: rr.RecordingStream, entity: str, at: NDArray[np.float64], words: list[str], colours: Sequence[Colour]
+    stream: rr.RecordingStream, entity: str, at: NDArray[np.float64], words: list[str], colours: Colours
 ) -> None:
-    # As an array: Rerun takes three or four numbers in a list for the parts of one colour.
-    as_array = np.array(colours, np.uint32)
-    points = rr.Points2D(at, labels=words, show_labels=True, colors=as_array, radii=rr.Radius.ui_points(0.1))
+    points = rr.Points2D(at, labels=words, show_labels=True, colors=colours, radii=rr.Radius.ui_points(0.1))
     stream.log(entity, points, static=True)
 
 

@@ -236,7 +236,7 @@ class RerunRecorder:
         with np.errstate(divide="ignore", invalid="ignore"):
             logarithms = np.where(table[0] > 0, np.log10(table[0]), np.nan)
         names, times = [f"frame {frame}" for frame in frames], [self._clock[frame] for frame in frames]
-        colours = [blueprint.COLOURS[k % len(blueprint.COLOURS)] for k in range(len(frames))]
+        colours = curves.colours(blueprint.COLOURS[k % len(blueprint.COLOURS)] for k in range(len(frames)))
         self._stream.log("/convergence", rr.AnyValues(frames=frames, times=times), static=True)
         for name, values in {"residual": table[0], "log10_residual": logarithms, "objective": table[1]}.items():
             self._stream.log(f"/convergence/{name}", rr.SeriesLines(names=names, colors=colours), static=True)

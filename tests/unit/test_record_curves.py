@@ -1,0 +1,30 @@
+"""Curves as drawings: each in its own colour, however many there are."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import pytest
+import rerun as rr
+
+from harness.record import curves
+
+
+class Logged:
+    """A stream that keeps what is logged."""
+
+    def __init__(self) -> None:
+        self.held: dict[str, Any] = {}
+
+    def log(self, entity: str, drawn: Any, *, static: bool) -> None:
+        self.held[entity] = drawn
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
+def test_each_curve_and_its_name_have_its_colour(count: int) -> None:
+    given = [0xE69F00FF, 0x56B4E9FF, 0x009E73FF, 0xCC79A7FF, 0xF0E442FF][:count]
+    logged = Logged()
+    drawn = {f"frame {k}": [1.0, 0.1 / (k + 1)] for k in range(count)}
+    curves.draw(cast(rr.RecordingStream, logged), "/curves", drawn, curves.colours(given))
+    for entity in ("/curves/curves", "/curves/names"):
+        assert logged.held[entity].colors.as_arrow_array().to_pylist() == given
