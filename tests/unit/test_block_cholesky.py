@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, coo_array, csr_array
+from scipy.sparse import bsr_array, coo_array, csr_array, diags_array
 from scipy.sparse.linalg import spsolve
 
 from solvers.linear.block import BlockCholesky
@@ -23,7 +23,7 @@ def blocks(n: int, pairs: np.ndarray, seed: int = 0, margin: float = 0.1) -> bsr
     graph.sum_duplicates()
     random = bsr_array((rng.normal(size=(graph.nnz, 3, 3)), graph.indices, graph.indptr), shape=(3 * n, 3 * n))
     A = csr_array(random + random.T)
-    A = csr_array(A + csr_array(np.diag(np.asarray(abs(A).sum(axis=1)).ravel() + margin)))
+    A = csr_array(A + diags_array(np.asarray(abs(A).sum(axis=1)).ravel() + margin))
     out = bsr_array(A, blocksize=(3, 3))
     out.sort_indices()
     return out
