@@ -86,7 +86,7 @@ def ablation(folder: Path) -> Path:
 
 
 def speed(folder: Path) -> Path:
-    """A speed report: the machine's limits and three candidates at three sizes."""
+    """A speed report: the machine's limits and three candidates at three sizes, the last by other code."""
     for size in (8, 16, 32):
         known = HERE | {"scene": "cloth", "size": size, "vertices": size**2, "springs": 4 * size**2, "load": 0.5}
         machine = known | {"run_id": f"m{size}", "solver": "machine", "parameters": "{}", "phase": "read", "bytes": 1e3}
@@ -100,6 +100,7 @@ def speed(folder: Path) -> Path:
         for place, (solver, linear) in enumerate((("sparse", None), ("numba", "auto"), ("numba", "supernodal"))):
             parameters = json.dumps({"linear": linear} if linear else {})
             one = known | {"run_id": f"{solver}{linear}{size}", "solver": solver, "parameters": parameters}
+            one |= {"started": "2025"} if linear == "supernodal" else {"started": "2026", "code": None}
             rows = [
                 one | {"phase": phase, "round": k, "seconds": share * 1e-6 * (4 - place) * size**2, "iterations": 10}
                 for phase, share in (("prepare", 5.0), ("local", 0.3), ("global", 0.7), ("step", 1.0))

@@ -18,6 +18,9 @@ WIDTH, HEIGHT, DPI = 1600, 900, 100
 PAGE, INK, MUTED, RULE = "#fcfbf9", "#23262b", "#6c7078", "#dcdad5"
 """Background, text, secondary text, hairlines."""
 
+OLDER = "Hollow marks: measured by other code than today's."
+"""What hollow marks mean, in all pictures; those of the page are told beside the newest rows."""
+
 WARNING = "#b3261e"
 """Words that a reader must not miss."""
 

@@ -190,6 +190,14 @@ def test_a_point_of_a_curve_leads_to_its_solve_by_keys(tab: Tab, page: str):
     assert not point.is_visible(), "the card goes when something else is shown"
 
 
+def test_points_of_other_code_are_hollow_and_told(tab: Tab, page: str):
+    shown = tab.open(page, "plots?sweep=made&plot=accuracy&scene=hanging-cloth")
+    shown.wait_for_function("document.querySelector('.plot')?.data?.length")
+    symbols = shown.evaluate("document.querySelector('.plot').data.flatMap(one => one.marker.symbol)")
+    assert sum(symbol.endswith("-open") for symbol in symbols) == 1, "one run was made by other code than the newest"
+    assert "measured by other code than the newest rows" in shown.inner_text("main")
+
+
 @pytest.mark.long
 def test_light_and_dark_are_a_choice(tab: Tab, page: str):
     shown = tab.open(page)

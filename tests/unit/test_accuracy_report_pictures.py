@@ -15,9 +15,13 @@ from PIL import Image
 from harness.record.blueprint import BACKGROUND
 from harness.report import page
 from harness.report.accuracy import draw, sheet
+from harness.report.accuracy.convergence import draw_convergence
+from harness.report.accuracy.growth import draw_growth
+from harness.report.accuracy.profiles import draw_profiles
 from harness.report.accuracy.reading import read
 from harness.report.accuracy.time_plot import draw_times
-from harness.report.style import HEIGHT, PAGE, WIDTH, marks
+from harness.report.accuracy.work_plot import draw_work
+from harness.report.style import HEIGHT, OLDER, PAGE, WIDTH, marks
 from solvers.registry import EVERY, load
 from tests import accuracy_rows as made
 
@@ -104,6 +108,32 @@ def test_the_default_of_the_assignment_and_methods_that_do_not_minimise_are_mark
 
 def test_growth_is_told_at_the_ends_of_lines(drawn) -> None:
     assert "numba  $n^{1.00}$" in written(drawn[1]["report/growth"])
+
+
+def test_what_other_code_measured_is_hollow_in_every_picture_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows: list[dict] = []
+    for size in (6, 12, 24):
+        rows += made.problem("net", size, "early")
+        for solver in ("numba", "newton"):
+            rows += made.curve("net", size, "early", solver, code="before" if solver == "newton" else None)
+    rows += [row | {"code": "before" if row["solver"] == "hybrid" else None} for row in made.work("net", 6)]
+    pages: dict[str, Figure] = {}
+    monkeypatch.setattr(sheet, "save", lambda drawn, path: pages.setdefault(path.parent.name, drawn))
+    table = read(made.write(tmp_path, rows))
+    for draw_all, name in ((draw_convergence, "convergence"), (draw_times, "times"), (draw_work, "work")):
+        draw_all(table, tmp_path / name)
+    for draw_one, name in ((draw_growth, "growth"), (draw_profiles, "profiles")):
+        draw_one(table, tmp_path / name / name)
+    told = {"profiles": "Measured by other code than today's, in whole or in part: newton."}
+    for name, solver in {"convergence": "newton", "times": "newton", "work": "hybrid", "growth": "newton"}.items():
+        lines = [one for ax in pages[name].axes for one in ax.lines if len(np.asarray(one.get_xdata())) > 1]
+        hollow = {one.get_color() for one in lines if one.get_marker() != "None" and one.get_markerfacecolor() == PAGE}
+        assert hollow == {marks([])[solver].color}, name
+        told[name] = OLDER
+    for name, words in told.items():
+        assert words in written(pages[name]), name
 
 
 # Machado, Oliveira and Fernandes 2009, "A Physiologically-based Model for Simulation of Color Vision Deficiency",

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
@@ -16,7 +17,7 @@ from harness.report.site import build, keep, update
 from harness.report.site.failures import Failed, causes
 from harness.report.site.script import column
 from harness.report.site.sentences import sentences
-from tests import accuracy_rows, site_results
+from tests import accuracy_rows, figure_results, site_results
 from tests.site_results import fails, run
 
 COUNT = 40
@@ -123,6 +124,25 @@ def test_accuracy_s_charts_are_there_with_the_solvers_marks(results: Path):
     assert set(chart["marks"]) == {"numba", "dense"}
     assert "Liu" in chart["references"]["numba"]["cited"]
     assert chart["references"]["numba"]["bibtex"].startswith("@misc{liu2013")
+
+
+def test_points_of_other_code_than_the_newest_are_told_in_every_chart(tmp_path: Path):
+    rows = accuracy_rows.problem("net", 6, "early") + accuracy_rows.problem("net", 12, "early")
+    for solver, code, day in (("numba", "new", "2"), ("newton", "old", "1")):
+        known = {"code": code, "started": f"2026-11-0{day}T10:00:00+00:00"}
+        for size in (6, 12):
+            rows += accuracy_rows.curve("net", size, "early", solver, **known)
+        rows += [row | known for row in accuracy_rows.work("net", 6, (solver,))]
+    accuracy_rows.write(tmp_path / "study", rows)
+    figure_results.speed(tmp_path / "speed")
+    update(tmp_path)
+    for name in ("study/convergence", "study/times", "study/work", "study/growth"):
+        told = {item["label"] for item in read(tmp_path, name)["items"] if np.any(item["older"])}
+        assert told == {"newton"}, name
+    said = read(tmp_path, "study/profiles")["note"]
+    assert "other code than that of the newest rows, in whole or in part: newton." in said
+    told = {item["label"] for item in read(tmp_path, "speed/speed")["items"] if any(item["older"])}
+    assert told == {"numba supernodal"}
 
 
 def test_only_what_is_new_is_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from harness.report.accuracy.measured import Curve, Measurements, Problem, Values, step_words
+from harness.report.accuracy.measured import Curve, Measurements, Problem, Values, older, step_words
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -30,7 +30,7 @@ from harness.report.accuracy.sheet import (
     sheet,
 )
 from harness.report.page import count, quantity, text
-from harness.report.style import INK, MUTED, PAGE, WARNING, WIDTH, Mark, looks
+from harness.report.style import INK, MUTED, OLDER, PAGE, WARNING, WIDTH, Mark, looks
 
 GUESSES: dict[str, str] = {
     "current": "from the current positions",
@@ -114,6 +114,7 @@ def _draw(stem: Path, problem: Problem, curves: list[Curve], marked: dict[str, M
         *machine,
     ]
     words = ([f"Reference not certified: {problem.doubt}"] if problem.doubt else []) + _grouped(curves)
+    words += [OLDER] if any(map(older, curves)) else []
     guesses = [guess for guess in GUESSES if any(curve.first_guess == guess for curve in curves)]
     timed = [curve.seconds[:, 1:].ravel() for curve in curves]
     first, last = limits(np.concatenate([*timed, [np.nan]]))
@@ -157,7 +158,7 @@ def _panel(ax: Axes, row: _Row, curves: Sequence[Curve], marked: dict[str, Mark]
         if against == "seconds":
             early, x, late = np.quantile(curve.seconds, (0.25, 0.5, 0.75), axis=0)
             ax.fill_betweenx(values, early, late, color=look.color, alpha=0.18, linewidth=0)
-        line(ax, x, values, look)
+        line(ax, x, values, look, older=older(curve))
         ends = np.flatnonzero(np.isfinite(values) & np.isfinite(x))
         if not len(ends):
             continue

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import ceil
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +13,7 @@ import numpy as np
 from matplotlib.ticker import FixedLocator
 
 from harness.report.accuracy.convergence import GUESSES
-from harness.report.accuracy.measured import Curve, Measurements
+from harness.report.accuracy.measured import Curve, Measurements, older
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -30,7 +31,7 @@ from harness.report.accuracy.sheet import (
 from harness.report.accuracy.time_plot import middle
 from harness.report.accuracy.times import left_out, power
 from harness.report.labels import direct_labels
-from harness.report.style import looks
+from harness.report.style import OLDER, looks
 
 TARGET = 1e-3
 
@@ -41,7 +42,8 @@ class Growth(NamedTuple):
     """A solver's times to TARGET on the sizes of a scene where it got there.
 
     vertices (k,), seconds (k,): median over the moments; exponent: of the fit, nan for too few sizes;
-    lost: the vertices of the sizes on which it did not get there.
+    lost: the vertices of the sizes on which it did not get there; older: on which of the others (k,) other code than
+    today's took part.
     """
 
     scene: str
@@ -51,10 +53,11 @@ class Growth(NamedTuple):
     seconds: list[float]
     exponent: float
     lost: list[int]
+    older: list[bool]
 
 
-def growths(table: Measurements) -> list[Growth]:
-    """The growth of each solver on each scene with two sizes or more."""
+def growths(table: Measurements, other: Callable[[Curve], bool] = older) -> list[Growth]:
+    """The growth of each solver on each scene with two sizes or more; other: which curves are of other code."""
     groups: dict[tuple[str, str, str], dict[int, list[Curve]]] = {}
     for curve in table.curves:
         sizes = groups.setdefault((curve.problem.scene, curve.first_guess, curve.label), {})
@@ -65,7 +68,9 @@ def growths(table: Measurements) -> list[Growth]:
         reached = {n: t for n, t in times.items() if np.isfinite(t) and t > 0.0}
         if len(times) > 1:
             lost = [n for n, t in times.items() if t == np.inf]
-            found.append(Growth(scene, guess, label, [*reached], [*reached.values()], _exponent(reached), lost))
+            hollow = [any(map(other, sizes[n])) for n in reached]
+            exponent = _exponent(reached)
+            found.append(Growth(scene, guess, label, [*reached], [*reached.values()], exponent, lost, hollow))
     return found
 
 
@@ -91,6 +96,7 @@ def draw_growth(table: Measurements, stem: Path) -> list[Path]:
             for g in found
             if g.lost
         ),
+        *([OLDER] if any(any(growth.older) for growth in found) else []),
     ]
     with sheet(stem, f"Growth with size: time to a gap of {power(TARGET)}", table.machine) as page:
         places = [(guess, scene) for guess in guesses for scene in scenes]
@@ -111,7 +117,7 @@ def draw_growth(table: Measurements, stem: Path) -> list[Path]:
             log_axis(ax.yaxis, low, high, unit="time")
             ax.tick_params(labelleft=column == 0)
             for growth in here:
-                line(ax, growth.vertices, growth.seconds, marked[growth.label], spaced=False)
+                line(ax, growth.vertices, growth.seconds, marked[growth.label], spaced=False, older=growth.older)
             ends = [
                 (g.vertices[-1], g.seconds[-1], f"{g.label}  $n^{{{g.exponent:.2f}}}$", marked[g.label].color)
                 for g in here

@@ -6,10 +6,13 @@ target), g* of the lowest minimum that is known. Rows hold energies, so a lower 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
+from harness.base import machine
 
 Values = NDArray[np.float64]
 
@@ -77,7 +80,7 @@ class Curve:
 
     iterations, gap, largest [mean rest lengths], stationarity (k,); seconds (rounds, k), nan where not timed;
     warm, cold: seconds to prepare, nan where not known; branch: the minimum that was reached;
-    status and reason: of the rows; recording: relative to the results' folder, or "".
+    status and reason: of the rows; recording: relative to the results' folder, or ""; code: by which it was measured.
     """
 
     problem: Problem
@@ -99,13 +102,14 @@ class Curve:
     status: str
     reason: str
     recording: str
+    code: str
 
 
 @dataclass(frozen=True, slots=True)
 class WorkPoint:
     """One simulation of a horizon [s]: its relative error, and wall seconds a simulated second (nan if it failed).
 
-    family, reference, minimises, own_steps: what the solver states of itself.
+    family, reference, minimises, own_steps: what the solver states of itself; code: by which it was measured.
     """
 
     scene: str
@@ -128,6 +132,7 @@ class WorkPoint:
     seconds: float
     status: str
     reason: str
+    code: str
 
     @property
     def mesh(self) -> str:
@@ -144,12 +149,27 @@ class WorkPoint:
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """All that the rows say, in their order; machine: processor, threads and commit, in words."""
+    """All that the rows say, in their order; machine: processor, threads and commit, in words; newest: the
+    code of the rows that were measured last."""
 
     problems: tuple[Problem, ...]
     curves: tuple[Curve, ...]
     works: tuple[WorkPoint, ...]
     machine: tuple[str, ...]
+    newest: str
+
+
+def older(one: Curve | WorkPoint) -> bool:
+    """Whether other code than today's measured it; of rows that do not say by which code nobody can tell."""
+    return one.code not in ("", machine.code_hash())
+
+
+def by_other_code(measured: Iterable[Curve | WorkPoint], newest: str | None = None) -> list[str]:
+    """A sentence about those that other code than today's measured, or than `newest`, if there are any: for what has no
+    marks of its own for them."""
+    names = sorted({one.label for one in measured if (older(one) if newest is None else one.code != newest)})
+    than = "today's" if newest is None else "that of the newest rows"
+    return [f"Measured by other code than {than}, in whole or in part: {', '.join(names)}."] if names else []
 
 
 def step_words(dt: float) -> str:

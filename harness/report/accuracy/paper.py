@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from harness.report.accuracy.measured import LONG, Curve, Measurements, Problem
+from harness.report.accuracy.measured import LONG, Curve, Measurements, Problem, by_other_code
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -118,7 +118,7 @@ def at(curve: Curve, iterations: int) -> float:
     return max(float(curve.gap[k]), curve.problem.round_off) if exact else np.nan
 
 
-def _own(table: Measurements) -> Iterator[Curve]:
+def own(table: Measurements) -> Iterator[Curve]:
     """The paper's local-global by our fastest backend that was measured, from the paper's first guess."""
     paper = [c for c in table.curves if c.problem.paper and c.first_guess == "inertial"]
     theirs = [c for c in paper if c.family == LOCAL_GLOBAL]
@@ -134,12 +134,12 @@ def _iteration_seconds(curve: Curve) -> float:
 
 
 def _long(table: Measurements) -> list[Curve]:
-    return [c for c in _own(table) if c.problem.vertices == 81**2 and c.iterations.max(initial=0.0) >= LONG]
+    return [c for c in own(table) if c.problem.vertices == 81**2 and c.iterations.max(initial=0.0) >= LONG]
 
 
 def _frames(table: Measurements, side: int, k: float) -> list[Curve]:
     """The curves of one curtain; a tenth leaves room for how pins are counted, and tells all stiffnesses apart."""
-    return [c for c in _own(table) if c.problem.vertices == side**2 and abs(stiffness(c.problem) / k - 1) < 0.1]
+    return [c for c in own(table) if c.problem.vertices == side**2 and abs(stiffness(c.problem) / k - 1) < 0.1]
 
 
 def draw_paper(table: Measurements, stem: Path) -> list[Path]:
@@ -148,7 +148,7 @@ def draw_paper(table: Measurements, stem: Path) -> list[Path]:
     if not found:
         return []
     far = sorted((c for c in found if max(c.ratio, 1 / c.ratio) > FAR), key=lambda c: -abs(np.log(c.ratio)))
-    words = [f"differs by more than {FAR:g}: {c.sentence}" for c in far]
+    words = [*by_other_code(own(table)), *(f"differs by more than {FAR:g}: {c.sentence}" for c in far)]
     facts = ["relative error (g − g*) / (g0 − g*)", "ours filled, the paper's open", *table.machine]
     long = [
         c for c in table.curves if _long(table) and c.problem is _long(table)[0].problem and c.first_guess == "inertial"

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from harness.report.accuracy.measured import Curve, Measurements, Values
+from harness.report.accuracy.measured import Curve, Measurements, Values, by_other_code
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -118,7 +118,7 @@ def draw_profiles(table: Measurements, stem: Path) -> list[Path]:
     missed = partly_tried(table)
     marked = looks((curve.label, curve.solver) for curve in table.curves if curve.label not in missed)
     words = ["The step alone, set-up apart. A solver that failed on a problem never solves it."]
-    words += [*not_shown(table), *left_out(table.problems)]
+    words += [*not_shown(table), *left_out(table.problems), *by_other_code(table.curves)]
     steps = f"{sum(not problem.doubt for problem in table.problems)} steps, first guesses apart"
     with sheet(stem, "Performance and data profiles", ["share of the problems solved", steps, *table.machine]) as page:
         width = (RIGHT - LEFT - 50) / len(TARGETS) - 16

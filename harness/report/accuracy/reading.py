@@ -33,7 +33,8 @@ def read(folder: Path, files: Iterable[Path] | None = None) -> Measurements:
     if not units:
         raise InputError(Mistake("holds no accuracy rows; run `springbench accuracy CONFIG` first", folder))
     kinds: dict[str, list[_Row]] = defaultdict(list)
-    missing = dict.fromkeys(("family", "reference", "minimises", "own_steps"))  # in rows made before there were any
+    # In rows made before there were any.
+    missing = dict.fromkeys(("family", "reference", "minimises", "own_steps", "code", "started", "commit"))
     for row in read_rows(units, pa.schema([]), needed=("kind",), promote="permissive").to_pylist():
         kinds[row["kind"]].append(missing | row)
     for rows in kinds.values():  # files come by their names, 122 before 22
@@ -45,6 +46,7 @@ def read(folder: Path, files: Iterable[Path] | None = None) -> Measurements:
         tuple(_curves(kinds, problems, label)),
         tuple(_work(row, label) for row in kinds["work"]),
         _machine(kinds["curve"] + kinds["work"]),
+        max(((row["started"] or "", row["code"] or "") for row in kinds["curve"] + kinds["work"]), default=("", ""))[1],
     )
 
 
@@ -141,6 +143,7 @@ def _curve(problem: Problem, rows: Sequence[_Row], prepared: _Row, label: str) -
         status=bad["status"],
         reason=bad["reason"] or "",
         recording=next((row["recording"] for row in rows if row["recording"]), ""),
+        code=rows[0]["code"] or "",
     )
 
 
@@ -158,6 +161,7 @@ def _work(row: _Row, label: _Label) -> WorkPoint:
         error_rms=_number(row["error_rms_m"]),
         seconds=_number(row["seconds_per_simulated"]),
         reason=row["reason"] or "",
+        code=row["code"] or "",
     )
 
 
@@ -182,7 +186,9 @@ def _labels(rows: Sequence[_Row]) -> _Label:
 def _machine(rows: Sequence[_Row]) -> tuple[str, ...]:
     cpus, threads = (sorted({row[key] for row in rows if row[key] is not None}) for key in ("cpu", "threads"))
     count = [f"{', '.join(map(str, threads))} thread{'s' if threads != [1] else ''}"] if threads else []
-    return (*cpus[:2], *count)
+    commits = sorted({row["commit"] for row in rows if row["commit"] is not None})
+    made = [f"commit {commits[0]:.7}" if len(commits) == 1 else f"{len(commits)} commits"] if commits else []
+    return (*cpus[:2], *count, *made)
 
 
 def _number(value: Any) -> float:

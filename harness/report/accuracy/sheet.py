@@ -50,11 +50,23 @@ def files(stem: Path) -> list[Path]:
     return [stem.with_suffix(".png"), stem.with_suffix(".svg")]
 
 
-def line(ax: Axes, x: ArrayLike, y: ArrayLike, look: Mark, *, spaced: bool = True, **more: Any) -> None:
-    """A solver's line; `spaced` markers keep a distance, as iterates lie dense."""
-    more = {"linewidth": 1.5, "markersize": 5 * size(look)} | more
-    more = ({"markevery": 0.12} if spaced and np.size(x) > 3 else {}) | more
-    ax.plot(x, y, color=look.color, linestyle=look.dash, marker=look.marker, mec=PAGE, mew=0.5, **more)
+def line(
+    ax: Axes, x: ArrayLike, y: ArrayLike, look: Mark, *, spaced: bool = True, older: ArrayLike = False, **more: Any
+) -> None:
+    """A solver's line; `spaced` markers keep a distance, as iterates lie dense. older: whether other code measured it,
+    or which of its points (k,), whose marks are hollow."""
+    hollow = np.broadcast_to(np.asarray(older, bool), np.shape(x))
+    every: dict[str, Any] = {"markevery": 0.12} if spaced and np.size(x) > 3 else {}
+    more = {"linewidth": 1.5, "markersize": 5 * size(look)} | mark(look, hollow=bool(hollow.all())) | every | more
+    ax.plot(x, y, color=look.color, linestyle=look.dash, marker=look.marker, **more)
+    if hollow.any() and not hollow.all():
+        at = np.asarray(x)[hollow], np.asarray(y)[hollow]
+        ax.plot(*at, look.marker, markersize=more["markersize"], **mark(look, hollow=True))
+
+
+def mark(look: Mark, *, hollow: bool) -> dict[str, Any]:
+    """How a marker is filled, and its edge; hollow: of what other code measured."""
+    return {"mfc": PAGE, "mec": look.color, "mew": 1.3} if hollow else {"mfc": look.color, "mec": PAGE, "mew": 0.5}
 
 
 def size(look: Mark) -> float:

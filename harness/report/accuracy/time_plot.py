@@ -15,7 +15,7 @@ from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
 from numpy.typing import NDArray
 
 from harness.report.accuracy.convergence import GUESSES
-from harness.report.accuracy.measured import Curve, Measurements, Problem
+from harness.report.accuracy.measured import Curve, Measurements, Problem, older
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -26,13 +26,14 @@ from harness.report.accuracy.sheet import (
     limits,
     line,
     log_axis,
+    mark,
     notes,
     panel,
     sheet,
 )
 from harness.report.accuracy.times import STEPS, TARGETS, askable, crossings, left_out, power, seconds_to
 from harness.report.page import count, text
-from harness.report.style import INK, Mark, looks
+from harness.report.style import INK, OLDER, Mark, looks
 
 _COLUMNS = {None: "the step alone", **{n: f"set-up over {count(n)} step{'s' if n > 1 else ''}" for n in STEPS}}
 
@@ -111,6 +112,7 @@ def _draw(
     facts = [f"{count(problems[0].vertices)} vertices", over, "gap of the energy", *machine]
     shown, same = differing(series)
     words += [same] if same else []
+    words += [OLDER] if any(map(older, curves)) else []
     with sheet(stem, f"Time to accuracy: {mesh}", facts) as page:
         width, gap = (RIGHT - LEFT - 62) / len(shown) - 16, 84
         height = (foot(words) - TOP - len(guesses) * gap) / max(len(guesses), 1)
@@ -137,7 +139,8 @@ def _panel(
     for label, curves in series.items():
         look = marked[label]
         times = np.array([middle(curves, target, steps) for target in TARGETS])
-        line(ax, np.arange(len(TARGETS)), np.where((times > 0) & np.isfinite(times), times, np.nan), look, spaced=False)
+        seen, hollow = np.where((times > 0) & np.isfinite(times), times, np.nan), any(map(older, curves))
+        line(ax, np.arange(len(TARGETS)), seen, look, spaced=False, older=hollow)
         failed = np.flatnonzero(times == inf)
         if len(failed):
             at = int(failed[0])
@@ -145,7 +148,8 @@ def _panel(
             x, y = at - 0.3 + 0.15 * (place % 5), 0.975 - 0.04 * (place // 5)
             ax.plot(x, y, "x", color=look.color, transform=ax.get_xaxis_transform(), markersize=6, markeredgewidth=1.8)
         if steps is None:
-            ax.plot(-1, np.median([curve.warm for curve in curves]), look.marker, color=look.color, markersize=5)
+            warm = np.median([curve.warm for curve in curves])
+            ax.plot(-1, warm, look.marker, markersize=5, **mark(look, hollow=hollow))
     log_axis(ax.yaxis, *span, unit="time")
     first = -1 if steps is None else 0
     ax.set_xlim(first - 0.4, len(TARGETS) - 0.6)

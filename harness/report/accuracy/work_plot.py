@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from harness.report.accuracy.measured import Measurements, WorkPoint, step_words
+from harness.report.accuracy.measured import Measurements, WorkPoint, older, step_words
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -21,6 +21,7 @@ from harness.report.accuracy.sheet import (
     foot,
     legend,
     limits,
+    line,
     log_axis,
     notes,
     panel,
@@ -29,7 +30,7 @@ from harness.report.accuracy.sheet import (
 )
 from harness.report.accuracy.times import duration, power
 from harness.report.page import quantity, text
-from harness.report.style import INK, MUTED, PAGE, Mark, looks
+from harness.report.style import INK, MUTED, OLDER, PAGE, Mark, looks
 from solvers.about import LOCAL_GLOBAL
 from solvers.integrators import INTEGRATORS
 
@@ -144,9 +145,9 @@ def _draw(stem: Path, mesh: str, works: list[WorkPoint], marked: dict[str, Mark]
 
 
 def _sizes(works: Iterable[WorkPoint]) -> dict[float | None, float]:
-    """Sizes of the marks by tolerance, larger for tighter ones; None: fixed iterations."""
+    """Sizes of the marks by tolerance, larger for tighter ones; None: fixed iterations, the least."""
     tolerances = sorted({work.tolerance for work in works if work.tolerance}, reverse=True)
-    return {None: 5.0, **{tolerance: 4.0 + 1.6 * k for k, tolerance in enumerate(tolerances)}}
+    return {None: 2.8, **{tolerance: 4.4 + 1.6 * k for k, tolerance in enumerate(tolerances)}}
 
 
 def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dict[float | None, float]) -> None:
@@ -156,13 +157,9 @@ def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dic
         chains.setdefault((work.label, work.tolerance, work.iterations, work.first_guess), []).append(work)
     for (label, tolerance, *_), members in chains.items():
         members.sort(key=lambda work: work.time_step)
-        look = marked[label]
-        grown = sizes[tolerance]
-        ax.plot(
-            [work.seconds for work in members], [work.error for work in members], color=look.color, linestyle=look.dash,
-            linewidth=0.9, alpha=0.9, marker=look.marker, markersize=grown * size(look),
-            mfc=look.color if tolerance else PAGE, mec=PAGE if tolerance else look.color, mew=0.5 if tolerance else 1.1,
-        )  # fmt: skip
+        look, hollow = marked[label], [older(work) for work in members]
+        x, y = [work.seconds for work in members], [work.error for work in members]
+        line(ax, x, y, look, spaced=False, older=hollow, linewidth=0.9, markersize=sizes[tolerance] * size(look))
     base = default(works)
     if base:
         ax.plot(base.seconds, base.error, "o", mfc="none", mec=INK, markersize=15, mew=1.6, zorder=6)
@@ -188,7 +185,7 @@ def _meanings(sizes: dict[float | None, float]) -> list[tuple[Line2D, str]]:
 
     return [
         (Line2D([], [], color=MUTED, linewidth=5, alpha=0.28), "Pareto front of all"),
-        *((dot(mfc=PAGE if t is None else MUTED, markersize=grown), _stop(t)) for t, grown in sizes.items()),
+        *((dot(markersize=grown), _stop(t)) for t, grown in sizes.items()),
     ]
 
 
@@ -200,6 +197,7 @@ def _notes(works: Sequence[WorkPoint]) -> list[str]:
     words = ["Joined points differ in the time step alone: " + ", ".join(map(step_words, _steps(works)))]
     if not all(work.minimises for work in works):
         words.append("† does not minimise the step's objective: its limit is not the integrator's own solution")
+    words += [OLDER] if any(map(older, works)) else []
     failed = [work for work in works if work.status != "ok"]
     return words + [f"× {work.setting}: {work.status}{': ' if work.reason else ''}{work.reason}" for work in failed]
 

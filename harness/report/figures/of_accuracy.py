@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from harness.report.accuracy.convergence import GUESSES
 from harness.report.accuracy.growth import TARGET, growths
-from harness.report.accuracy.measured import Curve, Measurements, Problem, Values, WorkPoint, without_short
+from harness.report.accuracy.measured import (
+    Curve,
+    Measurements,
+    Problem,
+    Values,
+    WorkPoint,
+    by_other_code,
+    older,
+    without_short,
+)
 from harness.report.accuracy.profiles import iteration_ratios, judged, least_ratios, not_shown, share, yardstick
 from harness.report.accuracy.reading import read
 from harness.report.accuracy.time_plot import middle
@@ -19,7 +29,7 @@ from harness.report.figures.entry import Entry, ready
 from harness.report.figures.panel import Band, Plot, Scale, Series
 from harness.report.figures.scales import power, superscript
 from harness.report.page import count, quantity
-from harness.report.style import MUTED, Mark, looks
+from harness.report.style import MUTED, OLDER, Mark, looks
 
 _LEAST = 1e-16
 _QUANTITIES: dict[str, tuple[str, Callable[[Curve], Values]]] = {
@@ -60,10 +70,11 @@ def _converging(
     for curve in curves:
         y = np.maximum(values(curve), _LEAST)
         early, x, late = np.quantile(curve.seconds, (0.25, 0.5, 0.75), axis=0)
+        how: Any = {"older": np.full(len(y), older(curve))}
         if against == "iterations":
-            series.append(Series(curve.label, marked[curve.label], curve.iterations, y))
+            series.append(Series(curve.label, marked[curve.label], curve.iterations, y, **how))
         else:
-            series.append(Series(curve.label, marked[curve.label], x, y, early, late, across=True))
+            series.append(Series(curve.label, marked[curve.label], x, y, early, late, across=True, **how))
     lowest = min((float(np.nanmin(one.y)) for one in series if np.isfinite(one.y).any()), default=np.inf)
     shaded = what == "gap" and lowest < problem.round_off < np.inf
     doubt = [f"Reference not certified: {problem.doubt}."] if problem.doubt else []
@@ -72,9 +83,13 @@ def _converging(
         *(of, (what, against), f"{problem.name}, {GUESSES[of[-1]]}", ""),
         *(_AGAINST[against], Scale(words, "log", "power"), series),
         bands=[Band(0.0, problem.round_off, "round-off")] if shaded else [],
-        notes=[*doubt, *shares, *_ended(curves)],
+        notes=[*doubt, *shares, *_hollow(curves), *_ended(curves)],
         machine=", ".join(table.machine),
     )
+
+
+def _hollow(measured: Iterable[Curve | WorkPoint]) -> list[str]:
+    return [OLDER] if any(map(older, measured)) else []
 
 
 def _ended(curves: Sequence[Curve]) -> list[str]:
@@ -104,16 +119,9 @@ def times(folder: Path) -> list[Entry]:
                 problems = [p for p in table.problems if (p.scene, p.size) == mesh[:2]]
                 plots.append(
                     Plot(
-                        *(
-                            of,
-                            name,
-                            f"{mesh[2]}, {GUESSES[guess]}",
-                            title,
-                            x,
-                            y,
-                        ),
+                        *(of, name, f"{mesh[2]}, {GUESSES[guess]}", title, x, y),
                         series,
-                        notes=[f"{sentence}." for sentence in left_out(problems)],
+                        notes=[*(f"{sentence}." for sentence in left_out(problems)), *_hollow(here)],
                         machine=", ".join(table.machine),
                     )
                 )
@@ -126,7 +134,8 @@ def _reaching(curves: Sequence[Curve], marked: dict[str, Mark], steps: int | Non
         y = np.array([middle(own, target, steps) for target in TARGETS])
         y = np.where(np.isfinite(y) & (y > 0.0), y, np.nan)
         if np.isfinite(y).any():
-            yield Series(label, marked[label], np.arange(len(TARGETS), dtype=float), y)
+            hollow = np.full(len(y), any(map(older, own)))
+            yield Series(label, marked[label], np.arange(len(TARGETS), dtype=float), y, older=hollow)
 
 
 def work(folder: Path) -> list[Entry]:
@@ -149,7 +158,7 @@ def work(folder: Path) -> list[Entry]:
                     Scale("wall time a simulated second", "log", "time"),
                     Scale("error of the positions, relative to the way from the start", "log", "percent"),
                     [_front(here), *_chains(mine, marked, tolerances)],
-                    notes=[*said, "Grey: the least error that a budget buys, by any integrator."],
+                    notes=[*said, "Grey: the least error that a budget buys, by any integrator.", *_hollow(mine)],
                     machine=", ".join(table.machine),
                 )
             )
@@ -171,7 +180,8 @@ def _chains(works: Sequence[WorkPoint], marked: dict[str, Mark], tolerances: Seq
         x, y = np.array([one.seconds for one in members]), np.array([one.error for one in members])
         setting = f"tolerance {tolerance:g}" if tolerance else f"{iterations} iterations"
         grown = 1.0 + 0.25 * tolerances.index(tolerance) if tolerance in tolerances else 1.0
-        yield Series(label, marked[label], x, y, setting=setting, grown=grown)
+        hollow = np.array([older(one) for one in members])
+        yield Series(label, marked[label], x, y, older=hollow, setting=setting, grown=grown)
 
 
 def profiles(folder: Path) -> list[Entry]:
@@ -194,7 +204,7 @@ def profiles(folder: Path) -> list[Entry]:
                         *(f"to a gap of {power(target)}: {races} problems", Scale(words, "log", "plain")),
                         Scale("share of the problems solved", "linear", "percent"),
                         list(_stairs(found, marked)),
-                        notes=not_shown(table),
+                        notes=[*not_shown(table), *by_other_code(table.curves)],
                         machine=", ".join(table.machine),
                     )
                 )
@@ -221,14 +231,17 @@ def growth(folder: Path) -> list[Entry]:
             Series(
                 one.label + (f"  n{superscript(f'{one.exponent:.2f}')}" if np.isfinite(one.exponent) else ""),
                 *(marked[one.label], np.array(one.vertices, float), np.array(one.seconds)),
+                older=np.array(one.older),
             )
             for one in here
         ]
+        lost = [f"Not reached by {g.label} at {', '.join(map(str, g.lost))} vertices." for g in here if g.lost]
+        hollow = [OLDER] if any(any(g.older) for g in here) else []
         plots.append(
             Plot(
                 *((scene, guess), ("growth",), f"{scene}, {GUESSES[guess]}", "", Scale("vertices", "sizes", "plain")),
                 *(Scale(f"wall time to a gap of {power(TARGET)}", "log", "time"), series),
-                notes=[f"Not reached by {g.label} at {', '.join(map(str, g.lost))} vertices." for g in here if g.lost],
+                notes=[*lost, *hollow],
                 machine=", ".join(table.machine),
             )
         )
@@ -237,7 +250,7 @@ def growth(folder: Path) -> list[Entry]:
 
 def paper(folder: Path) -> list[Entry]:
     """Figures 2 and 3 of Liu et al. 2013 beside ours."""
-    from harness.report.accuracy.paper import comparisons
+    from harness.report.accuracy.paper import comparisons, own
 
     table = read(folder)
     found = comparisons(table)
@@ -253,6 +266,7 @@ def paper(folder: Path) -> list[Entry]:
             Plot(
                 *((of[0],), tuple(of[1:]) or ("iterations",), curve, "", Scale("iterations", "log", "plain")),
                 *(Scale("relative error (g − g*) / (g₀ − g*)", "log", "power"), series),
+                notes=by_other_code(own(table)),
                 machine=", ".join(table.machine),
             )
         )

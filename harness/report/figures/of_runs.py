@@ -16,10 +16,9 @@ from harness.report.figures.entry import Entry, ready
 from harness.report.figures.panel import Band, Line, Plot, Scale, Series
 from harness.report.speed import figures as speed_figures
 from harness.report.speed.pictures import PICTURES
-from harness.report.style import Mark, looks, numbered
+from harness.report.style import OLDER, Mark, looks, numbered
 from harness.report.timing_table import RunTimes, labels, runs
 
-OLDER = "Hollow marks: measured by other code than today's."
 Older = Callable[[pa.Table], Collection[str]]
 """The ids of those runs in rows that other code than today's measured."""
 
@@ -135,9 +134,10 @@ def speed(folder: Path) -> list[Entry]:
             if points:
                 series, scales = _lines(points, marked)
                 shown = _SHARE if picture.share else _TIME
-                scales = tuple(shown if scale is _VALUE else scale for scale in scales)
+                x, y = (shown if scale is _VALUE else scale for scale in scales)
                 title = picture.title.replace("Milliseconds ", "")
-                plots.append(Plot((scene,), (picture.stem,), scene, title, scales[0], scales[1], series, machine=told))
+                hollow = [OLDER] if any(one.older for one, _ in points) else []
+                plots.append(Plot((scene,), (picture.stem,), scene, title, x, y, series, notes=hollow, machine=told))
     return ready(plots)
 
 
@@ -147,17 +147,17 @@ _VALUE, _SHARE, _TIME = Scale(""), Scale("part of the limit", "linear", "percent
 def _lines(
     points: Sequence[tuple[speed_figures.Figures, float]], marked: dict[str, Mark]
 ) -> tuple[list[Series], tuple[Scale, ...]]:
-    each: dict[str, list[tuple[float, float]]] = {}
+    each: dict[str, list[tuple[float, float, bool]]] = {}
     for one, value in sorted(points, key=lambda point: point[0].vertices):
-        each.setdefault(one.label, []).append((float(one.vertices), value))
+        each.setdefault(one.label, []).append((float(one.vertices), value, one.older))
     lone = len({one.vertices for one, _ in points}) == 1
     if lone:
         each = dict(sorted(each.items(), key=lambda pair: pair[1][0][1]))
     series: list[Series] = []
     for k, (label, members) in enumerate(each.items()):
-        n, values = (np.array(side) for side in zip(*members, strict=True))
+        n, values, older = (np.array(side) for side in zip(*members, strict=True))
         x, y = (values, np.full(len(n), float(k))) if lone else (n, values)
-        series.append(Series(label, marked[label], x, y, joined=not lone))
+        series.append(Series(label, marked[label], x, y, older=older, joined=not lone))
     return series, (_VALUE, Scale("", "names", names=tuple(each))) if lone else (_VERTICES, _VALUE)
 
 

@@ -6,7 +6,7 @@ items by `filters`, puts them into a panel each `panel`, and draws the chosen co
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from harness.report.accuracy.convergence import GUESSES
 from harness.report.accuracy.growth import TARGET, growths
-from harness.report.accuracy.measured import Curve, Measurements, WorkPoint, step_words
+from harness.report.accuracy.measured import Curve, Measurements, WorkPoint, by_other_code, step_words
 from harness.report.accuracy.pictures import nearest, place
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
@@ -39,7 +39,7 @@ def charts(table: Measurements, folder: Path) -> dict[str, Item]:
     made = {
         "convergence": _convergence(table, pictures, folder),
         "times": _times(table, pictures),
-        "work": _work(table.works),
+        "work": _work(table),
         "profiles": _profiles(table),
         "growth": _growth(table),
     }
@@ -54,7 +54,7 @@ def axis(column: str, title: str, how: Mapping[str, Any] = LOG) -> Item:
     return {"column": column, "title": title, "axis": how}
 
 
-def _run(curve: Curve, pictures: Mapping[str, Item]) -> Item:
+def _run(table: Measurements, curve: Curve, pictures: Mapping[str, Item]) -> Item:
     """What all items of a curve say."""
     return {
         "label": curve.label,
@@ -64,13 +64,14 @@ def _run(curve: Curve, pictures: Mapping[str, Item]) -> Item:
         "panel": GUESSES.get(curve.first_guess, curve.first_guess),
         "picture": pictures.get(curve.problem.digest),
         "recording": curve.recording,
+        "older": curve.code != table.newest,
     }
 
 
 def _convergence(table: Measurements, pictures: Mapping[str, Item], folder: Path) -> Item:
     items: list[Item] = []
     for curve in table.curves:
-        run = _run(curve, pictures)
+        run = _run(table, curve, pictures)
         if run["recording"] and not (folder / run["recording"]).is_file():
             run["recording"] = ""
         columns = {
@@ -113,7 +114,7 @@ def _times(table: Measurements, pictures: Mapping[str, Item]) -> Item:
             continue
         columns = {f"over {steps}": _numbers(seconds_to(curve, t, steps) for t in TARGETS) for steps in STEPS}
         items.append(
-            _run(curve, pictures)
+            _run(table, curve, pictures)
             | columns
             | {
                 "target": [power(target) for target in TARGETS],
@@ -135,9 +136,9 @@ def _times(table: Measurements, pictures: Mapping[str, Item]) -> Item:
     }
 
 
-def _work(works: Sequence[WorkPoint]) -> Item:
+def _work(table: Measurements) -> Item:
     chains: dict[tuple[Any, ...], list[WorkPoint]] = {}
-    for w in works:
+    for w in table.works:
         if w.status == "ok":
             chains.setdefault((w.mesh, w.label, w.integrator, w.tolerance, w.iterations, w.first_guess), []).append(w)
     items: list[Item] = []
@@ -151,7 +152,8 @@ def _work(works: Sequence[WorkPoint]) -> Item:
                 "scene": mesh,
                 "parameters": members[0].parameters,
                 "panel": integrator,
-                "open": tolerance is None,
+                "small": tolerance is None,
+                "older": [work.code != table.newest for work in members],
                 "seconds": _numbers(work.seconds for work in members),
                 "error": _numbers(work.error for work in members),
                 "step": [step_words(work.time_step) for work in members],
@@ -159,7 +161,7 @@ def _work(works: Sequence[WorkPoint]) -> Item:
         )
     return {
         "title": "Work and precision",
-        "note": "Total error of the positions at the horizon against wall time; a line joins time steps, open marks "
+        "note": "Total error of the positions at the horizon against wall time; a line joins time steps, small marks "
         "do a fixed number of iterations.",
         "filters": ["scene"],
         "x": [axis("seconds", "wall seconds a simulated second")],
@@ -187,10 +189,11 @@ def _profiles(table: Measurements) -> Item:
                         "share": _numbers(share(values, finite)),
                     }
                 )
+    more = [*not_shown(table), *by_other_code(table.curves, table.newest)]
     return {
         "title": "Performance and data profiles",
         "note": "The share of the problems solved within a multiple of the fastest solver's time, and of the time of "
-        f"one plain local-global iteration. What failed is never solved. {' '.join(not_shown(table))}",
+        f"one plain local-global iteration. What failed is never solved. {' '.join(more)}",
         "filters": ["gap"],
         "x": [axis("ratio", "multiple")],
         "y": [axis("share", "share of the problems solved", _SHARES)],
@@ -210,9 +213,10 @@ def _growth(table: Measurements) -> Item:
             "panel": GUESSES[growth.first_guess],
             "vertices": growth.vertices,
             "seconds": _numbers(growth.seconds),
+            "older": growth.older,
             "exponent": "too few sizes" if np.isnan(growth.exponent) else f"{growth.exponent:.2f}",
         }
-        for growth in growths(table)
+        for growth in growths(table, lambda curve: curve.code != table.newest)
     ]
     return {
         "title": f"Growth with size: time to a gap of {power(TARGET)}",

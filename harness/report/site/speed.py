@@ -42,6 +42,8 @@ def chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
     for f in sorted(timed, key=lambda f: f.vertices):
         lines.setdefault((f.scene, f.label), []).append(f)
     marks = looks((f.label, f.solver) for f in timed)
+    dated = zip(*(table[name].to_pylist() for name in ("started", "code")), strict=True)
+    newest = max(((started or "", code or "") for started, code in dated), default=("", ""))[1]
     hover = [["vertices", "vertices"], ["step", "ms a step"], ["global_", "ms a global step"]]
     return {
         "title": "Speed and its limits",
@@ -51,17 +53,17 @@ def chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
         "x": [axis("vertices", "vertices")],
         "y": list(_COLUMNS.values()),
         "hover": [*hover, ["binds", "limit that binds"], ["reached", "share of that limit reached"]],
-        "items": [_item(scene, label, some) for (scene, label), some in lines.items()],
+        "items": [_item(scene, label, some, newest) for (scene, label), some in lines.items()],
         "marks": {label: drawn(mark) for label, mark in marks.items()},
         "references": {f.label: {"cited": cited(reference.get(f.solver)), "bibtex": ""} for f in timed},
     }, remarks(found)
 
 
-def _item(scene: str, label: str, some: list[Figures]) -> dict[str, Any]:
+def _item(scene: str, label: str, some: list[Figures], newest: str) -> dict[str, Any]:
     names = ("vertices", *(name for name in _COLUMNS if name != "faster"))
     columns = {name: [number(getattr(f, name)) for f in some] for name in names}
     columns["faster"] = [number(f.faster and f.faster.middle) for f in some]
     ends = {f"faster_{end}": [number(getattr(f.faster, end, None)) for f in some] for end in ("low", "high")}
     threads = f"{some[0].threads} thread{'s' if some[0].threads > 1 else ''}"
     told = {"label": label, "what": f"{scene}, {threads}", "scene": scene, "panel": scene, "parameters": "{}"}
-    return told | columns | ends | {"binds": [f.binds for f in some]}
+    return told | columns | ends | {"binds": [f.binds for f in some], "older": [f.code != newest for f in some]}

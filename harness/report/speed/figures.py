@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from harness.base import machine
 from harness.base.statistics import Interval, ratio
 from harness.report.speed.counts import Counted, count
 
@@ -37,7 +38,8 @@ class Figures(NamedTuple):
     factor's panels hold; binds: the limit that binds; reached: the part of it that an iteration reaches, by those
     bytes and flops; passes: the part of the time that two passes over the entries of L alone take, both from where
     they lie, which whoever reads them twice while they are near can pass; faster: than the yardstick a step;
-    solves_faster: than cholespy a global step; apart: from float64's converged positions, in the scene's size.
+    solves_faster: than cholespy a global step; apart: from float64's converged positions, in the scene's size; code: by
+    which it was measured.
     """
 
     scene: str
@@ -66,6 +68,12 @@ class Figures(NamedTuple):
     apart: float | None = None
     load: float | None = None
     solver: str = ""
+    code: str = ""
+
+    @property
+    def older(self) -> bool:
+        """Whether other code than today's measured it; of rows that do not say by which code nobody can tell."""
+        return self.code not in ("", machine.code_hash())
 
 
 class Machine:
@@ -119,10 +127,10 @@ def figures(table: pa.Table) -> list[Figures]:
         groups[found[0]["scene"], found[0]["size"]][labels[found[0]["run_id"]]] = found
     out: list[Figures] = []
     for group in groups.values():
-        machine = Machine([row for found in group.values() for row in found if row["solver"] == MACHINE])
+        limits = Machine([row for found in group.values() for row in found if row["solver"] == MACHINE])
         for label, found in group.items():
             if found[0]["solver"] != MACHINE:
-                out.append(_figures(label, found, group, machine))
+                out.append(_figures(label, found, group, limits))
     return out
 
 
@@ -142,12 +150,13 @@ def _labels(firsts: Sequence[Row]) -> dict[str, str]:
     }
 
 
-def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], machine: Machine) -> Figures:
+def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], limits: Machine) -> Figures:
     first = found[0]
     known = Figures(
         *(first["scene"], first["size"], first["vertices"], label, first["threads"]),
         *(first["status"], first["reason"], first["choice"]),
         solver=first["solver"],
+        code=first["code"] or "",
     )
     if first["status"] != "ok":
         return known
@@ -172,14 +181,14 @@ def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], m
     counts, how = (first["vertices"], first["springs"], precision), (first["threads"], precision)
     touched = count(facts, *counts)["iteration"]
     bare = count({"nnz_factor": facts["nnz_factor"]}, *counts)["iteration"]
-    limit, seconds = machine.limit(touched, *how), float(np.median(times["step"]))
+    limit, seconds = limits.limit(touched, *how), float(np.median(times["step"]))
     return known._replace(
         entries=facts["nnz_factor"],
         bytes=touched.bytes,
         touched=touched.bytes / seconds,
         binds=limit.binds,
         reached=limit.seconds / seconds,
-        passes=machine.passes(bare, *how).seconds / seconds,
+        passes=limits.passes(bare, *how).seconds / seconds,
     )
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from harness.base import machine
 from harness.report.speed.figures import STEP, Figures
 from harness.report.speed.size_plot import Series, draw_by_size
+from harness.report.style import OLDER
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +39,7 @@ def draw(found: Sequence[Figures], folder: Path) -> None:
     facts = ["median over the rounds, candidates in turns", f"{here.cores} cores", here.cpu]
     if loads:
         facts.append(f"load {min(loads):.1f} to {max(loads):.1f}")
+    facts += [OLDER] if any(f.older for f in found) else []
     for scene in dict.fromkeys(f.scene for f in found):
         members = [f for f in found if f.scene == scene]
         for picture in PICTURES:
@@ -50,7 +52,12 @@ def _series(members: Sequence[Figures], picture: Picture) -> list[Series]:
     lines: list[Series] = []
     for label in dict.fromkeys(f.label for f in members):
         mine = [f for f in members if f.label == label]
-        points = sorted((f.vertices, value) for f in mine if (value := picture.value(f)) is not None)
+        points = sorted((f.vertices, value, f.older) for f in mine if (value := picture.value(f)) is not None)
         alone = label.removesuffix(f" x{mine[0].threads}")
-        lines.append(Series(label, alone, mine[0].solver, [n for n, _ in points], [value for _, value in points]))
+        n, values, older = (
+            [point[0] for point in points],
+            [point[1] for point in points],
+            [point[2] for point in points],
+        )
+        lines.append(Series(label, alone, mine[0].solver, n, values, older))
     return lines

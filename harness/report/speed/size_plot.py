@@ -21,21 +21,23 @@ _LEFT, _TOP, _NAMES, _BELOW = 110, 130, 400, 70
 
 
 class Series(NamedTuple):
-    """The line of a candidate: its name, what it is called with one thread, its solver, vertices and values (k,)."""
+    """The line of a candidate: its name, what it is called with one thread, its solver, vertices and values (k,), and
+    which of them (k,) other code than today's measured."""
 
     name: str
     alone: str
     solver: str
     vertices: Sequence[int]
     values: Sequence[float]
+    older: Sequence[bool]
 
 
 def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[Series], *, share: bool) -> None:
     """Draw to `path`, WIDTH x HEIGHT pixels, PNG; `share`: values are parts of a whole, drawn in percent.
 
     Candidates have the colour and the marker of their solver, and a line style of their own; with more threads than one
-    they are thinner. A series without values is not drawn; it keeps its line style free, so that pictures of the same
-    candidates look alike.
+    they are thinner; what other code than today's measured is hollow. A series without values is not drawn; it keeps
+    its line style free, so that pictures of the same candidates look alike.
     """
     drawn = [line for line in series if line.values]
     marked = looks((line.alone, line.solver) for line in series)
@@ -57,6 +59,8 @@ def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[
                 markeredgecolor=PAGE,
                 label=shorten(line.name, 44),
             )
+            for n, value in ((n, v) for n, v, older in zip(*line[3:], strict=True) if older):
+                ax.plot(n, value, look.marker, mfc=PAGE, mec=look.color, mew=1.5, markersize=6)
             handles.append((line.values[-1], handle))
         _scales(ax, drawn, share)
         ordered = [handle for _, handle in sorted(handles, key=lambda pair: -pair[0])]

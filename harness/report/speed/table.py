@@ -62,7 +62,9 @@ def _places(found: Sequence[Figures]) -> Callable[[Figures], str]:
 
 
 def _named(f: Figures) -> str:
-    return f.label if f.iterations == STEP else f"{f.label} ({f.iterations} of {STEP})"
+    said = [f"{f.iterations} of {STEP}"] if f.iterations != STEP else []
+    said += ["by other code"] if f.older else []
+    return f"{f.label} ({', '.join(said)})" if said else f.label
 
 
 def _cells(f: Figures) -> list[str]:

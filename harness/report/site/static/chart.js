@@ -6,11 +6,14 @@ springbench.chart = (() => {
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const at = (item, column, k) => (Array.isArray(item[column]) ? item[column][k] : item[column]);
 
+  const older = (item, k) => Boolean(Array.isArray(item.older) ? item.older[k] : item.older);
+
   function told(chart, item, k) {
     const rows = chart.hover.map(([column, words]) => {
       const value = at(item, column, k);
       return value === null || value === undefined ? null : element("tr", {}, element("td", {}, words), element("td", {}, typeof value === "string" ? value : number(value)));
     });
+    if (older(item, k)) rows.push(element("tr", {}, element("td", {}, "code"), element("td", {}, "other than the newest rows'")));
     return [element("b", {}, item.label), item.what, element("table", {}, element("tbody", {}, ...rows.filter(Boolean)))];
   }
 
@@ -33,13 +36,14 @@ springbench.chart = (() => {
       type: "data", symmetric: false, color: ink, thickness: 1.2, width: 3,
       array: some[2].map((v, k) => v - some[0][k]), arrayminus: some[1].map((v, k) => some[0][k] - v),
     } : undefined);
-    const hollow = item.open ? "-open" : "";
+    // What other code than the newest measured is hollow.
+    const hollow = item[x.column].map((_, k) => older(item, k));
     return {
       x: item[x.column], y: item[y.column], name: item.label, xaxis: `x${tail}`, yaxis: `y${tail}`, meta: { item },
       mode: points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
       line: { color: ink, dash: mark.dash, width: 1.7, shape: chart.shape === "hv" ? "hv" : undefined },
       // Marks stand apart: so many of a line at most, whatever the number of its points.
-      marker: { symbol: mark.symbol + hollow, color: ink, size: 8, maxdisplayed: points ? 0 : chart.shape === "hv" ? 4 : 9, line: { width: item.open ? 1.6 : 0, color: ink } },
+      marker: { symbol: hollow.map(yes => mark.symbol + (yes ? "-open" : "")), color: ink, size: item.small ? 5 : 8, maxdisplayed: points ? 0 : chart.shape === "hv" ? 4 : 9, line: { width: hollow.map(yes => (yes ? 1.6 : 0)), color: ink } },
     };
   }
 

@@ -31,6 +31,7 @@
         label: some[0].label, what: some[0].scene, scene: some[0].scene, panel: some[0].scene, runs: column("key"), vertices: column("vertices"), size: column("size"), step: column("step"),
         step_low: column("lower"), step_high: column("upper"), least: column("least"), warm: column("warm"), local: column("local"), global: column("global"),
         iterations: column("iterations"), residual: column("residual"), strain: some.map(row => row.largest_strain === null ? null : 100 * row.largest_strain),
+        older: some.map(row => row.by === "other code"),
       };
     });
     const hover = [["vertices", "vertices"], ["step", "ms a step"], ["least", "least ms"], ["iterations", "iterations"], ["residual", "last residual"], ["strain", "largest strain, %"]];
@@ -60,7 +61,8 @@
         last = `${drawn}\n${sweep.slug}/${plot.id}`;
         const chart = await load(sweep, plot.id);
         title.textContent = chart.title;
-        note.textContent = chart.note || "";
+        const mixed = chart.items?.some(item => (Array.isArray(item.older) ? item.older.some(Boolean) : item.older));
+        note.textContent = [chart.note, mixed && "Hollow marks: measured by other code than the newest rows."].filter(Boolean).join(" ");
         top.hidden = sweeps.length < 2;
         top.replaceChildren(element("label.field", {}, element("span", {}, "Results"), element("select", { onchange: event => { location.hash = address("plots", { sweep: event.target.value }); } },
           ...sweeps.map(one => element("option", { value: one.slug, selected: one === sweep }, one.name)))));
