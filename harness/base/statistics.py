@@ -3,15 +3,17 @@
     what something takes         the median over the rounds (of a run: over its steps too)
     what a frame adds to a run   the mean over the frames of the median over the rounds: such means add up
     how many times as much       the median of the ratios, round by round, of what took turns
+    the same on another day      exp(median over the frames of log(new / old)), of the least over the rounds
 
 A busy machine delays some rounds and speeds up none. The median bears that of nearly half of them; a mean does not, and
-a minimum has no interval. Intervals are those of a percentile bootstrap (Efron 1979, `scipy.stats.bootstrap`), which
-resamples the rounds; it is seeded, so the same times give the same interval.
+a minimum has no interval. Rounds of two days do not pair, and their load differs: there the least is what load moves
+least, and the frames are what is resampled. Intervals are those of a percentile bootstrap (Efron 1979,
+`scipy.stats.bootstrap`), which resamples the rounds; it is seeded, so the same times give the same interval.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,6 +48,21 @@ def added(more: ArrayLike) -> Interval:
         return np.mean([np.median(frame, axis=axis) for frame in rounds], axis=0)
 
     return _resampled(frames, statistic)
+
+
+def least(steps: Iterable[tuple[int, float]]) -> dict[int, float]:
+    """Of each frame's step the least over its rounds [s], of pairs of a frame and its seconds in a round."""
+    seconds: dict[int, float] = {}
+    for frame, taken in steps:
+        seconds[frame] = min(taken, seconds.get(frame, taken))
+    return seconds
+
+
+def changed(new: Mapping[int, float], old: Mapping[int, float]) -> Interval:
+    """How many times as much `new` is as `old`, both by frame: over those that both have, of which there is one."""
+    frames = sorted(set(new) & set(old))
+    logs = np.log([new[frame] / old[frame] for frame in frames])
+    return Interval(*(float(np.exp(end)) for end in _resampled((logs,), np.median)))
 
 
 def _resampled(samples: Sequence[NDArray[np.float64]], statistic: Callable[..., Any]) -> Interval:

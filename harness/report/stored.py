@@ -1,13 +1,9 @@
 """Compares two stored results, folders or archives of rows: what became slower, and what else changed with it?
 
-Runs are paired by what they were asked to do. The time of a step is the least over its rounds, which the load of the
-machine moves least; two runs are compared by the ratios of their steps,
-
-    ratio = exp(median over frames of log(new / old)),
-
-with a 95 % interval by resampling frames (SciPy's percentile bootstrap). The load may have been another on the day of
-the other results, and no statistics sees that: hence a margin beyond the interval, and `springbench gate --against` for
-what is smaller. Times of two machines do not compare; with a yardstick, a solver that both ran, the ratios to it do.
+Runs are paired by what they were asked to do, and compared step by step (`harness.base.statistics.changed`). The load
+may have been another on the day of the other results, and no statistics sees that: hence a margin beyond the interval,
+and `springbench gate --against` for what is smaller. Times of two machines do not compare; with a yardstick, a solver
+that both ran, the ratios to it do.
 """
 
 from __future__ import annotations
@@ -23,18 +19,16 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-from scipy.stats import bootstrap
 
-from harness.base import rows, shelf
+from harness.base import rows, shelf, statistics
 from harness.base.errors import InputError, Mistake
 
 MARGIN = 0.10
-"""Beyond the interval: minima of two runs of the same code lie up to 4 % apart on an idle machine,more on others."""
+"""Beyond the interval: minima of two runs of the same code lie up to 4 % apart on an idle machine, more on others."""
 
 ASKED = (
     *("scene", "size", "solver", "parameters", "time_step", "integrator", "first_guess", "max_iterations"),
@@ -47,7 +41,6 @@ _ROWS, _MOST = ".parquet", 2**31
 
 Row = Mapping[str, Any]
 Key = tuple[Any, ...]
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,16 +154,13 @@ def _require_room(path: Path, unpacked: int) -> None:
 
 def _run(found: Sequence[Row]) -> StoredRun:
     steps = [row for row in found if row["phase"] == "step" and row["frame"] is not None]
-    seconds: dict[int, float] = {}
-    for row in steps:
-        seconds[row["frame"]] = min(row["seconds"], seconds.get(row["frame"], np.inf))
     once = {row["frame"]: row for row in steps}
     last: Row = once[max(once)] if once else {}
     counted = [row["iterations"] for row in once.values() if row["iterations"] is not None]
     return StoredRun(
         found[0],
         next((row["status"] for row in found if row["status"] != "ok"), "ok"),
-        seconds,
+        statistics.least((row["frame"], row["seconds"]) for row in steps),
         sum(counted) if counted else None,
         *(last.get(name) for name in ("residual", "stationarity", "digest")),
     )
@@ -199,21 +189,12 @@ def _judged(old: StoredRun, new: StoredRun, units: Sequence[float | None]) -> tu
     if new.status != "ok":
         return ("", "", ""), "fails now"
     frames = sorted(set(old.seconds) & set(new.seconds))
-    was, now = (np.array([run.seconds[f] for f in frames]) * unit for run, unit in zip((old, new), units, strict=True))
-    ratio, low, high = _interval(np.log(now / was))
+    was, now = ({f: run.seconds[f] * (unit or 1) for f in frames} for run, unit in zip((old, new), units, strict=True))
+    ratio, low, high = statistics.changed(now, was)
     slower, faster = low > 1 + MARGIN, high * (1 + MARGIN) < 1
-    told = [f"{float(np.median(x)):.4g}" for x in (was, now)]
+    told = [f"{float(np.median([*x.values()])):.4g}" for x in (was, now)]
     change = f"{100 * (ratio - 1):+.1f} % [{100 * (low - 1):+.1f}, {100 * (high - 1):+.1f}]"
     return (told[0], told[1], change), "slower" if slower else "faster" if faster else "unchanged"
-
-
-def _interval(logs: Array) -> tuple[float, float, float]:
-    """The median ratio and its 95 % interval; of one frame, or of ratios that are all alike, that ratio alone."""
-    middle = float(np.exp(np.median(logs)))
-    if len(logs) < 2 or np.ptp(logs) == 0:
-        return middle, middle, middle
-    found = bootstrap((logs,), np.median, method="percentile", n_resamples=2000, rng=np.random.default_rng(0))
-    return middle, float(np.exp(found.confidence_interval.low)), float(np.exp(found.confidence_interval.high))
 
 
 def _beside(old: StoredRun, new: StoredRun) -> tuple[str, str, str, str]:

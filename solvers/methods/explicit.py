@@ -51,10 +51,11 @@ class Explicit:
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False
     name: ClassVar[str]
+    coefficients: ClassVar[Composition | Tableau]
 
     def method(self) -> Composition | Tableau:
         """The coefficients."""
-        raise NotImplementedError
+        return self.coefficients
 
     def _prepared(self, system: System, substeps: int, error: float) -> PreparedExplicit:
         """substeps: times the fewest that are stable; error: of the springs' mean length, 0 for none."""
@@ -136,10 +137,7 @@ class VelocityVerlet(_Fixed):
         "A computer simulation method for the calculation of equilibrium constants",
         "10.1063/1.442716",
     )
-
-    def method(self) -> Composition | Tableau:
-        """The coefficients."""
-        return VERLET
+    coefficients: ClassVar[Composition | Tableau] = VERLET
 
 
 @dataclass(frozen=True)
@@ -148,10 +146,7 @@ class BlanesMoan4(_Fixed):
 
     name: ClassVar[str] = "blanes-moan-4"
     about: ClassVar[About] = _BLANES_MOAN
-
-    def method(self) -> Composition | Tableau:
-        """The coefficients."""
-        return BLANES_MOAN_4
+    coefficients: ClassVar[Composition | Tableau] = BLANES_MOAN_4
 
 
 @dataclass(frozen=True)
@@ -160,10 +155,7 @@ class BlanesMoan6(_Fixed):
 
     name: ClassVar[str] = "blanes-moan-6"
     about: ClassVar[About] = _BLANES_MOAN
-
-    def method(self) -> Composition | Tableau:
-        """The coefficients."""
-        return BLANES_MOAN_6
+    coefficients: ClassVar[Composition | Tableau] = BLANES_MOAN_6
 
 
 @dataclass(frozen=True)
@@ -172,10 +164,7 @@ class RungeKutta4(_Fixed):
 
     name: ClassVar[str] = "runge-kutta-4"
     about: ClassVar[About] = _HAIRER
-
-    def method(self) -> Composition | Tableau:
-        """The coefficients."""
-        return RUNGE_KUTTA_4
+    coefficients: ClassVar[Composition | Tableau] = RUNGE_KUTTA_4
 
 
 @dataclass(frozen=True)
@@ -189,10 +178,7 @@ class Tsitouras5(_Controlled):
         "Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying assumption",
         "10.1016/j.camwa.2011.06.002",
     )
-
-    def method(self) -> Composition | Tableau:
-        """The coefficients."""
-        return TSITOURAS_5
+    coefficients: ClassVar[Composition | Tableau] = TSITOURAS_5
 
 
 @dataclass(frozen=True)
@@ -203,7 +189,7 @@ class DormandPrince8(_Controlled):
     about: ClassVar[About] = _HAIRER
 
     def method(self) -> Composition | Tableau:
-        """The coefficients."""
+        """The coefficients; SciPy has them."""
         return dormand_prince_8()
 
 

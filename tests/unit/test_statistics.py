@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from harness.base.statistics import added, ratio
+from harness.base.statistics import added, changed, least, ratio
 
 
 def test_the_interval_holds_the_ratio_and_is_the_same_each_time():
@@ -38,3 +38,15 @@ def test_nine_of_ten_intervals_or_more_hold_what_is_true():
     found = [ratio(2.0 * t, o) for t, o in np.exp(0.1 * rng.standard_normal((200, 2, 15)))]
     # A percentile bootstrap of a median of 15 is known to be a little short of its 95 %.
     assert np.mean([f.low <= 2.0 <= f.high for f in found]) > 0.9
+
+
+def test_of_each_frame_the_least_of_its_rounds_counts():
+    assert least([(1, 3.0), (2, 5.0), (1, 2.0), (2, 7.0)]) == {1: 2.0, 2: 5.0}
+
+
+def test_a_change_is_that_of_the_frames_that_both_days_have():
+    old = {frame: float(frame) for frame in range(1, 8)}
+    new = {frame: 1.5 * seconds for frame, seconds in old.items()} | {3: 90.0, 99: 1e9}
+    found = changed(new, old)
+    assert found.middle == pytest.approx(1.5, rel=1e-15)
+    assert found.low <= found.middle <= found.high

@@ -5,43 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from harness.base import holding, machine, rows
-from harness.base.errors import InputError
+from harness.base import holding, machine
 from harness.base.progress import Display
-from harness.base.workers import Limits, Lost, Tick
+from harness.base.workers import Tick
 from harness.config.load import Sweep
-from harness.config.sweep import RunSpec
+from harness.experiments.ablation.base import OfEffects, Row
 from harness.experiments.ablation.prices import Price, only, priced, prices
-from harness.experiments.ablation.rows import SCHEMA
 from harness.experiments.core import do_all
-from harness.experiments.failure import failure
 from harness.experiments.provenance import asked, provenance
-from harness.experiments.resume import Standing, standings, wanted
+from harness.experiments.resume import wanted
 from harness.scenes.bind import build
 from solvers.problem import Solver, StopRule
 from solvers.registry import EVERY, load
 
-Row = dict[str, Any]
-
 
 @dataclass(frozen=True, slots=True)
-class Prices:
-    """The prices of a scene's effects by a run's solver (`harness.experiments.core.Unit`)."""
-
-    run: RunSpec
-    folder: Path
-
-    @property
-    def path(self) -> Path:
-        """The file of rows."""
-        return self.folder / "ablation" / f"{self.run.label(machine.describe().id)}-prices.parquet"
-
-    @property
-    def standing(self) -> Standing:
-        """Whether its rows are there."""
-        return standings({self.path: lambda row: True}, (), SCHEMA)[self.path]
+class Prices(OfEffects):
+    """The prices of a scene's effects by a run's solver."""
 
     @property
     def title(self) -> str:
@@ -53,31 +34,12 @@ class Prices:
         """One an effect."""
         return len(priced(self.run.scene))
 
-    @property
-    def work(self) -> float:
-        """See Unit."""
-        return 1.0
+    def suffix(self) -> str:
+        """See OfEffects."""
+        return "-prices"
 
-    @property
-    def limits(self) -> Limits:
-        """Those of a run."""
-        return Limits(self.run.time_limit, self.run.memory_limit)
-
-    def do(self, tick: Tick) -> str:
-        """See Unit."""
-        try:
-            return self._written(self._measured(tick))
-        except InputError:
-            raise
-        except Exception as error:  # a solver may fail in any way
-            told = failure(error)
-            return self._written([{"status": told["status"], "reason": told["reason"]}])
-
-    def lost(self, lost: Lost) -> str:
-        """See Unit."""
-        return self._written([{"status": lost.status, "reason": str(lost)}])
-
-    def _measured(self, tick: Tick) -> list[Row]:
+    def measured(self, tick: Tick) -> list[Row]:
+        """See OfEffects."""
         run = self.run
         solver: Solver = load(EVERY[run.solver.name])(**run.solver.parameters)
         stop, told = StopRule(run.iterations, run.tolerance), list[Row]()
@@ -87,15 +49,15 @@ class Prices:
             for found in prices(run.scene, run.size, solver, stop, frames=run.frames, rounds=run.rounds):
                 told.append(counts | _row(found))
                 tick(found.effect)
-        return told
+        return self._shared(told)
 
-    def _written(self, told: list[Row]) -> str:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+    def unanswered(self, status: str, reason: str) -> list[Row]:
+        """See OfEffects: none of the effects has a price."""
+        return self._shared([{"name": effect, "status": status, "reason": reason} for effect in priced(self.run.scene)])
+
+    def _shared(self, told: list[Row]) -> list[Row]:
         shared = asked(self.run) | provenance() | {"kind": "price", "frames": self.run.frames}
-        effects = priced(self.run.scene)
-        told = told if "name" in told[0] else [{"name": effect} | told[0] for effect in effects]
-        rows.write(self.path, [shared | row for row in told], SCHEMA)
-        return "ok" if any(row["status"] == "ok" for row in told) else f"{told[0]['status']}: {told[0]['reason']}"
+        return [shared | row for row in told]
 
 
 def _row(found: Price) -> Row:

@@ -5,29 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-from harness.base import holding, machine, rows
-from harness.base.errors import InputError
+from harness.base import holding, machine
 from harness.base.progress import Display
-from harness.base.workers import Limits, Lost, Tick
+from harness.base.workers import Tick
 from harness.config.load import Sweep
 from harness.config.sweep import RunSpec
+from harness.experiments.ablation.base import OfEffects, Row
 from harness.experiments.ablation.difference import States, difference, rest_length
-from harness.experiments.ablation.rows import SCHEMA
 from harness.experiments.ablation.suggest import seen, suggestions
 from harness.experiments.ablation.turns import Contender, cost, motion, seconds, turns
 from harness.experiments.ablation.variants import variants
 from harness.experiments.core import do_all
 from harness.experiments.failure import failure
 from harness.experiments.provenance import asked, provenance
-from harness.experiments.resume import Standing, standings, wanted
+from harness.experiments.resume import wanted
 from harness.scenes.bind import Scene, build
 from harness.simulation.measure import Settings
 from solvers.problem import Solver, StopRule
 from solvers.registry import EVERY, SOLVERS, load
-
-Row = dict[str, Any]
 
 _BETTER_ANSWERS = ("solver", "time-step")
 """In what the better answers are better."""
@@ -39,24 +35,11 @@ CONVERGED = StopRule(200, 1e-8)
 
 
 @dataclass(frozen=True, slots=True)
-class Ablation:
-    """A run of a scene, the whole and without its effects, taking turns in one process
-    (`harness.experiments.core.Unit`). pairs: whether each pair of effects is left out too."""
+class Ablation(OfEffects):
+    """A run of a scene, the whole and without its effects, taking turns in one process. pairs: whether each pair of
+    effects is left out too."""
 
-    run: RunSpec
-    folder: Path
     pairs: bool
-
-    @property
-    def path(self) -> Path:
-        """The file of rows."""
-        label = self.run.label(machine.describe().id) + ("-pairs" if self.pairs else "")
-        return self.folder / "ablation" / f"{label}.parquet"
-
-    @property
-    def standing(self) -> Standing:
-        """Whether its rows are there."""
-        return standings({self.path: lambda row: True}, (), SCHEMA)[self.path]
 
     @property
     def title(self) -> str:
@@ -68,39 +51,18 @@ class Ablation:
         """A motion of each variant, the timed rounds, two better answers."""
         return len(variants(self.run.scene, pairs=self.pairs)) + self.run.rounds + len(_BETTER_ANSWERS)
 
-    @property
-    def work(self) -> float:
-        """See Unit."""
-        return 1.0
+    def suffix(self) -> str:
+        """See OfEffects."""
+        return "-pairs" if self.pairs else ""
 
-    @property
-    def limits(self) -> Limits:
-        """Those of a run."""
-        return Limits(self.run.time_limit, self.run.memory_limit)
+    def measured(self, tick: Tick) -> list[Row]:
+        """See OfEffects."""
+        return _measured(self.run, self.pairs, tick)
 
-    def do(self, tick: Tick) -> str:
-        """See Unit."""
-        try:
-            found = _measured(self.run, self.pairs, tick)
-        except InputError:
-            raise
-        except Exception as error:  # without the whole scene there is nothing to compare
-            told = failure(error)
-            found = [self._unanswered(told["status"], told["reason"])]
-        return self._written(found)
-
-    def lost(self, lost: Lost) -> str:
-        """See Unit."""
-        return self._written([self._unanswered(lost.status, str(lost))])
-
-    def _unanswered(self, status: str, reason: str) -> Row:
+    def unanswered(self, status: str, reason: str) -> list[Row]:
+        """See OfEffects: without the whole scene there is nothing to compare."""
         why = {"kind": "whole", "name": "", "status": status, "reason": reason}
-        return asked(self.run) | provenance() | why
-
-    def _written(self, found: list[Row]) -> str:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        rows.write(self.path, found, SCHEMA)
-        return "ok" if found[0]["status"] == "ok" else f"{found[0]['status']}: {found[0]['reason']}"
+        return [asked(self.run) | provenance() | why]
 
 
 def run_ablation(

@@ -1,13 +1,10 @@
 """Whether an archive is what was published, and whether its numbers come out again.
 
 All checksums are compared. Then a random tenth of its runs is done here, each beside another solver's run on the same
-scene and size: positions must be equal to the bit after every step, and the ratio of the two solvers' times that which
-was published,
-
-    ratio = exp(median over frames of log((a / b here) / (a / b published))),  a, b: the least time over the rounds,
-
-within RATIO on the machine type that it was published from, within ELSEWHERE on others. Where another machine, other
-libraries or other code ran, positions that differ, and ratios that do not hold, refute nothing: it cannot be told.
+scene and size: positions must be equal to the bit after every step, and the ratio of the two solvers' times, step by
+step (`harness.base.statistics.changed`), that which was published: within RATIO on the machine type that it was
+published from, within ELSEWHERE on others. Where another machine, other libraries or other code ran, positions that
+differ, and ratios that do not hold, refute nothing: it cannot be told.
 """
 
 from __future__ import annotations
@@ -19,16 +16,15 @@ import random
 import shutil
 import zipfile
 from collections import defaultdict
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from harness.base import machine, rows, shelf
+from harness.base import machine, rows, shelf, statistics
 from harness.base.errors import InputError, Mistake
 from harness.base.progress import Display
 from harness.config.load import load_any
@@ -225,13 +221,11 @@ _WHERE = {"machine": "machine", "versions": "libraries", "code": "code", "thread
 
 
 def _ratio(old: tuple[Published, Published], new: tuple[list[Row], list[Row]]) -> Claim:
-    was, now = (tuple(map(_seconds, pair)) for pair in ((old[0].rows, old[1].rows), new))
-    first, *others = (*was, *now)
-    frames = sorted(set(first).intersection(*others))
-    ratio = [median(math.log(a[f] / b[f]) for f in frames) for a, b in (was, now)]
-    apart = math.exp(median(math.log(now[0][f] / now[1][f] * was[1][f] / was[0][f]) for f in frames))
-    what = f"{old[0].title} takes {math.exp(ratio[0]):.3g} times as long as {old[1].run.solver.name}"
-    why = f"here {math.exp(ratio[1]):.3g} times"
+    was, now = (_seconds(pair) for pair in ((old[0].rows, old[1].rows), new))
+    published, here = (statistics.changed(*pair).middle for pair in (was, now))
+    apart = statistics.changed(*(_ratios(*pair) for pair in (now, was))).middle
+    what = f"{old[0].title} takes {published:.3g} times as long as {old[1].run.solver.name}"
+    why = f"here {here:.3g} times"
     elsewhere = _elsewhere(old[0].rows[0], new[0][0])
     limit = ELSEWHERE if elsewhere else RATIO
     if 1 / limit <= apart <= limit:
@@ -243,13 +237,14 @@ def _ratio(old: tuple[Published, Published], new: tuple[list[Row], list[Row]]) -
     return Claim(what, Holds.NO, why)
 
 
-def _seconds(found: list[Row]) -> dict[int, float]:
-    """Of each frame's step, the least over its rounds."""
-    seconds: dict[int, float] = {}
-    for row in found:
-        if row["phase"] == "step":
-            seconds[row["frame"]] = min(row["seconds"], seconds.get(row["frame"], math.inf))
-    return seconds
+def _seconds(pair: tuple[Sequence[Row], Sequence[Row]]) -> list[dict[int, float]]:
+    """Of the steps of two runs, by frame."""
+    return [statistics.least((r["frame"], r["seconds"]) for r in run if r["phase"] == "step") for run in pair]
+
+
+def _ratios(ours: Mapping[int, float], theirs: Mapping[int, float]) -> dict[int, float]:
+    """How many times as long as theirs each frame's step takes."""
+    return {frame: taken / theirs[frame] for frame, taken in ours.items() if frame in theirs}
 
 
 def possible(runs: Sequence[Published]) -> list[Published]:

@@ -1,0 +1,79 @@
+"""What ablations and prices have in common: one run of a scene becomes a file of rows under `<folder>/ablation`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from harness.base import machine, rows
+from harness.base.errors import InputError
+from harness.base.workers import Limits, Lost, Tick
+from harness.config.sweep import RunSpec
+from harness.experiments.ablation.rows import SCHEMA
+from harness.experiments.failure import failure
+from harness.experiments.resume import Standing, standings
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class OfEffects(ABC):
+    """What a scene's effects come to in a run (`harness.experiments.core.Unit`)."""
+
+    run: RunSpec
+    folder: Path
+
+    @property
+    def path(self) -> Path:
+        """The file of rows."""
+        return self.folder / "ablation" / f"{self.run.label(machine.describe().id)}{self.suffix()}.parquet"
+
+    @property
+    def standing(self) -> Standing:
+        """Whether its rows are there."""
+        return standings({self.path: lambda row: True}, (), SCHEMA)[self.path]
+
+    @property
+    def work(self) -> float:
+        """See Unit."""
+        return 1.0
+
+    @property
+    def limits(self) -> Limits:
+        """Those of a run."""
+        return Limits(self.run.time_limit, self.run.memory_limit)
+
+    def do(self, tick: Tick) -> str:
+        """See Unit."""
+        try:
+            found = self.measured(tick)
+        except InputError:
+            raise
+        except Exception as error:  # a solver may fail in any way
+            told = failure(error)
+            found = self.unanswered(told["status"], told["reason"])
+        return self._written(found)
+
+    def lost(self, lost: Lost) -> str:
+        """See Unit."""
+        return self._written(self.unanswered(lost.status, str(lost)))
+
+    @abstractmethod
+    def suffix(self) -> str:
+        """What tells its file from others of the same run."""
+
+    @abstractmethod
+    def measured(self, tick: Tick) -> list[Row]:
+        """The rows. Raises what the solver raises."""
+
+    @abstractmethod
+    def unanswered(self, status: str, reason: str) -> list[Row]:
+        """The rows where there is no answer."""
+
+    def _written(self, found: list[Row]) -> str:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        rows.write(self.path, found, SCHEMA)
+        first = found[0]
+        return "ok" if any(row["status"] == "ok" for row in found) else f"{first['status']}: {first['reason']}"
