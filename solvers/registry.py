@@ -29,6 +29,10 @@ SOLVERS = {
     "runge-kutta-4": "solvers.methods.explicit:RungeKutta4",
     "tsitouras-5": "solvers.methods.explicit:Tsitouras5",
     "dormand-prince-8": "solvers.methods.explicit:DormandPrince8",
+    "baraff-witkin": "solvers.methods.linearised:BaraffWitkin",
+    "ros2": "solvers.methods.rosenbrock:Ros2",
+    "ros3p": "solvers.methods.rosenbrock:Ros3P",
+    "rodas": "solvers.methods.rosenbrock:Rodas",
 }
 
 OPTIONAL = {"eigen": "solvers.methods.eigen:EigenLocalGlobal"}

@@ -100,7 +100,8 @@ def rows_of_four(x: Positions, *, far: bool = False) -> NDArray[np.float64]:
 class Whole(Iterating):
     """A whole step as the only iterate, again and again."""
 
-    def __init__(self, p: Positions, v: Positions) -> None:
+    def __init__(self, p: Positions, v: Positions | None) -> None:
+        """v: at the step's end, None where it follows from the positions."""
         self.positions, self.velocity = p, v
 
     def advance(self) -> bool:

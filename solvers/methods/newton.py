@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from solvers.about import About, Reference
 from solvers.contact.touching import is_contact
 from solvers.core.bounds import is_bounded
+from solvers.core.definite import LEVELS, factorised
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
@@ -30,9 +31,6 @@ from solvers.problem import Positions, System
 
 if TYPE_CHECKING:
     from solvers.contact.settling import Settling
-
-_LEVELS = ((1.0, 0.0), (0.9, 0.0), (0.5, 0.0), (0.0, 0.0), *((0.0, 10.0**k) for k in range(-4, 9, 2)))
-"""What is kept of negative lateral parts, and what multiple of Q's diagonal is added: the first that factorises."""
 
 _SLIGHT = 1e-12
 """Of the steepest slope of a solve, what tells of a saddle where the exact Hessian has no factor."""
@@ -83,7 +81,7 @@ class NewtonMethod:
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
         """The gradient, the Hessian with its factorisation, and a solve with it."""
-        hessian, (keep, by) = step.hessian(at.positions), _LEVELS[-1]  # any other may have no factor to solve with
+        hessian, (keep, by) = step.hessian(at.positions), LEVELS[-1]  # any other may have no factor to solve with
         hessian.factorise(keep, by * self._diagonal)
         return {
             "gradient": lambda: step.gradient(at.positions),
@@ -94,7 +92,7 @@ class NewtonMethod:
     def _next(self, step: StepObjective, at: Point, steepest: float) -> tuple[Point, float]:
         """The point after `at`, and the steepest slope so far [J]."""
         hessian = step.hessian(at.positions)
-        level = next((k for k, (keep, by) in enumerate(_LEVELS) if hessian.factorise(keep, by * self._diagonal)), None)
+        level = factorised(hessian, self._diagonal)
         if level is None:
             return at._replace(stalled=True), steepest
         direction = -hessian.solve(at.gradient)
