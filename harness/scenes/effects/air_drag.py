@@ -43,7 +43,9 @@ class AirDrag(Model):
         if self.law == "linear":
             return Contribution(energies=(Energy.of_vertices(c),))
         force = _force(c, mass / time_step)
-        return Contribution(filters=(_quadratic(mass, c * time_step),), continuous=(Contribution(forces=(force,)),))
+        return Contribution(
+            filters=(_quadratic(mass, c * time_step),), continuous=lambda: Contribution(forces=(force,))
+        )
 
     @classmethod
     def called_for(cls, seen: Seen) -> str:

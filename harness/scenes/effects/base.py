@@ -5,7 +5,7 @@ An absent effect is an empty tuple: no flag, no branch, no allocation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -81,12 +81,12 @@ class Contribution:
     """Edges (m, 2) and triangles (f, 3) of the mesh that may not pass through each other, for whoever looks."""
     ends: tuple[str, ...] = ()
     """Why each unknown has to be where a step ends, in words."""
-    continuous: tuple[Contribution, ...] = field(default=())
-    """What does the same by forces and energies alone: for integrators that take forces at their unknowns."""
+    continuous: Callable[[], Contribution] | None = None
+    """Makes what does the same by forces and energies alone: for integrators that take forces at their unknowns."""
 
     def by(self, method: integrators.Any) -> Contribution:
         """What an integrator takes of it."""
-        return self.continuous[0] if self.continuous and not splits(method) else self
+        return self.continuous() if self.continuous and not splits(method) else self
 
     @property
     def empty(self) -> bool:

@@ -36,5 +36,7 @@ class EtherDrag(Model):
         def decay(v: Positions) -> Positions:
             return kept * v
 
-        drag = Energy.of_vertices(self.rate * mass)
-        return Contribution(filters=(decay,), continuous=(Contribution(energies=(drag,)),))
+        def drag() -> Contribution:
+            return Contribution(energies=(Energy.of_vertices(self.rate * mass),))
+
+        return Contribution(filters=(decay,), continuous=drag)
