@@ -81,12 +81,12 @@ class Contribution:
     """Edges (m, 2) and triangles (f, 3) of the mesh that may not pass through each other, for whoever looks."""
     ends: tuple[str, ...] = ()
     """Why each unknown has to be where a step ends, in words."""
-    continuous: Callable[[], Contribution] | None = None
+    continuous: tuple[Callable[[], Contribution], ...] = field(default=())
     """Makes what does the same by forces and energies alone: for integrators that take forces at their unknowns."""
 
     def by(self, method: integrators.Any) -> Contribution:
         """What an integrator takes of it."""
-        return self.continuous() if self.continuous and not splits(method) else self
+        return self.continuous[0]() if self.continuous and not splits(method) else self
 
     @property
     def empty(self) -> bool:

@@ -39,4 +39,4 @@ class EtherDrag(Model):
         def drag() -> Contribution:
             return Contribution(energies=(Energy.of_vertices(self.rate * mass),))
 
-        return Contribution(filters=(decay,), continuous=drag)
+        return Contribution(filters=(decay,), continuous=(drag,))
