@@ -42,10 +42,11 @@ class AirDrag(Model):
             return Contribution()
         if self.law == "linear":
             return Contribution(energies=(Energy.of_vertices(c),))
-        force = _force(c, mass / time_step)
-        return Contribution(
-            filters=(_quadratic(mass, c * time_step),), continuous=lambda: Contribution(forces=(force,))
-        )
+
+        def force() -> Contribution:
+            return Contribution(forces=(_force(c, mass / time_step),))
+
+        return Contribution(filters=(_quadratic(mass, c * time_step),), continuous=(force,))
 
     @classmethod
     def called_for(cls, seen: Seen) -> str:
