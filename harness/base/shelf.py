@@ -102,12 +102,12 @@ def parts(asked: Iterable[Path]) -> tuple[list[Part], list[int]]:
     alike: dict[bytes, list[tuple[str, int]]] = {}
     packed: dict[Path, dict[str, int]] = {}
     damaged: list[int] = []
-    own: dict[Path, set[str]] = {}
+    there: dict[Path, frozenset[str]] = {}
     for number, path in enumerate(asked):
         folder = path.parent
-        if folder not in own:
-            own[folder] = own_files(folder)
-        if path.stem not in own[folder] and path.stem in packed_units(folder):
+        if folder not in there:
+            there[folder] = packed_units(folder) - own_files(folder)
+        if path.stem in there[folder]:
             packed.setdefault(packed_file(folder), {})[path.stem] = number
         elif (kind := _kind(str(path))) is None:
             damaged.append(number)

@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
 
-import duckdb
 import numpy as np
 import pyarrow as pa
 from rich.box import SIMPLE_HEAD
@@ -18,6 +17,7 @@ from rich.table import Table
 
 from harness.report.page import quantity
 from harness.report.references import cited
+from harness.report.sql import answer
 
 
 class RunTimes(NamedTuple):
@@ -75,16 +75,14 @@ select run_id, any_value(scene), any_value("size"), any_value(solver), any_value
     arg_min(stopped, list_position(['iterations', 'stalled', 'tolerance', 'floor'], stopped)),
     arg_max(residual, frame) filter (phase = 'step'),
     max(largest_strain), max(strain_99), bool_or(interrupted) filter (phase = 'step'), bool_and(adds_up)
-from numbered group by run_id order by min(place)
+from rows_of group by run_id order by min(place)
 """
 
 
 def runs(table: pa.Table) -> list[RunTimes]:
     """The runs in a table of rows (schema: `harness.base.columns.SCHEMA`), in the order of their first rows."""
     numbered = table.append_column("place", pa.array(np.arange(len(table))))
-    with duckdb.connect() as connection:
-        connection.register("numbered", numbered)
-        return [RunTimes(*row) for row in connection.execute(_SUMMARY).fetchall()]
+    return [RunTimes(*row) for row in answer(_SUMMARY, numbered)]
 
 
 def labels(found: Sequence[RunTimes]) -> dict[str, str]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-import duckdb
 import pyarrow as pa
 
 from harness.report.site import script
 from harness.report.site.folders import Folder
+from harness.report.sql import answer
 
 _FIGURES = {
     "ms": "1e3 * median(seconds)",
@@ -40,7 +40,5 @@ def write(folder: Folder, table: pa.Table, data: Path, wanted: Collection[str]) 
             select run_id, frame, {inner} from rows_of
             where phase = 'step' and frame is not null and run_id in (select unnest($wanted)) group by run_id, frame
         ) select run_id, to_json({{'frame': list(frame order by frame), {outer}}}) from steps group by run_id"""
-    with duckdb.connect() as connection:
-        connection.register("rows_of", table)
-        for run, value in connection.execute(sql, {"wanted": list(wanted)}).fetchall():
-            script.write_text(data / "runs" / f"{run}.js", f"{folder.slug}/runs/{run}", value)
+    for run, value in answer(sql, table, {"wanted": list(wanted)}):
+        script.write_text(data / "runs" / f"{run}.js", f"{folder.slug}/runs/{run}", value)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -116,18 +117,18 @@ def _add_recorded(folder: Folder, home: Path, found: Sequence[dict[str, Any]], a
 
 def _without(folder: Folder, home: Path, found: Sequence[dict[str, Any]]) -> list[str]:
     """The runs whose script is missing, or older than their rows."""
-    scripts = {path.stem: path.stat().st_mtime_ns for path in (home / "runs").glob("*.js")}
+    scripts, rows_of = _written(home / "runs"), _written(folder.path / "rows")
     packed = shelf.packed_file(folder.path / "rows")
     otherwise = packed.stat().st_mtime_ns if packed.exists() else 0
-    wanted: list[str] = []
-    for run in found:
-        try:
-            made = (folder.path / "rows" / f"{run['unit']}.parquet").stat().st_mtime_ns
-        except OSError:
-            made = otherwise
-        if scripts.get(run["run_id"], -1) < made:
-            wanted.append(run["run_id"])
-    return wanted
+    return [r["run_id"] for r in found if scripts.get(r["run_id"], -1) < rows_of.get(r["unit"], otherwise)]
+
+
+def _written(folder: Path) -> dict[str, int]:
+    """When each file in a folder was written [ns], by their stems."""
+    if not folder.is_dir():
+        return {}
+    with os.scandir(folder) as entries:
+        return {os.path.splitext(entry.name)[0]: entry.stat().st_mtime_ns for entry in entries}
 
 
 def _parquet(path: Path, found: Sequence[dict[str, Any]]) -> None:

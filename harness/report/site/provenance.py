@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import duckdb
 import pyarrow as pa
 
 from harness.base.claim import NAME as CLAIM
+from harness.report.sql import answer
 
 _COLUMNS = ("machine", "cpu", "cores", "memory_gib", "system", "commit")
 
@@ -24,11 +24,8 @@ def made(table: pa.Table, unit: str) -> list[dict[str, Any]]:
     lacking = [name for name in (*_COLUMNS, "code", "started", unit) if name not in table.column_names]
     for name in lacking:
         table = table.append_column(name, pa.nulls(len(table), pa.string()))
-    with duckdb.connect() as connection:
-        connection.register("rows_of", table)
-        found = connection.execute(_MADE.format(unit=unit)).fetchall()
     names = (*_COLUMNS, "codes", "from", "to", "count")
-    return [dict(zip(names, row, strict=True)) for row in found]
+    return [dict(zip(names, row, strict=True)) for row in answer(_MADE.format(unit=unit), table)]
 
 
 def config_of(folder: Path) -> str:

@@ -8,8 +8,6 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-import duckdb
-import numpy as np
 import pyarrow as pa
 
 from harness.base import rows, shelf
@@ -17,6 +15,7 @@ from harness.report.references import bibtex, cited
 from harness.report.site.folders import Folder
 from harness.report.site.marks import drawn
 from harness.report.site.script import column
+from harness.report.sql import answers
 from harness.report.style import looks
 from harness.report.timing_table import labels, runs
 from solvers.registry import OPTIONAL, SOLVERS, load
@@ -39,7 +38,7 @@ select run_id, any_value(file) as unit, any_value(family) as family, any_value(r
     any_value(memory_gib) as memory, any_value("system") as os, any_value("commit") as "commit",
     any_value(code) as code, any_value(own) as own, any_value(started) as started, any_value(timing) as timing,
     any_value(versions) as versions
-from numbered group by run_id
+from rows_of group by run_id
 """
 
 
@@ -120,12 +119,7 @@ _SHOWN = (
 
 def _more(table: pa.Table) -> dict[str, Run]:
     """What the table of a sweep's end does not say of its runs, by their ids."""
-    numbered = table.append_column("place", pa.array(np.arange(len(table))))
-    with duckdb.connect() as connection:
-        connection.register("numbered", numbered)
-        answer = connection.execute(_MORE)
-        names = [column[0] for column in answer.description or ()]
-        return {row[0]: dict(zip(names[1:], row[1:], strict=True)) for row in answer.fetchall()}
+    return {run.pop("run_id"): run for run in answers(_MORE, table)}
 
 
 def _is_plain(solver: str, parameters: str | None) -> bool:

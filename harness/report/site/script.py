@@ -39,7 +39,7 @@ def numbers(values: Iterable[Any]) -> list[float | int | None]:
 
 def column(values: Sequence[Any]) -> Any:
     """A column as the page reads it: numbers as they are; words as a list of different ones, `of`, and where, `at`."""
-    if not any(isinstance(value, str) for value in values):
+    if str not in set(map(type, values)):
         return numbers(values)
     known = [word for word, _ in Counter(v for v in values if v is not None).most_common()]
     places = {word: k for k, word in enumerate(known)}
