@@ -10,6 +10,7 @@ import pytest
 from hypothesis import settings
 
 import harness  # noqa: F401  sets what Numba and OpenMP read when they load
+from tests import slow
 
 # What commands time in tests waits for no other's.
 _LOCKS = tempfile.TemporaryDirectory(prefix="springbench-locks-")
@@ -29,6 +30,17 @@ _NEEDS_NONE = ("worker", "bare_", "other_code", "damaged", "full_disk", "plugins
 sweeps, whose workers are forks as long as no thread of Numba runs."""
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--find-slow", type=float, metavar="SECONDS", help="write tests/slow.txt: what takes longer")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    limit: float | None = config.getoption("--find-slow")
+    if limit and not hasattr(config, "workerinput"):  # the test runner's processes report to the first
+        config.pluginmanager.register(slow.Finder(limit))
+
+
+@pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files go to the test runner's processes in this order, which its `--no-loadscope-reorder` keeps."""
 
@@ -39,6 +51,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return next((rank for rank, start in enumerate(_NEEDS_NONE) if name.startswith(start)), len(_NEEDS_NONE))
 
     items.sort(key=order)
+    slow.mark(items)
 
 
 def pytest_collection_finish() -> None:

@@ -25,7 +25,7 @@ OUTCOMES = Path(__file__).with_name("outcomes.json")
 LONGEST = 600.0
 """Seconds after which tests count as hanging, which is noticed too."""
 WHOLE = 3600.0
-PYTEST = ("-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-n", "0")
+PYTEST = ("-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-n", "0", "-m", "not long")
 CAUGHT, SURVIVED, BROKEN = "caught", "survived", "broken"
 
 

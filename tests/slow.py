@@ -1,0 +1,48 @@
+"""What takes long enough to be left to the CI: `slow.txt` names it, and a run of all tests finds it.
+
+    pytest -n 2 --dist loadfile -m 'not long' --find-slow 0.5      on an idle machine, with all kernels compiled
+
+A line is a test or a whole file. A file is, where tests share what takes long to make: the next of them would make it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent
+LIST = ROOT / "slow.txt"
+
+
+def named() -> frozenset[str]:
+    """The lines."""
+    return frozenset(LIST.read_text(encoding="utf-8").split("\n")) - {""}
+
+
+def mark(items: list[pytest.Item]) -> None:
+    """Mark the items that are named."""
+    slow = named()
+    for item in items:
+        if item.nodeid in slow or item.nodeid.partition("::")[0] in slow:
+            item.add_marker(pytest.mark.slow)
+
+
+class Finder:
+    """Adds up what each test takes, and writes the list in the end."""
+
+    def __init__(self, limit: float) -> None:
+        self._limit = limit
+        self._tests: dict[str, float] = {}
+        self._files: set[str] = set()
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        name = report.nodeid
+        if report.when == "setup" and report.duration > self._limit:
+            self._files.add(name.partition("::")[0])
+        self._tests[name] = self._tests.get(name, 0.0) + report.duration
+
+    def pytest_sessionfinish(self) -> None:
+        slow = {name for name, seconds in self._tests.items() if seconds > self._limit}
+        alone = {name for name in slow if name.partition("::")[0] not in self._files}
+        LIST.write_text("\n".join(sorted(self._files | alone)) + "\n", encoding="utf-8")
