@@ -25,13 +25,15 @@ class About:
 
     family: methods of one family share a colour; those of LOCAL_GLOBAL do the same iterations. own_steps: whether it
     integrates a frame in substeps of its own, whatever the integrator of the run. first: whether it is the one of its
-    family to take first.
+    family to take first. to_error: whether it is tried where an error is asked for: one with steps of its own chooses
+    them by their error (`within`), others minimise what an integrator with an error states.
     """
 
     family: str
     reference: Reference | None = None
     own_steps: bool = False
     first: bool = False
+    to_error: bool = False
 
 
 LIU_2013 = Reference(

@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from harness.base.files import replacing
 from harness.reference.frozen import Arrays, Frozen, agree, bind, freeze, moment_frames, reference_run, thaw
 from harness.reference.minimiser import MINIMUM, Minimum, Reference, find_minima, polish
-from harness.reference.motion import Field
+from harness.reference.motion import Field, Unintegrable
 from harness.reference.trajectory import Trajectory, integrate
 from harness.scenes.bind import Scene
 from harness.scenes.spec import IntegratorName, SceneSpec
@@ -93,10 +94,9 @@ class Store:
 
         It is the same for every time step of the scene. Raises InputError, Unintegrable, Unpredictable.
         """
-        scene = bind(spec, size)
+        scene, witness = _moving(spec, size)
         name = f"{spec.stepped(1.0).digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
         path = self.folder / f"trajectory-{name}.npz"
-        witness = Field(scene).witness()
         stored: dict[str, Any] = dict(_read(path)) if path.exists() else {}
         if stored and agree(stored.pop("witness"), witness):
             found = Trajectory(**stored)
@@ -134,6 +134,18 @@ class _Asked:
     def __init__(self, spec: SceneSpec, size: int, integrator: IntegratorName) -> None:
         self.scene: Scene = bind(spec, size, integrator)
         self.name = f"{spec.digest[:12]}-{size}-{integrator}"
+
+
+def _moving(spec: SceneSpec, size: int) -> tuple[Scene, NDArray[np.float64]]:
+    """A scene with equations of motion, and their witness; what is a filter without one is taken as a force."""
+    scene = bind(spec, size)
+    try:
+        return scene, Field(scene).witness()
+    except Unintegrable:
+        if not scene.filters:
+            raise
+    scene = bind(spec, size, "own")
+    return scene, Field(scene).witness()
 
 
 def _minima(arrays: Arrays) -> Reference:

@@ -8,17 +8,17 @@ Differential Equations II, section IV.8). An implicit step is a part 2^-level of
 of itself: so few factors are needed, those used last are kept (`FACTORS`), and the horizon is met exactly. It doubles
 where h' is twice as long; a control by proportion and integral, as the explicit methods have it, would not get there.
 What the solver of a step leaves undone is a part of the tolerance (`ALGEBRAIC`). Positions between steps are those of
-Hermite's cubic. Explicit methods choose their substeps within a frame, without factors.
+Hermite's cubic. Solvers with steps of their own choose them within a frame.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from math import ceil, inf, isfinite, log2
 from time import perf_counter
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -27,9 +27,7 @@ from harness.scenes.bind import Scene
 from harness.simulation.stages import Done, Stages
 from harness.simulation.step import FIRST_GUESSES, State, prepare, problem, start
 from solvers.integrators import Motion, RungeKutta
-from solvers.methods.explicit import PreparedExplicit
-from solvers.methods.explicit_tables import Tableau
-from solvers.problem import Positions, Prepared, Solution, Solver, StopRule, Unsupported
+from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule, Unsupported
 
 SAFETY, DECREASE, LEAST = 0.9, 0.1, 1e-10
 """Of the step that the error allows; what a step shrinks by at once, at most; ratios below count as this."""
@@ -144,7 +142,7 @@ class _Following:
         scene, _ = self._ladder.at(self._level)
         method = scene.integrator
         if not isinstance(method, RungeKutta) or not method.embedded:
-            raise Unsupported("the integrator tells no error of its steps; take esdirk-3, esdirk-4, sdirk-4 or tr-bdf2")
+            raise Unsupported("the integrator tells no error of its steps")
         if scene.filters:
             raise Unsupported("a filter of the velocity acts once a step, and no error tells of it")
         self._method, self._power = method, 1.0 + min(method.order, method.embedded)
@@ -247,10 +245,33 @@ def hermite(before: Motion, after: Motion, h: float, part: float) -> Positions:
     return p + s * (h * v + s * (3.0 * d - h * (2.0 * v + w) + s * (h * (v + w) - 2.0 * d)))
 
 
+@runtime_checkable
+class Controlled(Protocol):
+    """A prepared solver that can choose its steps within a frame by their error."""
+
+    @property
+    def order(self) -> int:
+        """Of the error."""
+        ...
+
+    @property
+    def evaluations(self) -> int:
+        """Of the forces, in a step."""
+        ...
+
+    def within(self, tolerance: float) -> Controlled:
+        """The same with an error of each step [m]. Raises Unsupported where it chooses none."""
+        ...
+
+    def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, Sequence[float]]:
+        """Positions [m] and velocities [m/s] at the frame's end, and steps accepted, rejected and the last one's length
+        [s]; h: the first one's."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
-class Explicit:
-    """By an explicit method that chooses its substeps within frames. scene: its step is a frame, its integrator
-    `own`."""
+class Own:
+    """By a solver that chooses its steps within frames. scene: its step is a frame, its integrator `own`."""
 
     scene: Scene
     solver: Solver
@@ -259,33 +280,40 @@ class Explicit:
     @property
     def order(self) -> int:
         """See Follower."""
-        return self._prepared(0.0).method.order
+        return self._prepared(1.0).order
 
     def follow(self, tolerance: float, *, limit: float = inf) -> Path:
-        """See Follower. Raises Unsupported as the solver does, and for what moves in a frame."""
+        """See Follower. Raises Unsupported as the solver does, and for what changes in a frame."""
         scene = self.scene
         ready, state = self._prepared(tolerance), start(scene)
         began = perf_counter()
-        seen, h, told = [state.now.positions], None, np.zeros((self.frames, 4))
+        seen, h, told = [state.now.positions], None, np.zeros((self.frames, 3))
         for k in range(self.frames):
             stated = problem(scene, state, "current")
             try:
-                p, v, told[k] = ready.step(stated, h)
+                p, v, each = ready.step(stated, h)
             except RuntimeError as error:
                 raise Stuck(f"frame {k + 1}, after {scene.time(k):.6g} s: {error}") from error
-            h, state = told[k, 2], State(Motion(p, v), None, k + 1)
+            told[k] = each[:3]
+            h, state = float(told[k, 2]), State(Motion(p, v), None, k + 1)
             seen.append(p)
             if perf_counter() - began > limit:
                 raise TooSlow
         accepted, rejected = (int(count) for count in told[:, :2].sum(axis=0))
-        evaluations = (accepted + rejected) * ready.method.evaluations
+        evaluations = (accepted + rejected) * ready.evaluations
         mean = scene.system.time_step * self.frames / accepted
         return Path(np.array(seen), accepted, rejected, 0, evaluations, (mean, mean), perf_counter() - began)
 
-    def _prepared(self, tolerance: float) -> PreparedExplicit:
-        if self.scene.forces or self.scene.moving:
-            raise Unsupported("explicit methods take moving pins and forces of place and time of order 1 here")
-        ready = self.solver.prepare(self.scene.system)
-        if not isinstance(ready, PreparedExplicit) or not isinstance(ready.method, Tableau) or not ready.tolerance:
-            raise Unsupported("the method chooses no steps by an error; take tsitouras-5 or dormand-prince-8")
-        return replace(ready, tolerance=tolerance)
+    def _prepared(self, tolerance: float) -> Controlled:
+        scene = self.scene
+        changes = [
+            what
+            for what, there in (("forces of place, speed and time", scene.forces), ("moving pins", scene.moving))
+            if there
+        ]
+        if changes:
+            raise Unsupported(f"takes {' and '.join(changes)} as even within a frame, which is of order 1")
+        ready = self.solver.prepare(scene.system)
+        if not isinstance(ready, Controlled):
+            raise Unsupported("the method chooses no steps by an error")
+        return ready.within(tolerance)

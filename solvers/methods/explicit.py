@@ -108,8 +108,8 @@ class _Controlled(Explicit):
         return self._prepared(system, 1, self.error)
 
 
-def _about(authors: str, year: int, title: str, doi: str = "", *, first: bool = False) -> About:
-    return About("explicit", Reference(authors, year, title, doi), own_steps=True, first=first)
+def _about(authors: str, year: int, title: str, doi: str = "") -> About:
+    return About("explicit", Reference(authors, year, title, doi), own_steps=True)
 
 
 _HAIRER = _about(
@@ -172,11 +172,14 @@ class Tsitouras5(_Controlled):
     """Tsitouras's pair of orders 5 and 4, six evaluations a substep."""
 
     name: ClassVar[str] = "tsitouras-5"
-    about: ClassVar[About] = _about(
-        "Tsitouras, Charalampos",
-        2011,
-        "Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying assumption",
-        "10.1016/j.camwa.2011.06.002",
+    about: ClassVar[About] = replace(
+        _about(
+            "Tsitouras, Charalampos",
+            2011,
+            "Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying assumption",
+            "10.1016/j.camwa.2011.06.002",
+        ),
+        to_error=True,
     )
     coefficients: ClassVar[Composition | Tableau] = TSITOURAS_5
 
@@ -186,7 +189,7 @@ class DormandPrince8(_Controlled):
     """Dormand and Prince's method of order 8 with errors of orders 5 and 3, twelve evaluations a substep."""
 
     name: ClassVar[str] = "dormand-prince-8"
-    about: ClassVar[About] = _HAIRER
+    about: ClassVar[About] = replace(_HAIRER, to_error=True)
 
     def method(self) -> Composition | Tableau:
         """The coefficients; SciPy has them."""
@@ -212,6 +215,22 @@ class PreparedExplicit(Iterative):
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """The whole step."""
         return Whole(*self.step(problem)[:2])
+
+    @property
+    def order(self) -> int:
+        """Of the error."""
+        return self.method.order
+
+    @property
+    def evaluations(self) -> int:
+        """Of the forces, in a substep."""
+        return self.method.evaluations
+
+    def within(self, tolerance: float) -> PreparedExplicit:
+        """The same with an error of each substep [m]. Raises Unsupported for substeps of one length."""
+        if isinstance(self.method, Composition) or not self.tolerance:
+            raise Unsupported("the method chooses no steps by an error")
+        return replace(self, tolerance=tolerance)
 
     def refined(self, times: int) -> PreparedExplicit:
         """The same with so many times the substeps."""

@@ -35,6 +35,7 @@ class Lbfgs(Windowed):
             "10.1145/2990496",
         ),
         first=True,
+        to_error=True,
     )
 
     def prepare(self, system: System) -> PreparedAccelerated:

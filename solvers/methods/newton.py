@@ -46,6 +46,7 @@ class Newton:
         "Newton",
         Reference("Nocedal, Jorge and Wright, Stephen J.", 2006, "Numerical Optimization", "10.1007/978-0-387-40065-5"),
         first=True,
+        to_error=True,
     )
 
     def prepare(self, system: System) -> PreparedDescent:

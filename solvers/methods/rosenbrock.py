@@ -126,11 +126,14 @@ class Rodas(_Linear):
 
     name: ClassVar[str] = "rodas"
     table: ClassVar[Rosenbrock] = RODAS
-    about: ClassVar[About] = _about(
-        "Hairer, Ernst and Wanner, Gerhard",
-        1996,
-        "Solving Ordinary Differential Equations II",
-        "10.1007/978-3-642-05221-7",
+    about: ClassVar[About] = replace(
+        _about(
+            "Hairer, Ernst and Wanner, Gerhard",
+            1996,
+            "Solving Ordinary Differential Equations II",
+            "10.1007/978-3-642-05221-7",
+        ),
+        to_error=True,
     )
 
 
@@ -176,6 +179,10 @@ class PreparedRosenbrock(Iterative):
     def evaluations(self) -> int:
         """Solves of a step."""
         return len(self.table.a)
+
+    def within(self, tolerance: float) -> PreparedRosenbrock:
+        """The same with steps by an error of each [m]."""
+        return replace(self, tolerance=tolerance)
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """The whole frame."""

@@ -17,23 +17,29 @@ from harness.config.load import load_scene
 from harness.experiments.accuracy.rows import SCHEMA
 from harness.experiments.asked.peers import PEERS, pattern
 from harness.experiments.asked.search import foresee, search
-from harness.experiments.asked.ways import Asked
+from harness.experiments.asked.ways import Asked, tried, ways
 from harness.reference.growth import growth
 from harness.reference.motion import Field
+from harness.reference.store import Store
 from harness.reference.trajectory import integrate
 from harness.scenes.bind import Scene, build
+from harness.scenes.effects.air_drag import AirDrag
 from harness.scenes.effects.dashpots import Dashpots
 from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.chain import Chain
 from harness.scenes.spec import SceneSpec
-from harness.simulation.controlled import Implicit, Stuck, hermite
+from harness.simulation.controlled import Implicit, Own, Stuck, hermite
 from solvers.integrators import Motion
 from solvers.methods.newton import Newton
+from solvers.methods.rosenbrock import Rodas
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 HELD = Pins(at=("first",), weight="exact")
+MOVED = Pins.model_validate(
+    {"at": ["first"], "weight": "exact", "motion": {"keys": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0]}]}}
+)
 END, FRAMES = 0.5, 10
 
 
@@ -139,6 +145,49 @@ def test_the_pattern_of_the_jacobian_holds_all_that_differs_from_zero():
     changes = np.array([field(0.0, y + step) - field(0.0, y) for step in 1e-4 * np.eye(24)]).T
     assert (found | (np.abs(changes) < 1e-14)).all()  # round-off of forces of some newtons
     assert not found.all()
+
+
+def test_ways_are_what_solvers_and_integrators_say_of_themselves():
+    assert set(tried()) == {
+        *(("esdirk-4", solver) for solver in ("lbfgs", "newton")),
+        *(("own", solver) for solver in ("tsitouras-5", "dormand-prince-8", "rodas")),
+    }
+
+
+@pytest.mark.parametrize(
+    ("effect", "what"),
+    [
+        (MOVED, "moving pins"),
+        (AirDrag(law="quadratic", coefficient=0.5), "forces of place, speed and time"),
+    ],
+)
+def test_methods_that_would_lose_their_order_are_named_with_the_reason(effect, what):
+    held = () if effect is MOVED else (HELD,)
+    told, asked = list[str](), Asked(chain(Springs(stretch=40.0), effect, *held), 5, 0.1, 2)
+    assert {way.integrator for way in ways(asked, told.append)} == {"esdirk-4"}
+    assert [line.split(":")[0].removeprefix("  not by ") for line in told] == [
+        "tsitouras-5",
+        "dormand-prince-8",
+        "rodas",
+    ]
+    assert all(what in line for line in told)
+
+
+def test_a_rosenbrock_method_keeps_to_an_error_that_is_asked_for():
+    truth = integrate(build(SWINGING, 5, "own"), [END])
+    scene = build(SWINGING, 5, "own")
+    coarse, fine = (Own(scene, Rodas(), FRAMES).follow(tolerance) for tolerance in (1e-3, 1e-6))
+    assert fine.accepted > coarse.accepted
+    assert truth.error(0, fine.positions[-1]) < 0.1 * truth.error(0, coarse.positions[-1])
+
+
+def test_drag_that_grows_with_the_square_of_the_speed_is_graded_too(tmp_path):
+    """As a force: where frames split, it is a filter, which has no equation of motion."""
+    spec = chain(Springs(stretch=40.0), AirDrag(law="quadratic", coefficient=0.5), HELD)
+    found = Store(tmp_path).trajectory(spec, 5, [0.1], error=1e-3)
+    asked = Asked(spec, 5, 0.1, 2)
+    path = Implicit(lambda h: asked.bound(h, "esdirk-4"), Newton(), asked.horizon, asked.frames).follow(1e-6)
+    assert found.error(0, path.positions[-1]) < 1e-3
 
 
 def test_contact_is_refused_before_anything_is_simulated():

@@ -37,9 +37,8 @@ from tests.scenes import cloth
 
 ROOT = Path(__file__).resolve().parents[2]
 
-DEFAULTS = {"numba", "hybrid", "newton"} | {"lbfgs", "tsitouras-5", "dormand-prince-8"}
-"""Solvers that run where nobody says which, or that judge others, and those that are tried where an error is asked for:
-all that is known by name, and in no report."""
+DEFAULTS = {"numba", "hybrid", "newton"}
+"""Solvers that run where nobody says which, or that judge others: all that is known by name, and in no report."""
 
 SCENE = """
 mesh: {kind: chain, length: 2.0}

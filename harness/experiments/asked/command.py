@@ -10,7 +10,7 @@ from typing import Any
 
 from harness.base import machine, rows
 from harness.base.claim import claimed
-from harness.base.errors import InputError, Mistake
+from harness.base.errors import InputError, Mistake, RunFailed
 from harness.base.stated import stated
 from harness.config.load import load_scene
 from harness.experiments.accuracy.rows import SCHEMA
@@ -22,6 +22,7 @@ from harness.experiments.provenance import provenance
 from harness.experiments.run import save_positions
 from harness.record.base import Frame, RecordingInfo
 from harness.record.rerun import RerunRecorder
+from solvers.problem import Positions
 
 Say = Callable[[str], None]
 _SHARED = ("sweep", "scene", "size", "vertices", "threads", "horizon", "asked")
@@ -62,11 +63,7 @@ def run_to_error(
         + (f"; more exact than asked, for {answer.note}" if answer.note else "")
     )
     say(f"choosing, and a closer motion for the estimate, took {answer.seconds:.3g} s besides")
-    measured = None
-    if check:
-        trajectory = references(results).trajectory(asked.scene, asked.size, [asked.horizon], error=error)
-        measured = trajectory.error(-1, path.positions[-1])
-        say(f"by the reference it errs by {measured:.2g}, {'as' if measured <= error else 'not as'} asked")
+    measured = _checked(asked, error, path.positions[-1], results, say) if check else None
     label = f"{config.stem}-{asked.size}-asked-{error:g}-{asked.horizon:g}"
     recording = _record(folder / "recordings" / f"{label}.rrd", config.stem, asked, answer)
     row = _row(config.stem, asked, error, answer) | {"error": measured, "recording": f"recordings/{recording.name}"}
@@ -76,7 +73,19 @@ def run_to_error(
     if positions:
         save_positions(positions, path.positions[1:])
     say(f"the row is in {folder / 'accuracy'}, the recording is {recording}")
-    return measured is None or measured <= error
+    return not check or (measured is not None and measured <= error)
+
+
+def _checked(asked: Asked, error: float, p: Positions, results: Path, say: Say) -> float | None:
+    """The error of the end p (n, 3) [m] by the reference, told; None where that cannot grade it."""
+    try:
+        trajectory = references(results).trajectory(asked.scene, asked.size, [asked.horizon], error=error)
+    except RunFailed as failed:
+        say(f"the reference cannot grade it: {failed}")
+        return None
+    measured = trajectory.error(-1, p)
+    say(f"by the reference it errs by {measured:.2g}, {'as' if measured <= error else 'not as'} asked")
+    return measured
 
 
 def _require(error: float, horizon: float | None, others: Mapping[str, Any]) -> None:

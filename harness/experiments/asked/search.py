@@ -90,7 +90,7 @@ class _Search:
     def answer(self) -> Answer:
         self._say("ways to the error:")
         tolerance = 0.2 * self._error * self._seen.scale
-        raced = self._race(ways(self._asked), tolerance)
+        raced = self._race(ways(self._asked, self._say), tolerance)
         closer = self._closer(raced)
         graded = sorted((self._graded(one, closer) for one in raced), key=self._promise)
         for one in graded:

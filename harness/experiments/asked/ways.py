@@ -1,7 +1,8 @@
-"""Ways to follow a motion to an error: explicit pairs, and implicit ones with the solvers of their steps."""
+"""Ways to follow a motion to an error: solvers with steps of their own, and integrators with solvers of their steps."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from harness.base.errors import InputError, RunFailed
@@ -9,18 +10,11 @@ from harness.config.load import misfits
 from harness.reference.frozen import bind
 from harness.scenes.bind import Scene
 from harness.scenes.spec import SceneSpec
-from harness.simulation.controlled import Explicit, Follower, Implicit
+from harness.simulation.controlled import Follower, Implicit, Own
 from solvers.contact.touching import without_contact
+from solvers.integrators import INTEGRATORS, RungeKutta
 from solvers.problem import NotPositiveDefinite, Unsupported
-from solvers.registry import SOLVERS, load
-
-TRIED = (
-    ("own", "tsitouras-5"),
-    ("own", "dormand-prince-8"),
-    ("esdirk-4", "lbfgs"),
-    ("esdirk-4", "newton"),
-)
-"""Integrators and solvers: those that were the cheapest of their kind for some scene and error."""
+from solvers.registry import SOLVERS, about, load
 
 _ONCE = 1e-2
 """Of the mesh's size: the tolerance of what only compiles."""
@@ -78,16 +72,27 @@ class Way:
         return self.solver if self.integrator == "own" else f"{self.integrator} with {self.solver}"
 
 
-def ways(asked: Asked) -> list[Way]:
-    """Those that know the scene, warmed up: what they compile counts against nobody. Raises RunFailed for none."""
+def tried() -> list[tuple[str, str]]:
+    """Integrators and solvers by name: those that choose their own steps, and those that minimise what the integrator
+    with an error states that has the highest order, and the highest of its stages."""
+    pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded}
+    best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].starts))
+    told = {name: about(load(target), name) for name, target in SOLVERS.items()}
+    return [("own" if one.own_steps else best, name) for name, one in told.items() if one.to_error]
+
+
+def ways(asked: Asked, say: Callable[[str], None]) -> list[Way]:
+    """Those that know the scene, warmed up: what they compile counts against nobody; others are told, with the reason.
+    Raises RunFailed for none."""
     found, reasons = list[Way](), list[str]()
-    for integrator, solver in TRIED:
+    for integrator, solver in tried():
         way = Way(integrator, solver, _follower(asked, integrator, solver))
         try:
             _warm(asked, integrator, solver)
             found.append(way)
         except (Unsupported, NotPositiveDefinite) as error:
-            reasons.append(f"{way}: {error}")
+            reasons.append(f"{way}: {str(error).removeprefix(f'{solver}: ')}")
+            say(f"  not by {reasons[-1]}")
     if not found:
         raise RunFailed(f"no method that keeps to an error knows this scene: {'; '.join(reasons)}")
     return found
@@ -96,7 +101,7 @@ def ways(asked: Asked) -> list[Way]:
 def _follower(asked: Asked, integrator: str, solver: str, frames: int | None = None) -> Follower:
     made, frames = load(SOLVERS[solver])(), frames or asked.frames
     if integrator == "own":
-        return Explicit(asked.bound(asked.frame, integrator), made, frames)
+        return Own(asked.bound(asked.frame, integrator), made, frames)
     return Implicit(lambda h: asked.bound(h, integrator), made, asked.frame * frames, frames)
 
 
