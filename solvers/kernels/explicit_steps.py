@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 from solvers.kernels.springs import Bundles, add_descent
+from solvers.memory import aligned
 from solvers.problem import Positions
 
 FEWEST, LARGEST, CAUTION = 0.2, 5.0, 0.9
@@ -98,30 +99,66 @@ def compose(forces, drifts, kept, gained, count, h, p, v, acceleration):
                         v[c] = kept[k, i] * v[c] + gained[k, i] * acceleration[c]
 
 
+class Stages(NamedTuple):
+    """A Runge-Kutta method: a (s, s), rows of the tableau, the last of which ends the step; times (s,): c; errors
+    (1 or 2, s): weights of the error, the second one that of a lower order which tempers it; power: the error falls by
+    h^power, 0 keeps h."""
+
+    a: Array
+    times: Array
+    errors: Array
+    power: float
+
+
+class Steps(NamedTuple):
+    """How a frame [s] is cut: tolerance [m]: of each step, root mean square; most: how many may be tried; first [s]."""
+
+    frame: float
+    tolerance: float
+    most: float
+    first: float
+
+
+class Scratch(NamedTuple):
+    """The motion at a stage, q [m] and w [m/s], and q' and w' at all of them, (s, rows)."""
+
+    q: Array
+    w: Array
+    speeds: Array
+    pulls: Array
+
+    @classmethod
+    def of(cls, stages: int, rows: int) -> Scratch:
+        """Memory for so many numbers of positions."""
+        return cls(aligned(rows), aligned(rows), *np.zeros((2, stages, rows)))
+
+
 @inner
-def _stage(forces, a, s, h, p, v, speeds, pulls, q, w):
-    """Write the motion of stage s to q and w."""
+def _stage(stages, s, h, p, v, at):
+    """Write the motion of stage s to `at`."""
     for i in range(len(p)):
-        q[i], w[i] = p[i], v[i]
+        at.q[i], at.w[i] = p[i], v[i]
     for j in range(s):
-        if a[j] != 0.0:
+        a = stages.a[s, j]
+        if a != 0.0:
             for i in range(len(p)):
-                q[i] += h * a[j] * speeds[j, i]
-                w[i] += h * a[j] * pulls[j, i]
+                at.q[i] += h * a * at.speeds[j, i]
+                at.w[i] += h * a * at.pulls[j, i]
 
 
 @inner
-def _evaluate(forces, s, q, w, speeds, pulls):
-    pull(forces, q, pulls[s])
+def _evaluate(forces, s, q, w, at):
+    """Write q' and w' of stage s to `at`."""
+    pull(forces, q, at.pulls[s])
     for i in range(len(forces.inverse)):
         for c in range(4 * i, 4 * i + 3):
-            pulls[s, c] -= forces.drag[i] * w[c]
+            at.pulls[s, c] -= forces.drag[i] * w[c]
     for i in range(len(q)):
-        speeds[s, i] = w[i]
+        at.speeds[s, i] = w[i]
 
 
 @inner
-def _size(forces, weights, span, speeds, pulls):
+def _squares(forces, weights, span, at):
     """The sum of squares of an error by its weights: of positions, and of velocities by what they move in `span`."""
     total = 0.0
     for i in range(len(forces.inverse)):
@@ -129,44 +166,50 @@ def _size(forces, weights, span, speeds, pulls):
             for c in range(4 * i, 4 * i + 3):
                 x = y = 0.0
                 for j in range(len(weights)):
-                    x += weights[j] * speeds[j, c]
-                    y += weights[j] * pulls[j, c]
+                    x += weights[j] * at.speeds[j, c]
+                    y += weights[j] * at.pulls[j, c]
                 total += x * x + span * span * y * y
     return total
 
 
-@kernel
-def integrate(forces, a, times, errors, power, tolerance, most, span, frame, h, p, v, q, w, speeds, pulls, told):
-    """A frame [s] by a Runge-Kutta method whose steps keep an error at most `tolerance` [m], root mean square.
+@inner
+def _error(forces, errors, span, at):
+    """The sum of squares of a step's error; of two estimates the second one tempers the first."""
+    size = _squares(forces, errors[0], span, at)
+    if len(errors) == 1:
+        return size
+    other = _squares(forces, errors[1], span, at)
+    return size * size / (size + 0.01 * other) if size > 0.0 else 0.0
 
-    a (s, s): rows of the tableau, the last of which ends the step; times (s,): c; errors (1 or 2, s): weights of the
-    error, the second one that of a lower order which tempers it; power: the error falls by h^power, 0 keeps h; most:
-    how many steps may be tried; span [s]: by what velocities count; h: to begin with; q, w: scratch; speeds, pulls:
-    scratch (s, rows); told: takes the steps accepted, those rejected, the last step [s] and the time reached [s].
+
+@kernel
+def integrate(forces, stages, steps, p, v, at, told):
+    """A frame by a Runge-Kutta method whose steps keep to an error; an error of velocity counts by what it moves in the
+    frame.
+
+    p [m], v [m/s]: take the result; at: scratch; told: takes the steps accepted, those rejected, the last step [s] and
+    the time reached [s].
     """
     free = 0
     for i in range(len(forces.inverse)):
         free += 3 * (forces.inverse[i] != 0.0)
-    t, before, stages = 0.0, 1.0, len(a)
+    frame, power, end = steps.frame, stages.power, len(stages.a) - 1
+    t, before, h = 0.0, 1.0, steps.first
     told[0] = told[1] = 0.0
-    _evaluate(forces, 0, p, v, speeds, pulls)
+    _evaluate(forces, 0, p, v, at)
     while t < frame:
         last = t + 1.0000001 * h >= frame
         step = frame - t if last else h
-        for s in range(1, stages):
-            _stage(forces, a[s], s, step, p, v, speeds, pulls, q, w)
-            carry(forces, (t + times[s] * step) / frame, q)
-            _evaluate(forces, s, q, w, speeds, pulls)
-        size = _size(forces, errors[0], span, speeds, pulls)
-        if len(errors) > 1:
-            other = _size(forces, errors[1], span, speeds, pulls)
-            size = size * size / (size + 0.01 * other) if size > 0.0 else 0.0
-        error = step * np.sqrt(size / max(1, free)) / tolerance
+        for s in range(1, end + 1):
+            _stage(stages, s, step, p, v, at)
+            carry(forces, (t + stages.times[s] * step) / frame, at.q)
+            _evaluate(forces, s, at.q, at.w, at)
+        error = step * np.sqrt(_error(forces, stages.errors, frame, at) / max(1, free)) / steps.tolerance
         if error <= 1.0:
             t = frame if last else t + step
             for i in range(len(p)):
-                p[i], v[i] = q[i], w[i]
-                speeds[0, i], pulls[0, i] = speeds[stages - 1, i], pulls[stages - 1, i]
+                p[i], v[i] = at.q[i], at.w[i]
+                at.speeds[0, i], at.pulls[0, i] = at.speeds[end, i], at.pulls[end, i]
             told[0] += 1.0
             if power > 0.0:  # by proportion and integral (Hairer and Wanner, section IV.2)
                 change = CAUTION * max(error, 1e-10) ** (-0.7 / power) * before ** (0.4 / power)
@@ -176,6 +219,6 @@ def integrate(forces, a, times, errors, power, tolerance, most, span, frame, h, 
             told[1] += 1.0
             known = power > 0.0 and error < np.inf
             h = step * (max(FEWEST, CAUTION * error ** (-1.0 / power)) if known else FEWEST)
-        if h < FLOOR * frame or told[0] + told[1] >= most:
+        if h < FLOOR * frame or told[0] + told[1] >= steps.most:
             break
     told[2], told[3] = h, t

@@ -21,8 +21,7 @@ from solvers.about import About, Reference
 from solvers.core import vertex_terms
 from solvers.core.driver import Iterating, Iterative
 from solvers.core.forces import Parts, Whole, frequency, rows_of_four
-from solvers.kernels.explicit_steps import Forces, compose, integrate
-from solvers.memory import aligned
+from solvers.kernels.explicit_steps import Forces, Scratch, Stages, Steps, compose, integrate
 from solvers.methods.explicit_tables import (
     BLANES_MOAN_4,
     BLANES_MOAN_6,
@@ -273,14 +272,13 @@ class PreparedExplicit(Iterative):
         h: float | None,
         told: NDArray[np.float64],
     ) -> None:
-        frame, rows = self.system.time_step, np.zeros((2, len(method.a), len(p)))
-        fixed = not self.tolerance
+        frame, fixed = self.system.time_step, not self.tolerance
         first = frame / self.substeps if fixed else min(frame, h or (1.0 / self.rate if self.rate else frame))
         errors = np.zeros((1, len(method.a))) if fixed else method.errors
         most = self.substeps if fixed else _TRIED * self.substeps + 10_000
-        whole = (self.tolerance or 1.0, float(most), frame, frame, first)
-        q, w = aligned(len(p)), aligned(len(p))
-        integrate(forces, method.a, method.times, errors, method.power, *whole, p, v, q, w, *rows, told)
+        steps = Steps(frame, self.tolerance or 1.0, float(most), first)
+        stages = Stages(method.a, method.times, errors, method.power)
+        integrate(forces, stages, steps, p, v, Scratch.of(len(method.a), len(p)), told)
         if told[3] < frame:
             raise RuntimeError(
                 f"the error of {self.tolerance:.3g} m was not kept within {told[0] + told[1]:.0f} steps, the last of "
