@@ -159,8 +159,8 @@ COLUMNS = (
         "intersections",
         _INT,
         "",
-        "edges that pass through triangles of the mesh after the step, told exactly by code that no solver shares; "
-        "null without self-contact",
+        "edges that pass through triangles of the mesh, or of what it may not pass through, after the step, told "
+        "exactly by code that no solver shares; null where no effect sees to that",
     ),
     Column("digest", _TEXT, "", "SHA-256 of the positions after the step (float64 bytes)"),
     Column(

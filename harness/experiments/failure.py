@@ -10,6 +10,7 @@ from harness.base.blame import where
 from harness.base.errors import RunFailed
 from harness.base.files import CannotWrite
 from harness.simulation.measure import Diverged, StepFailed
+from solvers.core.clearing import Blocked
 from solvers.problem import NotPositiveDefinite, Unsupported
 
 _STATUS: dict[type[BaseException], str] = {Unsupported: "unsupported", Diverged: "diverged"}
@@ -27,6 +28,6 @@ def failure(error: BaseException, own: Collection[Path] = ()) -> dict[str, Any]:
 
 def _reason(error: BaseException, own: Collection[Path]) -> str:
     """An error of ours speaks for itself; of any other the row also says what it was and where it came from."""
-    if isinstance(error, (Unsupported, NotPositiveDefinite, Diverged, RunFailed)):
+    if isinstance(error, (Unsupported, NotPositiveDefinite, Blocked, Diverged, RunFailed)):
         return str(error)
     return f"{type(error).__name__}: {error} ({where(error, set(map(str, own)))})"

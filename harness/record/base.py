@@ -14,7 +14,7 @@ from harness.scenes.mesh.base import Mesh
 from solvers.problem import Positions
 
 if TYPE_CHECKING:
-    from harness.scenes.obstacles import AnyObstacle
+    from harness.scenes.shapes import AnySurface
 
 
 LAYOUT = 2
@@ -61,7 +61,7 @@ class RecordingInfo:
     strain_range: float
     properties: Mapping[str, str | int | float | bool]
     iterates: bool = False
-    obstacles: Sequence[AnyObstacle] = ()
+    obstacles: Sequence[AnySurface] = ()
 
 
 class Recorder(Protocol):

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:  # a scene without obstacles imports none of them
     from harness.scenes.effects.base import Effect
     from harness.scenes.motion import Motion
-    from harness.scenes.obstacles import AnyObstacle, Box, Capsule, Plane, Sphere
+    from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
+    from harness.scenes.shapes import AnySurface, Solid
 
 Array = NDArray[np.float64]
 
@@ -27,12 +28,12 @@ _AROUND = 2.0
 """Half the side of what is drawn of a plane, in the mesh's size and distance."""
 
 
-def listed(effects: Iterable[Effect]) -> tuple[AnyObstacle, ...]:
+def listed(effects: Iterable[Effect]) -> tuple[AnySurface, ...]:
     """What a scene's effects keep its mesh out of: to be seen beside it."""
     return tuple(one for effect in effects for one in getattr(effect, "obstacles", ()))
 
 
-def declared(obstacles: Sequence[AnyObstacle]) -> dict[str, str]:
+def declared(obstacles: Sequence[AnySurface]) -> dict[str, str]:
     """The property of a recording with these obstacles; none where there are none."""
     return {KEY: f"[{', '.join(one.model_dump_json(exclude_none=True) for one in obstacles)}]"} if obstacles else {}
 
@@ -40,7 +41,7 @@ def declared(obstacles: Sequence[AnyObstacle]) -> dict[str, str]:
 class Obstacles:
     """Obstacles beside a mesh at rest (n, 3) [m], in an open recording."""
 
-    def __init__(self, stream: rr.RecordingStream, obstacles: Sequence[AnyObstacle], rest: Array) -> None:
+    def __init__(self, stream: rr.RecordingStream, obstacles: Sequence[AnySurface], rest: Array) -> None:
         self._stream = stream
         self._moving: list[tuple[str, Motion]] = []
         for k, one in enumerate(obstacles):
@@ -94,9 +95,24 @@ def _plane(one: Plane, rest: Array) -> rr.Mesh3D:
     )
 
 
+def _mesh(one: Solid, rest: Array) -> rr.Mesh3D:
+    """Every triangle with points of its own: edges stay sharp."""
+    points, triangles = one.shape()
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return rr.Mesh3D(
+        vertex_positions=corners.reshape(-1, 3),
+        triangle_indices=np.arange(corners.size // 3).reshape(-1, 3),
+        vertex_normals=np.repeat(normals, 3, axis=0),
+        vertex_colors=[_COLOUR] * (corners.size // 3),
+    )
+
+
 _SHAPES: dict[str, Callable[[Any, Array], rr.AsComponents]] = {
     "sphere": _sphere,
     "capsule": _capsule,
     "box": _box,
     "plane": _plane,
+    "mesh": _mesh,
 }

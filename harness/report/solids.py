@@ -15,7 +15,8 @@ from harness.record.base import Replay
 from harness.record.obstacles import KEY
 
 if TYPE_CHECKING:  # a recording without obstacles imports none of them
-    from harness.scenes.obstacles import AnyObstacle, Box, Capsule, Plane, Sphere
+    from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
+    from harness.scenes.shapes import AnySurface, Solid
 
 _LEVEL = 0.999
 """Planes whose normal is as upright as this are the ground, which pictures show by the shadow on it."""
@@ -25,7 +26,7 @@ def solids(replay: Replay, frame: int) -> list[pv.PolyData]:
     """The obstacles of a recording, where they are in a recorded frame."""
     if KEY not in replay.properties:
         return []
-    from harness.scenes.obstacles import from_json
+    from harness.scenes.shapes import from_json
 
     time, seen = float(replay.times[frame]), replay.positions[frame]
     made = (solid(one, time, seen) for one in from_json(str(replay.properties[KEY])))
@@ -37,7 +38,7 @@ def seen(replay: Replay, frames: Iterable[int]) -> NDArray[np.float32]:
     return np.concatenate([p for k in frames for p in (replay.positions[k], *(s.points for s in solids(replay, k)))])
 
 
-def solid(obstacle: AnyObstacle, time: float, seen: NDArray[np.floating]) -> pv.PolyData | None:
+def solid(obstacle: AnySurface, time: float, seen: NDArray[np.floating]) -> pv.PolyData | None:
     """The obstacle at a time [s]; of a plane the part below the points `seen` (q, 3) [m]; None for the level ground."""
     made = _MADE[obstacle.kind](obstacle, seen)
     if made is not None and obstacle.motion is not None:
@@ -72,9 +73,15 @@ def _plane(one: Plane, seen: NDArray[np.floating]) -> pv.PolyData | None:
     return pv.Plane(center=middle, direction=normal, i_size=side, j_size=side)
 
 
+def _mesh(one: Solid, seen: NDArray[np.floating]) -> pv.PolyData:
+    points, triangles = one.shape()
+    return pv.PolyData.from_regular_faces(points, triangles)
+
+
 _MADE: dict[str, Callable[[Any, NDArray[np.floating]], pv.PolyData | None]] = {
     "sphere": _sphere,
     "capsule": _capsule,
     "box": _box,
     "plane": _plane,
+    "mesh": _mesh,
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ from solvers.integrators import IMPLICIT_EULER, find
 from solvers.matrices import assemble
 from solvers.problem import NotPositiveDefinite, Pins, Positions, ProjectiveEnergy, System
 
+if TYPE_CHECKING:  # for those who have any
+    from harness.scenes.intersections import Apart
+
 _LOG = logging.getLogger("springbench")
 AT_REST = Rest()
 LONG = 1.0
@@ -36,7 +40,7 @@ class Scene:
     pin_targets: (q, 3) [m], in the order of `system.pins`; moving: which of them move, and how;
     velocity: of every vertex at the start [m/s], less the start's spin; integrator: its factor and speed are the
     system's;
-    apart: edges (m, 2) and triangles (f, 3) that may not pass through each other, none without self-contact;
+    apart: what may not pass through what, nothing without an effect that sees to it;
     alternate: the same in every second step, where that is of another length.
     """
 
@@ -50,7 +54,7 @@ class Scene:
     integrator: integrators.Any = IMPLICIT_EULER
     moving: tuple[tuple[NDArray[np.int64], Motion], ...] = ()
     start: Rest = AT_REST
-    apart: tuple[NDArray[np.int64], ...] = ()
+    apart: tuple[Apart, ...] = ()
     alternate: Scene | None = None
 
     def at(self, index: int) -> Scene:
@@ -121,7 +125,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
         integrator=method,
         moving=moving,
         start=start,
-        apart=next((part.apart for part in parts if part.apart), ()),
+        apart=tuple(one for part in parts for one in part.apart),
         alternate=None if other in (None, spec.time_step) else build(spec.stepped(other), size, integrator),
     )
 

@@ -1,4 +1,5 @@
-"""Whether a mesh passes through itself: edges against triangles, told exactly, by code that no solver shares.
+"""Whether meshes pass through themselves or each other: edges against triangles, told exactly, by code that no solver
+shares.
 
 Two convex bodies are apart where an axis separates them. For an edge and a triangle the axes to try are the normal,
 the products of the edge with the sides, and in the plane those across the sides and across the edge: where one of them
@@ -8,7 +9,8 @@ shows a gap beyond round-off, they are apart. What is left is decided in rationa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise, product
 from typing import Any
@@ -26,6 +28,20 @@ _ROUND = 64.0 * np.finfo(np.float64).eps
 
 _AT_ONCE = 200_000
 """Pairs that are looked at together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Apart:
+    """What may not pass through what: edges (m, 2) through triangles (f, 3) of a mesh, each pair once, by vertices of
+    the mesh and of what follows them: beside, where that is at a time [s], (o, 3) [m]."""
+
+    pairs: tuple[tuple[Indices, Indices], ...]
+    beside: Callable[[float], Array] | None = None
+
+    def crossings(self, p: Array, time: float) -> list[Crossing]:
+        """The edges that meet triangles at positions p (n, 3) [m] of the mesh at a time [s]."""
+        every = p if self.beside is None else np.concatenate([p, self.beside(time)])
+        return [found for edges, triangles in self.pairs for found in crossings(every, edges, triangles)]
 
 
 def crossings(p: Array, edges: Indices, triangles: Indices) -> list[Crossing]:

@@ -63,6 +63,12 @@ class Motion(Model):
         arm = points - self.about
         return points + offset + arm @ (_rotation(self.axis, np.deg2rad(turn)) - np.eye(3)).T
 
+    def back(self, points: Positions, time: float) -> Positions:
+        """Where points that are at (q, 3) [m] at a time [s] were declared."""
+        *offset, turn = self._at(time)
+        arm = points - offset - self.about
+        return points - offset + arm @ (_rotation(self.axis, np.deg2rad(turn)) - np.eye(3))
+
     def velocity(self, points: Positions, time: float) -> Positions:
         """How fast points declared at (q, 3) [m] move at a time [s], and right after it at a key, (q, 3) [m/s]."""
         (*offset, rise), (*_, turn) = self._slope(time), self._at(time)

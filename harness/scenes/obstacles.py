@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PositiveFloat, TypeAdapter, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from harness.base.model import Model, Vector
 from harness.scenes.motion import Motion
@@ -115,11 +115,6 @@ class Box(_Moving):
 
 
 AnyObstacle = Annotated[Plane | Sphere | Capsule | Box, Field(discriminator="kind")]
-
-
-def from_json(text: str) -> tuple[AnyObstacle, ...]:
-    """The obstacles that a recording declares. Raises ValueError."""
-    return TypeAdapter(tuple[AnyObstacle, ...]).validate_json(text)
 
 
 def _about(direction: Vector) -> Array:

@@ -50,7 +50,7 @@ def observe(
 
     def look(step: Step, residual: float) -> None:
         p, s = step.positions, step.solution
-        crossed = intersections(scene, p)
+        crossed = intersections(scene, p, scene.time(step.index))
         terms = step.problem.terms(s.positions)
         found[step.index] = {
             **{f"energy_{name}": terms[name] for name in _OWN if name in terms},
@@ -115,13 +115,10 @@ def penetration(scene: Scene, p: Positions, time: float) -> float | None:
     return float(max(inside)) if inside else None
 
 
-def intersections(scene: Scene, p: Positions) -> int | None:
-    """How often the mesh passes through itself at p (n, 3) [m], by edges and triangles; None without self-contact."""
-    if not scene.apart:
-        return None
-    from harness.scenes.intersections import crossings  # for those who need it
-
-    return len(crossings(p, *scene.apart))
+def intersections(scene: Scene, p: Positions, time: float) -> int | None:
+    """How often the mesh passes through itself or an obstacle's surface at p (n, 3) [m] and a time [s], by edges and
+    triangles; None where no effect sees to that."""
+    return sum(len(one.crossings(p, time)) for one in scene.apart) if scene.apart else None
 
 
 def returned_residual(prepared: Prepared, step: Step) -> float:

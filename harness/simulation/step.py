@@ -8,7 +8,7 @@ from functools import reduce
 
 from harness.scenes.bind import Scene
 from harness.simulation.stages import Stages, require_mass
-from solvers.core.bounds import begun_free
+from solvers.core.clearing import begun_free
 from solvers.integrators import IMPLICIT_EULER, Integrator, Motion
 from solvers.problem import Positions, Prepared, Solution, Solver, Start, StepProblem, StopRule, System, Unsupported
 

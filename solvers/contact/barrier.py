@@ -82,6 +82,19 @@ def _gap(pairs, e, p):
     return (d / pairs.scale[e] - pairs.thickness) / pairs.reach
 
 
+def distances(pairs: Pairs, p: Array) -> Array:
+    """Of each pair at p (n, 3) [m]."""
+    out = np.empty(len(pairs.vertices))
+    _distances(pairs, p, out)
+    return out
+
+
+@kernel
+def _distances(pairs, p, out):
+    for e in range(len(pairs.vertices)):
+        out[e] = distance(p, pairs.vertices[e], e >= pairs.points)
+
+
 @kernel
 def value(pairs, p):
     """The energy [J] at p (n, 3); infinite where a gap is closed."""
@@ -148,6 +161,22 @@ def active(pairs, p, reach, out):
             out[count] = e
             count += 1
     return count
+
+
+@kernel
+def press(pairs, which, p, weights, ways, force):
+    """Write c (a, 4), z (a, 3) and -f' (a,) [N] of the pairs `which` (a,) at p (n, 3)."""
+    for k in range(len(which)):
+        e = which[k]
+        x = pairs.vertices[e]
+        c0, c1, c2, c3, _, _ = closest(p, x, e >= pairs.points)
+        z0, z1, z2 = between(p, x, c1, c2, c3)
+        weights[k, 0], weights[k, 1], weights[k, 2], weights[k, 3] = c0, c1, c2, c3
+        ways[k, 0], ways[k, 1], ways[k, 2] = z0, z1, z2
+        gap, m = _gap(pairs, e, p), 1.0
+        if pairs.parallel[e] > 0.0:
+            m = _mollifier(_crossed(p, x)[9], pairs.parallel[e])[0]
+        force[k] = -m * pairs.stiffness[e] * pairs.scale[e] * pairs.reach * law(max(gap, 1e-6))[1]
 
 
 @kernel
@@ -269,27 +298,3 @@ def _four(H, a, b, i, j, h):
     H[i + a, j + 3 + b] -= h
     H[i + 3 + a, j + b] -= h
     H[i + 3 + a, j + 3 + b] += h
-
-
-@kernel
-def scatter(blocks, places, values):
-    """Add blocks (a, 12, 12) to `values` (b, 3, 3), at places (a, 16); -1 for none."""
-    for k in range(len(blocks)):
-        for i in range(4):
-            for j in range(4):
-                at = places[k, 4 * i + j]
-                if at >= 0:
-                    for a in range(3):
-                        for b in range(3):
-                            values[at, a, b] += blocks[k, 3 * i + a, 3 * j + b]
-
-
-@kernel
-def multiply(vertices, blocks, x, out):
-    """Add the product of blocks (a, 12, 12) with x (n, 3) to `out`."""
-    for k in range(len(blocks)):
-        for i in range(12):
-            total = 0.0
-            for j in range(12):
-                total += blocks[k, i, j] * x[vertices[k, j // 3], j % 3]
-            out[vertices[k, i // 3], i % 3] += total

@@ -56,20 +56,22 @@ def near(points: Indices, trees: Trees, p: Positions, q: Positions, reach: float
     point and a triangle, then of two edges, by their numbers, (k, 2), and how many are of the first kind. trees: of
     triangles and of edges. Pairs that share a vertex are left out."""
     triangles, edges = trees
-    found: list[Indices] = []
-    scratch = np.empty(_DEPTH, np.int64), np.empty(6)
-    for corners, tree, same in ((points[:, None], triangles, False), (edges.corners, edges, True)):
-        boxes = np.empty((2 * len(tree.leaves), 6))
-        refit(tree, p, q, reach, boxes)
-        room = 8 * len(corners) + 64
-        while True:
-            out = np.empty((room, 2), np.int64)
-            count = look(corners, tree, boxes, p, q, same, *scratch, out)
-            if count <= room:
-                break
-            room = count
-        found.append(out[:count])
-    return np.concatenate(found), len(found[0])
+    one = found(points[:, None], triangles, p, q, reach)
+    return np.concatenate([one, found(edges.corners, edges, p, q, reach, same=True)]), len(one)
+
+
+def found(corners: Indices, tree: Tree, p: Positions, q: Positions, reach: float, *, same: bool = False) -> Indices:
+    """Primitives with corners (m, k) and those of a tree that may come nearer than `reach` [m] on the straight way from
+    p to q, by their numbers, (k, 2); same: see `look`."""
+    boxes = np.empty((2 * len(tree.leaves), 6))
+    refit(tree, p, q, reach, boxes)
+    room, stack, box = 8 * len(corners) + 64, np.empty(_DEPTH, np.int64), np.empty(6)
+    while True:
+        out = np.empty((room, 2), np.int64)
+        count = look(corners, tree, boxes, p, q, same, stack, box, out)
+        if count <= room:
+            return out[:count]
+        room = count
 
 
 @inner

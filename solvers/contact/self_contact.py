@@ -1,14 +1,19 @@
-"""Contact of a mesh with itself: an energy of positions alone (`solvers.contact.barrier`), and the largest safe step.
+"""Contact by pairs: an energy of positions alone (`solvers.contact.barrier`), and the largest safe step.
 
 Which pairs may be near is looked up for a point, and kept for as long as the vertices stay close to it (their common
 motion apart). What is kept changes no bit of what is computed: pairs out of range add nothing, and all others come in
 one order. Steps are bounded by what they may meet on the way (`solvers.contact.ways`).
+
+`SelfContact` is a mesh against itself, `ObstacleContact` a mesh against the surfaces of obstacles. The vertices of
+these follow those of the mesh in all that is computed; in a step they are where they are at its end, and go there from
+where they are at its start, evenly.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +21,9 @@ from scipy.sparse import coo_array, csr_array
 
 from solvers.contact import barrier, ways
 from solvers.contact.barrier import Pairs
-from solvers.contact.surface import Surface
-from solvers.problem import Positions
+from solvers.contact.blocks import Blocks
+from solvers.contact.grip import NO_GRIP, Grip
+from solvers.problem import Positions, Start
 
 Array = NDArray[np.float64]
 
@@ -25,19 +31,30 @@ _ROUND = 8.0 * np.finfo(np.float64).eps
 """Of the largest coordinate: by so much boxes are made wider."""
 
 
-class Blocks(NamedTuple):
-    """The second derivatives of pairs that are in range. vertices (a, 4); values (a, 12, 12) [N/m]."""
+class Surfaces(Protocol):
+    """What may touch: finds pairs among all vertices."""
 
-    vertices: NDArray[np.int64]
-    values: Array
+    @property
+    def thickness(self) -> float:
+        """So far apart pairs stay at least [m]."""
+        ...
 
-    def add_product(self, x: Positions, out: Positions) -> None:
-        """Add their product with x (n, 3) to `out`."""
-        barrier.multiply(self.vertices, self.values, x, out)
+    @property
+    def reach(self) -> float:
+        """So far beyond that they feel each other [m]."""
+        ...
 
-    def add(self, places: NDArray[np.int64], values: Array) -> None:
-        """Add them to blocks (b, 3, 3), at places (a, 16); -1 for none."""
-        barrier.scatter(self.values, places, values)
+    def within(self, p: Positions, reach: float) -> Pairs:
+        """Pairs that are nearer than `reach` [m] at p (n, 3) [m]."""
+        ...
+
+    def on_way(self, p: Positions, q: Positions, reach: float) -> Pairs:
+        """Pairs that may come nearer than `reach` [m] on the straight way from p to q, (n, 3) [m] both."""
+        ...
+
+
+Place = Callable[[float], Positions]
+Carry = Callable[[float, float, Positions], list[Positions]]
 
 
 class _Kept(NamedTuple):
@@ -49,19 +66,41 @@ class _Kept(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class SelfContact:
-    """Contact of a surface with itself. kept: what was found last, one or none."""
+class PairContact:
+    """A barrier of pairs, and their friction. kept: what was found last, one or none; grip: of a step that has begun;
+    friction: mu; slip [m/s]: below it a pair counts as sticking."""
 
-    surface: Surface
+    surface: Surfaces
+    friction: float = 0.0
+    slip: float = 1e-3
     kept: list[_Kept] = field(default_factory=list[_Kept])
+    grip: Grip = NO_GRIP
 
     @property
     def range(self) -> float:
         """From this distance on [m] nothing is felt."""
         return self.surface.thickness + self.surface.reach
 
+    def begin_step(self, start: Start) -> Self:
+        """The energy of a step: what was in range at its start grips."""
+        if not self.friction:
+            return self
+        return replace(self, grip=self._gripping(self.whole(start.positions), start))
+
+    def _gripping(self, p: Positions, start: Start) -> Grip:
+        """p: all vertices at the step's start."""
+        return Grip.of(self.pairs(p), p, self.friction, self.slip * (start.until - start.time))
+
+    def whole(self, p: Positions) -> Positions:
+        """Positions of all vertices that pairs name, those of the mesh (n, 3) first."""
+        return p if p.flags.carray else np.array(p, order="C")
+
+    def toward(self, direction: Positions) -> Positions:
+        """The ways of all vertices, those of the mesh (n, 3) first."""
+        return direction if direction.flags.carray else np.array(direction, order="C")
+
     def pairs(self, p: Positions) -> Pairs:
-        """Pairs that may be in range at p (n, 3): all that are, and maybe more."""
+        """Pairs that may be in range at p, all vertices' (N, 3): all that are, and maybe more."""
         for kept in self.kept:
             if kept.p.shape == p.shape and 2.0 * _apart(kept.p, p) <= kept.reach - self.range:
                 return kept.pairs
@@ -72,36 +111,66 @@ class SelfContact:
 
     def value(self, p: Positions) -> float:
         """The energy [J] at p, shape (n, 3); infinite where a pair is nearer than the thickness."""
-        p = _contiguous(p)
-        return barrier.value(self.pairs(p), p) if np.isfinite(p).all() else np.inf
+        p = self.whole(p)
+        if not np.isfinite(p).all():
+            return np.inf
+        pressed = barrier.value(self.pairs(p), p)
+        return pressed + self.grip.value(p) if len(self.grip.vertices) else pressed
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N], shape (n, 3), to `out`."""
-        p = _contiguous(p)
-        if np.isfinite(p).all():
-            barrier.add_gradient(self.pairs(p), p, out)
+        n, p = len(p), self.whole(p)
+        if not np.isfinite(p).all():
+            return
+        total = out if len(p) == n else np.zeros_like(p)
+        barrier.add_gradient(self.pairs(p), p, total)
+        if len(self.grip.vertices):
+            self.grip.add_gradient(p, total)
+        if total is not out:
+            out += total[:n]
 
     def blocks(self, p: Positions, keep: float = 1.0) -> Blocks:
         """The second derivatives of each pair in range at p (n, 3); keep: of what bends downwards."""
-        p = _contiguous(p)
+        n, p = len(p), self.whole(p)
         pairs = self.pairs(p)
         which = np.empty(len(pairs.vertices), np.int64)
         which = which[: barrier.active(pairs, p, 1.0, which)]
-        out = np.empty((len(which), 12, 12))
-        barrier.curve(pairs, which, p, keep, np.empty((9, 12)), out)
-        return Blocks(pairs.vertices[which], out)
+        values = np.empty((len(which), 12, 12))
+        barrier.curve(pairs, which, p, keep, np.empty((9, 12)), values)
+        vertices = pairs.vertices[which]
+        if len(self.grip.vertices):
+            vertices = np.concatenate([vertices, self.grip.vertices])
+            values = np.concatenate([values, self.grip.curvature(p)])
+        return Blocks(np.where(vertices < n, vertices, -1) if len(p) > n else vertices, values)
 
     def hessian(self, p: Positions) -> csr_array:
         """The Hessian [N/m], shape (3n, 3n)."""
         vertices, values = self.blocks(p)
         at = (3 * vertices[:, :, None] + np.arange(3)).reshape(len(vertices), 12)
-        rows, columns = np.repeat(at, 12, axis=1).ravel(), np.tile(at, 12).ravel()
-        return csr_array(coo_array((values.ravel(), (rows, columns)), shape=(p.size, p.size)))
+        rows, columns, values = np.repeat(at, 12, axis=1).ravel(), np.tile(at, 12).ravel(), values.ravel()
+        own = (rows >= 0) & (columns >= 0)
+        return csr_array(coo_array((values[own], (rows[own], columns[own])), shape=(p.size, p.size)))
 
     def largest_step(self, p: Positions, direction: Positions) -> float:
         """The largest t up to 1 by which p may go along a direction, both (n, 3), with all gaps open; 0 where one is
         closed at p. Nothing touches at any smaller t either."""
-        p, way = _contiguous(p), _contiguous(direction)
+        return self._largest(self.whole(p), self.toward(direction))
+
+    def carried(self, p: Positions, direction: Positions, begin: float) -> float:
+        """The largest part t of what is left of the step by which p may go along a direction, both (n, 3), while
+        obstacles go on from the part `begin` of theirs."""
+        return self.largest_step(p, direction)
+
+    def at_part(self, part: float) -> Self:
+        """The same with obstacles at a part of their way in the step, 1 at its end."""
+        return self
+
+    def with_obstacles(self, p: Positions) -> list[Positions]:
+        """Where p (n, 3) would be at the step's end, were it to move with each of the obstacles that move."""
+        return []
+
+    def _largest(self, p: Positions, way: Positions) -> float:
+        """The same for all vertices, (N, 3) both."""
         if not np.isfinite(way).all():
             return 0.0
         way = way - way.mean(axis=0)
@@ -119,16 +188,69 @@ class SelfContact:
     def closed(self, p: Positions) -> list[tuple[NDArray[np.int64], bool, float]]:
         """Pairs that are not farther apart than their thickness at p (n, 3): their vertices (4,), whether they are
         edges, and their distance [m], the nearest first."""
-        p = _contiguous(p)
+        p = self.whole(p)
         pairs = self.pairs(p)
-        apart = self.surface.distances(pairs, p)
+        apart = barrier.distances(pairs, p)
         bad = np.flatnonzero(~(apart > pairs.scale * pairs.thickness))
         bad = bad[np.argsort(apart[bad], kind="stable")]
         return [(pairs.vertices[e], bool(e >= pairs.points), float(apart[e])) for e in bad.tolist()]
 
 
-def _contiguous(p: Positions) -> Positions:
-    return p if p.flags.carray else np.array(p, order="C")
+@dataclass(frozen=True, eq=False)
+class SelfContact(PairContact):
+    """Contact of a surface with itself."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObstacleContact(PairContact):
+    """Contact of a surface with obstacles.
+
+    place: a time [s] -> where their vertices are, (o, 3) [m], the same array at all times where none moves; carry: two
+    times and positions (n, 3) -> where these would be, were they to move with each of the moving ones in turn; begun,
+    placed: (o, 3) [m] at the step's start, and where they are now; left: vertices' ways to the step's end.
+    """
+
+    place: Place
+    carry: Carry
+    begun: Positions
+    placed: Positions
+    end: Positions
+    times: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def of(cls, surface: Surfaces, place: Place, carry: Carry, friction: float, slip: float) -> Self:
+        """The contact at the time 0, before any step."""
+        now = place(0.0)
+        return cls(surface, friction, slip, place=place, carry=carry, begun=now, placed=now, end=now)
+
+    def begin_step(self, start: Start) -> Self:
+        """The energy of a step, with obstacles where they are at its end."""
+        begun, end = self.place(start.time), self.place(start.until)
+        step = replace(self, begun=begun, placed=end, end=end, times=(start.time, start.until))
+        if self.friction:
+            step = replace(step, grip=step._gripping(np.concatenate([start.positions, begun]), start))
+        return step
+
+    def whole(self, p: Positions) -> Positions:
+        """See PairContact."""
+        return np.concatenate([p, self.placed])
+
+    def toward(self, direction: Positions) -> Positions:
+        """See PairContact."""
+        return np.concatenate([direction, np.zeros_like(self.placed)])
+
+    def carried(self, p: Positions, direction: Positions, begin: float) -> float:
+        """See PairContact."""
+        there = self.at_part(begin).placed
+        return self._largest(np.concatenate([p, there]), np.concatenate([direction, self.end - there]))
+
+    def at_part(self, part: float) -> Self:
+        """See PairContact."""
+        return self if self.begun is self.end else replace(self, placed=self.begun + part * (self.end - self.begun))
+
+    def with_obstacles(self, p: Positions) -> list[Positions]:
+        """See PairContact."""
+        return self.carry(*self.times, p)
 
 
 def _apart(p: Positions, q: Positions) -> float:

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import kernel
 from solvers.contact import boxes
-from solvers.contact.barrier import MOLLIFIED, Pairs
+from solvers.contact.barrier import MOLLIFIED, Pairs, distances
 from solvers.contact.boxes import Indices, Tree, Trees
-from solvers.contact.closest import distance
 from solvers.problem import Positions
 
 Array = NDArray[np.float64]
@@ -51,7 +49,7 @@ class Surface:
         trees = Tree.of(rest, edges), Tree.of(rest, triangles)
         bare = cls(points, *trees, lengths, np.array(stiffness), thickness, reach, none)
         found, first = boxes.near(points, bare._trees, rest, rest, thickness + reach)
-        apart = bare.distances(bare._pairs(found, first), rest)
+        apart = distances(bare._pairs(found, first), rest)
         close = apart < thickness + reach
         keys, share = bare._keys(found, first)[close], _LESS * apart[close] / (thickness + reach)
         order = np.argsort(keys)
@@ -65,7 +63,7 @@ class Surface:
     def within(self, p: Positions, reach: float) -> Pairs:
         """Pairs that are nearer than `reach` [m] at p (n, 3) [m]."""
         found, first = boxes.near(self.points, self._trees, p, p, reach)
-        close = self.distances(self._pairs(found, first), p) < reach
+        close = distances(self._pairs(found, first), p) < reach
         return self._pairs(found[close], int(close[:first].sum()))
 
     def on_way(self, p: Positions, q: Positions, reach: float) -> Pairs:
@@ -95,16 +93,3 @@ class Surface:
         key = found[:, 0] * many + found[:, 1]
         key[first:] += len(self.points) * many
         return key
-
-    @staticmethod
-    def distances(pairs: Pairs, p: Positions) -> Array:
-        """Of each pair at p (n, 3) [m]."""
-        out = np.empty(len(pairs.vertices))
-        _distances(pairs, p, out)
-        return out
-
-
-@kernel
-def _distances(pairs, p, out):
-    for e in range(len(pairs.vertices)):
-        out[e] = distance(p, pairs.vertices[e], e >= pairs.points)

@@ -15,7 +15,7 @@ from typing import Protocol, TypeGuard, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.problem import Energy, Positions, StepProblem, System
+from solvers.problem import Energy, Positions, System
 
 
 class PairBlocks(Protocol):
@@ -43,6 +43,19 @@ class Bounded(Energy, Protocol):
         """The largest t up to 1 by which p may go along a direction, both (n, 3) [m]."""
         ...
 
+    def carried(self, p: Positions, direction: Positions, begin: float) -> float:
+        """The largest part of what is left of the step by which p may go along a direction, both (n, 3) [m], while
+        obstacles go on from the part `begin` of their way in it."""
+        ...
+
+    def at_part(self, part: float) -> Bounded:
+        """The same with obstacles at a part of their way in the step, 1 at its end."""
+        ...
+
+    def with_obstacles(self, p: Positions) -> list[Positions]:
+        """Where p (n, 3) [m] would be at the step's end, were it to move with each of the obstacles that move."""
+        ...
+
     def blocks(self, p: Positions, keep: float = 1.0) -> PairBlocks:
         """The second derivatives at p (n, 3); keep: of what bends downwards, 0 leaves them positive semidefinite."""
         ...
@@ -62,14 +75,3 @@ def without_bounded(system: System) -> System:
     """The same system without such energies; itself where it has none."""
     kept = tuple(energy for energy in system.energies if not is_bounded(energy))
     return system if len(kept) == len(system.energies) else replace(system, energies=kept)
-
-
-def begun_free(problem: StepProblem) -> StepProblem:
-    """The same problem, its current positions and its first guess where the step starts unless the straight way from
-    there to them is free; itself without such energies."""
-    energies = [energy for energy in problem.system.energies if is_bounded(energy)]
-    if not energies:
-        return problem
-    p = problem.start.positions
-    current, guess = (q if reach(energies, p, q - p) == 1.0 else p for q in (problem.current, problem.first_guess))
-    return replace(problem, current=current, first_guess=guess)

@@ -80,8 +80,9 @@ class Objective:
 
     @cached_property
     def number(self) -> NDArray[np.int64]:
-        """The number of each vertex among the free ones, -1 for the others, (n,)."""
-        number = np.full(self.system.vertices, -1)
+        """The number of each vertex among the free ones, -1 for the others, and for the vertex -1, which is none of the
+        mesh's, (n + 1,)."""
+        number = np.full(self.system.vertices + 1, -1)
         number[self.system.free] = np.arange(len(self.system.free))
         return number
 

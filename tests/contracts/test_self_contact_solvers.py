@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from harness.base.errors import InputError
+from harness.scenes import touching
 from harness.scenes.bind import Scene, build
-from harness.scenes.effects import self_contact
 from harness.scenes.effects.base import Effect
 from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.self_contact import SelfContact
 from harness.scenes.effects.springs import Springs
-from harness.scenes.intersections import crossings
 from harness.scenes.mesh.grid import Grid
 from harness.scenes.motion import Key, Motion
 from harness.scenes.spec import SceneSpec
@@ -54,17 +53,17 @@ def test_a_sheet_that_falls_onto_itself_passes_through_nowhere(name):
     (energy,) = (e for e in made.system.energies if isinstance(e, Energy))
     rule = StopRule(60, 1e-3)
     for step in simulate(made, prepare(made, solver(name)), rule, first_guess="motion", frames=14):
-        assert intersections(made, step.positions) == 0
+        assert intersections(made, step.positions, 0.0) == 0
         assert not energy.closed(step.positions)
         touched = max(touched, len(energy.blocks(step.positions).vertices))
     assert touched > 5
 
 
 def test_without_the_effect_it_does_pass_through():
-    made, edges = upside_down(), upside_down(APART).apart
+    made, (apart,) = upside_down(), upside_down(APART).apart
     steps = simulate(made, prepare(made, Newton()), StopRule(60, 1e-3), first_guess="motion", frames=14)
-    assert any(crossings(step.positions, *edges) for step in steps)
-    assert intersections(made, made.mesh.rest) is None
+    assert any(apart.crossings(step.positions, 0.0) for step in steps)
+    assert intersections(made, made.mesh.rest, 0.0) is None
 
 
 @functools.cache
@@ -132,7 +131,7 @@ def test_two_free_sheets_that_collide_keep_their_momentum():
         touched += len(energy.blocks(step.positions).vertices)
         # Forces of pairs add up to nothing; what is left is the solve's tolerance.
         np.testing.assert_allclose(mass @ step.state.now.velocity, before, atol=1e-8)
-        assert intersections(made, step.positions) == 0
+        assert intersections(made, step.positions, 0.0) == 0
     assert touched > 50
 
 
@@ -179,12 +178,12 @@ def test_a_fine_mesh_with_edges_below_the_thickness_runs():
     made = scene(Grid(), Springs(stretch=100.0, shear=20.0), Gravity(), Pins(at=("left",)), fine, size=9)
     assert made.mesh.spacing < fine.thickness
     for step in simulate(made, prepare(made, Newton()), StopRule(30, 1e-4), first_guess="current", frames=2):
-        assert intersections(made, step.positions) == 0
+        assert intersections(made, step.positions, 0.0) == 0
 
 
 @pytest.mark.parametrize(("stiff", "told"), [(0.1, "agrees"), (0.1001, "disagrees: effects[1] self-contact")])
 def test_the_second_opinion_agrees_with_the_barrier_and_with_no_other(stiff, told, monkeypatch):
     given = {"mesh": Grid(), "mass": 1.0, "time_step": 0.02, "frames": 3, "path": "scene.yaml"}
     spec = SceneSpec.model_validate(given | {"effects": (Springs(stretch=100.0), SelfContact(thickness=0.4))})
-    monkeypatch.setattr(self_contact, "_STIFF", stiff)
+    monkeypatch.setattr(touching, "_STIFF", stiff)
     assert second_opinion(spec, build(spec, 3), "implicit-euler").startswith(told)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from harness.scenes.intersections import crossings
-from solvers.contact.barrier import Pairs
+from solvers.contact.barrier import Pairs, distances
 from solvers.contact.self_contact import SelfContact
 from solvers.contact.surface import Surface
 from tests.self_contacts import RANGE, THICKNESS, sides, touching, way
@@ -41,16 +41,16 @@ SHAPES = {"any": (1.0, 1.0, 1.0), "in a plane": FLAT, "needles": (1.0, 1e-6, 1e-
 def test_distances_are_the_least_of_all_places(shape, edges):
     for seed in range(40):
         p = np.random.default_rng(seed).normal(size=(4, 3)) * SHAPES[shape]
-        found, least = Surface.distances(pair(edges), p)[0], sampled(p, edges)
+        found, least = distances(pair(edges), p)[0], sampled(p, edges)
         # A place of the finest sampling is at most a cell of 1/80 from the nearest: the lengths here are below 6 m.
         assert least - 6.0 / 80 <= found <= least + 1e-12
 
 
 def test_parallel_and_coincident_edges_have_their_distance():
     p = np.array([[0, 0, 0], [1, 0, 0], [0.5, 0.3, 0], [2, 0.3, 0]], float)
-    assert Surface.distances(pair(True), p)[0] == pytest.approx(0.3, rel=1e-14)
-    assert Surface.distances(pair(True), p[[0, 1, 0, 1]])[0] == 0.0
-    assert Surface.distances(pair(False), np.array([[0.2, 0.2, 0.1], [0, 0, 0], [1, 0, 0], [0, 1, 0.0]]))[0] == 0.1
+    assert distances(pair(True), p)[0] == pytest.approx(0.3, rel=1e-14)
+    assert distances(pair(True), p[[0, 1, 0, 1]])[0] == 0.0
+    assert distances(pair(False), np.array([[0.2, 0.2, 0.1], [0, 0, 0], [1, 0, 0], [0, 1, 0.0]]))[0] == 0.1
 
 
 def test_gradients_and_second_derivatives_are_those_of_the_value():
@@ -110,7 +110,7 @@ def test_candidates_are_all_that_are_near():
     first = sum(1 for _ in range(len(p)) for _ in triangles) - 3 * len(triangles)
     one = np.ones(len(wanted))
     every = Pairs(np.array(wanted), first, one, one, 0 * one, THICKNESS, RANGE)
-    near = surface.distances(every, p) < reach
+    near = distances(every, p) < reach
     found = surface.within(p, reach)
     assert {tuple(x) for x in found.vertices.tolist()} == {tuple(x) for x in every.vertices[near].tolist()}
     assert found.points == int(near[:first].sum())

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from solvers import integrators
 from solvers.energies.springs import Springs
 from solvers.integrators import splits
 from solvers.problem import Energy, Positions
+
+if TYPE_CHECKING:  # for those who have any
+    from harness.scenes.intersections import Apart
 
 
 class Force(Protocol):
@@ -77,8 +80,8 @@ class Contribution:
     checks: tuple[Check, ...] = field(default=())
     once: tuple[str, ...] = field(default=())
     """What a scene can have but once, in words; a second one would be added to the first."""
-    apart: tuple[NDArray[np.int64], ...] = ()
-    """Edges (m, 2) and triangles (f, 3) of the mesh that may not pass through each other, for whoever looks."""
+    apart: tuple[Apart, ...] = ()
+    """What may not pass through what, for whoever looks."""
     ends: tuple[str, ...] = ()
     """Why each unknown has to be where a step ends, in words."""
     continuous: tuple[Callable[[], Contribution], ...] = field(default=())

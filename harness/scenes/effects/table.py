@@ -17,6 +17,7 @@ EFFECTS = {
     "self-contact": "harness.scenes.effects.self_contact:SelfContact",
     "springs": "harness.scenes.effects.springs:Springs",
     "strain-limits": "harness.scenes.effects.strain_limits:StrainLimits",
+    "surface-contact": "harness.scenes.effects.surface_contact:SurfaceContact",
     "wind": "harness.scenes.effects.wind:Wind",
 }
 

@@ -9,6 +9,7 @@ MESHES: dict[str, str] = {
     "skirt": "harness.scenes.mesh.surfaces:Skirt",
     "balloon": "harness.scenes.mesh.surfaces:Balloon",
     "tower": "harness.scenes.mesh.solids:Tower",
+    "body": "harness.scenes.mesh.body:Body",
     "block": "harness.scenes.mesh.solids:Block",
     "star": "harness.scenes.mesh.star:Star",
     "network": "harness.scenes.mesh.network:Network",

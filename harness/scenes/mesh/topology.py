@@ -36,6 +36,13 @@ def lattice_triangles(index: Indices) -> Indices:
     return np.stack([a, c, d, a, d, b], axis=1).reshape(-1, 3)
 
 
+def closed_by_points(rings: Indices, first: int, last: int) -> Indices:
+    """The triangles of a lattice of rings (r, k), whose last column is the first one, and of a point at each end."""
+    begin = np.column_stack([np.full(rings.shape[1] - 1, first), rings[0, :-1], rings[0, 1:]])
+    end = np.column_stack([np.full(rings.shape[1] - 1, last), rings[-1, 1:], rings[-1, :-1]])
+    return np.concatenate([begin, lattice_triangles(rings), end])
+
+
 def unique_pairs(pairs: Indices) -> Indices:
     """Each unordered pair once, the lower vertex first, in lexicographic order, (k, 2)."""
     if not len(pairs):

@@ -1,0 +1,103 @@
+"""Contact of a mesh's points, edges and triangles with the surfaces of obstacles, meshes among them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from harness.base.errors import InputError
+from harness.base.model import Model
+from harness.scenes.effects.base import Contribution, Pin
+from harness.scenes.intersections import Apart
+from harness.scenes.mesh.base import Mesh
+from harness.scenes.shapes import AnySurface, Shape, shape
+from harness.scenes.touching import ENDS, outline, require_open, require_still, resisting, told
+from solvers.contact.obstacles import Against, Side
+from solvers.contact.self_contact import ObstacleContact
+from solvers.problem import Energy, Positions
+
+_SAG = 0.1
+"""Of the thickness: how far the triangles of round obstacles lie inside."""
+
+
+class SurfaceContact(Model):
+    """Keeps points, edges and triangles of the mesh from those of obstacles, from either side, by a barrier that grows
+    without bound as their gap closes (formulas: `solvers.contact.barrier`). Every position on the way is free of
+    intersections, and obstacles that move go where they go without passing through the mesh.
+
+    Planes, spheres, capsules and boxes are met as triangles too: those of round ones lie a tenth of the thickness
+    inside at most.
+    """
+
+    kind: Literal["surface-contact"] = "surface-contact"
+    obstacles: tuple[AnySurface, ...] = Field(min_length=1)
+    """What the mesh is kept from."""
+    thickness: Annotated[PositiveFloat, Field(le=1e9)] = 0.002
+    """How far from an obstacle's triangles the mesh stays at least [m], and a little more."""
+    range: PositiveFloat | None = None
+    """How far beyond that they feel each other [m]; as far as the thickness if left out."""
+    stiffness: PositiveFloat | None = None
+    """The barrier's stiffness k [N/m] at each vertex; a tenth of what inertia and springs resist with if left out."""
+    friction: NonNegativeFloat = 0.0
+    """Coulomb's coefficient mu, the same at rest and in motion; forces are those of the step's start (order 1)."""
+    creep: PositiveFloat = 1e-3
+    """Pairs that slip slower than this [m/s] count as sticking, and creep."""
+
+    @property
+    def reach(self) -> float:
+        """How far beyond the thickness they feel each other [m]."""
+        return self.thickness if self.range is None else self.range
+
+    def shapes(self, rest: Positions) -> list[Shape]:
+        """The obstacles' points and triangles, as they are declared; rest (n, 3) [m]: of the mesh."""
+        return [shape(one, _SAG * self.thickness, rest) for one in self.obstacles]
+
+    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
+        """The barrier as one energy, its stiffness by the other effects'; raises InputError for a bad obstacle."""
+        edges, n, shapes = outline(mesh), len(mesh.rest), self.shapes(mesh.rest)
+        if not len(edges):
+            return Contribution()
+        sizes = np.cumsum([0, *(len(points) for points, _ in shapes)]).tolist()
+        points = np.concatenate([points for points, _ in shapes])
+        triangles = np.concatenate([first + faces for first, (_, faces) in zip(sizes, shapes, strict=False)])
+        sides = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
+        ends = np.unique(np.sort(sides, axis=1), axis=0)
+        motions = [one.motion for one in self.obstacles]
+        moving = any(motions)
+
+        @lru_cache(maxsize=2)  # a step's end is the start of the next one
+        def moved(time: float) -> Positions:
+            parts = zip(shapes, motions, strict=True)
+            return np.concatenate([x if motion is None else motion.moved(x, time) for (x, _), motion in parts])
+
+        def place(time: float) -> Positions:
+            return moved(time) if moving else points
+
+        def carry(begin: float, end: float, p: Positions) -> list[Positions]:
+            return [motion.moved(motion.back(p, begin), end) for motion in motions if motion is not None]
+
+        def energy(stiffness: NDArray[np.float64]) -> ObstacleContact:
+            own, others = Side.of(mesh.rest, edges, mesh.triangles), Side.of(points, ends, triangles, n)
+            against = Against(own, others, stiffness, self.thickness, self.reach)
+            return ObstacleContact.of(against, place, carry, self.friction, self.creep)
+
+        def derived(energies: Sequence[Energy]) -> tuple[Energy, ...]:
+            return (energy(resisting(self.stiffness, mass, time_step, energies)),)
+
+        apart = Apart(((edges, n + triangles), (n + ends, mesh.triangles)), place)
+
+        def check(start: Positions, pins: Sequence[Pin]) -> None:
+            """Raise InputError for exact pins that move, and for a start (n, 3) [m] that is not free."""
+            require_still(self.kind, start, pins)
+            if crossed := apart.crossings(start, 0.0):
+                raise InputError(
+                    f"{self.kind}: the start passes through obstacles, {told(crossed, n)}; move them apart"
+                )
+            require_open(self.kind, energy(np.ones(n)), start, self.thickness)
+
+        return Contribution(derived=(derived,), checks=(check,), ends=ENDS, apart=(apart,))

@@ -1,0 +1,95 @@
+"""A dress form with a head: what garments hang on."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from harness.scenes.mesh.base import SHEAR, STRETCH, Mesh
+from harness.scenes.mesh.generator import Generator, Metres, cells
+from harness.scenes.mesh.topology import Points, assemble, by_area, closed_by_points, offset_pairs
+
+_OUTLINE = np.array(
+    [
+        (1.0, 0.0, 0.0),
+        (0.985, 0.041, 0.052),
+        (0.95, 0.064, 0.083),
+        (0.89, 0.083, 0.108),
+        (0.82, 0.078, 0.092),
+        (0.775, 0.058, 0.06),
+        (0.73, 0.056, 0.058),
+        (0.695, 0.07, 0.066),
+        (0.675, 0.12, 0.078),
+        (0.65, 0.18, 0.094),
+        (0.61, 0.212, 0.112),
+        (0.52, 0.196, 0.136),
+        (0.42, 0.165, 0.12),
+        (0.34, 0.148, 0.106),
+        (0.22, 0.186, 0.132),
+        (0.1, 0.205, 0.142),
+        (0.03, 0.19, 0.128),
+        (0.0, 0.16, 0.105),
+        (0.0, 0.0, 0.0),
+    ]
+)
+"""Height, half width and half depth from the crown down, in the height of the form."""
+
+
+class Body(Generator):
+    """A closed surface that stands on y = 0 and looks along +z: head, neck, shoulders, waist and hips.
+
+    `size` vertices around, ring by ring from the crown, which is one vertex, down to the last one, in the middle of the
+    base. Cells are about as high as they are wide at the waist. Springs: along rings and down (STRETCH), then the
+    diagonals down forwards and down backwards (SHEAR). Triangles face outwards. Parts: crown, base (one vertex each).
+    Mass goes by area. Dimension 2.
+    """
+
+    kind: Literal["body"] = "body"
+    height: Metres = 0.9
+    """From the base to the crown [m]."""
+
+    SMALLEST: ClassVar[int] = 4
+    COUNTS: ClassVar[str] = "vertices around"
+    SPRINGS: ClassVar[int] = 4
+
+    def count(self, size: int) -> int:
+        """See Generator."""
+        return size * (_rows(size) - 1) + 2
+
+    def generate(self, size: int) -> Mesh:
+        """See Generator."""
+        along: Points = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(_OUTLINE, axis=0), axis=1))])
+        places: Points = np.linspace(0.0, float(along[-1]), _rows(size) + 1)
+        y, across, deep = (self.height * _between(places, along, column) for column in _OUTLINE.T)
+        inner = np.arange(1, len(places) - 1)
+        angle = np.linspace(0, 2 * np.pi, size, endpoint=False)
+        x, z = np.outer(across[inner], np.cos(angle)), -np.outer(deep[inner], np.sin(angle))
+        rings = np.stack([x, np.broadcast_to(y[inner, None], x.shape), z], axis=2).reshape(-1, 3)
+        rest = np.concatenate([[[0.0, y[0], 0.0]], rings, [[0.0, y[-1], 0.0]]])
+        index = 1 + np.arange(len(rings)).reshape(-1, size)
+        closed, first, last = np.column_stack([index, index[:, 0]]), 0, len(rest) - 1
+        triangles = closed_by_points(closed, first, last)
+        down = [triangles[:size, :2], offset_pairs(index, (1, 0)), triangles[-size:, [2, 0]]]
+        return assemble(
+            rest=rest,
+            springs={
+                STRETCH: np.concatenate([offset_pairs(closed, (0, 1)), *down]),
+                SHEAR: offset_pairs(closed, (1, 1), (1, -1)),
+            },
+            triangles=triangles,
+            weights=by_area(rest, triangles),
+            dimension=2,
+            resolution=size,
+            parts={"crown": [first], "base": [last]},
+        )
+
+
+def _between(places: Points, along: Points, values: Points) -> Points:
+    return np.asarray(np.interp(places, along, values), np.float64)
+
+
+def _rows(size: int) -> int:
+    """Cells from crown to base along the outline."""
+    length = float(np.linalg.norm(np.diff(_OUTLINE, axis=0), axis=1).sum())
+    return max(8, cells(length, 2 * np.pi * 0.127 / size))

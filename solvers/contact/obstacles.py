@@ -1,0 +1,81 @@
+"""What of a mesh may touch obstacles: points against triangles both ways, and edges against edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.contact import boxes
+from solvers.contact.barrier import MOLLIFIED, Pairs, distances
+from solvers.contact.boxes import Tree
+from solvers.problem import Positions
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+class Side(NamedTuple):
+    """points (q, 1), edges and triangles of one of both, by vertices of all; length: of its edges (m,) [m]."""
+
+    points: Indices
+    edges: Tree
+    triangles: Tree
+    length: Array
+
+    @classmethod
+    def of(cls, rest: Positions, edges: Indices, triangles: Indices, first: int = 0) -> Self:
+        """The side of a shape (n, 3) [m] whose vertices are counted from `first`."""
+        points = np.unique(np.append(edges.ravel(), triangles.ravel())).astype(np.int64)
+        length = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
+        one, two = Tree.of(rest, edges), Tree.of(rest, triangles)
+        one, two = (tree._replace(corners=tree.corners + first) for tree in (one, two))
+        return cls(points[:, None] + first, one, two, length)
+
+
+@dataclass(frozen=True, eq=False)
+class Against:
+    """A mesh and obstacles, whose vertices follow those of the mesh; they keep a thickness [m] from each other and feel
+    each other within a range [m] beyond it. stiffness (n,): of the mesh's vertices [N/m]."""
+
+    mesh: Side
+    others: Side
+    stiffness: Array
+    thickness: float
+    reach: float
+
+    def within(self, p: Positions, reach: float) -> Pairs:
+        """See `solvers.contact.self_contact.Surfaces`."""
+        pairs = self._pairs(p, p, reach)
+        close = distances(pairs, p) < reach
+        return pairs._replace(
+            vertices=pairs.vertices[close],
+            points=int(close[: pairs.points].sum()),
+            scale=pairs.scale[close],
+            stiffness=pairs.stiffness[close],
+            parallel=pairs.parallel[close],
+        )
+
+    def on_way(self, p: Positions, q: Positions, reach: float) -> Pairs:
+        """See `solvers.contact.self_contact.Surfaces`."""
+        return self._pairs(p, q, reach)
+
+    def _pairs(self, p: Positions, q: Positions, reach: float) -> Pairs:
+        a, b = self.mesh, self.others
+        one, two = (boxes.found(x.points, y.triangles, p, q, reach).T for x, y in ((a, b), (b, a)))
+        e, f = boxes.found(a.edges.corners, b.edges, p, q, reach).T
+        vertices = np.concatenate(
+            [
+                np.column_stack([a.points[one[0]], b.triangles.corners[one[1]]]),
+                np.column_stack([b.points[two[0]], a.triangles.corners[two[1]]]),
+                np.column_stack([a.edges.corners[e], b.edges.corners[f]]),
+            ]
+        )
+        points = one.shape[1] + two.shape[1]
+        own = vertices < len(self.stiffness)
+        stiffness = np.where(own, self.stiffness[np.where(own, vertices, 0)], 0.0).sum(axis=1) / own.sum(axis=1)
+        parallel = np.zeros(len(vertices))
+        parallel[points:] = MOLLIFIED * (a.length[e] * b.length[f]) ** 2
+        return Pairs(vertices, points, np.ones(len(vertices)), stiffness, parallel, self.thickness, self.reach)
