@@ -35,7 +35,10 @@ SOLVERS = {
     "rodas": "solvers.methods.rosenbrock:Rodas",
 }
 
-OPTIONAL = {"eigen": "solvers.methods.eigen:EigenLocalGlobal"}
+OPTIONAL = {
+    "eigen": "solvers.methods.eigen:EigenLocalGlobal",
+    "cholmod": "solvers.methods.cholmod:CholmodLocalGlobal",
+}
 """Those that need what is not everywhere, and refuse with the reason where it is missing."""
 
 EVERY = Table("springbench.solvers", SOLVERS, OPTIONAL)

@@ -62,7 +62,7 @@ class PreparedLocalGlobal(Iterative):
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """See Iterative."""
-        return _Iterating(self, problem, guess)
+        return Iterations(self, problem, guess)
 
     def scale(self, problem: StepProblem) -> float:
         """See Iterative."""
@@ -134,26 +134,26 @@ class PreparedLocalGlobal(Iterative):
         return self.norm(e)
 
 
-class _Iterating(Iterating):
-    """Positions and those before them take turns at two arrays."""
+class Iterations(Iterating):
+    """Positions and those before them take turns at two arrays; constant: y (n, 3) [N]."""
 
     def __init__(self, base: PreparedLocalGlobal, problem: StepProblem, guess: Positions) -> None:
-        self._base, self._project = base, base.local(problem)
-        self._constant, self._b = base.constant(problem), np.empty_like(problem.target)
+        self.base, self._project = base, base.local(problem)
+        self.constant, self._b = base.constant(problem), np.empty_like(problem.target)
         self.positions, self._other = base.placed(guess, problem), base.placed(problem.current, problem)
         self._moved = False
 
     def advance(self) -> bool:
         """See Iterating."""
         p = self.positions
-        self._project(p, self._constant, self._b)
-        self._base.toward(self._b, p, self._other)
+        self._project(p, self.constant, self._b)
+        self.base.toward(self._b, p, self._other)
         self.positions, self._other, self._moved = self._other, p, True
         return True
 
     def residual(self) -> float:
         """|p - LG(p)|_Q of the previous positions p."""
-        return self._base.residual(self._other - self.positions) if self._moved else float("nan")
+        return self.base.residual(self._other - self.positions) if self._moved else float("nan")
 
 
 def projective(system: System, solver: str) -> list[ProjectiveEnergy]:

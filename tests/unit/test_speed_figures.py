@@ -75,11 +75,12 @@ def test_figures_say_how_near_the_binding_limit_is():
         *LIMITS,
         *timed("eigen", '{"temporaries": "default"}', [9.0, 8.0, 8.0]),
         *timed("eigen", '{"temporaries": "cheap"}', [4.0, 4.0, 4.0]),
+        *timed("cholmod", "{}", [2.0, 2.0, 2.0]),
         *timed("numba", '{"linear": "cholespy"}', [3.0, 3.0, 3.0]),
         *timed("numba", '{"linear": "supernodal"}', [1.0, 2.0, 1.0], nnz_factor=100, flops_per_solve=2400),
     ]
     found = {f.label: f for f in figures(pa.Table.from_pylist(rows, schema=SCHEMA))}
-    assert list(found) == ["eigen default", "eigen cheap", "numba cholespy", "numba supernodal"]
+    assert list(found) == ["eigen default", "eigen cheap", "cholmod", "numba cholespy", "numba supernodal"]
     ours = found["numba supernodal"]
     assert ours.iterations == 10
     # 1 s an iteration in the median, so a step of 50 takes 50 s.
@@ -88,6 +89,8 @@ def test_figures_say_how_near_the_binding_limit_is():
     assert ours.faster.middle == 8.0
     assert ours.cheap_faster is not None
     assert ours.cheap_faster.middle == 4.0
+    assert ours.careful_faster is not None
+    assert ours.careful_faster.middle == 2.0
     assert ours.solves_faster is not None
     assert ours.solves_faster.middle == 3.0
     work = count({"nnz_factor": 100, "flops_per_solve": 2400}, 16, 42)["iteration"]

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from harness.base.errors import RunFailed
+from solvers.core.native import compile_cpp
 from solvers.energies.springs import Springs
-from solvers.methods.eigen import compile_cpp
+from solvers.methods.eigen import NEEDS
 from solvers.problem import Positions, StepProblem, Unsupported
 
 SOURCE = Path(__file__).with_name("yardstick.cpp")
@@ -30,7 +31,7 @@ MALFORMED = {2: "wanted a scene and a file for positions", 3: "the scene's file 
 
 def build(folder: Path) -> Path:
     """The compiled yardstick in `folder`, made anew when its source has changed. Raises Unsupported: why not."""
-    return compile_cpp(SOURCE, folder)
+    return compile_cpp(SOURCE, folder, NEEDS)
 
 
 class Yardstick:

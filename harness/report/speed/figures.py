@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -17,6 +17,9 @@ from harness.report.speed.counts import Counted, count
 
 MACHINE, YARDSTICK = "machine", "eigen"
 """What rows of candidates that are no solvers have as their solver."""
+
+CAREFUL = "cholmod"
+"""The solver that is a careful program in C++."""
 
 STEP = 50
 """Iterations of the step that all steps are stated as, however many were done."""
@@ -38,8 +41,8 @@ class Figures(NamedTuple):
     factor's panels hold; binds: the limit that binds; reached: the part of it that an iteration reaches, by those
     bytes and flops; passes: the part of the time that two passes over the entries of L alone take, both from where
     they lie, which whoever reads them twice while they are near can pass; faster: than the yardstick a step;
-    solves_faster: than cholespy a global step; apart: from float64's converged positions, in the scene's size; code: by
-    which it was measured.
+    careful_faster: than a careful program; solves_faster: than cholespy a global step; apart: from float64's converged
+    positions, in the scene's size; code: by which it was measured.
     """
 
     scene: str
@@ -64,6 +67,7 @@ class Figures(NamedTuple):
     passes: float | None = None
     faster: Interval | None = None
     cheap_faster: Interval | None = None
+    careful_faster: Interval | None = None
     solves_faster: Interval | None = None
     apart: float | None = None
     load: float | None = None
@@ -170,7 +174,8 @@ def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], l
         step=1e3 * STEP * float(np.median(times["step"])),
         faster=_against(group, f"{YARDSTICK} default", "step", times),
         cheap_faster=_against(group, f"{YARDSTICK} cheap", "step", times),
-        solves_faster=_against(group, _cholespy(group), "global", times),
+        careful_faster=_against(group, _on_one(group, lambda row: row["solver"] == CAREFUL), "step", times),
+        solves_faster=_against(group, _on_one(group, _by_cholespy), "global", times),
         apart=first["apart"],
         load=max(row["load"] for row in found),
     )
@@ -199,16 +204,14 @@ def _times(found: Sequence[Row], phase: str) -> NDArray[np.float64]:
     )
 
 
-def _cholespy(group: Mapping[str, list[Row]]) -> str:
-    """The label of the candidate that solves with cholespy on one thread."""
-    return next(
-        (
-            label
-            for label, found in group.items()
-            if found[0]["threads"] == 1 and json.loads(found[0]["parameters"]).get("linear") == "cholespy"
-        ),
-        "",
-    )
+def _on_one(group: Mapping[str, list[Row]], those: Callable[[Row], bool]) -> str:
+    """The label of the candidate of those rows that ran on one thread."""
+    return next((label for label, found in group.items() if found[0]["threads"] == 1 and those(found[0])), "")
+
+
+def _by_cholespy(row: Row) -> bool:
+    """Whether a candidate solves with cholespy."""
+    return json.loads(row["parameters"]).get("linear") == "cholespy"
 
 
 def _against(

@@ -29,6 +29,7 @@ _NUMBERS = (
     "of two passes\nover L",
     "step against eigen\ntimes faster",
     "with cheap\ntemporaries",
+    "against careful\nC++ (cholmod)",
     "solve against\ncholespy",
     "converged, apart\nfrom float64",
     "load",
@@ -75,7 +76,7 @@ def _cells(f: Figures) -> list[str]:
         f.binds or "–",
         _share(f.reached),
         _share(f.passes),
-        *(_ratio(interval) for interval in (f.faster, f.cheap_faster, f.solves_faster)),
+        *(_ratio(interval) for interval in (f.faster, f.cheap_faster, f.careful_faster, f.solves_faster)),
         "–" if f.apart is None else f"{f.apart:.0e}",
         _number(f.load),
     ]

@@ -1,4 +1,4 @@
-"""The yardstick as a solver: the iterates of the others, or a reason why there are none."""
+"""The programs in C++ as solvers: the iterates of the others, or a reason why there are none."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from scipy.sparse import csr_array
 from harness.base.stated import stated
 from harness.config.load import load_any
 from solvers.about import LOCAL_GLOBAL
-from solvers.methods import eigen
-from solvers.methods.eigen import EigenLocalGlobal
-from solvers.methods.local_global import PreparedLocalGlobal, SparseLocalGlobal
+from solvers.core import native
+from solvers.core.prefactored import PreparedLocalGlobal
+from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import NotPositiveDefinite, Positions, StopRule, System, Unsupported
-from solvers.registry import OPTIONAL, SOLVERS
+from solvers.registry import OPTIONAL, SOLVERS, load
 from tests.scenes import cloth, first_problem
 
 SCENE = """
@@ -29,40 +29,46 @@ effects: [{kind: springs, stretch: 200}]
 """
 
 
-def made(system: System) -> PreparedLocalGlobal:
+def made(name: str, system: System) -> PreparedLocalGlobal:
     """The real one; where it cannot be compiled it refuses with the reason, and there is nothing to compare."""
     try:
-        return EigenLocalGlobal().prepare(system)
+        return load(OPTIONAL[name])().prepare(system)
     except Unsupported as error:
         pytest.skip(str(error))
 
 
+@pytest.mark.parametrize("name", OPTIONAL)
 @pytest.mark.parametrize("weight", [1e10, "exact"])
-def test_its_iterates_are_those_of_the_others(weight: float | str):
+def test_its_iterates_are_those_of_the_others(name: str, weight: float | str):
     scene = cloth(12, weight=weight)
     problem = first_problem(scene)
     ours = SparseLocalGlobal().prepare(scene.system)
-    theirs = made(scene.system)
+    theirs = made(name, scene.system)
     for p, q in islice(zip(ours.iterates(problem), theirs.iterates(problem), strict=True), 30):
         # Two factorisations of a matrix with weights from 1e2 to 1e10: round-off in positions of a metre.
         np.testing.assert_allclose(q, p, rtol=0, atol=1e-11)
     stop = StopRule(1000, 1e-3)
     assert theirs.solve(problem, stop).iterations == ours.solve(problem, stop).iterations
+    solution = theirs.solve(problem, StopRule(30))
+    np.testing.assert_array_equal(solution.positions, next(islice(theirs.iterates(problem), 29, None)))
+    assert solution.residual == pytest.approx(ours.solve(problem, StopRule(30)).residual, rel=1e-6)
 
 
-def test_a_matrix_without_a_factor_is_refused():
+@pytest.mark.parametrize("name", OPTIONAL)
+def test_a_matrix_without_a_factor_is_refused(name: str):
     scene = cloth(3)
-    made(scene.system)
+    made(name, scene.system)
     loose = System(np.full(9, -1.0), scene.system.time_step, scene.system.energies)
     with pytest.raises(NotPositiveDefinite):
-        EigenLocalGlobal().prepare(loose)
+        load(OPTIONAL[name])().prepare(loose)
 
 
-def test_other_energies_are_refused_before_anything_is_compiled(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(eigen, "_library", lambda: pytest.fail("compiled"))
+@pytest.mark.parametrize("name", OPTIONAL)
+def test_other_energies_are_refused_before_anything_is_compiled(name: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(native, "library", lambda *_: pytest.fail("compiled"))
     system = cloth(3).system
-    with pytest.raises(Unsupported, match="eigen: knows springs only"):
-        EigenLocalGlobal().prepare(System(system.mass, system.time_step, (*system.energies, _Other())))
+    with pytest.raises(Unsupported, match=f"{name}: knows springs only"):
+        load(OPTIONAL[name])().prepare(System(system.mass, system.time_step, (*system.energies, _Other())))
 
 
 class _Other:
@@ -76,20 +82,21 @@ class _Other:
         return csr_array((p.size, p.size))
 
 
-def test_without_a_compiler_the_row_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("name", OPTIONAL)
+def test_without_a_compiler_the_row_says_so(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from harness.experiments.plan import Files
     from harness.experiments.run import execute
 
-    monkeypatch.setattr(eigen.shutil, "which", lambda _: None)
+    monkeypatch.setattr(native.shutil, "which", lambda _: None)
     (tmp_path / "chain.yaml").write_text(SCENE)
-    (run,) = load_any(tmp_path / "chain.yaml", solvers=["eigen"]).runs()
+    (run,) = load_any(tmp_path / "chain.yaml", solvers=[name]).runs()
     (tmp_path / "rows").mkdir()
     (row,) = execute(run, Files.of(run, tmp_path), lambda phase: None)
     assert (row["status"], row["family"]) == ("unsupported", LOCAL_GLOBAL)
     assert "there is no C++ compiler" in row["reason"]
 
 
-def test_it_is_not_among_those_that_are_everywhere():
-    assert set(OPTIONAL) == {"eigen"}
+def test_they_are_not_among_those_that_are_everywhere():
+    assert set(OPTIONAL) == {"eigen", "cholmod"}
     assert not set(OPTIONAL) & set(SOLVERS)
-    assert stated("eigen")["minimises"]
+    assert all(stated(name)["minimises"] for name in OPTIONAL)
