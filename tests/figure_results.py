@@ -12,6 +12,7 @@ from harness.base import rows as base_rows
 from harness.base.columns import SCHEMA
 from harness.experiments.ablation.rows import SCHEMA as ABLATION
 from tests import accuracy_rows as made
+from tests import gate_results
 from tests.recordings import info, record
 
 HERE = {"cpu": "A processor", "threads": 1, "commit": "0" * 40, "code": "abc", "status": "ok"}
@@ -108,6 +109,12 @@ def speed(folder: Path) -> Path:
             ]
             write(folder / "rows" / f"{solver}-{linear}-{size}.parquet", rows)
     return folder
+
+
+def gates(folder: Path) -> Path:
+    """Thirty results of two gates, one of which became slower by 5 %."""
+    changed, same = gate_results.series(3, 30, (18, 1.05)), gate_results.series(4, 30)
+    return gate_results.write(folder, {"test_step[cloth]": changed, "test_local": same})
 
 
 def recorded(folder: Path) -> Path:

@@ -15,6 +15,8 @@ from harness.record.camera import Box
 BACKGROUND = (38, 40, 46)
 _LEGEND = 0.55
 """The share of a plot's data that its legend's place is wide."""
+_LISTED = 1.6
+"""The height of a plot with a legend over that of one without: five names have their place at 800 pixels."""
 
 FORCES = {"external": 0xF0E442FF, "contact": 0x56B4E9FF}
 """The colours of arrows."""
@@ -70,6 +72,7 @@ def blueprint(info: RecordingInfo, box: Box, last: int = 0) -> rrb.Blueprint:
         plot("log10 residual [J^(1/2)]", ["+ /residual/log10"], last=last, legend=False),
         plot("Largest strain of a spring", ["+ /strain/largest"], last=last, legend=False),
         plot("Milliseconds by phase", ["+ /milliseconds/**"], last=last),
+        row_shares=[_LISTED, 1.0, 1.0, _LISTED],
         name="By frame",
     )
     convergence = rrb.Vertical(
@@ -96,6 +99,7 @@ def _solve(last: int) -> rrb.Vertical:
         plot("log10 of gap and stationarity, relative", ["+ /solve/**"], last=last),
         plot("Energies: change, by its largest", ["+ /energy_change/**"], last=last),
         plot("Largest strain of a spring", ["+ /strain/largest"], last=last, legend=False),
+        row_shares=[1.0, _LISTED, 1.0],
         name="By iteration",
     )
 

@@ -13,8 +13,8 @@ import pyarrow as pa
 from harness.report.page import quantity
 from harness.report.timing_table import WIDTH, RunTimes, labels, runs
 
-SAME = 2.0
-"""Residuals within this factor of each other are called equal."""
+SAME = 10.0
+"""Residuals within this factor of the lowest are called equal, here and on the page."""
 
 GROWS = 1.5
 """The largest strain is said to grow where it does by this factor, and by as much more than what 99 % stay below."""

@@ -60,7 +60,10 @@ RESULTS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "ablation": ("", made.ablation),
     "prices": ("numba", made.ablation),
     "speed": ("step", made.speed),
+    "history": ("", made.gates),
 }
+DRAWN = {"run", "comparison", "scenes"}
+"""Kinds whose pictures another system may draw in other pixels: the sheet leaves them out."""
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +103,7 @@ def similarity(one: Image.Image, other: Image.Image) -> float:
 def sheet(figures: dict[str, Figure]) -> Image.Image:
     """All figures below and beside each other."""
     pictures = [pixels(figure) for figure in figures.values()]
-    whole = Image.new("RGB", (1400, TALL), "white")
+    whole = Image.new("RGB", (1750, TALL), "white")
     x = y = 0
     for picture in pictures:
         if y + picture.height > TALL:
@@ -108,6 +111,10 @@ def sheet(figures: dict[str, Figure]) -> Image.Image:
         whole.paste(picture, (x, y))
         y += picture.height + 10
     return whole
+
+
+def test_all_kinds_are_on_the_sheet_or_drawn_meshes() -> None:
+    assert {*RESULTS} | DRAWN == {*kinds.KINDS}
 
 
 def test_the_sheet_of_all_figures_looks_as_it_did(figures: dict[str, Figure], tmp_path: Path) -> None:
@@ -304,6 +311,33 @@ def test_meshes_side_by_side_have_one_camera_one_scale_and_the_distance_from_the
     alone, (one,) = composed_meshes("run", folder)
     assert len(one.rows()) == 36
     assert faults(alone) == []
+
+
+@pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
+def test_a_sheet_has_each_scene_once_of_one_shape_and_by_one_scale(tmp_path: Path) -> None:
+    folder = made.recorded(tmp_path)
+    for path in [*(folder / "rows").glob("*.parquet")]:
+        table = base_rows.read([path]).to_pylist()
+        if table[0]["solver"] == "numba":
+            made.write(path, [row | {"scene": "other-cloth"} for row in table])
+    figure, pictures = composed_meshes("scenes", folder)
+    assert faults(figure) == []
+    assert [picture.title for picture in pictures] == ["cloth", "other cloth"]
+    assert len({picture.limit for picture in pictures}) == len({picture.aspect for picture in pictures}) == 1
+    assert "numba, 36 vertices" in pictures[1].facts
+
+
+def test_a_gate_s_level_has_a_gap_where_it_changed(results: dict[str, Path]) -> None:
+    figure, (panel,) = composed("history", results["history"], Asked())
+    assert panel.subject == "test_step[cloth]", "the one that changed most"
+    stored, level = panel.series
+    assert len(stored.x) == 30
+    known = np.isfinite(level.y)
+    assert known.tolist() == [True, True, False] * 2
+    assert level.y[3] / level.y[0] == pytest.approx(1.05, rel=0.01)
+    said = " ".join(text.get_text() for text in texts(figure))
+    assert re.search(r"Changed by \+[456]\.\d % at 00000", said)
+    assert not kinds.kind("history").panels(results["timing"], lambda _: ())
 
 
 def composed_meshes(kind: str, folder: Path) -> tuple[Figure, list[Any]]:

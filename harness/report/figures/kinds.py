@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from harness.base.errors import InputError, Mistake, RunFailed, SpringbenchError, did_you_mean
 from harness.config.sweep import EVERY_REPORT
-from harness.report.figures import of_accuracy, of_hard, of_meshes, of_runs
+from harness.report.figures import of_accuracy, of_gates, of_hard, of_meshes, of_runs
 from harness.report.figures.entry import Entry, ready
 from harness.report.figures.panel import Grid, Panel, Picture
 from solvers.plugins import load
@@ -31,6 +31,10 @@ class Kind(NamedTuple):
 def _meshes(entries: Sequence[Entry]) -> list[Panel]:
     pictures = [panel for panel in (entry.make() for entry in entries) if isinstance(panel, Picture)]
     return [one for _, of in groupby(pictures, lambda picture: picture.subject) for one in of_meshes.alike(list(of))]
+
+
+def _sheet(entries: Sequence[Entry]) -> list[Panel]:
+    return [*of_meshes.sheet([panel for panel in (e.make() for e in entries) if isinstance(panel, Picture)])]
 
 
 def _maps(entries: Sequence[Entry]) -> list[Panel]:
@@ -68,6 +72,8 @@ KINDS: dict[str, Kind] = {
     "comparison": Kind(
         "Solvers side by side", f"{_SWEEP} with recordings", _rows_alone(of_meshes.comparison), draw=_meshes
     ),
+    "scenes": Kind("Scenes at their end", f"{_SWEEP} with recordings", _rows_alone(of_meshes.scenes), draw=_sheet),
+    "history": Kind("Results of a gate, by commit", of_gates.WANTED, _rows_alone(of_gates.gates)),
 }
 
 

@@ -1,4 +1,4 @@
-"""Pictures of recorded meshes: one run at its last frame, or the solvers of a scene side by side."""
+"""Pictures of recorded meshes: one run at its last frame, the solvers of a scene side by side, or all scenes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,40 +31,71 @@ from harness.report.render import (
 )
 from harness.report.solids import seen
 from harness.report.style import Mark, marks
-from harness.report.timing_table import labels, runs
+from harness.report.timing_table import RunTimes, labels, runs
 
 _LEAST, _MOST = 0.6, 1.9
 """Width over height of a picture."""
 
 
+class _Recorded(NamedTuple):
+    """A run that has a recording. label: what tells it from the others; told: by what it was measured."""
+
+    run: RunTimes
+    label: str
+    path: Path
+    look: Mark
+    told: str
+
+    @property
+    def mesh(self) -> tuple[str, str]:
+        """Scene and size."""
+        return self.run.scene, str(self.run.size)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The label's parts."""
+        return tuple(self.label.split(", "))
+
+    def entry(self, of: tuple[str, ...], name: tuple[str, ...]) -> Entry:
+        """Its last frame as a panel of this name."""
+        return Entry(of, name, partial(_made, of, name, self.path, self.label, self.look, self.told))
+
+
 def run(folder: Path) -> list[Entry]:
     """The last frame of each run that was recorded."""
-    return _entries(folder, alone=True)
+    return [one.entry((*one.mesh, *one.parts), ("mesh",)) for one in _recorded(folder)]
 
 
 def comparison(folder: Path) -> list[Entry]:
     """The last frames of all solvers of a scene and size, by one camera and one scale."""
-    return _entries(folder, alone=False)
+    return [one.entry(one.mesh, one.parts) for one in _recorded(folder)]
 
 
-def _entries(folder: Path, *, alone: bool) -> list[Entry]:
-    """alone: whether each run is something of its own, or one of those of its scene and size."""
+def scenes(folder: Path) -> list[Entry]:
+    """The last frame of each scene at its largest size, by the run of the lowest residual."""
+    best = {one.run.scene: one for one in sorted(_recorded(folder), key=_worth)}
+    return [one.entry(("scenes",), (scene,)) for scene, one in sorted(best.items())]
+
+
+def _worth(one: _Recorded) -> tuple[bool, int, float]:
+    residual = np.inf if one.run.residual is None else one.run.residual
+    return one.run.status == "ok", one.run.vertices or 0, -residual
+
+
+def _recorded(folder: Path) -> list[_Recorded]:
+    """The runs that were recorded, the largest first. Raises InputError where there are none."""
     table = sweep_rows(folder)
     found = runs(table)
     names, looks = labels(found), marks(run.solver for run in found)
     told = {row["run_id"]: row for row in table.select(["run_id", "cpu", "threads", "commit", "code"]).to_pylist()}
-    entries: list[Entry] = []
-    for one in sorted(found, key=lambda run: -(run.vertices or 0)):
-        path = next(iter((folder / "recordings").glob(f"*-{one.run_id}.rrd")), None)
-        if path is not None:
-            label = names[one.run_id]
-            scene, parts = (one.scene, str(one.size)), tuple(label.split(", "))
-            of, name = ((*scene, *parts), ("mesh",)) if alone else (scene, parts)
-            made = partial(_made, of, name, path, label, looks[one.solver], measured_on([told[one.run_id]]))
-            entries.append(Entry(of, name, made))
-    if not entries:
+    there = [
+        _Recorded(one, names[one.run_id], path, looks[one.solver], measured_on([told[one.run_id]]))
+        for one in sorted(found, key=lambda run: -(run.vertices or 0))
+        for path in [*(folder / "recordings").glob(f"*-{one.run_id}.rrd")][:1]
+    ]
+    if not there:
         raise InputError(Mistake("holds no recordings; run a sweep with `record: true`", folder))
-    return entries
+    return there
 
 
 def _made(of: tuple[str, ...], name: tuple[str, ...], path: Path, label: str, look: Mark, told: str) -> Picture:
@@ -141,3 +172,22 @@ def alike(pictures: Sequence[Picture]) -> list[Picture]:
 
 
 _FROM = "Distance: of the farthest vertex from the reference, the run of the lowest residual, in mean rest lengths."
+
+
+def sheet(pictures: Sequence[Picture]) -> list[Picture]:
+    """Pictures of several scenes: each by a camera of its own, all of one shape and by one scale of strain."""
+    limit = max(picture.limit for picture in pictures)
+    aspect = float(np.median([picture.aspect for picture in pictures]))
+    out: list[Picture] = []
+    for picture in pictures:
+        render: Any = picture.render
+        replay, frame = render.replay, render.frame
+        angles = natural_angles(replay.positions[frame], area_vectors(replay, frame))
+        view = frame_all(seen(replay, [frame]), aspect=aspect, angles=angles)
+        made = _Render(replace(replay, strain_range=limit), frame, view)
+        made.aspect = aspect
+        label, *how = picture.title.split(", ")
+        facts = [f"{label}, {how[0]}", *how[1:], *picture.facts] if how else [label, *picture.facts]
+        scene = picture.name[0].replace("-", " ")
+        out.append(replace(picture, subject="", title=scene, limit=limit, aspect=aspect, render=made, facts=facts))
+    return out

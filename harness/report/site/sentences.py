@@ -6,12 +6,10 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from harness.report.learned import SAME
 from harness.report.page import quantity
 
 Run = dict[str, Any]
-
-EQUAL = 10.0
-"""Residuals within this factor of the lowest are equally accurate here."""
 
 
 def sentences(found: Sequence[Run]) -> list[dict[str, Any]]:
@@ -36,7 +34,7 @@ def _race(group: Sequence[Run]) -> Iterator[dict[str, Any]]:
     where = f"{group[0]['scene']}{' ' + str(group[0]['size']) if group[0]['size'] else ''}"
     known = [run for run in group if run["residual"] is not None]
     lowest = min((run["residual"] for run in known), default=None)
-    equal = [run for run in known if lowest is not None and run["residual"] <= EQUAL * lowest] or list(group)
+    equal = [run for run in known if lowest is not None and run["residual"] <= SAME * lowest] or list(group)
     first, *others = sorted(equal, key=lambda run: run["step"])
     words = f"{where}: fastest at equal accuracy is {first['label']}, {quantity(first['step'])} ms a step"
     if others:
