@@ -82,7 +82,7 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
         told = times.rows(measured := measure(scene, _solver(run), settings, tick))
     with beside(tick):
         by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
-    require_numbers(by_frame, minimises=minimises(_solver(run)), yardstick=run.tolerance is not None)
+    require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=run.tolerance is not None)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
     facts |= {"choice": measured.prepared.choice} | standing(run) | how
     return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]

@@ -144,12 +144,13 @@ def strain_of(scene: Scene, p: Positions) -> dict[str, float]:
     return {"largest_strain": float(strain.max(initial=0.0)), "strain_99": percentile}
 
 
-def require_numbers(by_frame: Mapping[int, dict[str, Any]], *, minimises: bool, yardstick: bool) -> None:
+def require_numbers(by_frame: Mapping[int, dict[str, Any]], *, minimises: bool, tolerance: bool) -> None:
     """What is measured of each frame is a number: raises StepFailed, from Diverged, where one is infinite or NaN.
 
-    minimises, yardstick: whether the solver has a residual, and the stop rule a yardstick; else they become null.
+    minimises: whether the solver has a residual; tolerance: whether it was to keep to one, which takes a yardstick.
+    What it has not becomes null.
     """
-    known = {"residual": minimises, "last_residual": minimises, "yardstick": yardstick}
+    known = {"residual": minimises, "last_residual": minimises, "yardstick": minimises and tolerance}
     for frame, columns in by_frame.items():
         columns.update({name: None for name, has in known.items() if name in columns and not has})
         for name, value in columns.items():

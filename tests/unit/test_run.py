@@ -59,13 +59,28 @@ def test_a_run_whose_residual_is_no_number_is_not_ok(tmp_path: Path, solver: str
 def test_a_measured_column_that_is_no_number_fails_its_frame(name: str, value: float):
     columns = {1: {name: 0.0, "digest": "", "minimum": True}, 2: {name: value, "digest": "", "minimum": None}}
     with pytest.raises(StepFailed) as caught:
-        require_numbers(columns, minimises=True, yardstick=True)
+        require_numbers(columns, minimises=True, tolerance=True)
     assert caught.value.frame == 2
     assert run.failure(caught.value)["status"] == "diverged"
     assert run.failure(caught.value)["reason"].startswith(f"{name} is {value}")
 
 
-def test_what_a_method_does_not_have_is_null_and_no_failure():
+@pytest.mark.parametrize("tolerance", [False, True])
+def test_what_a_method_does_not_have_is_null_and_no_failure(tolerance: bool):
     columns = {1: {"residual": float("nan"), "yardstick": float("nan"), "objective": 1.0}}
-    require_numbers(columns, minimises=False, yardstick=False)
+    require_numbers(columns, minimises=False, tolerance=tolerance)
     assert columns == {1: {"residual": None, "yardstick": None, "objective": 1.0}}
+
+
+@pytest.mark.parametrize("solver", ["xpbd", "symplectic-euler", "velocity-verlet", "ros2", "baraff-witkin"])
+def test_a_method_that_minimises_nothing_may_be_asked_for_a_tolerance(tmp_path: Path, solver: str):
+    (tmp_path / "scene.yaml").write_text(
+        "mesh: {kind: chain}\nmass: 1\ntime_step: 0.01\nframes: 2\ndefault_size: 3\neffects: [{kind: gravity}, "
+        "{kind: springs, stretch: 100}, {kind: pins, at: [first]}]\n"
+    )
+    (spec,) = load_any(tmp_path / "scene.yaml", solvers=[solver], tolerance=1e-6).runs()
+    files = Files.of(spec, tmp_path)
+    files.rows.parent.mkdir()
+    found = execute(spec, files, lambda phase: None)
+    assert {row["status"] for row in found} == {"ok"}, found[0]["reason"]
+    assert all(row["residual"] is row["yardstick"] is None for row in found if row["phase"] == "step")
