@@ -22,7 +22,7 @@ from harness.base.files import replacing
 from harness.reference.frozen import Arrays, Frozen, agree, bind, freeze, moment_frames, reference_run, thaw
 from harness.reference.minimiser import MINIMUM, Minimum, Reference, find_minima, polish
 from harness.reference.motion import Field, Unintegrable
-from harness.reference.trajectory import Trajectory, integrate
+from harness.reference.trajectory import Told, Trajectory, integrate
 from harness.scenes.bind import Scene
 from harness.scenes.spec import IntegratorName, SceneSpec
 from harness.simulation.step import Step
@@ -89,8 +89,11 @@ class Store:
             self._remember(frozen, joined)
         return joined.minima[joined.branch(found)] if found.certified else found
 
-    def trajectory(self, spec: SceneSpec, size: int, times: Sequence[float], *, error: float) -> Trajectory:
-        """The trajectory at ascending times [s], by which relative errors down to `error` can be measured.
+    def trajectory(
+        self, spec: SceneSpec, size: int, times: Sequence[float], *, error: float, told: Told | None = None
+    ) -> Trajectory:
+        """The trajectory at ascending times [s], by which relative errors down to `error` can be measured; told: how
+        far it is, where it has to be made.
 
         It is the same for every time step of the scene. Raises InputError, Unintegrable, Unpredictable.
         """
@@ -101,7 +104,7 @@ class Store:
         if stored and agree(stored.pop("witness"), witness):
             found = Trajectory(**stored)
         else:
-            found = integrate(scene, times)
+            found = integrate(scene, times, told)
             arrays = {f.name: getattr(found, f.name) for f in fields(Trajectory)}
             _write(path, arrays | {"witness": witness})
         found.require(error)

@@ -7,7 +7,7 @@ is 1e-12 at the start grows past the error that is to be measured has no traject
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,10 +61,31 @@ class Trajectory:
                     )
 
 
-def integrate(scene: Scene, times: Sequence[float]) -> Trajectory:
-    """The motion of a scene whose pins are exact, at ascending times after its start [s]. Raises Unintegrable."""
-    field = Field(scene)
-    start, size = field.start, scene.mesh.size or 1.0
+Told = Callable[[int, float], None]
+"""Is told, with each evaluation of the forces, which of the motions is followed, from 1 to 3, and up to when [s]."""
+
+
+class _Telling:
+    """A field that tells how far each motion is: one that begins anew is the next."""
+
+    def __init__(self, field: Field, told: Told) -> None:
+        self._field, self._told, self._motion, self._until = field, told, 1, 0.0
+
+    def __call__(self, t: float, y: State) -> State:
+        if t == 0.0 < self._until:
+            self._motion, self._until = self._motion + 1, 0.0
+        self._until = max(self._until, t)
+        self._told(self._motion, t)
+        return self._field(t, y)
+
+
+def integrate(scene: Scene, times: Sequence[float], told: Told | None = None) -> Trajectory:
+    """The motion of a scene whose pins are exact, at ascending times after its start [s]; told: how far it is.
+
+    Raises Unintegrable."""
+    alone = Field(scene)
+    start, size = alone.start, scene.mesh.size or 1.0
+    field = _Telling(alone, told) if told else alone
     nudge = np.zeros_like(start)
     half = len(start) // 2
     nudge[:half] = PERTURBATION * size * np.random.default_rng(0).choice([-1.0, 1.0], half)
@@ -72,7 +93,7 @@ def integrate(scene: Scene, times: Sequence[float]) -> Trajectory:
     path, perturbed = (_dop853(field, y, times, atol) for y in (start, start + nudge))
     other = _adams(field, start, times, atol)
     moved, unknown = _apart(path, start), np.full(len(path), np.inf)
-    motions = [tuple(part.copy() for part in field.motion(t, y)) for t, y in zip(times, path, strict=True)]
+    motions = [tuple(part.copy() for part in alone.motion(t, y)) for t, y in zip(times, path, strict=True)]
     return Trajectory(
         np.array(times, float),
         scene.system.free,
@@ -88,7 +109,7 @@ def _apart(path: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.
     return np.linalg.norm((path - other)[:, : path.shape[1] // 2], axis=1)
 
 
-def _dop853(field: Field, y: State, times: Sequence[float], atol: float) -> State:
+def _dop853(field: Callable[[float, State], State], y: State, times: Sequence[float], atol: float) -> State:
     """The states (k, 6 f); each time ends a step, for interpolation would not be as exact."""
     path, begin = list[State](), 0.0
     for end in times:
@@ -100,7 +121,7 @@ def _dop853(field: Field, y: State, times: Sequence[float], atol: float) -> Stat
     return np.array(path)
 
 
-def _adams(field: Field, y: State, times: Sequence[float], atol: float) -> State:
+def _adams(field: Callable[[float, State], State], y: State, times: Sequence[float], atol: float) -> State:
     """The states (k, 6 f)."""
     solver = ode(field).set_integrator("vode", method="adams", rtol=RTOL, atol=atol, order=12, nsteps=10**8)
     solver.set_initial_value(y, 0.0)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
+from dataclasses import replace
 from pathlib import Path
+from time import sleep
 from typing import Any
 
 import pyarrow as pa
@@ -12,10 +15,14 @@ import pytest
 from harness.base import rows
 from harness.base.claim import claimed
 from harness.base.errors import InputError, RunFailed
+from harness.base.yaml import scalar
 from harness.cli import main
+from harness.config.load import load_any, load_scene
 from harness.experiments.accuracy import recommend as module
+from harness.experiments.accuracy import work
 from harness.experiments.accuracy.recommend import Recommendation, recommend
 from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.units import references, trajectory_of
 from tests.displays import Quiet
 
 SCENE = """
@@ -70,6 +77,11 @@ def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: 
     assert found.best.spec.case.scene.time_step == cheapest["time_step"]
     assert found.checked.error == found.best.error  # the same simulation gives the same positions
     assert found.checked.cost > 0.0
+    slower = replace(found, checked=replace(found.best, cost=2.0 * found.best.cost))
+    other = replace(found, checked=replace(found.best, error=2.0 * found.best.error))
+    assert replace(found, checked=found.best).verdict.startswith("as predicted")
+    assert "the time 2 times that" in slower.verdict
+    assert other.verdict.startswith("not as predicted")
 
 
 def test_what_was_measured_is_not_measured_again(scene: Path) -> None:
@@ -105,8 +117,8 @@ def test_the_results_of_another_scene_of_this_name_are_left_alone(scene: Path) -
 
 
 def test_an_error_that_nothing_keeps_to_is_told_with_the_nearest(scene: Path) -> None:
-    with pytest.raises(RunFailed, match=r"nothing that was measured keeps to an error of 1e-12 .* midpoint") as told:
-        asked(scene, 1e-12)
+    with pytest.raises(RunFailed, match=r"nothing that was measured keeps to an error of 1e-08 .* midpoint") as told:
+        asked(scene, 1e-8)
     assert "ask for a larger --error or a shorter --horizon" in str(told.value)
 
 
@@ -136,3 +148,35 @@ def test_the_command_shows_what_it_predicts_and_what_it_measured(
     told = capsys.readouterr()
     assert not ended.value.code, told.err
     assert all(word in told.out for word in ("predicted", "measured", "sparse", "time step"))
+    assert list((scene.parent / "results" / "recommend-chain" / "pictures").glob("ways-chain-4-0_1-0_2.png"))
+    said = (told.out + told.err).splitlines()
+    command = next(line for line in said if line.startswith("  springbench run "))
+    _, _, config, *given = shlex.split(command)
+    options = {name[2:].replace("-", "_"): scalar(value) for name, value in zip(given[::2], given[1::2], strict=True)}
+    (run,) = load_any(Path(config), solvers=[options.pop("solver")], sizes=[options.pop("size")], **options).runs()
+    assert run.solver.name == "sparse"
+    assert run.frames * run.scene.time_step == pytest.approx(0.2)
+
+
+def test_a_scene_without_a_reference_is_refused_before_anything_is_measured(scene: Path) -> None:
+    scene.write_text(SCENE.replace("{kind: gravity}", "{kind: contact, obstacles: [{kind: plane, point: [0, -9, 0]}]}"))
+    with pytest.raises(RunFailed, match="contact is stiff"):
+        asked(scene, 0.1)
+    assert not measured(scene)
+
+
+def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = module._grid(scene, load_scene(scene), 4, 0.2, 60.0).work[0]
+    first, slow = [True], work.simulate
+
+    def simulate(*given: Any, **more: Any) -> Any:
+        for step in slow(*given, **more):
+            if first.pop() if first else False:
+                sleep(0.3)
+            yield step
+
+    monkeypatch.setattr(work, "simulate", simulate)
+    limited = replace(spec, how=replace(spec.how, time_limit=0.25))
+    row = work.work_rows(limited, trajectory_of(limited, references(scene.parent / "results")), lambda: None)[0]
+    assert row["status"] == "ok", row
+    assert not first

@@ -24,6 +24,7 @@ def recommend(
 
     from harness.base.progress import display
     from harness.experiments.accuracy.recommend import recommend as find
+    from harness.report.accuracy.runners_up import Point, draw_ways
 
     found = find(
         scene,
@@ -39,3 +40,13 @@ def recommend(
     for name, way in (("predicted", found.best), ("measured", found.checked)):
         table.add_row(name, f"{way.error:.3g}", f"{way.cost:.4g}", str(way))
     out().print(table)
+    say(found.verdict)
+    points = [Point(way.spec.solver.name, way.error, way.cost, str(way)) for way in found.ways]
+    title = f"Ways to an error of {100 * error:g} %: {scene.stem} {found.best.spec.case.size or ''}".rstrip()
+    folder = results / f"recommend-{scene.stem}" / "pictures"
+    name = f"ways-{scene.stem}-{found.best.spec.case.size}-{error:g}-{horizon:g}".replace(".", "_")
+    facts = [f"{horizon:g} s simulated", "time stepping and solver together"]
+    picture, *_ = draw_ways(folder / name, title, facts, points, error)
+    say(f"the runners-up are in {picture}")
+    if command := found.best.command(scene):
+        say(f"to run it:\n  {command}")

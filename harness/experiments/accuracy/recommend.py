@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from harness.base import machine, rows, shelf
@@ -37,6 +39,11 @@ from solvers.registry import SOLVERS, about, load, minimises
 
 REFINEMENTS = (0.5, 1, 2, 4, 8)
 """Steps in the horizon, relative to those of the scene's own time step."""
+
+_SAID = 2.0
+"""Seconds between two remarks on the reference."""
+_SAME, _APART = 1e-6, 1.3
+"""How far two errors of one simulation may differ, by compilers alone; and how many times as long it may take."""
 
 TRIED = ["implicit-euler", "bdf2", "midpoint", "sdirk-4"]
 """Integrators: one of each order and kind."""
@@ -68,6 +75,18 @@ class Way:
         stop = f"{u.options['iterations']} iterations" if tolerance is None else f"tolerance {tolerance:g}"
         return f"{u.case.integrator}, time step {u.case.scene.time_step:.6g} s, {stop}, solver {u.solver.name}"
 
+    def command(self, scene: Path) -> str:
+        """The command line that simulates a scene in a file this way; "" where a solver's parameters need a sweep."""
+        u = self.spec
+        if u.solver.parameters:
+            return ""
+        steps = round(u.horizon / u.case.scene.time_step)
+        given: dict[str, Any] = {"size": u.case.size or None, "solver": u.solver.name, "integrator": u.case.integrator}
+        given |= {"time-step": repr(u.case.scene.time_step), "frames": steps, **u.options}
+        said = ((name.replace("_", "-"), value) for name, value in given.items() if value is not None)
+        options = (part for name, value in said for part in (f"--{name}", str(value)))
+        return shlex.join(["springbench", "run", str(scene), *options])
+
 
 @dataclass(frozen=True, slots=True)
 class Recommendation:
@@ -76,6 +95,23 @@ class Recommendation:
     ways: tuple[Way, ...]
     best: Way
     checked: Way
+
+    @property
+    def verdict(self) -> str:
+        """Whether what was predicted is what the check measured, in words."""
+        before, now = self.best, self.checked
+        if not math.isclose(now.error, before.error, rel_tol=_SAME):
+            return (
+                f"not as predicted: the error is {now.error:.3g}, not {before.error:.3g}; what was measured before is "
+                "not this simulation, so remove it and ask again"
+            )
+        ratio = now.cost / before.cost
+        if not 1.0 / _APART <= ratio <= _APART:
+            return (
+                f"the error is as predicted, the time {ratio:.2g} times that: other programs ran beside one of the "
+                "two, so ask again on an idle machine before you rely on the time"
+            )
+        return f"as predicted: the same error, {ratio:.2g} times the time"
 
 
 def recommend(
@@ -104,16 +140,35 @@ def recommend(
         asked = _grid(path, scene, size, horizon, time_limit)
     except InputError as refused:  # the studies are ours; what is wrong came with an option
         raise InputError(list(dict.fromkeys(map(_of_option, refused.mistakes)))) from refused
+    store = references(results)
+    _referenced(scene, size, error, horizon, store, say)
     ways, reasons = _known(path.stem, scene, size, horizon, results)
     if not any(way.error <= error for way in ways):
-        say(f"nothing measured of {path.stem} {size or ''} keeps to an error of {error:g}: measuring")
+        count = len(asked.work)
+        say(f"nothing measured of {path.stem} {size or ''} keeps to an error of {error:g}: measuring {count} ways")
         run_accuracy(asked, claimed(results / asked.name, path), display, say)
         ways, reasons = _known(path.stem, scene, size, horizon, results)
     within = [way for way in ways if way.error <= error]
     if not within:
         raise RunFailed(_nothing(ways, reasons, error, horizon))
     best = within[0]
-    return Recommendation(tuple(ways), best, _check(best, references(results)))
+    say(f"checking {best}")
+    return Recommendation(tuple(ways), best, _check(best, store))
+
+
+def _referenced(
+    scene: SceneSpec, size: int, error: float, horizon: float, store: Store, say: Callable[[str], None]
+) -> None:
+    """Make the reference, or say at once why there is none. Raises RunFailed."""
+    say(f"the reference first, the motion up to {horizon:g} s, which is made once")
+    last = [monotonic()]
+
+    def told(motion: int, time: float) -> None:
+        if monotonic() - last[0] > _SAID:
+            last[0] = monotonic()
+            say(f"  motion {motion} of 3, at {time:.3g} of {horizon:g} s")
+
+    store.trajectory(scene, size, [horizon], error=error, told=told)
 
 
 def _grid(path: Path, scene: SceneSpec, size: int, horizon: float, time_limit: float) -> Accuracy:
