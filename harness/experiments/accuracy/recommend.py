@@ -35,7 +35,7 @@ from harness.reference.store import Store
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
 from solvers.about import LOCAL_GLOBAL
-from solvers.registry import SOLVERS, about, load, minimises
+from solvers.registry import EVERY, SOLVERS, about, load, minimises
 
 REFINEMENTS = (0.5, 1, 2, 4, 8)
 """Steps in the horizon, relative to those of the scene's own time step."""
@@ -77,8 +77,8 @@ class Way:
 
     def command(self, scene: Path) -> str:
         """The command line that simulates a scene in a file this way; "" where a solver's parameters need a sweep."""
-        u = self.spec
-        if u.solver.parameters:
+        u, made = self.spec, load(EVERY[self.spec.solver.name])
+        if made(**u.solver.parameters) != made():
             return ""
         steps = round(u.horizon / u.case.scene.time_step)
         given: dict[str, Any] = {"size": u.case.size or None, "solver": u.solver.name, "integrator": u.case.integrator}

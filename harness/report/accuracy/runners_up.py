@@ -41,14 +41,14 @@ def draw_ways(stem: Path, title: str, facts: Sequence[str], points: Sequence[Poi
         down = limits([*(point.error for point in points), asked], margin=1.8)
         ax.axhspan(down[0], asked, color=RULE, alpha=0.45, zorder=0, lw=0)
         for point in points:
-            look, kept = looks[point.solver], point.error <= asked
-            style = mark(look, hollow=not kept)
+            look = looks[point.solver]
+            style: dict[str, Any] = mark(look, hollow=False) | {"alpha": 1.0 if point.error <= asked else 0.35}
             ax.plot(point.cost, point.error, look.marker, color=look.color, ms=6.5 * sized(look), zorder=3, **style)
         for k, point in enumerate(within[: SHOWN + 1]):
             ring: dict[str, Any] = {"mec": INK, "mew": 1.8, "ms": 18} if not k else {"mec": MUTED, "mew": 0.9, "ms": 14}
             ax.plot(point.cost, point.error, "o", mfc="none", zorder=4, **ring)
             ax.annotate(
-                "recommended" if not k else str(k), (point.cost, point.error), (0, 13 if not k else 10),
+                "recommended" if not k else str(k), (point.cost, point.error), (0, 10 if k else -22),
                 textcoords="offset points", ha="center", fontsize=9, color=INK if not k else MUTED,
             )  # fmt: skip
         log_axis(ax.xaxis, *limits([point.cost for point in points], margin=1.8), unit="time")
