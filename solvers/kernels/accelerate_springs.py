@@ -49,17 +49,13 @@ class Shares(NamedTuple):
 @inner
 def descend(bundles, shares, p, right, out):
     """Write minus the gradient at p to the rows of `out`, and return the objective."""
-    own, start, neighbour, kind, weights, _spring, _direction = bundles
     total = 0.0
-    for b in range(len(start) - 1):
-        energy = descent.descend(
-            *(p, own, b, neighbour, kind, weights, shares.kind, shares.shares),
-            *(start[b], start[b + 1], right, shares.inverse, out),
-        )
+    for b in range(len(bundles.start) - 1):
+        energy = descent.descend(bundles, shares, b, p, right, out)
         if energy < 0.0:
             for lane in range(LANES):
                 for c in range(4):
-                    out[own[LANES * b + lane] + c] = 0.0
+                    out[bundles.own[LANES * b + lane] + c] = 0.0
             add_short(bundles, b, p, right, out, True)
             energy = _short(bundles, shares, b, p, right)
         total += energy

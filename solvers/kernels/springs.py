@@ -141,20 +141,18 @@ def kinds(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.
 @inner
 def add_projection(bundles, begin, end, p, right, out, shift):
     """Add y + A'K d(p) of the bundles from `begin` to `end` to rows of `out`, moved by `shift`."""
-    own, start, neighbour, kind, weights, _spring, _direction = bundles
     moved = out[4 * shift :]
     for b in range(begin, end):
-        if vectors.project(p, own, b, neighbour, kind, weights, start[b], start[b + 1], right, moved):
+        if vectors.project(bundles, b, p, right, moved):
             add_short(bundles, b, p, right, moved, False)
 
 
 @inner
 def add_descent(bundles, begin, end, p, right, out, shift):
     """Add y - Q p + A'K d(p), minus the gradient, of the bundles from `begin` to `end` to rows of `out`."""
-    own, start, neighbour, kind, weights, _spring, _direction = bundles
     moved = out[4 * shift :]
     for b in range(begin, end):
-        if vectors.correct(p, own, b, neighbour, kind, weights, start[b], start[b + 1], right, moved):
+        if vectors.correct(bundles, b, p, right, moved):
             add_short(bundles, b, p, right, moved, True)
 
 
@@ -198,10 +196,9 @@ def one_by_one(bundles, b, p, out, correct):
 @inner
 def squared_norm(bundles, begin, end, e, measure):
     """|e|_Q^2 [J] of displacements in rows of four: half of each spring at each end, `measure` [N/m] of each lane."""
-    own, start, neighbour, kind, weights, _spring, _direction = bundles
     total = 0.0
     for b in range(begin, end):
-        total += vectors.energy(e, own, b, neighbour, kind, weights, start[b], start[b + 1], measure, e)
+        total += vectors.energy(bundles, b, e, measure)
     return total
 
 

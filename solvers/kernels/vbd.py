@@ -44,13 +44,13 @@ class Work(NamedTuple):
 @inner
 def _sweep(blocks, spaces, right, p, work):
     """Move every vertex once to a lower energy."""
-    own, start, neighbour, kind, weights, _spring, _direction = blocks.bundles
-    for b in range(len(start) - 1):
+    own = blocks.bundles.own
+    for b in range(len(blocks.bundles.start) - 1):
         if spaces is not None:  # noqa: SIM102 Numba leaves a branch out for None alone
             if spaces.near[b]:
                 move(blocks.bundles, spaces, b, blocks.unknowns, p, right, blocks.majorant)
                 continue
-        short = descend(p, own, b, neighbour, kind, weights, start[b], start[b + 1], right, blocks.majorant, work.near)
+        short = descend(blocks.bundles, b, p, right, blocks.majorant, work.near)
         if short:
             # A spring without length has no Hessian: the majorant's step takes it apart.
             for lane in range(LANES):

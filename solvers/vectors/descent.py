@@ -10,27 +10,22 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from solvers.vectors.intrinsics import F64, I64, unpacked
-from solvers.vectors.springs import LANES, MOST, WIDE, Eights, constant
+from solvers.vectors.springs import LANES, MOST, WIDE, Bundle, Eights, constant
 
 
-def _bundle(
-    typingctx: Any, x: Any, own: Any, bundle: Any, neighbour: Any, kind: Any, weights: Any, part: Any, shares: Any,
-    begin: Any, end: Any, right: Any, inverse: Any, out: Any,
-) -> Any:  # fmt: skip
+def _bundle(typingctx: Any, bundles: Any, shares: Any, number: Any, x: Any, right: Any, out: Any) -> Any:
     """A bundle's code: writes its rows of `out`, returns its energy; -1, and writes none, if a spring is short."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        x, own, bundle, neighbour, kind, weights, part, shares, begin, end, right, inverse, out = unpacked(
-            context, builder, signature, args
-        )
-        v = Eights(context, builder)
-        centre = v.gather(x, v.places(own, bundle))
+        bundles, shares, number, x, right, out = unpacked(context, builder, signature, args)
+        v, springs = Eights(context, builder), Bundle.of(builder, bundles, number)
+        centre = v.gather(x, v.places(springs.own, number))
         sums, shortest = v.sums(4), cgutils.alloca_once_value(builder, constant(MOST))
 
         def read(entry: Any) -> list[Any]:
             """What an entry's springs need: k r, k, 1/(4 k), and the vector from their other ends."""
-            numbers = [*v.eights(weights, kind, entry), *v.eights(shares, part, entry, 1)]
-            return [*numbers, *v.arrow(x, centre, neighbour, entry)]
+            numbers = [*v.eights(springs.weights, springs.kind, entry), *v.eights(shares.shares, shares.kind, entry, 1)]
+            return [*numbers, *v.arrow(x, centre, springs.neighbour, entry)]
 
         def add(values: list[Any]) -> None:
             """Add an entry's springs to the sums."""
@@ -41,21 +36,20 @@ def _bundle(
             energy = builder.fmul(builder.fmul(share, scale), scale)
             v.add_products([scale] * 3 + [energy], [*arrow, squared], sums)
 
-        v.over_entries(begin, end, read, add)
+        v.over_entries(springs.begin, springs.end, read, add)
         *total, energy = [builder.load(accumulator) for accumulator in sums]
         short = v.short(shortest)
         with builder.if_then(builder.not_(short), likely=True):
-            *constants, held = v.right(right, bundle)
+            *constants, held = v.right(right, number)
             away = [v.subtract_product(a, held, b) for a, b in zip(constants, centre, strict=True)]
-            half = v.load(builder.gep(inverse, [builder.mul(bundle, I64(LANES))]), WIDE)
+            half = v.load(builder.gep(shares.inverse, [builder.mul(number, I64(LANES))]), WIDE)
             builder.store(v.multiply_add(half, v.dot(away), energy), sums[3])
             total = [builder.fadd(a, b) for a, b in zip(total, away, strict=True)]
-            for place, row in zip(v.places(own, bundle), v.rows(total), strict=True):
+            for place, row in zip(v.places(springs.own, number), v.rows(total), strict=True):
                 v.store(row, builder.gep(out, [place]))
         return builder.select(short, F64(-1.0), v.total(builder.load(sums[3])))
 
-    arguments = x, own, bundle, neighbour, kind, weights, part, shares, begin, end, right, inverse, out
-    return types.float64(*arguments), generate
+    return types.float64(bundles, shares, number, x, right, out), generate
 
 
 descend: Any = intrinsic(_bundle)  # Numba passes the first argument itself, which type checkers do not know

@@ -26,16 +26,20 @@ def signature(*kinds: Any, compiled_in: int = 1) -> Any:
 
 
 def unpacked(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
-    """A kernel's arguments: of arrays where they begin, of numbers int64, of what is compiled in Python's int."""
-    out: list[Any] = []
-    for kind, value in zip(signature.args, args, strict=True):
-        if isinstance(kind, types.Array):
-            out.append(context.make_array(kind)(context, builder, value).data)
-        elif isinstance(kind, types.IntegerLiteral):
-            out.append(kind.literal_value)
-        else:
-            out.append(context.cast(builder, value, kind, types.int64))
-    return out
+    """A kernel's arguments: of arrays where they begin, of numbers int64, of what is compiled in Python's int, of named
+    tuples the same of each field."""
+    return [_unpacked(context, builder, *both) for both in zip(signature.args, args, strict=True)]
+
+
+def _unpacked(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    if isinstance(kind, types.Array):
+        return context.make_array(kind)(context, builder, value).data
+    if isinstance(kind, types.IntegerLiteral):
+        return kind.literal_value
+    if hasattr(kind, "instance_class"):
+        fields = [builder.extract_value(value, k) for k in range(len(kind))]
+        return kind.instance_class(*(_unpacked(context, builder, *both) for both in zip(kind, fields, strict=True)))
+    return context.cast(builder, value, kind, types.int64)
 
 
 class Vectors:

@@ -13,7 +13,7 @@ take time for.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 from llvmlite import ir
 from numba import types
@@ -35,12 +35,29 @@ LEAST, MOST = TINY * TINY, 1.7e308
 AHEAD = 128
 """How many rows ahead memory is asked for what is read once an iteration: of large meshes it is in no cache by then."""
 
-Kind = Literal["project", "correct", "energy"]
-
 
 def constant(value: float) -> ir.Constant:
     """Eight times one number."""
     return ir.Constant(WIDE, [value] * LANES)
+
+
+class Bundle(NamedTuple):
+    """The springs of eight vertices in memory: where the arrays of `solvers.kernels.springs.Bundles` begin, the
+    bundle's number, and its first entry and the one behind its last."""
+
+    own: Any
+    neighbour: Any
+    kind: Any
+    weights: Any
+    number: Any
+    begin: Any
+    end: Any
+
+    @classmethod
+    def of(cls, builder: Any, bundles: Any, number: Any) -> Bundle:
+        """The bundle of this number."""
+        begin, end = (builder.load(builder.gep(bundles.start, [builder.add(number, I64(k))])) for k in (0, 1))
+        return cls(bundles.own, bundles.neighbour, bundles.kind, bundles.weights, number, begin, end)
 
 
 class Eights(Vectors):
@@ -158,17 +175,17 @@ class Eights(Vectors):
         at = self.builder.gep(array, [self.builder.mul(bundle, I64(RIGHT))])
         return [self.load(self.builder.gep(at, [I64(LANES * k)]), WIDE) for k in range(4)]
 
-    def ask_ahead(self, bundle: Any, places: list[Any], entry: Any, right: Any, out: Any, neighbour: Any) -> None:
+    def ask_ahead(self, springs: Bundle, places: list[Any], right: Any, out: Any) -> None:
         """Ask for what a bundle reads AHEAD rows on."""
         b = self.builder
-        first = b.mul(b.add(bundle, I64(AHEAD // LANES)), I64(RIGHT))
+        first = b.mul(b.add(springs.number, I64(AHEAD // LANES)), I64(RIGHT))
         for k in range(4):
             ask(b, b.gep(right, [b.add(first, I64(LANES * k))]))
         for place in places[::2]:
             ask(b, b.gep(out, [b.add(place, I64(4 * AHEAD))]))
-        first = b.mul(b.add(entry, I64(AHEAD)), I64(LANES))  # about as many entries as rows
+        first = b.mul(b.add(springs.begin, I64(AHEAD)), I64(LANES))  # about as many entries as rows
         for k in range(LANES // 2):
-            ask(b, b.gep(neighbour, [b.add(first, I64(2 * LANES * k))]))
+            ask(b, b.gep(springs.neighbour, [b.add(first, I64(2 * LANES * k))]))
 
     def guess(self, s: Any) -> tuple[Any, Any]:
         """y, nearly 1/sqrt(s), and 1 - s y^2, for s between LEAST and MOST; `correction` does the rest."""
@@ -201,72 +218,86 @@ class Eights(Vectors):
         return self.multiply_add(self.builder.fmul(y, e), self.correction(e), y)
 
 
-def _over_bundle(kind: Kind) -> Callable[..., Any]:
-    """The code for a bundle: its eight vertices and their springs."""
+def _over_bundle(correct: bool) -> Callable[..., Any]:
+    """The code that adds a bundle's forces to rows of `out`, or none if a spring is short, which it returns.
 
-    def declare(
-        typingctx: Any, x: Any, own: Any, bundle: Any, neighbour: Any, kinds: Any, weights: Any, begin: Any, end: Any,
-        right: Any, out: Any,
-    ) -> Any:  # fmt: skip
+    correct: minus the gradient; else the constant right-hand side and the springs' projections.
+    """
+
+    def declare(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, out: Any) -> Any:
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            x, own, bundle, neighbour, kinds, weights, begin, end, right, out = unpacked(
-                context, builder, signature, args
-            )
-            v = Eights(context, builder)
-            places = v.places(own, bundle)
+            bundles, number, x, right, out = unpacked(context, builder, signature, args)
+            v, springs = Eights(context, builder), Bundle.of(builder, bundles, number)
+            places = v.places(springs.own, number)
             centre = v.gather(x, places)
-            if kind != "energy":
-                v.ask_ahead(bundle, places, begin, right, out, neighbour)
-            sums, shortest = v.sums(3), cgutils.alloca_once_value(builder, constant(MOST))
-
-            def read(entry: Any) -> list[Any]:
-                """What an entry's springs need: k r, k, and the vector from their other ends with its square."""
-                arrow = v.arrow(x, centre, neighbour, entry)
-                return [*v.eights(weights, kinds, entry), v.dot(arrow), *arrow]
-
-            def scale(values: list[Any]) -> list[Any]:
-                """What the vectors are multiplied by, as a guess and what is to be added to it."""
-                pull, stiffness, squared, *arrow = values
-                v.note_least(squared, shortest)
-                y, e = v.guess(squared)
-                guess = builder.fmul(pull, y)
-                short = builder.fmul(guess, e)
-                if kind == "correct":
-                    guess = builder.fsub(guess, stiffness)
-                return [guess, short, e, *arrow]
-
-            def add(values: list[Any]) -> None:
-                """Add an entry's springs to the sums."""
-                if kind == "energy":
-                    _, stiffness, squared, *_ = values
-                    v.add_products([stiffness], [squared], sums[:1])
-                else:
-                    guess, short, e, *arrow = values
-                    v.add_products([v.multiply_add(short, v.correction(e), guess)] * 3, arrow, sums)
-
-            v.over_entries(begin, end, read, *([add] if kind == "energy" else [scale, add]))
-            total = [builder.load(accumulator) for accumulator in sums]
-            if kind == "energy":
-                held = v.load(builder.gep(right, [builder.mul(bundle, I64(LANES))]), WIDE)
-                return v.total(v.multiply_add(v.dot(centre), held, builder.fmul(constant(0.5), total[0])))
-            short = v.short(shortest)
+            v.ask_ahead(springs, places, right, out)
+            sums, short = _sums(v, springs, x, centre, correct)
             with builder.if_then(builder.not_(short), likely=True):
-                *constants, held = v.right(right, bundle)
-                total = [builder.fadd(a, b) for a, b in zip(total, constants, strict=True)]
-                if kind == "correct":
+                *constants, held = v.right(right, number)
+                total = [builder.fadd(a, b) for a, b in zip(sums, constants, strict=True)]
+                if correct:
                     total = [v.subtract_product(a, held, b) for a, b in zip(total, centre, strict=True)]
-                places = v.places(own, bundle)  # again: they would not stay in registers
+                places = v.places(springs.own, number)  # again: they would not stay in registers
                 for place, row in zip(places, v.rows(total, out.type.pointee), strict=True):
                     v.add_to(builder.gep(out, [place]), row)
             return short
 
-        returned = types.float64 if kind == "energy" else types.boolean
-        return returned(x, own, bundle, neighbour, kinds, weights, begin, end, right, out), generate
+        return types.boolean(bundles, number, x, right, out), generate
 
     return declare
 
 
+def _sums(v: Eights, springs: Bundle, x: Any, centre: list[Any], correct: bool) -> tuple[list[Any], Any]:
+    """What the springs of eight vertices add up to, (k r/|v| - k) v, or k r/|v| v; and whether one is short."""
+    builder: Any = v.builder
+    sums, shortest = v.sums(3), cgutils.alloca_once_value(builder, constant(MOST))
+
+    def read(entry: Any) -> list[Any]:
+        """What an entry's springs need: k r, k, and the vector from their other ends with its square."""
+        arrow = v.arrow(x, centre, springs.neighbour, entry)
+        return [*v.eights(springs.weights, springs.kind, entry), v.dot(arrow), *arrow]
+
+    def scale(values: list[Any]) -> list[Any]:
+        """What the vectors are multiplied by, as a guess and what is to be added to it."""
+        pull, stiffness, squared, *arrow = values
+        v.note_least(squared, shortest)
+        y, e = v.guess(squared)
+        guess = builder.fmul(pull, y)
+        more = builder.fmul(guess, e)
+        return [builder.fsub(guess, stiffness) if correct else guess, more, e, *arrow]
+
+    def add(values: list[Any]) -> None:
+        """Add an entry's springs to the sums."""
+        guess, more, e, *arrow = values
+        v.add_products([v.multiply_add(more, v.correction(e), guess)] * 3, arrow, sums)
+
+    v.over_entries(springs.begin, springs.end, read, scale, add)
+    return [builder.load(total) for total in sums], v.short(shortest)
+
+
+def _energy(typingctx: Any, bundles: Any, number: Any, x: Any, measure: Any) -> Any:
+    """A bundle's share of the squared norm of x: half of its springs', and what `measure` holds each vertex with."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        bundles, number, x, measure = unpacked(context, builder, signature, args)
+        v, springs = Eights(context, builder), Bundle.of(builder, bundles, number)
+        centre, (total,) = v.gather(x, v.places(springs.own, number)), v.sums(1)
+
+        def read(entry: Any) -> list[Any]:
+            arrow = v.arrow(x, centre, springs.neighbour, entry)
+            return [v.eights(springs.weights, springs.kind, entry)[1], v.dot(arrow)]
+
+        def add(values: list[Any]) -> None:
+            v.add_products(values[:1], values[1:], [total])
+
+        v.over_entries(springs.begin, springs.end, read, add)
+        held = v.load(builder.gep(measure, [builder.mul(number, I64(LANES))]), WIDE)
+        return v.total(v.multiply_add(v.dot(centre), held, builder.fmul(constant(0.5), builder.load(total))))
+
+    return types.float64(bundles, number, x, measure), generate
+
+
 # Numba passes the first argument itself, which type checkers do not know.
-project: Any = intrinsic(_over_bundle("project"))
-correct: Any = intrinsic(_over_bundle("correct"))
-energy: Any = intrinsic(_over_bundle("energy"))
+project: Any = intrinsic(_over_bundle(correct=False))
+correct: Any = intrinsic(_over_bundle(correct=True))
+energy: Any = intrinsic(_energy)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 from llvmlite import ir
 from numba import types
@@ -10,7 +10,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from solvers.vectors.intrinsics import I64, unpacked
-from solvers.vectors.springs import LANES, LEAST, MASK, WIDE, Eights, constant
+from solvers.vectors.springs import LANES, LEAST, MASK, WIDE, Bundle, Eights, constant
 
 NUMBERS = 4
 """What is kept of each spring between the two passes: its vector and its length."""
@@ -43,24 +43,14 @@ def _newton(v: Eights, block: list[Any], g: list[Any]) -> tuple[list[Any], Any]:
     return [x0, x1, x2], builder.and_(builder.and_(large[0], large[1]), large[2])
 
 
-class _Springs(NamedTuple):
-    """A bundle's springs in memory, and `near`, where what both passes need of them is kept."""
-
-    neighbour: Any
-    kind: Any
-    weights: Any
-    begin: Any
-    end: Any
-    near: Any
-
-    def kept(self, builder: Any, entry: Any) -> list[Any]:
-        """Where an entry's vector and length are kept."""
-        begins = builder.mul(builder.sub(entry, self.begin), I64(LANES * NUMBERS))
-        return [builder.gep(self.near, [builder.add(begins, I64(LANES * k))]) for k in range(NUMBERS)]
+def _kept(builder: Any, springs: Bundle, near: Any, entry: Any) -> list[Any]:
+    """Where the vector and the length of an entry's springs are kept for the second pass."""
+    begins = builder.mul(builder.sub(entry, springs.begin), I64(LANES * NUMBERS))
+    return [builder.gep(near, [builder.add(begins, I64(LANES * k))]) for k in range(NUMBERS)]
 
 
 def _model(
-    v: Eights, springs: _Springs, x: Any, centre: list[Any], load: list[Any], weight: Any
+    v: Eights, springs: Bundle, near: Any, x: Any, centre: list[Any], load: list[Any], weight: Any
 ) -> tuple[list[Any], list[Any], Any]:
     """Minus the gradients, the upper triangles of the blocks, row by row, and whether a spring is too short.
 
@@ -75,7 +65,8 @@ def _model(
         tiny = builder.fcmp_ordered("<=", squared, constant(LEAST))
         builder.store(builder.or_(builder.load(short), tiny), short)
         root = v.inverse_root(v.clamped(squared))
-        for value, pointer in zip([*arrow, builder.fmul(squared, root)], springs.kept(builder, entry), strict=True):
+        kept = _kept(builder, springs, near, entry)
+        for value, pointer in zip([*arrow, builder.fmul(squared, root)], kept, strict=True):
             v.store(value, pointer)
         pull, k = v.eights(springs.weights, springs.kind, entry)
         inward = builder.fmul(pull, root)
@@ -95,7 +86,7 @@ def _model(
     return found[:3], found[3:], v.any(builder.load(short))
 
 
-def _rise(v: Eights, springs: _Springs, load: list[Any], weight: Any, d: list[Any]) -> Any:
+def _rise(v: Eights, springs: Bundle, near: Any, load: list[Any], weight: Any, d: list[Any]) -> Any:
     """By how much steps d raise the energy, from differences of lengths, which do not cancel."""
     builder: Any = v.builder
     rise = builder.fmul(builder.fmul(_HALF, weight), v.dot(d))
@@ -103,7 +94,7 @@ def _rise(v: Eights, springs: _Springs, load: list[Any], weight: Any, d: list[An
         rise = v.subtract_product(rise, component, own_force)
     rises = cgutils.alloca_once_value(builder, rise)
     with cgutils.for_range_slice(builder, springs.begin, springs.end, I64(1), I64) as (entry, _):
-        *arrow, length = [v.load(pointer, WIDE) for pointer in springs.kept(builder, entry)]
+        *arrow, length = [v.load(pointer, WIDE) for pointer in _kept(builder, springs, near, entry)]
         moved = [builder.fadd(a, b) for a, b in zip(arrow, d, strict=True)]
         squared = v.dot(moved)
         both = v.multiply_add(squared, v.inverse_root(v.clamped(squared)), length)
@@ -116,26 +107,21 @@ def _rise(v: Eights, springs: _Springs, load: list[Any], weight: Any, d: list[An
     return builder.load(rises)
 
 
-def _bundle(
-    typingctx: Any, x: Any, own: Any, bundle: Any, neighbour: Any, kind: Any, weights: Any, begin: Any, end: Any,
-    right: Any, majorant: Any, near: Any,
-) -> Any:  # fmt: skip
+def _bundle(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, majorant: Any, near: Any) -> Any:
     """A bundle's code: moves its vertices in x, and returns whether a spring is too short, when it moves none."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        x, own, bundle, neighbour, kind, weights, begin, end, right, majorant, near = unpacked(
-            context, builder, signature, args
-        )
-        v, springs = Eights(context, builder), _Springs(neighbour, kind, weights, begin, end, near)
-        places = v.places(own, bundle)
+        bundles, number, x, right, majorant, near = unpacked(context, builder, signature, args)
+        v, springs = Eights(context, builder), Bundle.of(builder, bundles, number)
+        places = v.places(springs.own, number)
         centre = v.gather(x, places)
-        *constants, weight = v.right(right, bundle)
+        *constants, weight = v.right(right, number)
         load = [v.subtract_product(here, weight, p) for here, p in zip(constants, centre, strict=True)]
-        force, block, short = _model(v, springs, x, centre, load, weight)
+        force, block, short = _model(v, springs, near, x, centre, load, weight)
         d, definite = _newton(v, block, [builder.fsub(_ZERO, component) for component in force])
-        falls = builder.fcmp_ordered("<=", _rise(v, springs, load, weight, d), _ZERO)
+        falls = builder.fcmp_ordered("<=", _rise(v, springs, near, load, weight, d), _ZERO)
         better = builder.and_(definite, falls)
-        scale = builder.fdiv(_ONE, v.load(builder.gep(majorant, [builder.mul(bundle, I64(LANES))]), WIDE))
+        scale = builder.fdiv(_ONE, v.load(builder.gep(majorant, [builder.mul(number, I64(LANES))]), WIDE))
         safe = [builder.fmul(scale, component) for component in force]
         ends = [builder.fadd(p, builder.select(better, a, b)) for p, a, b in zip(centre, d, safe, strict=True)]
         with builder.if_then(builder.not_(short), likely=True):
@@ -143,8 +129,7 @@ def _bundle(
                 v.store(row, builder.gep(x, [place]))
         return short
 
-    arguments = x, own, bundle, neighbour, kind, weights, begin, end, right, majorant, near
-    return types.boolean(*arguments), generate
+    return types.boolean(bundles, number, x, right, majorant, near), generate
 
 
 descend: Any = intrinsic(_bundle)  # Numba passes the first argument itself, which type checkers do not know

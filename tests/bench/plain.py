@@ -11,33 +11,35 @@ from solvers.vectors.block import ROWS
 from solvers.vectors.springs import LANES, RIGHT
 
 
-def refuse(x, own, bundle, neighbour, kinds, weights, begin, end, right, out):
+def refuse(bundles, number, x, right, out):
     """Springs: `solvers.kernels.springs.add_short` does the bundle."""
     return True
 
 
-def refuse_energy(x, own, bundle, neighbour, kind, weights, part, shares, begin, end, right, inverse, out):
+def refuse_energy(bundles, shares, number, x, right, out):
     """The objective and its gradient: `add_short` and `_short` do the bundle."""
     return -1.0
 
 
-def energy(x, own, bundle, neighbour, kinds, weights, begin, end, right, out):
+def energy(bundles, number, x, measure):
     """Half of each spring's k |v|^2, and what holds each vertex."""
+    own, neighbour, kinds, weights = bundles.own, bundles.neighbour, bundles.kind, bundles.weights
     total = 0.0
     for lane in range(LANES):
-        i = own[LANES * bundle + lane]
-        total += right[LANES * bundle + lane] * (x[i] ** 2 + x[i + 1] ** 2 + x[i + 2] ** 2)
-        for entry in range(begin, end):
+        i = own[LANES * number + lane]
+        total += measure[LANES * number + lane] * (x[i] ** 2 + x[i + 1] ** 2 + x[i + 2] ** 2)
+        for entry in range(bundles.start[number], bundles.start[number + 1]):
             j = neighbour[LANES * entry + lane]
             v0, v1, v2 = x[i] - x[j], x[i + 1] - x[j + 1], x[i + 2] - x[j + 2]
             total += 0.5 * weights[kinds[entry] + LANES + lane] * (v0 * v0 + v1 * v1 + v2 * v2)
     return total
 
 
-def newton(x, own, bundle, neighbour, kind, weights, begin, end, right, majorant, near):
+def newton(bundles, number, x, right, majorant, near):
     """Vertex block descent: a Newton step of each vertex; springs that are short are not looked for."""
+    own, neighbour, kind, weights = bundles.own, bundles.neighbour, bundles.kind, bundles.weights
     for lane in range(LANES):
-        i, at = own[LANES * bundle + lane], RIGHT * bundle + lane
+        i, at = own[LANES * number + lane], RIGHT * number + lane
         held = right[at + 3 * LANES]
         p0, p1, p2 = x[i], x[i + 1], x[i + 2]
         load0, load1, load2 = (
@@ -47,7 +49,7 @@ def newton(x, own, bundle, neighbour, kind, weights, begin, end, right, majorant
         )
         g0, g1, g2 = load0, load1, load2
         a, b, c, d, e, f = held, 0.0, 0.0, held, 0.0, held
-        for entry in range(begin, end):
+        for entry in range(bundles.start[number], bundles.start[number + 1]):
             j, w = neighbour[LANES * entry + lane], kind[entry] + lane
             v0, v1, v2 = p0 - x[j], p1 - x[j + 1], p2 - x[j + 2]
             pull, k, root = weights[w], weights[w + LANES], 1.0 / np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
@@ -67,7 +69,7 @@ def newton(x, own, bundle, neighbour, kind, weights, begin, end, right, majorant
         s0 = g0 / a - l1 * s1 - l2 * s2
         least = 1e-14 * (a + d + f)
         rise = 0.5 * held * (s0 * s0 + s1 * s1 + s2 * s2) - s0 * load0 - s1 * load1 - s2 * load2
-        for entry in range(begin, end):
+        for entry in range(bundles.start[number], bundles.start[number + 1]):
             j, w = neighbour[LANES * entry + lane], kind[entry] + lane
             v0, v1, v2 = p0 - x[j], p1 - x[j + 1], p2 - x[j + 2]
             m0, m1, m2 = v0 + s0, v1 + s1, v2 + s2
@@ -75,12 +77,12 @@ def newton(x, own, bundle, neighbour, kind, weights, begin, end, right, majorant
             change = (v0 + m0) * s0 + (v1 + m1) * s1 + (v2 + m2) * s2
             rise += (0.5 * weights[w + LANES] - weights[w] / both) * change
         if not (a > least and second > least and third > least and rise <= 0.0):
-            scale = 1.0 / majorant[LANES * bundle + lane]
+            scale = 1.0 / majorant[LANES * number + lane]
             s0, s1, s2 = scale * g0, scale * g1, scale * g2
         near[3 * lane], near[3 * lane + 1], near[3 * lane + 2] = p0 + s0, p1 + s1, p2 + s2
     for lane in range(LANES):
         for axis in range(3):
-            x[own[LANES * bundle + lane] + axis] = near[3 * lane + axis]
+            x[own[LANES * number + lane] + axis] = near[3 * lane + axis]
     return False
 
 
