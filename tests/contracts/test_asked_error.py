@@ -15,6 +15,8 @@ from harness.base.errors import RunFailed
 from harness.cli import app
 from harness.config.load import load_scene
 from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.asked import ways as module
+from harness.experiments.asked.halving import halved
 from harness.experiments.asked.peers import PEERS, pattern
 from harness.experiments.asked.search import foresee, search
 from harness.experiments.asked.ways import Asked, tried, ways
@@ -24,6 +26,7 @@ from harness.reference.store import Store
 from harness.reference.trajectory import integrate
 from harness.scenes.bind import Scene, build
 from harness.scenes.effects.air_drag import AirDrag
+from harness.scenes.effects.contact import Contact
 from harness.scenes.effects.dashpots import Dashpots
 from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins
@@ -31,9 +34,11 @@ from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.chain import Chain
 from harness.scenes.spec import SceneSpec
 from harness.simulation.controlled import Implicit, Own, Stuck, hermite
+from harness.simulation.step import prepare, simulate
 from solvers.integrators import Motion
 from solvers.methods.newton import Newton
 from solvers.methods.rosenbrock import Rodas
+from solvers.problem import StopRule
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 HELD = Pins(at=("first",), weight="exact")
@@ -190,9 +195,20 @@ def test_drag_that_grows_with_the_square_of_the_speed_is_graded_too(tmp_path):
     assert found.error(0, path.positions[-1]) < 1e-3
 
 
-def test_contact_is_refused_before_anything_is_simulated():
-    with pytest.raises(RunFailed, match="contact begins and ends within steps"):
-        Asked.of(load_scene(SCENES / "block-drop.yaml"), None, None)
+def test_contact_is_refused_with_what_can_be_had(monkeypatch):
+    """Which is the difference that halving the steps makes: half as much each time, for the order is 1."""
+    floor = Contact.model_validate({"obstacles": [{"kind": "plane", "point": [0.0, -9.0, 0.0]}]})
+    spec = chain(Springs(stretch=40.0), Gravity(), HELD, floor)
+    monkeypatch.setattr(module, "_SPENT", 0.5)
+    with pytest.raises(RunFailed, match=r"contact begins and ends within steps.*steps of .* s end within .* of where"):
+        Asked.of(spec, 5, END)
+    asked = Asked(chain(Springs(stretch=40.0), Gravity(), HELD), 5, END, FRAMES)
+    found = halved(asked.bound, END, FRAMES, seconds=0.5)
+    error = integrate(asked.bound(asked.frame, "own"), [END]).error
+    scene, steps = asked.bound(found.step, "implicit-euler"), round(END / found.step)
+    path = simulate(scene, prepare(scene, Newton()), StopRule(50, 1e-9), first_guess="current", frames=steps)
+    true = error(0, [step.positions for step in path][-1])
+    assert found.moved == pytest.approx(0.5 * true, rel=0.3)  # h - h/2, and what is of order 2
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def run_to_error(
     whether what was checked holds. Raises InputError, RunFailed.
     """
     _require(error, horizon, {**(others or {}), "second --size": sizes[1:]})
-    asked = Asked.of(load_scene(config), sizes[0] if sizes else None, horizon)
+    asked = Asked.of(load_scene(config), sizes[0] if sizes else None, horizon, say)
     folder = claimed(results / config.stem, config)
     with machine.pinned_threads(1):
         seen = foresee(asked, error, say)

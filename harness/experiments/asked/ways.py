@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from harness.base.errors import InputError, RunFailed
 from harness.config.load import misfits
+from harness.experiments.asked.halving import halved
 from harness.reference.frozen import bind
 from harness.scenes.bind import Scene
 from harness.scenes.spec import SceneSpec
@@ -18,6 +19,8 @@ from solvers.registry import SOLVERS, about, load
 
 _ONCE = 1e-2
 """Of the mesh's size: the tolerance of what only compiles."""
+_SPENT = 30.0
+"""Seconds on what can be had instead of a promise."""
 _CONTACT = (
     "contact begins and ends within steps, where every method here has order 1: no error can be promised; run it with "
     "steps of one length (--integrator, --time-step), and halve them until the motion stays as it is"
@@ -34,7 +37,9 @@ class Asked:
     frames: int
 
     @classmethod
-    def of(cls, scene: SceneSpec, size: int | None, horizon: float | None) -> Asked:
+    def of(
+        cls, scene: SceneSpec, size: int | None, horizon: float | None, say: Callable[[str], None] | None = None
+    ) -> Asked:
         """Of the scene's own size and length where none are given; frames are about as long as its time step.
 
         Raises InputError, and RunFailed for contact."""
@@ -47,7 +52,9 @@ class Asked:
         asked = cls(scene, size, horizon, frames)
         system = asked.bound(asked.frame, "implicit-euler").system
         if without_contact(system) is not system:
-            raise RunFailed(_CONTACT)
+            if say:
+                say(f"no error can be promised with contact; halving steps for {_SPENT:g} s to tell what can be had")
+            raise RunFailed(f"{_CONTACT}; {halved(asked.bound, horizon, frames, seconds=_SPENT)}")
         return asked
 
     def bound(self, time_step: float, integrator: str) -> Scene:
