@@ -59,7 +59,7 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Series:
+class GateHistory:
     """A gate on one kind of machine, in the order of its commits.
 
     starts: of its stretches, 0 first, the others are changes; ratio: whether values are ratios, or seconds.
@@ -98,7 +98,7 @@ def stored_files(places: Iterable[Path]) -> list[Path]:
     return found
 
 
-def history(files: Sequence[Path]) -> list[Series]:
+def history(files: Sequence[Path]) -> list[GateHistory]:
     """The gates in stored files and their changes; the largest first. Raises InputError for foreign files."""
     stored = sorted(map(read_stored, files), key=lambda s: (s.commit_info.time or s.datetime, s.datetime))
     points: dict[tuple[str, str, bool], list[Point]] = defaultdict(list)
@@ -106,7 +106,7 @@ def history(files: Sequence[Path]) -> list[Series]:
         for benchmark in one.benchmarks:
             key = benchmark.fullname.rpartition("::")[2], _machine(one), benchmark.extra_info.ratio is not None
             points[key].append(_point(one, benchmark))
-    found = [Series(*key, tuple(of_gate), changes(of_gate)) for key, of_gate in points.items()]
+    found = [GateHistory(*key, tuple(of_gate), changes(of_gate)) for key, of_gate in points.items()]
     return sorted(found, key=lambda s: (-max((abs(math.log(r)) for _, r in s.changes), default=0.0), s.gate))
 
 
@@ -140,7 +140,7 @@ def noise(y: Array) -> float:
     return max(float(np.median(apart)) / (0.6745 * math.sqrt(2)), FLOOR)
 
 
-def history_table(found: Sequence[Series]) -> Table:
+def history_table(found: Sequence[GateHistory]) -> Table:
     """The gates, their last level, and their changes in words."""
     table = Table("gate", "results", "now", "changes", box=SIMPLE_HEAD)
     for series in found:

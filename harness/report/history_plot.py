@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from harness.base.files import replacing
-from harness.report.history import FEWEST, Series
+from harness.report.history import FEWEST, GateHistory
 from harness.report.style import DPI, INK, MUTED, RC, WARNING, WIDTH
 
 MOST = 12
@@ -23,7 +23,7 @@ _ROW = 190
 """Pixels of a panel's height."""
 
 
-def draw_history(found: Sequence[Series], path: Path) -> int:
+def draw_history(found: Sequence[GateHistory], path: Path) -> int:
     """Draw the gates of which enough is known, at most MOST of them, and return how many are drawn."""
     shown = [series for series in found if len(series.points) >= FEWEST]
     count = len(shown)
@@ -53,7 +53,7 @@ def draw_history(found: Sequence[Series], path: Path) -> int:
     return len(shown)
 
 
-def _panel(axis: Any, series: Series) -> None:
+def _panel(axis: Any, series: GateHistory) -> None:
     unit = 1.0 if series.ratio else 1e3
     values = [unit * point.value for point in series.points]
     low = [unit * (p.value - p.low) for p in series.points]
@@ -87,7 +87,7 @@ def _panel(axis: Any, series: Series) -> None:
     axis.set_axisbelow(True)
 
 
-def _ticks(series: Series) -> list[int]:
+def _ticks(series: GateHistory) -> list[int]:
     """The results whose commits are named: those of changes, then the last, the first and others that have room."""
     count = len(series.points)
     wanted = [*(at for at, _ in series.changes), count - 1, *range(0, count, max(1, count // 8))]

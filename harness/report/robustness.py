@@ -76,7 +76,7 @@ _ENDED = {
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class Judged:
     """One run: its case, its solver, what became of it and why; worst: the largest `beyond` of a step, or where
     `graded` is "distance" the largest distance from the reference, None where there is none;
     reference: where the solver comes from, as rows have it; run_id: of the run."""
@@ -102,7 +102,7 @@ class Cell:
         return "0" if self.worst == 0.0 else f"1e{round(math.log10(self.worst))}"
 
 
-def read_cells(folder: Path) -> list[Cell]:
+def read_cells(folder: Path) -> list[Judged]:
     """The outcomes of the runs in a sweep's folder, the newest where one was repeated; by case, then by solver.
 
     Raises InputError where no run was judged.
@@ -118,12 +118,12 @@ def read_cells(folder: Path) -> list[Cell]:
     if any(row["stationarity"] is not None and row["beyond"] is None for row in table):
         raise InputError(f"{folder}: holds runs that another version judged; run the sweep again")
     firsts = [run[0] for run in runs.values()]
-    cells: dict[tuple[str, str], Cell] = {}
+    cells: dict[tuple[str, str], Judged] = {}
     for run in sorted(runs.values(), key=lambda run: run[0]["started"]):
         case, solver = _case(run[0], firsts), _solver(run[0], firsts)
         outcome, worst, graded, reason = judged(run)
         run_id, reference = run[0]["run_id"], run[0]["reference"] or ""
-        cells[case, solver] = Cell(case, solver, outcome, worst, graded, reason, reference, run_id)
+        cells[case, solver] = Judged(case, solver, outcome, worst, graded, reason, reference, run_id)
     order = [*SOLVERS, *OPTIONAL, *(first["solver"] for first in firsts)]
     return sorted(cells.values(), key=lambda cell: (cell.case, order.index(cell.solver.split()[0]), cell.solver))
 
@@ -185,10 +185,10 @@ class Score:
     counts: tuple[int, ...]
     right: float | None
     finite: float | None
-    worst: Cell
+    worst: Judged
 
 
-def scores(cells: Sequence[Cell]) -> list[Score]:
+def scores(cells: Sequence[Judged]) -> list[Score]:
     """A score for each solver, in the cells' order."""
     found: list[Score] = []
     for solver in dict.fromkeys(cell.solver for cell in cells):
@@ -209,7 +209,7 @@ def percent(share: float | None) -> str:
     return "" if share is None else f"{share:.0%}"
 
 
-def summary(cells: Sequence[Cell]) -> Table:
+def summary(cells: Sequence[Judged]) -> Table:
     """A row for each solver: how many cases ended how, the shares of those it did not refuse, the worst residual."""
     table = Table("solver", *(outcome.words for outcome in OUTCOMES), "right", "finite", "worst")
     for score in scores(cells):

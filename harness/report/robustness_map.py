@@ -22,7 +22,7 @@ from harness.report.robustness import (
     OUTCOMES,
     RIGHT,
     WRONG,
-    Cell,
+    Judged,
     Outcome,
     percent,
     read_cells,
@@ -50,14 +50,14 @@ NOTE = (
 )
 
 
-def headline(cells: Sequence[Cell], name: str) -> str:
+def headline(cells: Sequence[Judged], name: str) -> str:
     """The map in a line of words."""
     of = {outcome: sum(cell.outcome == outcome for cell in cells) for outcome in OUTCOMES}
     broken = of[DIVERGED] + of[FAILED]
     return f"{name}: {of[RIGHT]} of {len(cells)} runs right, {of[WRONG]} silently wrong, {broken} diverged or failed"
 
 
-def draw_map(cells: Sequence[Cell], path: Path, title: str, older: Collection[str] = ()) -> None:
+def draw_map(cells: Sequence[Judged], path: Path, title: str, older: Collection[str] = ()) -> None:
     """Draw the map to a PNG. older: the ids of the runs that other code than today's did, which get a hollow mark."""
     solvers = list(dict.fromkeys(cell.solver for cell in cells))
     places, rows = _places(list(dict.fromkeys(cell.case for cell in cells)))
@@ -108,7 +108,7 @@ def _places(cases: Sequence[str]) -> tuple[dict[str, float], float]:
     return places, y
 
 
-def _draw_scores(ax: Axes, cells: Sequence[Cell]) -> None:
+def _draw_scores(ax: Axes, cells: Sequence[Judged]) -> None:
     """The solvers' scores above their columns: both shares as bars, and the worst of their figures."""
     for y, words in enumerate(("right", "finite", "worst")):
         ax.text(-0.1, y + 0.53, words, ha="right", va="center", fontsize=8.5, color=INK, weight="bold")
@@ -124,7 +124,7 @@ _BARS = ("#8fcbad", "#c4ccd6")
 """Of the shares that are right and finite."""
 
 
-def _legend(figure: Figure, cells: Sequence[Cell], used: Sequence[Outcome], across: int, top: float) -> None:
+def _legend(figure: Figure, cells: Sequence[Judged], used: Sequence[Outcome], across: int, top: float) -> None:
     """The outcomes that the map has, so many in a row, from `top` [inches] down."""
     width, height = figure.get_size_inches()
     for k, outcome in enumerate(used):
@@ -154,7 +154,7 @@ def _ink(outcome: Outcome) -> str:
     return INK if 0.3 * red + 0.6 * green + 0.1 * blue > 120 else PAGE
 
 
-def draw_maps(results: Path, older: Callable[[Path], Collection[str]]) -> Iterator[tuple[Path, list[Cell]]]:
+def draw_maps(results: Path, older: Callable[[Path], Collection[str]]) -> Iterator[tuple[Path, list[Judged]]]:
     """Draw the maps of those sweeps in a folder of results, or of one sweep, whose runs were judged.
 
     older: tells the ids of those runs in a sweep's folder that other code than today's did.

@@ -99,7 +99,7 @@ def compose(forces, drifts, kept, gained, count, h, p, v, acceleration):
                         v[c] = kept[k, i] * v[c] + gained[k, i] * acceleration[c]
 
 
-class Stages(NamedTuple):
+class Coefficients(NamedTuple):
     """A Runge-Kutta method: a (s, s), rows of the tableau, the last of which ends the step; times (s,): c; errors
     (1 or 2, s): weights of the error, the second one that of a lower order which tempers it; power: the error falls by
     h^power, 0 keeps h."""
@@ -110,7 +110,7 @@ class Stages(NamedTuple):
     power: float
 
 
-class Steps(NamedTuple):
+class Subdivision(NamedTuple):
     """How a frame [s] is cut: tolerance [m]: of each step, root mean square; most: how many may be tried; first [s]."""
 
     frame: float

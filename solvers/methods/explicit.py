@@ -21,7 +21,7 @@ from solvers.about import About, Reference
 from solvers.core import vertex_terms
 from solvers.core.driver import Iterating, Iterative
 from solvers.core.forces import Parts, Whole, frequency, rows_of_four
-from solvers.kernels.explicit_steps import Forces, Scratch, Stages, Steps, compose, integrate
+from solvers.kernels.explicit_steps import Coefficients, Forces, Scratch, Subdivision, compose, integrate
 from solvers.methods.explicit_tables import (
     BLANES_MOAN_4,
     BLANES_MOAN_6,
@@ -276,8 +276,8 @@ class PreparedExplicit(Iterative):
         first = frame / self.substeps if fixed else min(frame, h or (1.0 / self.rate if self.rate else frame))
         errors = np.zeros((1, len(method.a))) if fixed else method.errors
         most = self.substeps if fixed else _TRIED * self.substeps + 10_000
-        steps = Steps(frame, self.tolerance or 1.0, float(most), first)
-        stages = Stages(method.a, method.times, errors, method.power)
+        steps = Subdivision(frame, self.tolerance or 1.0, float(most), first)
+        stages = Coefficients(method.a, method.times, errors, method.power)
         integrate(forces, stages, steps, p, v, Scratch.of(len(method.a), len(p)), told)
         if told[3] < frame:
             raise RuntimeError(

@@ -26,7 +26,7 @@ from harness.report.robustness import (
     SHORT,
     VALLEY,
     WRONG,
-    Cell,
+    Judged,
     judged,
     read_cells,
     scores,
@@ -141,14 +141,14 @@ FIGURES = {1e-6: "1e-6", 3.2e2: "1e3", 0.0: "0", float("inf"): "inf", float("nan
 
 @pytest.mark.parametrize("worst", FIGURES)
 def test_a_residual_is_shown_as_a_power_of_ten(worst: float):
-    assert Cell("a", "b", SHORT, worst, "stationarity", "").figure == FIGURES[worst]
+    assert Judged("a", "b", SHORT, worst, "stationarity", "").figure == FIGURES[worst]
 
 
 def test_a_solver_is_scored_by_the_cases_that_it_does_not_refuse():
     outcomes = {"a": [RIGHT, DIVERGED, REFUSED, SHORT], "b": [REFUSED, REFUSED]}
     worst = {RIGHT: 1e-7, SHORT: 1e-2}
     cells = [
-        Cell(f"case-{k}", solver, outcome, worst.get(outcome), "stationarity", "")
+        Judged(f"case-{k}", solver, outcome, worst.get(outcome), "stationarity", "")
         for solver, own in outcomes.items()
         for k, outcome in enumerate(own)
     ]

@@ -62,7 +62,7 @@ def candidates() -> list[dict[str, Any]]:
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class Recommended:
     """A way to simulate the scene, its relative error, and its wall seconds per simulated second."""
 
     spec: WorkSpec
@@ -92,9 +92,9 @@ class Way:
 class Recommendation:
     """ways: all that were measured, the cheapest first; best: of those within the error; checked: that once more."""
 
-    ways: tuple[Way, ...]
-    best: Way
-    checked: Way
+    ways: tuple[Recommended, ...]
+    best: Recommended
+    checked: Recommended
 
     @property
     def verdict(self) -> str:
@@ -194,10 +194,10 @@ def _of_option(mistake: Mistake) -> Mistake:
 
 def _known(
     name: str, scene: SceneSpec, size: int, horizon: float, results: Path
-) -> tuple[list[Way], list[dict[str, Any]]]:
+) -> tuple[list[Recommended], list[dict[str, Any]]]:
     """What was measured of this scene on this machine: the ways that have an error, the cheapest first, and the rows
     of those that have none."""
-    here, ways, without = machine.describe().id, list[Way](), list[dict[str, Any]]()
+    here, ways, without = machine.describe().id, list[Recommended](), list[dict[str, Any]]()
     units = (unit for folder in shelf.folders(results, "accuracy", "*/") for unit in shelf.units(folder))
     for path in sorted(unit for unit in units if unit.name.startswith(f"{name}-{size}-work-")):
         row = rows.read([path], SCHEMA).to_pylist()[0]
@@ -205,7 +205,7 @@ def _known(
         if path.stem != spec.label() or row["machine"] != here or row["horizon"] != horizon:
             continue  # the scene was another then, or the machine, or the question
         if row["status"] == "ok":
-            ways.append(Way(spec, row["error"], row["seconds_per_simulated"]))
+            ways.append(Recommended(spec, row["error"], row["seconds_per_simulated"]))
         else:
             without.append(row)
     return sorted(ways, key=lambda way: way.cost), without
@@ -219,15 +219,15 @@ def _spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSpec:
     return WorkSpec(case, row["horizon"], solver, {name: row[name] for name in OF_STEPS}, how)
 
 
-def _check(best: Way, store: Store) -> Way:
+def _check(best: Recommended, store: Store) -> Recommended:
     """The same once more."""
     row = work_rows(best.spec, trajectory_of(best.spec, store), lambda: None)[0]
     if row["status"] != "ok":
         raise RunFailed(f"the check of {best} ended otherwise than before: {row['status']}: {row['reason']}")
-    return Way(best.spec, row["error"], row["seconds_per_simulated"])
+    return Recommended(best.spec, row["error"], row["seconds_per_simulated"])
 
 
-def _nothing(ways: list[Way], without: list[dict[str, Any]], error: float, horizon: float) -> str:
+def _nothing(ways: list[Recommended], without: list[dict[str, Any]], error: float, horizon: float) -> str:
     """Why there is no answer, and what to do."""
     if ways:
         nearest = min(ways, key=lambda way: way.error)

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from harness.report.figures.entry import Entry, ready
-from harness.report.figures.panel import Plot, Scale
-from harness.report.figures.panel import Series as Curve
-from harness.report.history import FEWEST, Series, history, stored_files
+from harness.report.figures.panel import Plot, Scale, Series
+from harness.report.history import FEWEST, GateHistory, history, stored_files
 from harness.report.style import INK, MUTED, Mark
 
 WANTED = f"{FEWEST} stored results of a gate, by `pytest tests/bench --benchmark-only` at as many commits"
@@ -21,7 +20,7 @@ def gates(folder: Path) -> list[Entry]:
     return ready(_panel(one) for one in history(stored_files([folder])) if len(one.points) >= FEWEST)
 
 
-def _panel(gate: Series) -> Plot:
+def _panel(gate: GateHistory) -> Plot:
     x = np.arange(len(gate.points), dtype=float)
     y, low, high = (np.array([getattr(point, name) for point in gate.points]) for name in ("value", "low", "high"))
     changed = [f"{100 * (ratio - 1):+.1f} % at {gate.points[at].commit}" for at, ratio in gate.changes]
@@ -31,7 +30,7 @@ def _panel(gate: Series) -> Plot:
         Scale("stored results, by commit", "names", names=tuple(point.commit for point in gate.points)),
         Scale(words, "linear", unit),
         [
-            Curve("results, with their 95 % intervals", Mark(MUTED, "o"), x, y, low, high, joined=False),
+            Series("results, with their 95 % intervals", Mark(MUTED, "o"), x, y, low, high, joined=False),
             *_levels(gate, x),
         ],
         notes=[f"Changed by {', '.join(changed)}." if changed else "No change beyond noise."],
@@ -39,9 +38,9 @@ def _panel(gate: Series) -> Plot:
     )
 
 
-def _levels(gate: Series, x: np.ndarray) -> Iterator[Curve]:
+def _levels(gate: GateHistory, x: np.ndarray) -> Iterator[Series]:
     """The level of each stretch, with a gap before the next."""
     ends = (*gate.starts[1:], len(x))
     across = [(start - 0.35, end - 0.65, np.nan) for start, end in zip(gate.starts, ends, strict=True)]
     up = [(level, level, np.nan) for level in gate.levels]
-    yield Curve("their level", Mark(INK, "None"), np.concatenate(across), np.concatenate(up))
+    yield Series("their level", Mark(INK, "None"), np.concatenate(across), np.concatenate(up))

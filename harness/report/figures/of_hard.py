@@ -11,8 +11,7 @@ import numpy as np
 from harness.report.figures.entry import Entry, ready
 from harness.report.figures.of_runs import Older, measured_on, sweep_rows
 from harness.report.figures.panel import Cell, Grid, Panel, Plot, Scale, Series
-from harness.report.robustness import OUTCOMES, RIGHT, read_cells, scores
-from harness.report.robustness import Cell as Judged
+from harness.report.robustness import OUTCOMES, RIGHT, Judged, read_cells, scores
 from harness.report.style import OLDER, Mark, marks
 
 _DOTTED = "Dot: measured by other code than today's."
