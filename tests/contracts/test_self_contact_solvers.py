@@ -181,9 +181,22 @@ def test_a_fine_mesh_with_edges_below_the_thickness_runs():
         assert intersections(made, step.positions, 0.0) == 0
 
 
+@pytest.mark.parametrize("friction", [0.0, 0.4])
 @pytest.mark.parametrize(("stiff", "told"), [(0.1, "agrees"), (0.1001, "disagrees: effects[1] self-contact")])
-def test_the_second_opinion_agrees_with_the_barrier_and_with_no_other(stiff, told, monkeypatch):
+def test_the_second_opinion_agrees_with_the_barrier_and_with_no_other(stiff, told, friction, monkeypatch):
     given = {"mesh": Grid(), "mass": 1.0, "time_step": 0.02, "frames": 3, "path": "scene.yaml"}
-    spec = SceneSpec.model_validate(given | {"effects": (Springs(stretch=100.0), SelfContact(thickness=0.4))})
+    spec = SceneSpec.model_validate(
+        given | {"effects": (Springs(stretch=100.0), SelfContact(thickness=0.4, friction=friction))}
+    )
     monkeypatch.setattr(touching, "_STIFF", stiff)
     assert second_opinion(spec, build(spec, 3), "implicit-euler").startswith(told)
+
+
+def test_the_second_opinion_knows_another_friction(monkeypatch):
+    given = {"mesh": Grid(), "mass": 1.0, "time_step": 0.02, "frames": 3, "path": "scene.yaml"}
+    rough = SelfContact(thickness=0.4, friction=0.4)
+    spec = SceneSpec.model_validate(given | {"effects": (Springs(stretch=100.0), rough)})
+    made = build(spec, 3)
+    (energy,) = (e for e in made.system.energies if isinstance(e, Energy))
+    object.__setattr__(energy, "friction", 0.401)
+    assert second_opinion(spec, made, "implicit-euler").startswith("disagrees: effects[1] self-contact")

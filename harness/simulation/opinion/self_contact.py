@@ -7,6 +7,11 @@ Li, Kaufman and Jiang 2021).
 with u, v at rest in e, and the mean k of the four vertices, a tenth of the diagonal of Q where the scene does not say.
 Where d at rest is below t + r, both t and r are smaller in proportion, less 1e-12. Here the places of the least
 distance come from all candidates, by comparison: inside, on every side and at every corner.
+
+Friction is that of pairs in range where the step starts (Li et al. 2020, section 5), F the barrier's force there:
+
+    mu F h(|u|),   h(u) = u^2/s - u^3/(3 s^2) for u < s,  u - s/3 beyond,   s = creep dt
+    u = (I - nn')(z - z^t),   z = sum_i c_i x_i with the c_i of that time: dd/dx_i = c_i n
 """
 
 from __future__ import annotations
@@ -18,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from harness.simulation.opinion.declared import Array, Begin, Declared, Opinion
+from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion
 from harness.simulation.opinion.derivatives import Values, Wide, length, wide
 
 Indices = NDArray[np.int64]
@@ -32,7 +37,15 @@ def self_contact(effect: Any, declared: Declared) -> Opinion:
 
     def needs(resists: Array) -> Begin:
         k = np.full(len(resists), effect.stiffness) if effect.stiffness else 0.1 * np.asarray(resists, float)
-        return lambda moment: mesh.values(t, r, k)
+        if not effect.friction:
+            return lambda moment: mesh.values(t, r, k)
+
+        def begin(moment: Moment) -> Values:
+            pressed, slip = mesh.values(t, r, k), effect.creep * (moment.until - moment.time)
+            grips = [mesh.grip(moment.p, t, r, k, edges) for edges in (False, True)]
+            return lambda x: np.concatenate([pressed(x), *(effect.friction * rubbed(x, *grip, slip) for grip in grips)])
+
+        return begin
 
     return Opinion(needs=needs, shortest=r)
 
@@ -91,17 +104,49 @@ class Touching:
 
     def _pairs(self, rows: Indices, x: Wide, t: float, r: float, k: Array, edges: bool) -> Wide:
         d = length(_between(rows, x, edges))
-        rest = length(_between(rows, wide(self.rest), edges))
-        share = rest / (wide(t) + wide(r))
-        scale = np.where(share < 1, (1 - wide(1e-12)) * share, 1)
+        scale, m, stiff = self._of(rows, x, t, r, k, edges)
         at = (d / scale - t) / r
         feels, closed = at.real < 1, at.real <= 0
         b = -((1 - at) ** 2) * np.log(np.where(closed, 1, at))
-        energy = np.where(feels, wide(k[rows].mean(axis=1)) * (scale * r) ** 2 * b, 0)
+        return np.where(closed, np.inf, m * np.where(feels, stiff * (scale * r) ** 2 * b, 0))
+
+    def _of(self, rows: Indices, x: Wide, t: float, r: float, k: Array, edges: bool) -> tuple[Wide, Wide, Wide]:
+        """In what proportion t and r are smaller, m, and k [N/m], (k,) each."""
+        share = length(_between(rows, wide(self.rest), edges)) / (wide(t) + wide(r))
+        scale, m = np.where(share < 1, (1 - wide(1e-12)) * share, 1), wide(np.ones(len(rows)))
         if edges:
             c, e = _crossed(rows, x), _sides(rows, wide(self.rest)) / 1000
-            energy = np.where(np.real(c) < e, (2 - c / e) * (c / e), 1) * energy
-        return np.where(closed, np.inf, energy)
+            m = np.where(np.real(c) < e, (2 - c / e) * (c / e), 1)
+        return scale, m, wide(k[rows].mean(axis=1))
+
+    def grip(self, p: Wide, t: float, r: float, k: Array, edges: bool) -> tuple[Indices, Wide, Wide, Wide]:
+        """Of pairs in range at p (n, 3) [m]: rows (g, 4), c (g, 4), z (g, 3) [m] and the force (g,) [N]."""
+        rows = self.near(np.asarray(p, float), t + r)[int(edges)]
+        z, four = _between(rows, p, edges), np.arange(4 * len(rows)).reshape(-1, 4)
+        d = length(z)
+        n, weights = z / d[:, None], []
+        for i in range(4):
+            bumped = p[rows].astype(np.clongdouble)
+            bumped[:, i] += 1e-100j * n
+            weights.append(length(_between(four, bumped.reshape(-1, 3), edges)).imag / np.longdouble(1e-100))
+        scale, m, stiff = self._of(rows, p, t, r, k, edges)
+        at = (d / scale - t) / r
+        inside = (at > 0) & (at < 1)
+        at = np.where(inside, at, 1)
+        force = m * stiff * scale * r * ((1 - at) ** 2 / at - 2 * (1 - at) * np.log(at))
+        return rows, np.stack(weights, axis=1), z, np.where(inside, force, 0)
+
+
+def rubbed(x: Wide, rows: Indices, weights: Wide, z: Wide, force: Wide, slip: float) -> Wide:
+    """What pairs that grip take to slip (g,) [J], mu aside."""
+    u = (weights[:, :, None] * x[rows]).sum(axis=1) - z
+    n = z / length(z)[:, None]
+    u = u - (u * n).sum(axis=1)[:, None] * n
+    square = (u * u).sum(axis=1)
+    sticks = square.real < slip**2
+    held = np.where(sticks, square, slip**2)
+    rounded = held / slip - held * np.sqrt(np.where(held == 0, 1, held)) / (3 * slip**2)
+    return force * np.where(sticks, rounded, np.sqrt(np.where(sticks, 1, square)) - wide(slip) / 3)
 
 
 def _between(rows: Indices, x: Wide, edges: bool) -> Wide:
