@@ -78,16 +78,16 @@ class Solid(Model):
     motion: Motion | None = None
     """Key frames that take the obstacle along."""
 
-    @field_validator("mesh", mode="before")
+    @field_validator("mesh")
     @classmethod
     def _beside(cls, mesh: Any, info: ValidationInfo) -> Any:
         """Names of files are relative to the config's folder."""
-        if not (isinstance(mesh, dict) and isinstance(path := cast(dict[str, Any], mesh).get("path"), str)):
-            return cast(Any, mesh)
-        path = Path(cast(Mapping[str, Any], info.context or {}).get("folder", ".")) / path
+        if not isinstance(mesh, File):
+            return mesh
+        path = Path(cast(Mapping[str, Any], info.context or {}).get("folder", ".")) / mesh.path
         if not path.is_file():
             raise ValueError(f"there is no file {path}")
-        return {**cast(dict[str, Any], mesh), "path": str(path)}
+        return mesh.model_copy(update={"path": path})
 
     @model_serializer(mode="wrap")
     def _written_out(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:

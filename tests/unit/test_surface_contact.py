@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -163,7 +165,7 @@ def test_a_mesh_from_a_file_is_told_by_what_it_holds(tmp_path):
     (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 3 2\n")
     context = {"folder": tmp_path}
     given = {"kind": "mesh", "mesh": {"kind": "file", "path": "one.obj"}, "scale": 2.0, "offset": (0.0, -1.0, 0.0)}
-    one = Solid.model_validate(given, context=context)
+    one = Solid.model_validate_json(json.dumps(given), strict=True, context=context)  # as configs are read
     (tmp_path / "one.obj").unlink()
     with pytest.raises(InputError):
         one.shape()

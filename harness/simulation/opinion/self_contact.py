@@ -124,11 +124,12 @@ class Touching:
         rows = self.near(np.asarray(p, float), t + r)[int(edges)]
         z, four = _between(rows, p, edges), np.arange(4 * len(rows)).reshape(-1, 4)
         d = length(z)
-        n, weights = z / d[:, None], []
+        n: Wide = z / d[:, None]
+        weights: list[Wide] = []
         for i in range(4):
             bumped = p[rows].astype(np.clongdouble)
             bumped[:, i] += 1e-100j * n
-            weights.append(length(_between(four, bumped.reshape(-1, 3), edges)).imag / np.longdouble(1e-100))
+            weights.append(np.imag(length(_between(four, bumped.reshape(-1, 3), edges))) / np.longdouble(1e-100))
         scale, m, stiff = self._of(rows, p, t, r, k, edges)
         at = (d / scale - t) / r
         inside = (at > 0) & (at < 1)
