@@ -33,7 +33,8 @@ from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.chain import Chain
 from harness.scenes.spec import SceneSpec
-from harness.simulation.controlled import Implicit, Own, Stuck, hermite
+from harness.simulation.controlled import Implicit, Stuck, hermite
+from harness.simulation.own_steps import Own
 from harness.simulation.step import prepare, simulate
 from solvers.integrators import Motion
 from solvers.methods.newton import Newton

@@ -11,7 +11,8 @@ from harness.experiments.asked.halving import halved
 from harness.reference.frozen import bind
 from harness.scenes.bind import Scene
 from harness.scenes.spec import SceneSpec
-from harness.simulation.controlled import Follower, Implicit, Own
+from harness.simulation.controlled import Follower, Implicit
+from harness.simulation.own_steps import Own
 from solvers.contact.touching import without_contact
 from solvers.integrators import INTEGRATORS, RungeKutta
 from solvers.problem import NotPositiveDefinite, Unsupported
