@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from solvers.compiling import inner, kernel
 from solvers.energies.springs import TINY, Springs
 from solvers.memory import aligned
-from solvers.vectors import springs as vectors
+from solvers.vectors import forces as vectors
 from solvers.vectors.springs import LANES, RIGHT
 
 TINY_SQUARED = TINY * TINY

@@ -177,7 +177,7 @@ def system() -> tuple[csr_array, Positions]:
 
 
 CASES = {
-    "springs": of_springs,
+    "forces": of_springs,
     "descent": of_descent,
     "dots": of_dots,
     "vbd": of_vbd,
