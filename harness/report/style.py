@@ -60,6 +60,8 @@ STARS: tuple[Any, ...] = ((4, 1, 0), (6, 1, 0), (3, 1, 0), (8, 1, 0), (3, 1, 180
 """Of four, six, three, eight and three points, the last upside down."""
 CORNERS: tuple[Any, ...] = ((3, 0, 45), (3, 0, -45), (3, 0, 135), (3, 0, -135))
 """Triangles that point up and to the left, up and to the right, down and to the left, down and to the right."""
+HOURGLASS: Any = ((-1, 1), (1, 1), (-1, -1), (1, -1), (-1, 1))
+"""Two triangles that meet at their points."""
 _MARKERS: tuple[Any, ...] = (
     "s",
     "o",
@@ -78,11 +80,14 @@ _MARKERS: tuple[Any, ...] = (
     "8",
     *STARS,
     *CORNERS,
+    HOURGLASS,
 )
 
 # Okabe and Ito's palette, less its yellow and black, and five more: for families in the order of the registry.
 _FAMILIES = ("#0072b2", "#00a878", "#e69f00", "#d55e00", "#9a86e0", "#cc79a7", "#a8326e", "#858585", "#8a994c")
-_MEMBERS: tuple[tuple[float, Any], ...] = ((0.0, "-"), (-0.36, DASHED), (0.42, "-"), (0.2, DASH_DOTTED))
+_MEMBERS: tuple[tuple[float, Any], ...] = (
+    *((0.0, "-"), (-0.36, DASHED), (0.42, "-"), (0.2, DASH_DOTTED), (-0.18, (0, (1, 3)))),
+)
 """How much lighter the members of a family are drawn, or darker where negative, and in which line style."""
 _MANY: tuple[tuple[float, Any], ...] = (
     *((0.0, "-"), (-0.3, DOTTED), (0.3, (0, (10, 3))), (-0.48, (0, (3, 1, 1, 1, 1, 1)))),

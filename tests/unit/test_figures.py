@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import csv
-import io
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,29 +16,20 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
-from rich.console import Console
 from skimage.measure import block_reduce
 from skimage.metrics import structural_similarity
 from typer.testing import CliRunner
 
-from harness.base import rows as base_rows
-from harness.base import shelf
 from harness.cli import app
-from harness.report import opengl
-from harness.report.figures import canvas, kinds
+from harness.report.figures import kinds
 from harness.report.figures.asked import LEAST, Asked
 from harness.report.figures.canvas import INCH, compose, ordered, texts
 from harness.report.figures.drawing import mark
-from harness.report.figures.entry import chosen
 from harness.report.figures.faults import faults
 from harness.report.figures.panel import Plot, Scale, Series
-from harness.report.speed import size_plot
-from harness.report.speed.figures import figures as speed_figures
-from harness.report.speed.pictures import draw
-from harness.report.speed.table import speed_table
-from harness.report.style import OLDER, PAGE, Mark
-from tests import accuracy_rows
+from harness.report.style import Mark
 from tests import figure_results as made
+from tests.drawn_figures import RESULTS, composed
 
 LOOKS = Path(__file__).parents[1] / "looks" / "figures.png"
 PART, ALIKE = 24, 0.9
@@ -48,20 +37,6 @@ PART, ALIKE = 24, 0.9
 that parts of one look have: other rounding of grey edges leaves 0.98, and a curve of another colour 0.8 or less."""
 TALL = 1080
 
-RESULTS: dict[str, tuple[str, Callable[[Path], Path]]] = {
-    "convergence": ("block:gap", made.accuracy),
-    "times": ("net:10:current:alone", made.accuracy),
-    "work": ("bdf2", made.accuracy),
-    "profiles": ("performance:1e-3", made.accuracy),
-    "growth": ("net:current", made.accuracy),
-    "liu2013": ("figure-2", made.accuracy),
-    "timing": ("step", made.sweep),
-    "hard": ("map", made.sweep),
-    "ablation": ("", made.ablation),
-    "prices": ("numba", made.ablation),
-    "speed": ("step", made.speed),
-    "history": ("", made.gates),
-}
 DRAWN = {"run", "comparison", "scenes"}
 """Kinds whose pictures another system may draw in other pixels: the sheet leaves them out."""
 
@@ -72,13 +47,6 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("results")
     written = {make: make(folder / make.__name__) for _, make in RESULTS.values()}
     return {kind: written[make] for kind, (_, make) in RESULTS.items()}
-
-
-def composed(kind: str, results: Path, asked: Asked, older: Any = ()) -> tuple[Figure, list[Any]]:
-    found = kinds.kind(kind)
-    selectors = asked.selectors or tuple(tuple(one.split(":")) for one in [RESULTS[kind][0]] if one) or found.usual
-    panels = found.draw(chosen(found.panels(results, lambda _: older), selectors))
-    return compose(panels, found.title, asked), panels
 
 
 @pytest.fixture(scope="module")
@@ -204,66 +172,6 @@ def test_one_size_has_a_row_for_each_solver_the_fastest_first(tmp_path: Path) ->
     assert faults(figure) == []
 
 
-def test_what_other_code_measured_is_hollow_and_told(results: dict[str, Path]) -> None:
-    older = {f"geometry-flat-newton-{size}" for size in (8, 16, 32)}
-    figure, (panel,) = composed("timing", results["timing"], Asked(), older)
-    faces = {one.get_markerfacecolor() for one in figure.axes[0].lines if one.get_marker() == mark_of("newton")}
-    assert "white" in faces
-    assert OLDER in "\n".join(text.get_text() for text in texts(figure))
-    assert {row["series"] for row in panel.rows() if row["other_code"]} == {"newton"}
-    _, (grid,) = composed("hard", results["hard"], Asked(), older)
-    assert {cell.column for cell in grid.cells if cell.older} == {"newton"}
-    assert "other code" in grid.notes[0]
-
-
-@pytest.mark.parametrize("kind", ["convergence", "times", "work", "growth", "profiles", "liu2013"])
-def test_in_figures_of_accuracy_too(tmp_path: Path, kind: str) -> None:
-    rows: list[dict[str, Any]] = []
-    for size in (10, 24):
-        rows += accuracy_rows.problem("net", size, "early")
-        for solver in ("numba", "newton"):
-            rows += accuracy_rows.curve("net", size, "early", solver)
-    rows += [*accuracy_rows.work("net", 10, ("numba", "newton")), *accuracy_rows.paper()]
-    # The reproduction of the paper is by one solver alone.
-    before = "numba" if kind == "liu2013" else "newton"
-    rows = [row | {"code": "before" if row.get("solver") == before else None} for row in rows]
-    asked = Asked(selectors=(("net", "10", "gap"),)) if kind == "convergence" else Asked()
-    figure, panels = composed(kind, accuracy_rows.write(tmp_path, rows), asked)
-    said = " ".join(text.get_text() for text in texts(figure)).replace("\n", " ")
-    if kind in ("profiles", "liu2013"):
-        assert f"Measured by other code than today's, in whole or in part: {before}." in said
-    else:
-        assert OLDER in said
-        older = {row["series"].split()[0] for panel in panels for row in panel.rows() if row["other_code"]}
-        assert older == {"newton"}
-
-
-def test_and_in_those_of_speed(results: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, (panel,) = composed("speed", results["speed"], Asked())
-    assert {row["series"] for row in panel.rows() if row["other_code"]} == {"numba supernodal"}
-    found = speed_figures(base_rows.read(shelf.units(results["speed"] / "rows")))
-    pages: list[Figure] = []
-    monkeypatch.setattr(size_plot, "save", lambda page, path: pages.append(page))
-    draw(found, tmp_path)
-    drawn = [page for page in pages if page.axes[0].lines]
-    assert len(drawn) == 4, "the part of the limit is not known"
-    for page in drawn:
-        hollow = {line.get_linestyle() for line in page.axes[0].lines if line.get_markerfacecolor() == PAGE}
-        assert hollow == {"None"}, "marks on top of their line"
-        assert OLDER in "\n".join(text.get_text() for text in page.texts)
-    table = Console(width=400, record=True, file=io.StringIO())
-    table.print(speed_table(found))
-    marked = [line for line in table.export_text().splitlines() if "by other code" in line]
-    assert len(marked) == 3
-    assert all("numba supernodal (10 of 50, by other code)" in line for line in marked)
-
-
-def mark_of(solver: str) -> Any:
-    from harness.report.style import marks
-
-    return marks()[solver].marker
-
-
 def test_the_command_writes_each_format_the_data_and_a_script_that_draws_them(
     results: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -297,36 +205,6 @@ def test_without_a_title_its_words_and_the_origin_are_left_to_the_caption(result
     assert np.asarray(FigureCanvasAgg(figure).figure.get_facecolor())[3] == 0.0
 
 
-@pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
-def test_meshes_side_by_side_have_one_camera_one_scale_and_the_distance_from_the_lowest_residual(
-    tmp_path: Path,
-) -> None:
-    folder = made.recorded(tmp_path)
-    figure, pictures = composed_meshes("comparison", folder)
-    assert faults(figure) == []
-    assert len({picture.limit for picture in pictures}) == len({picture.aspect for picture in pictures}) == 1
-    assert len({picture.render.view for picture in pictures}) == 1
-    shown = [np.asarray(ax.images[0].get_array()) for ax in figure.axes[:2]]
-    assert all((picture.min(axis=-1) < 200).mean() > 0.1 for picture in shown), "the mesh fills its place"
-    alone, (one,) = composed_meshes("run", folder)
-    assert len(one.rows()) == 36
-    assert faults(alone) == []
-
-
-@pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
-def test_a_sheet_has_each_scene_once_of_one_shape_and_by_one_scale(tmp_path: Path) -> None:
-    folder = made.recorded(tmp_path)
-    for path in [*(folder / "rows").glob("*.parquet")]:
-        table = base_rows.read([path]).to_pylist()
-        if table[0]["solver"] == "numba":
-            made.write(path, [row | {"scene": "other-cloth"} for row in table])
-    figure, pictures = composed_meshes("scenes", folder)
-    assert faults(figure) == []
-    assert [picture.title for picture in pictures] == ["cloth", "other cloth"]
-    assert len({picture.limit for picture in pictures}) == len({picture.aspect for picture in pictures}) == 1
-    assert "numba, 36 vertices" in pictures[1].facts
-
-
 def test_a_gate_s_level_has_a_gap_where_it_changed(results: dict[str, Path]) -> None:
     figure, (panel,) = composed("history", results["history"], Asked())
     assert panel.subject == "test_step[cloth]", "the one that changed most"
@@ -338,12 +216,6 @@ def test_a_gate_s_level_has_a_gap_where_it_changed(results: dict[str, Path]) -> 
     said = " ".join(text.get_text() for text in texts(figure))
     assert re.search(r"Changed by \+[456]\.\d % at 00000", said)
     assert not kinds.kind("history").panels(results["timing"], lambda _: ())
-
-
-def composed_meshes(kind: str, folder: Path) -> tuple[Figure, list[Any]]:
-    found = kinds.kind(kind)
-    panels = found.draw(chosen(found.panels(folder, lambda _: ()), ()))
-    return canvas.compose(panels, found.title, Asked(width=60.0)), panels
 
 
 def test_a_report_from_outside_is_a_kind_if_it_has_panels(
