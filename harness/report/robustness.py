@@ -172,8 +172,9 @@ def _case(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
 def _solver(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
     """The solver's name, with the parameters in which the runs of that name differ."""
     others = [json.loads(text) for text in {run["parameters"] for run in runs if run["solver"] == row["solver"]}]
-    own = json.loads(row["parameters"])
-    return " ".join([row["solver"], *(str(v) for key, v in own.items() if any(other[key] != v for other in others))])
+    own = json.loads(row["parameters"])  # what a solver from outside was not given is not among them
+    varied = [str(v) for key, v in own.items() if any(other.get(key) != v for other in others)]
+    return " ".join([row["solver"], *varied])
 
 
 @dataclass(frozen=True, slots=True)

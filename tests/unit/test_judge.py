@@ -192,6 +192,20 @@ def test_results_that_were_not_judged_are_refused(tmp_path: Path):
         read_cells(tmp_path)
 
 
+def test_runs_of_a_solver_from_outside_may_give_different_parameters(tmp_path: Path):
+    (tmp_path / "rows").mkdir()
+    base = {"scene": "net", "size": 4, "solver": "./own.py:Own", "started": "2026", "phase": "step", "round": 0}
+    for run_id, given in (("x", "{}"), ("y", '{"momentum": 0.5}'), ("z", '{"momentum": 0.8}')):
+        one = base | {"run_id": run_id, "parameters": given, "status": "ok", "distance": 0.0}
+        rows.write(tmp_path / "rows" / f"{run_id}.parquet", [one])
+    own = "./own.py:Own"
+    assert [(cell.solver, cell.run_id) for cell in read_cells(tmp_path)] == [
+        (own, "x"),
+        (f"{own} 0.5", "y"),
+        (f"{own} 0.8", "z"),
+    ]
+
+
 def test_a_run_that_fails_keeps_and_marks_its_recording_up_to_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "scene.yaml").write_text(SCENE)
     (spec,) = load_any(tmp_path / "scene.yaml", solvers=["sparse"]).runs()

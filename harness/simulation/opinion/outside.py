@@ -6,6 +6,7 @@ is no analytic function of them, with central differences at two steps, whose di
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -75,7 +76,8 @@ def own_slope(own: Sequence[Energy], x: Array, d: Array, reach: float, shortest:
 def _by_complex_steps(energy: Any, x: Array, d: Array, slope: float, size: float, far: float) -> bool:
     """Whether the derivative of the energy's value by a complex step is the slope."""
     try:
-        found = complex(energy.value(x + 1j * _TINY * d)).imag / _TINY
+        with warnings.catch_warnings(action="error", category=np.exceptions.ComplexWarning):
+            found = complex(energy.value(x + 1j * _TINY * d)).imag / _TINY
     except Exception:  # it is made for real numbers, and may say so in any way
         return False
     return bool(abs(found - slope) <= ROUNDINGS * EPS * (1.0 + far) * size)
