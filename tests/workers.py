@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+from pathlib import Path
 from time import sleep
 
 from harness.base.worker import Tick
@@ -85,3 +86,11 @@ def copy(tick: Tick) -> int:
     if child:
         os.waitpid(child, 0)
     return os.getpid()
+
+
+def threads_after(path: Path, tick: Tick) -> int:
+    """The threads of this process after one more recording."""
+    from tests.recordings import record
+
+    record(path, count=2)
+    return len(os.listdir("/proc/self/task"))

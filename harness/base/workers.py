@@ -2,7 +2,8 @@
 
 One worker does all pieces of work, one after the other, so it stays warm: modules are imported, kernels compiled. It
 is replaced where it was lost, or where a piece left threads behind. It is a fork of this process, which costs nothing
-of that again, as long as no thread of Numba runs here: OpenMP's do not survive a fork, and then it is started anew.
+of that again, as long as nothing was begun here that does not survive a fork, as OpenMP's threads; then it is started
+anew.
 
 Files are read in a process of their own likewise (`harness.base.child`), which has nothing of this one's.
 """
@@ -26,6 +27,9 @@ from harness.base.worker import DUMP, Answer, Limits, Piece, Tick, serve
 
 Going = Generator[Connection, None, Any]
 """A piece that is being done: yields whom to wait for, and returns its value."""
+
+NO_FORK: set[str] = set()
+"""What was begun in this process, besides Numba's threads, and does not survive a fork."""
 
 _LOOK = 0.1
 """Seconds between two looks at a worker that is at work."""
@@ -94,7 +98,7 @@ class _Worker:
     """One worker process, seen from its parent."""
 
     def __init__(self, ready: Callable[[], object], *, fork: bool) -> None:
-        fork = fork and sys.platform == "linux" and not _threads_run()
+        fork = fork and sys.platform == "linux" and not NO_FORK and not _threads_run()
         context: Any = get_context("fork" if fork else "spawn")
         self._calls, calls = context.Pipe()
         (self._ticks, ticks), (self._said, said), (self._dump, dump) = (context.Pipe(duplex=False) for _ in range(3))

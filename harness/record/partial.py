@@ -18,6 +18,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings
 
+from harness.base import workers
 from harness.base.files import CannotWrite, cannot_write, partial_name
 from harness.record.sound import trust, whole_messages
 
@@ -29,8 +30,8 @@ _PAGE = 2**16
 
 _broken: list[rr.RecordingStream] = []
 """Streams whose writing thread has died."""
-_LOADED_IN = os.getpid()
-"""The process that loaded this; the streams of its own do not survive in a fork of it."""
+_first = 0
+"""The process that opened the first stream here, or in one that this is a fork of, in which it does not survive."""
 
 
 class PartialFile:
@@ -40,9 +41,12 @@ class PartialFile:
     """
 
     def __init__(self, path: Path, application: str, recording_id: str, title: str) -> None:
+        global _first
         self._path, self._broken = path, False
         self._partial = partial_name(path)
-        if not _broken and os.getpid() == _LOADED_IN:  # else this would wait for ever, or refuse
+        _first = _first or os.getpid()
+        workers.NO_FORK.add("Rerun's streams")
+        if not _broken and os.getpid() == _first:  # else this would wait for ever, or refuse
             rerun_bindings.flush_and_cleanup_orphaned_recordings()  # the library keeps two threads of each until then
         rr.set_strict_mode(True)  # without it a wrong shape is swallowed and logged as nothing
         self.stream = rr.RecordingStream(

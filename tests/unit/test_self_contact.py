@@ -148,6 +148,7 @@ def test_a_common_motion_bounds_no_step():
 
 def test_pairs_that_are_near_at_rest_keep_their_distance_in_proportion():
     contact, _, triangles = touching()
+    assert isinstance(contact.surface, Surface)
     fine = Surface.of(*_shrunk(0.05), sides(triangles), triangles, contact.surface.stiffness, THICKNESS, RANGE)
     assert len(fine.near[0]) > 100
     rest = _shrunk(0.05)[0]

@@ -132,7 +132,7 @@ def test_accuracy_s_charts_are_there_with_the_solvers_marks(results: Path):
 def test_points_of_other_code_than_the_newest_are_told_in_every_chart(tmp_path: Path):
     rows = accuracy_rows.problem("net", 6, "early") + accuracy_rows.problem("net", 12, "early")
     for solver, code, day in (("numba", "new", "2"), ("newton", "old", "1")):
-        known = {"code": code, "started": f"2026-11-0{day}T10:00:00+00:00"}
+        known: dict[str, Any] = {"code": code, "started": f"2026-11-0{day}T10:00:00+00:00"}
         for size in (6, 12):
             rows += accuracy_rows.curve("net", size, "early", solver, **known)
         rows += [row | known for row in accuracy_rows.work("net", 6, (solver,))]
