@@ -225,11 +225,11 @@ class StepProblem:
 
 @dataclass(frozen=True, slots=True)
 class StopRule:
-    """When a solve ends: after `iterations`, or once the residual is at most `within` [J^(1/2)], or a `tolerance` times
-    its value at the current positions, or the gradient round-off, so that a scene at rest stops at once.
+    """When a solve ends: after `iterations`; once the residual is at most `within` [J^(1/2)], or `tolerance` times that
+    at the current positions; or once the gradient is no more than round-off, so that a scene at rest stops at once.
 
-    It is |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q over the unpinned vertices. Round-off is at each of them at most `floor`
-    times its bound (see `solvers.round_off`); 0 looks for none."""
+    The residual is |Q^-1 grad g(p)|_Q = |p - LG(p)|_Q over the unpinned vertices. A gradient counts as round-off where
+    at each of them it is at most `floor` times the bound of `solvers.round_off`; a floor of 0 turns this off."""
 
     iterations: int = 50
     tolerance: float | None = None

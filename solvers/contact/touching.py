@@ -20,8 +20,8 @@ from solvers.problem import Energy, LaggedEnergy, Positions, StepProblem, System
 class Rows(NamedTuple):
     """Terms w/2 (direction.x_v + gap)^2 of the displacements x of vertices v (r,).
 
-    direction: (r, 3), unit vectors; weight: w (r,) [N/m]; gap (r,) [m]: zero where the force of today is part of the
-    gradient, the distance where there is none yet.
+    direction: (r, 3), unit vectors; weight: w (r,) [N/m]; gap (r,) [m]: zero where the contact's force at p is part of
+    the gradient, the distance where nothing touches at p.
     """
 
     vertices: NDArray[np.int64]

@@ -46,11 +46,11 @@ _ITERATIONS = 10
 """Of conjugate gradients to their tolerance: 9 to 11 on sheets and solids of 1e4 to 1e6 vertices."""
 
 _LEFT, _POWERS = 0.9, 4
-"""What a correction by a rounded factor may leave of an error, which is 1 where it ceases to descend; and how many
-corrections look for it."""
+"""The part of an error that a correction by a rounded factor may leave (at 1 corrections no longer converge); and by
+how many corrections it is estimated."""
 
 _ROUNDING: dict[Precision, float] = {"float64": 0.0, "float32": 0.5, "float16": 1.25}
-"""Memory for the rounded copy of a factor, in units of its panels in float64, which are there beside it."""
+"""Memory for the rounded copy of a factor, in parts of its panels in float64, which are kept while it is made."""
 
 _BYTES_PER_VERTEX = 200
 """Of the structure of a factor: 180 on a sheet of 512 vertices a side."""

@@ -46,10 +46,11 @@ _PROBE, _ROUND, _RELAXED = 4, 10, 5
 """Iterations of L-BFGS at the very first, in a round (the first one's are among them), and after a Newton step."""
 
 _QUICK = 0.5
-"""What the very first ones leave of the residual where L-BFGS suits a problem."""
+"""The part of the residual that the very first iterations leave at most where L-BFGS suits a problem."""
 
 _SLOW = 0.8
-"""What a round brings beside the one before it where L-BFGS gets slow."""
+"""Convergence counts as slow, and a Newton step is tried, where a round still lowers the objective by more than this
+part of what the round before it did."""
 
 _KEPT = 0.25
 """The quadratic model counts as right where a full step lowers the objective by this part of what the slope alone

@@ -40,9 +40,9 @@ class Figures(NamedTuple):
     step: of STEP iterations; entries: of the factor L; touched: bytes a second of an iteration, by what the
     factor's panels hold; binds: the limit that binds; reached: the part of it that an iteration reaches, by those
     bytes and flops; passes: the part of the time that two passes over the entries of L alone take, both from where
-    they lie, which whoever reads them twice while they are near can pass; faster: than the yardstick a step;
-    careful_faster: than a careful program; solves_faster: than cholespy a global step; apart: from float64's converged
-    positions, in the scene's size; code: by which it was measured.
+    they lie, which a program that uses entries twice while they are in the cache exceeds; faster: than the yardstick a
+    step; careful_faster: than a careful program; solves_faster: than cholespy a global step; apart: from float64's
+    converged positions, in the scene's size; code: by which it was measured.
     """
 
     scene: str
