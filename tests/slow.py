@@ -1,6 +1,6 @@
 """What takes long enough to be left to the CI: `slow.txt` names it, and a run of all tests finds it.
 
-    pytest -n 2 --dist loadfile -m 'not long' --find-slow 0.5      on an idle machine, with all kernels compiled
+    pytest -n 2 --dist loadfile -m 'not long' --find-slow 0.3      on an idle machine, with all kernels compiled
 
 A line is a test or a whole file. A file is, where tests share what takes long to make: the next of them would make it.
 """

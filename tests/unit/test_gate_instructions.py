@@ -1,5 +1,7 @@
 """The counter of instructions, on events that every Linux machine counts."""
 
+import mmap
+
 from harness.experiments.gates import instructions
 from harness.experiments.gates.instructions import PAGE_FAULTS
 
@@ -10,9 +12,14 @@ def test_an_event_of_the_kernels_own_is_counted_as_often_as_it_happens():
     if instructions.reason(PAGE_FAULTS):
         assert "cannot be counted" in instructions.reason(PAGE_FAULTS)  # a kernel without perf says so
         return
+
     # Every page of fresh memory faults once when it is touched; pages have 4 to 64 KiB, or 2 MiB where the kernel
     # hands out huge ones.
-    found = instructions.count(lambda: bytearray(64 * 1024 * PAGES), PAGE_FAULTS)
+    def touch() -> None:
+        with mmap.mmap(-1, 64 * 1024 * PAGES, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS) as fresh:
+            fresh[:: mmap.PAGESIZE] = bytes(len(fresh) // mmap.PAGESIZE)
+
+    found = instructions.count(touch, PAGE_FAULTS)
     assert found is not None
     assert 20 <= found <= 17 * PAGES
     nothing = instructions.count(lambda: None, PAGE_FAULTS)
