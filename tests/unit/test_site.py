@@ -234,3 +234,12 @@ def test_a_run_alone_is_on_the_page(tmp_path: Path):
     rows.write(tmp_path / "sweep" / "rows" / "a-failed-run.parquet", [same])
     update(tmp_path)
     assert cells(read(tmp_path, "sweep/runs"), "status") == ["unsupported"]
+
+
+def test_figures_of_what_blew_up_are_shown_as_large_as_a_page_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    normal = site_results.rows
+    monkeypatch.setattr(site_results, "rows", lambda k: [row | {"largest_strain": 5.2e39} for row in normal(k)])
+    site_results.write(tmp_path, 1)
+    update(tmp_path)
+    found = read(tmp_path, f"made/runs/{run(0)['run_id']}")
+    assert found["strain"] == pytest.approx([3e38] * len(found["frame"]))

@@ -25,15 +25,21 @@ _FIGURES = {
 }
 """Columns of a run's script, and each as SQL over the rounds of a frame."""
 
+_MOST = "3e38"
+"""What a number in single precision is at most."""
+
 
 def write(folder: Folder, table: pa.Table, data: Path, wanted: Collection[str]) -> None:
     """Write the scripts of these runs."""
     if not wanted:
         return
     inner = ", ".join(f"{sql} as {name}" for name, sql in _FIGURES.items())
-    # Single precision, whose shortest decimals to_json writes, is more than a page shows.
+    # Single precision, whose shortest decimals to_json writes, is more than a page shows; what is beyond it is so large
+    # that its logarithm alone says anything.
     outer = ", ".join(
-        f"'{name}': list(case when isfinite({name}) then {name}::float end order by frame)" for name in _FIGURES
+        f"'{name}': list(case when isfinite({name}) then least(greatest({name}, -{_MOST}), {_MOST})::float end "
+        "order by frame)"
+        for name in _FIGURES
     )
     sql = f"""
         with steps as (
