@@ -8,13 +8,14 @@ that both ran, the ratios to it do.
 
 from __future__ import annotations
 
+import shutil
 import tarfile
 import zipfile
 from collections import defaultdict
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -137,14 +138,25 @@ def _folder(path: Path) -> Generator[Path]:
                     packed.extractall(scratch, members)  # names that lead out of the folder are made to stay in it
             elif tarfile.is_tarfile(path):
                 with tarfile.open(path) as packed:
-                    inside = [info for info in packed if info.name.endswith(_ROWS)]
+                    inside = [info for info in packed if info.isfile() and info.name.endswith(_ROWS)]
                     _require_room(path, sum(info.size for info in inside))
-                    packed.extractall(scratch, inside, filter="data")
+                    for info in inside:  # not `extractall`: its safe filter is not in every Python 3.11
+                        _unpack(packed, info, Path(scratch))
             else:
                 raise InputError(Mistake(wanted, path))
         except (OSError, zipfile.BadZipFile, tarfile.TarError) as error:
             raise InputError(Mistake(f"cannot be unpacked: {error}", path)) from error
         yield Path(scratch)
+
+
+def _unpack(packed: tarfile.TarFile, info: tarfile.TarInfo, folder: Path) -> None:
+    """A regular file of an archive, inside the folder whatever it is called."""
+    inside = [part for part in PurePosixPath(info.name).parts if part not in ("/", "..")]
+    target, source = folder.joinpath(*inside), packed.extractfile(info)
+    assert source is not None, "only links and folders have no content"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with source, target.open("wb") as copy:
+        shutil.copyfileobj(source, copy)
 
 
 def _require_room(path: Path, unpacked: int) -> None:

@@ -63,16 +63,23 @@ class Tab:
     def open(self, page: str, view: str = "") -> Any:
         self.page.goto("about:blank")
         self.page.goto(f"{page}#{view}")
-        self.page.wait_for_selector("html[data-ready]")
-        return self.page
+        return self.settled()
 
     def go(self, view: str) -> None:
         """To another view of the page that is open."""
-        self.page.evaluate("view => { delete document.documentElement.dataset.ready; location.hash = view; }", view)
-        self.page.wait_for_selector("html[data-ready]")
+        self.page.evaluate("view => { location.hash = view; }", view)
+        self.settled()
+
+    def settled(self) -> Any:
+        """The page, once it shows what its URL says: a browser tells it of a new one later."""
+        self.page.wait_for_function("document.documentElement.dataset.ready === (location.hash || '#')")
+        return self.page
 
     def view(self) -> str:
-        return self.page.evaluate("location.hash")
+        return self.settled().evaluate("location.hash")
+
+    def rows(self) -> int:
+        return int(self.settled().get_by_role("grid").get_attribute("aria-rowcount")) - 1
 
     def close(self) -> None:
         """Ends it; no message, and no request but to files."""
@@ -86,10 +93,6 @@ def tab(browser: Any) -> Iterator[Tab]:
     made = Tab(browser)
     yield made
     made.close()
-
-
-def rows_shown(page: Any) -> int:
-    return int(page.get_by_role("grid").get_attribute("aria-rowcount")) - 1
 
 
 @pytest.mark.parametrize("view", list(VIEWS.values())[:3], ids=list(VIEWS)[:3])
@@ -127,7 +130,7 @@ def test_it_loads_runs_and_plots_when_they_are_asked_for(tab: Tab, page: str):
     assert not any("plotly.js" in url or "made/runs.js" in url for url in tab.asked), "they are not shown yet"
     shown.get_by_role("link", name="Runs", exact=True).click()
     shown.get_by_role("grid").wait_for()
-    assert rows_shown(shown) == COUNT
+    assert tab.rows() == COUNT
     assert shown.get_by_role("row").count() < 60, "only what is in sight is made"
 
 
@@ -138,12 +141,12 @@ def test_the_table_sorts_filters_and_says_so_in_the_url(tab: Tab, page: str):
     first = shown.locator(".body .tr").first
     assert "xpbd" in first.inner_text(), "the fastest of the smallest size"
     shown.get_by_label("Status").select_option("unsupported")
-    assert rows_shown(shown) == sum(fails(k) for k in range(COUNT))
+    assert tab.rows() == sum(fails(k) for k in range(COUNT))
     shown.get_by_label("Status").select_option("ok")
     shown.get_by_label("Solver").select_option("newton")
     shown.get_by_label("Search").fill("curtain 12")
     shown.wait_for_function("location.hash.includes('q=curtain')")
-    left = rows_shown(shown)
+    left = tab.rows()
     expected = sum(
         (r["solver"], r["scene"], r["size"]) == ("newton", "curtain", 12) and not fails(k)
         for k in range(COUNT)
@@ -152,7 +155,7 @@ def test_the_table_sorts_filters_and_says_so_in_the_url(tab: Tab, page: str):
     assert 0 < left <= expected + 20
     address = tab.view()
     again = tab.open(page, address[1:])
-    assert rows_shown(again) == left, "a link shows what was seen"
+    assert tab.rows() == left, "a link shows what was seen"
     assert again.get_by_label("Solver").input_value() == "newton"
 
 
@@ -225,7 +228,7 @@ def test_it_is_ready_within_seconds(tmp_path: Path, browser: Any, count: int, go
         # The least of three: others may have the processor for a while.
         seconds = min(tab.open(page, view).evaluate("performance.now() / 1000") for _ in range(3))
         assert seconds < goal, f"{view}: {seconds:.2f} s"
-    assert rows_shown(tab.page) == count
+    assert tab.rows() == count
     tab.page.get_by_role("grid").focus()
     tab.page.keyboard.press("End")
     assert tab.page.locator(".body .tr.active").count() == 1

@@ -20,7 +20,7 @@
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { theme(); dispatchEvent(new Event("recolour")); });
 
   async function show() {
-    const { view, query } = where(), named = view in views ? view : "overview";
+    const { view, query } = where(), address = location.hash, named = view in views ? view : "overview";
     const index = await data("index");
     for (const link of document.querySelectorAll("#views a")) {
       if (link.hash.startsWith(`#${named === "compare" ? "runs" : named}`)) link.setAttribute("aria-current", "page");
@@ -38,7 +38,7 @@
       scrollTo(0, 0);
       Object.assign(shown, await views[named](content, query, index));
     }
-    document.documentElement.dataset.ready = named;
+    if (address === location.hash) document.documentElement.dataset.ready = address || "#";  // what is shown, once it is
   }
 
   async function guarded() {
@@ -46,7 +46,7 @@
       await show();
     } catch (error) {
       content.replaceChildren(element("section.page", {}, element("h1", {}, "This cannot be shown"), element("p", {}, error.message)));
-      document.documentElement.dataset.ready = "failed";
+      document.documentElement.dataset.ready = location.hash || "#";
     }
   }
 
