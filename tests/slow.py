@@ -1,4 +1,5 @@
-"""What takes long enough to be left to the CI: `slow.txt` names it, and a run of all tests finds it.
+"""What takes long enough to be left to the CI: `slow.txt` names it, and a run of all tests finds it; `KINDS` are what
+nobody would call slow once all is compiled, and what a first run on a fresh machine would wait for.
 
     pytest -n 2 --dist loadfile -m 'not long' --find-slow 0.3      on an idle machine, with all kernels compiled
 
@@ -14,6 +15,13 @@ import pytest
 ROOT = Path(__file__).parent
 LIST = ROOT / "slow.txt"
 
+KINDS = (
+    *("float16", "float32", "eigen", "cholmod"),  # kernels of their own, and programs in C++
+    *("bench/test_exact.py", "unit/test_speed.py", "unit/test_second_opinion_lies.py"),
+    *("stability/test_hard_answers.py", "stability/test_properties", "contracts/test_backends_agree.py"),
+)
+"""Parts of their names."""
+
 
 def named() -> frozenset[str]:
     """The lines."""
@@ -24,7 +32,8 @@ def mark(items: list[pytest.Item]) -> None:
     """Mark the items that are named."""
     slow = named()
     for item in items:
-        if item.nodeid in slow or item.nodeid.partition("::")[0] in slow:
+        name = item.nodeid
+        if name in slow or name.partition("::")[0] in slow or any(kind in name for kind in KINDS):
             item.add_marker(pytest.mark.slow)
 
 
