@@ -15,9 +15,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Literal
 
-import psutil
-from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
-
 from harness.base.errors import InputError, Mistake
 
 _ROOT = Path(__file__).resolve().parents[2]
@@ -51,7 +48,8 @@ class Machine:
 def describe() -> Machine:
     """The machine that this process runs on, with the cores that it may use now."""
     system = f"{platform.system()} {platform.release()} {platform.machine()}"
-    return Machine(_cpu(), _cores(), round(psutil.virtual_memory().total / 2**30, 1), system)
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return Machine(_cpu(), _cores(), round(memory / 2**30, 1), system)
 
 
 @cache
@@ -141,6 +139,8 @@ def threads(asked: int | Literal["auto"]) -> Threads:
 @cache
 def _idle() -> Threads:
     """A thread for each core that others leave idle while this process looks on; once, so that runs are alike."""
+    import psutil  # as long to load as the rest of this module
+
     usable = _usable()
     mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(usable)
     busy = psutil.cpu_percent(_LOOK, percpu=True)
@@ -167,6 +167,7 @@ def pinned_threads(threads: int) -> Generator[None]:
     # Loaded here: BLAS can only be limited once it is loaded, NumPy and SciPy bring one each, and a process
     # that computes nothing should not wait for them.
     import numba
+    from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
     import_module("scipy.linalg")
     require_threads(threads)

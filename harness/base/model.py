@@ -1,8 +1,17 @@
-"""The base of every model that a config is checked against: frozen, and unknown keys are refused."""
+"""The base of every model that a config is checked against: frozen, and unknown keys are refused.
+
+The string below a field says what it means. Sources are parsed for these when somebody asks, as the schema does:
+to check a config nobody does.
+"""
 
 from __future__ import annotations
 
+import ast
+import inspect
+import sys
 from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
 from typing import Annotated, Any, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler
@@ -15,9 +24,45 @@ Vector = tuple[float, float, float]
 class Model(BaseModel):
     """A frozen pydantic model; unknown keys are errors, infinities and NaN are refused."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=False, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False, allow_inf_nan=False)
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, core_schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        schema = handler(core_schema)
+        fields = handler.resolve_ref_schema(schema).get("properties", {})
+        for name, says in meanings(cls).items():
+            if name in fields:
+                fields[name].setdefault("description", says)
+        return schema
+
+
+def meanings(model: type[Model]) -> dict[str, str]:
+    """What the fields of a model mean, its bases' among them."""
+    found: dict[str, str] = {}
+    for base in reversed(model.__mro__):
+        file = getattr(sys.modules.get(base.__module__), "__file__", None)
+        if issubclass(base, Model) and file:
+            found |= _stated(file).get(base.__qualname__, {})
+    return found
+
+
+@cache
+def _stated(file: str) -> dict[str, dict[str, str]]:
+    """What stands below the fields of each class of a source."""
+    with open(file, encoding="utf-8") as source:
+        classes = [node for node in ast.parse(source.read()).body if isinstance(node, ast.ClassDef)]
+    return {
+        made.name: {
+            field.target.id: inspect.cleandoc(below.value.value)
+            for field, below in pairwise(made.body)
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+            if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+            if isinstance(below.value.value, str)
+        }
+        for made in classes
+    }
 
 
 T = TypeVar("T")

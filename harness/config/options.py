@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 from pydantic import Field, create_model
 
-from harness.base.model import Many, Model
+from harness.base.model import Many, Model, meanings
 from harness.scenes.spec import FirstGuess, Frames, IntegratorName, TimeStep
 
 AUTO: Literal["auto"] = "auto"
@@ -80,12 +80,12 @@ OF_SCENE = tuple(name for name, option in OPTIONS.items() if option.null)
 OF_STEPS: tuple[str, ...] = ("first_guess", "iterations", "tolerance")
 """Those that say how a step is solved, whatever it is."""
 
-_HINTS = get_type_hints(Chosen, include_extras=True)
+_HINTS, _SAYS = get_type_hints(Chosen, include_extras=True), meanings(Chosen)
 
 
 def meaning(name: str) -> str:
     """What an option is, in a sentence."""
-    said, null = (Chosen.model_fields[name].description or "").removesuffix("."), OPTIONS[name].null
+    said, null = _SAYS[name].removesuffix("."), OPTIONS[name].null
     return f"{said}; {null}." if null else f"{said}."
 
 
@@ -99,7 +99,7 @@ def lists(*names: str, **usual: tuple[Any, ...]) -> Any:
         of_scene = name in OF_SCENE and name not in usual
         values = usual.get(name, (None if of_scene else Chosen.model_fields[name].default,))
         item = _HINTS[name] | None if of_scene else _HINTS[name]
-        says = meaning(name) if of_scene else Chosen.model_fields[name].description
+        says = meaning(name) if of_scene else _SAYS[name]
         fields[name] = (Many[item], Field(default=values, description=says))
     return create_model("Lists", __base__=Model, **fields)
 
@@ -107,7 +107,6 @@ def lists(*names: str, **usual: tuple[Any, ...]) -> Any:
 def single(**usual: Any) -> Any:
     """A model that has one value of each of these options, and this one where it is left out."""
     fields: dict[str, Any] = {
-        name: (_HINTS[name], Field(default=value, description=Chosen.model_fields[name].description))
-        for name, value in usual.items()
+        name: (_HINTS[name], Field(default=value, description=_SAYS[name])) for name, value in usual.items()
     }
     return create_model("Single", __base__=Model, **fields)

@@ -31,15 +31,12 @@ def schema() -> dict[str, Any]:
     scene = create_model(
         "Scene",
         __base__=SceneFile,
-        mesh=(mesh, Field(description=SceneFile.model_fields["mesh"].description)),
-        effects=(
-            list[effect],  # pyright: ignore[reportInvalidTypeForm]
-            Field(default=[], description=SceneFile.model_fields["effects"].description),
-        ),
+        mesh=(mesh, ...),
+        effects=(list[effect], []),  # pyright: ignore[reportInvalidTypeForm]
     )
     listed: Any = list[names | solver]  # pyright: ignore[reportInvalidTypeForm]
     others = [
-        create_model(name, __base__=base, solvers=(listed, Field(description=base.model_fields["solvers"].description)))
+        create_model(name, __base__=base, solvers=(listed, ...))
         for name, base in (("Sweep", SweepFields), ("Accuracy", AccuracyFields))
     ]
     models = (scene, *others)

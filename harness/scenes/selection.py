@@ -10,7 +10,7 @@ from pydantic import NonNegativeInt, PositiveInt, model_validator
 
 from harness.base.errors import InputError, did_you_mean
 from harness.base.model import Model, Vector
-from harness.scenes.mesh.base import Mesh
+from harness.scenes.mesh.base import Mesh, distinct
 
 
 class Box(Model):
@@ -53,8 +53,8 @@ class Selection(Model):
         if self.box:
             inside = (mesh.rest >= self.box.low) & (mesh.rest <= self.box.high)
             sets.append(np.flatnonzero(inside.all(axis=1)))
-        selected = np.arange(n) if not (self.at or self.indices or self.box) else np.unique(np.concatenate(sets))
-        vertices = selected[:: self.every].astype(np.int64)
+        named = self.at or self.indices or self.box
+        vertices = distinct(np.concatenate(sets), n)[:: self.every] if named else np.arange(0, n, self.every)
         if not len(vertices):
             raise InputError(f"{name}: no vertex of the mesh lies in the box from {self.box}")
         return vertices

@@ -9,6 +9,7 @@ import sys
 from dataclasses import astuple, replace
 from pathlib import Path
 
+import psutil
 import pytest
 from threadpoolctl import threadpool_info
 
@@ -170,7 +171,7 @@ def looked(monkeypatch: pytest.MonkeyPatch):
     def pretend(*busy: float) -> None:
         monkeypatch.setattr(machine, "_usable", lambda: 4)
         monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
-        monkeypatch.setattr(machine.psutil, "cpu_percent", lambda _, percpu: list(busy))
+        monkeypatch.setattr(psutil, "cpu_percent", lambda _, percpu: list(busy))
 
     machine._idle.cache_clear()
     yield pretend

@@ -54,3 +54,10 @@ class Mesh:
         """The rest length of each spring [m], shape (m,)."""
         i, j = self.springs.T
         return np.linalg.norm(self.rest[i] - self.rest[j], axis=1)
+
+
+def distinct(vertices: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """Some of n vertices, sorted and each once; `np.unique` would load `numpy.ma`, a tenth of a whole `list`."""
+    there = np.zeros(n, np.bool_)
+    there[vertices] = True
+    return np.flatnonzero(there)

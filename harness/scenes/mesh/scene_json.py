@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import FailFast, Field, ValidationError
 
 from harness.base.errors import InputError, Mistake, did_you_mean
-from harness.base.model import Model
+from harness.base.model import Model, meanings
 from harness.scenes.mesh.cells import check_file
 
 MAX_BYTES = 2**22
@@ -73,5 +73,5 @@ def _mistake(path: Path, detail: Any) -> Mistake:
     if detail["type"] == "extra_forbidden":
         problem = f"unknown key; wanted {did_you_mean(key, SceneJson.model_fields)}"
     elif detail["type"] == "missing":
-        problem = f"is missing: {SceneJson.model_fields[key].description}"
+        problem = f"is missing: {meanings(SceneJson)[key]}"
     return Mistake(problem, path, line_of(path, key), ".".join(map(str, detail["loc"]))[:80])

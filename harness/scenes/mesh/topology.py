@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
+from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh, distinct
 
 Points = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -143,5 +143,5 @@ def assemble(
         dimension=dimension,
         spacing=spacing,
         resolution=resolution,
-        parts={name: np.unique(np.asarray(part, np.int64)) for name, part in (parts or {}).items()},
+        parts={name: distinct(np.asarray(part, np.int64), len(rest)) for name, part in (parts or {}).items()},
     )
