@@ -83,7 +83,8 @@ def blueprint(info: RecordingInfo, box: Box, last: int = 0) -> rrb.Blueprint:
     run = rrb.TextDocumentView(origin="/run", name="Run and machine")
     tabs = (_solve(last),) if info.iterates else (series, convergence)
     return rrb.Blueprint(
-        rrb.Horizontal(
+        # A grid: in a window that is higher than wide, such as a phone's, the viewer puts the plots below the mesh.
+        rrb.Grid(
             scene_view("", info.title, box, springs_visible=not len(info.mesh.triangles)),
             rrb.Tabs(*tabs, run, active_tab=0),
             column_shares=[3, 2],

@@ -5,7 +5,8 @@ With x to the right, y up and z towards the camera, a point is seen from (cx, cy
     |x - cx| <= a h (D - z),    -b h (D - z) <= y - cy <= h (D - z),    h = tan(55 degrees / 2),
 
 a the view's width over its height, and b < 1 for what stays free below. All are linear in cx, cy and D: of the points
-only four maxima count, and the nearest camera that sees all of them follows.
+only four maxima count, and the nearest camera that sees all of them follows. Where that leaves room on two sides, h is
+replaced by smaller shares of it until it does not, so that the points stand in the middle.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ _SCALE_AT, _SCALE_HEIGHT, _SCALE_WIDTH = -0.84, 0.035, 0.62
 """The scale's upper edge, its height, and half its width, in half views."""
 
 _MARGIN = 1.04
+_SHARES = np.linspace(0.2, 1.0, 5)
 _NEAREST = 0.3
 """How near the camera comes to the nearest point, in the diagonal of the box."""
 
@@ -47,7 +49,12 @@ class Box:
     def __init__(self, rest: NDArray[np.floating], aspect: float = 1.0) -> None:
         self._low, self._high, self._aspect = rest.min(axis=0), rest.max(axis=0), aspect
         self._limit = 10 * np.linalg.norm(self._high - self._low)
-        self._ends = np.full(6, -np.inf)
+        side, room = np.outer(_SHARES, [aspect * _HALF_VIEW, _HALF_VIEW]).T
+        zero, one = np.zeros(len(_SHARES)), np.ones(len(_SHARES))
+        right, left = np.array([one, zero, side]), np.array([-one, zero, side])
+        up, down = np.array([zero, one, room]), np.array([zero, -one, _BELOW * room])
+        self._directions = np.hstack([right, left, up, down, [[0, 0], [0, 0], [1, -1]]]).T @ _AXES
+        self._ends = np.full(len(self._directions), -np.inf)
         self._see(rest)
 
     def add(self, p: NDArray[np.floating]) -> None:
@@ -58,32 +65,34 @@ class Box:
             self._see(p)
 
     def _see(self, p: NDArray[np.floating]) -> None:
-        x, y, z = _AXES @ p.T.astype(float)
-        side = self._aspect * _HALF_VIEW * z
-        ends = x + side, side - x, y + _HALF_VIEW * z, _BELOW * _HALF_VIEW * z - y, z, -z
-        self._ends = np.maximum(self._ends, [values.max() for values in ends])
+        ends = [float((p @ direction).max()) for direction in self._directions]
+        self._ends = np.maximum(self._ends, ends)
 
     def _camera(self) -> tuple[float, float, float]:
         """cx, cy and D."""
-        right, left, up, down, near, _ = self._ends
-        side, room = 2 * self._aspect * _HALF_VIEW, (1 + _BELOW) * _HALF_VIEW
-        distance = max((right + left) / side, (up + down) / room)
+        right, left, up, down = self._ends[:-2].reshape(4, -1)
+        near, side, room = self._ends[-2], 2 * self._aspect * _HALF_VIEW, (1 + _BELOW) * _HALF_VIEW
+        distance = max((right[-1] + left[-1]) / side, (up[-1] + down[-1]) / room)
         least = _NEAREST * float(np.linalg.norm(self._high - self._low)) or 1.0  # of a single point
         distance = near + max(_MARGIN * (distance - near), least)
-        y = ((up - _HALF_VIEW * distance) + (_BELOW * _HALF_VIEW * distance - down)) / 2
-        return (right - left) / 2, y, distance
+        reach = _SHARES * _HALF_VIEW * distance
+        return (
+            _middle(right - self._aspect * reach, self._aspect * reach - left),
+            _middle(up - reach, _BELOW * reach - down),
+            distance,
+        )
 
     def eye(self) -> rrb.EyeControls3D:
         """An orbiting eye that just sees all of it, and has room below."""
         x, y, distance = self._camera()
-        middle = (self._ends[4] - self._ends[5]) / 2
+        middle = (self._ends[-2] - self._ends[-1]) / 2
         eye, target = ((x, y, z) @ _AXES for z in (distance, middle))
         return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=eye, look_target=target, eye_up=(0, 1, 0))
 
     def scale(self, strain_range: float) -> tuple[rr.Mesh3D, rr.Points3D]:
         """The strip of colours in the room below, facing the camera, and its numbers."""
         x, y, distance = self._camera()
-        near = self._ends[4]
+        near = self._ends[-2]
         half = _HALF_VIEW * (distance - near)
         width = _SCALE_WIDTH * half * min(1.0, self._aspect)
         across = [x - width + 2 * width * k / (LEVELS - 1) for k in range(LEVELS)]
@@ -101,3 +110,9 @@ class Box:
         return strip, rr.Points3D(
             marks, labels=words, show_labels=True, radii=rr.Radius.ui_points(1), colors=(255, 255, 255)
         )
+
+
+def _middle(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
+    """The middle of the first of these intervals that is one."""
+    first = int(np.argmax(low <= high))
+    return float(low[first] + high[first]) / 2

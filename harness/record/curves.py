@@ -18,6 +18,8 @@ _WIDTH, _HEIGHT = 150.0, 100.0
 _PALE, _RULE = 0xFFFFFFFF, (70, 73, 80)
 _LINE = 7.0
 """The height of a word, by which those at the ends of curves are kept apart."""
+_LOWER = 4.5
+"""How far below its place the viewer writes a word."""
 
 _DEEPEST = 18
 """Decades below the largest value that are drawn."""
@@ -68,7 +70,7 @@ def _axes(stream: rr.RecordingStream, entity: str, bottom: int, top: int, last: 
     columns = _across(np.maximum(numbers, 1), last)
     rules = [[(0.0, y), (_WIDTH, y)] for y in rows] + [[(x, 0.0), (x, _HEIGHT)] for x in columns]
     stream.log(f"{entity}/rules", rr.LineStrips2D(rules, colors=_RULE, radii=rr.Radius.ui_points(0.5)), static=True)
-    places = [(-9.0, y) for y in rows] + [(x, _HEIGHT + 5.0) for x in columns]
+    places = [(-9.0, y) for y in rows] + [(x, _HEIGHT + 9.0) for x in columns]
     words = [f"1e{decade}" for decade in decades] + [str(max(1, number)) for number in numbers]
     _words(stream, f"{entity}/numbers", np.array(places), words, colours([_PALE] * len(words)))
 
@@ -76,7 +78,8 @@ def _axes(stream: rr.RecordingStream, entity: str, bottom: int, top: int, last: 
 def _words(
     stream: rr.RecordingStream, entity: str, at: NDArray[np.float64], words: list[str], colours: Colours
 ) -> None:
-    points = rr.Points2D(at, labels=words, show_labels=True, colors=colours, radii=rr.Radius.ui_points(0.1))
+    dots = rr.Radius.ui_points(0.1)
+    points = rr.Points2D(at - (0.0, _LOWER), labels=words, show_labels=True, colors=colours, radii=dots)
     stream.log(entity, points, static=True)
 
 

@@ -66,6 +66,13 @@ def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: f
     assert height(box, below).max() < lowest, "the scale covers no data"
 
 
+def test_what_is_wide_and_low_stands_in_the_middle_of_the_room_above_the_scale():
+    flat = np.array([[x, 0.0, z] for x in (0.0, 1.0) for z in (0.0, 1.0)])
+    heights = height(Box(flat), flat)
+    above, below = 1.0 - heights.max(), heights.min() + 0.72
+    assert above == pytest.approx(below, abs=0.2), "in half views; shares are tried in steps of 0.2"
+
+
 @pytest.mark.parametrize("bad", [1e6, np.nan, np.inf])
 def test_the_camera_ignores_positions_that_have_blown_up(bad: float):
     box, same = Box(CORNER), Box(CORNER)

@@ -19,6 +19,7 @@ window.springbench ??= {};
   background: #343a42; border: 1px solid #8a929c; border-radius: 4px; cursor: pointer }
 .replay :focus-visible { outline: 2px solid #7db7ff; outline-offset: 2px }
 .replay .stage { position: relative; flex: 1; min-height: 0 }
+@media (min-aspect-ratio: 1) { .replay .stage { max-height: calc(60vw + 57px) } } /* the mesh's view is not higher than wide */
 .replay canvas { position: absolute; inset: 0; width: 100%; height: 100%; display: block }
 .replay .said { position: absolute; inset: 0; margin: auto; width: min(44em, 90%); height: fit-content; text-align: center;
   font: 16px/1.5 system-ui, sans-serif }
