@@ -120,29 +120,35 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], key: Key) -> str:
     if kind == "missing":
         return "is missing" if isinstance(detail["loc"][-1], str) else "has too few items"
     if kind == "extra_forbidden":
-        owner = _model_at(model, detail["loc"][:-1])
-        allowed = owner.model_fields if owner else ()
+        owner = _models_at(model, detail["loc"][:-1])[:1]
+        allowed = owner[0].model_fields if owner else ()
         return "unknown key; " + (f"expected {did_you_mean(key[-1], allowed)}" if allowed else "remove it")
     if kind == "value_error":
         return said.removeprefix("Value error, ")
+    if kind.startswith("union_tag"):
+        kinds = [one.model_fields["kind"].default for one in _models_at(model, detail["loc"])]
+        came = detail.get("ctx", {}).get("tag")
+        if came is not None:
+            return f"unknown kind {quote(came)}; expected {did_you_mean(came, kinds)}"
+        return f"came {quote(detail['input'])}{_CAME}a mapping with a `kind`, {did_you_mean('', kinds)}"
     wanted = said.removeprefix("Input should be ").replace("a valid array", "a list")
     return f"came {quote(detail['input'])}{_CAME}{wanted}"
 
 
-def _model_at(model: type[BaseModel], location: Key) -> type[BaseModel] | None:
-    """The model of the mapping at an error's location, which names the member of a union by its kind."""
+def _models_at(model: type[BaseModel], location: Key) -> list[type[BaseModel]]:
+    """The model of the mapping at an error's location, which names the member of a union by its kind; or all."""
     members = [model]
     for step in location:
         if isinstance(step, int):
             continue
+        if not members:
+            break
         if len(members) > 1:
             members = [one for one in members if one.model_fields["kind"].default == step]
         else:
             given = members[0].model_fields.get(step)
             members = list(_models(given.annotation)) if given else []
-        if not members:
-            return None
-    return members[0]
+    return members
 
 
 def _models(annotation: Any) -> Iterator[type[BaseModel]]:

@@ -123,6 +123,7 @@ def _file(name: str) -> Path:
     """A lock's file, which all users of the machine may lock."""
     path = Path(os.environ.get("SPRINGBENCH_LOCKS") or tempfile.gettempdir()) / f"springbench-{name}.lock"
     if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileExistsError):
             os.close(os.open(path, os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o644))
     return path

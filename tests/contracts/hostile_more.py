@@ -186,6 +186,8 @@ SCENES: dict[str, tuple[str, str]] = {
     "keys of one time": (scene(effects=CONTACT % (SPHERE % "{time: 0}, {time: 0}")), "rise"),
     "keys at infinity": (scene(effects=CONTACT % (SPHERE % "{time: .inf}")), "time"),
     "an obstacle of no direction": (scene(effects=CONTACT % "{kind: plane, normal: [0, 0, 0]}"), "direction"),
+    "an obstacle of no kind": (scene(effects=CONTACT % "{shape: plane}"), "with a `kind`, one of"),
+    "an obstacle of an unknown kind": (scene(effects=CONTACT % "{kind: plan}"), "did you mean 'plane'"),
     "an obstacle of no radius": (scene(effects=CONTACT % "{kind: sphere, radius: 0}"), "radius"),
     "a box inside out": (scene(effects=CONTACT % "{kind: box, low: [1, 1, 1], high: [0, 0, 0]}"), "high"),
     "a press that closes": (
