@@ -4,10 +4,7 @@
 
 d is the distance of a point and a triangle, or of two edges; t the thickness, r the range, k a stiffness [N/m] (Li et
 al. 2020, "Incremental potential contact", with the offset of Li, Kaufman and Jiang 2021, "Codimensional incremental
-potential contact"; there b is of d^2). The distance of two edges has a kink where they are parallel, which their
-mollifier takes away, e = 1e-3 |u|^2 |v|^2 at rest:
-
-    m(c) = (2 - c/e) c/e  for c < e, else 1;     c = |u x v|^2
+potential contact"; there b is of d^2). m is 1 but for edges that are nearly parallel (`contact.mollifier`).
 
 Second derivatives in closed form: with z = sum_i c_i x_i and its free places (`contact.closest`), D = |z|^2/2,
 
@@ -27,12 +24,10 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 from solvers.contact.closest import WAYS, between, closest, distance
+from solvers.contact.mollifier import add_mollified, crossed, mollifier
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-MOLLIFIED = 1e-3
-"""Of |u|^2 |v|^2 at rest, the |u x v|^2 up to which edges count as nearly parallel (Li et al. 2020)."""
 
 
 class Pairs(NamedTuple):
@@ -54,25 +49,6 @@ def law(x):
     """b and its first two derivatives, for 0 < x < 1."""
     y, log = 1.0 - x, np.log(x)
     return -y * y * log, y * (2.0 * log - y / x), 4.0 * y / x + y * y / (x * x) - 2.0 * log
-
-
-@inner
-def _crossed(p, x):
-    """u, v, |u|^2, u v, |v|^2 and |u x v|^2 of two edges x (4,)."""
-    a, b, c, d = x[0], x[1], x[2], x[3]
-    u0, u1, u2 = p[b, 0] - p[a, 0], p[b, 1] - p[a, 1], p[b, 2] - p[a, 2]
-    v0, v1, v2 = p[d, 0] - p[c, 0], p[d, 1] - p[c, 1], p[d, 2] - p[c, 2]
-    w0, w1, w2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
-    uu, uv, vv = u0 * u0 + u1 * u1 + u2 * u2, u0 * v0 + u1 * v1 + u2 * v2, v0 * v0 + v1 * v1 + v2 * v2
-    return u0, u1, u2, v0, v1, v2, uu, uv, vv, w0 * w0 + w1 * w1 + w2 * w2
-
-
-@inner
-def _mollifier(c, e):
-    """m and its first two derivatives by c."""
-    if not c < e:
-        return 1.0, 0.0, 0.0
-    return (2.0 - c / e) * c / e, 2.0 * (1.0 - c / e) / e, -2.0 / (e * e)
 
 
 @inner
@@ -107,7 +83,7 @@ def value(pairs, p):
             return np.inf
         r, m = pairs.scale[e] * pairs.reach, 1.0
         if pairs.parallel[e] > 0.0:
-            m = _mollifier(_crossed(p, pairs.vertices[e])[9], pairs.parallel[e])[0]
+            m = mollifier(crossed(p, pairs.vertices[e]).c, pairs.parallel[e])[0]
         total += m * pairs.stiffness[e] * r * r * law(x)[0]
     return total
 
@@ -128,9 +104,10 @@ def add_gradient(pairs, p, out):
         r, m = pairs.scale[e] * pairs.reach, 1.0
         f, f1 = pairs.stiffness[e] * r * r * b, pairs.stiffness[e] * r * first
         if pairs.parallel[e] > 0.0:
-            u0, u1, u2, v0, v1, v2, uu, uv, vv, c = _crossed(p, x)
-            m, m1, _ = _mollifier(c, pairs.parallel[e])
+            both = crossed(p, x)
+            m, m1, _ = mollifier(both.c, pairs.parallel[e])
             if m1 != 0.0:
+                (u0, u1, u2), (v0, v1, v2), uu, uv, vv, _ = both
                 w = 2.0 * f * m1
                 a0, a1, a2 = w * (vv * u0 - uv * v0), w * (vv * u1 - uv * v1), w * (vv * u2 - uv * v2)
                 b0, b1, b2 = w * (uu * v0 - uv * u0), w * (uu * v1 - uv * u1), w * (uu * v2 - uv * u2)
@@ -175,13 +152,13 @@ def press(pairs, which, p, weights, ways, force):
         ways[k, 0], ways[k, 1], ways[k, 2] = z0, z1, z2
         gap, m = _gap(pairs, e, p), 1.0
         if pairs.parallel[e] > 0.0:
-            m = _mollifier(_crossed(p, x)[9], pairs.parallel[e])[0]
+            m = mollifier(crossed(p, x).c, pairs.parallel[e])[0]
         force[k] = -m * pairs.stiffness[e] * pairs.scale[e] * pairs.reach * law(max(gap, 1e-6))[1]
 
 
 @kernel
 def curve(pairs, which, p, keep, work, out):
-    """Write the second derivatives [N/m] of the pairs `which` (a,) at p (n, 3) to `out` (a, 12, 12); work (9, 12):
+    """Write the second derivatives [N/m] of the pairs `which` (a,) at p (n, 3) to `out` (a, 12, 12); work (6, 12):
     scratch. keep: of what bends downwards."""
     for k in range(len(which)):
         _curve(pairs, which[k], p, keep, work, out[k])
@@ -204,10 +181,8 @@ def _curve(pairs, e, p, keep, work, H):
     b, b1, b2 = law(max(gap, 1e-6))
     r, m, m1, m2 = pairs.scale[e] * pairs.reach, 1.0, 0.0, 0.0
     f, f1, f2 = pairs.stiffness[e] * r * r * b, pairs.stiffness[e] * r * b1, pairs.stiffness[e] * b2
-    u0 = u1 = u2 = v0 = v1 = v2 = uu = uv = vv = crossed = 0.0
     if pairs.parallel[e] > 0.0:
-        u0, u1, u2, v0, v1, v2, uu, uv, vv, crossed = _crossed(p, x)
-        m, m1, m2 = _mollifier(crossed, pairs.parallel[e])
+        m, m1, m2 = mollifier(crossed(p, x).c, pairs.parallel[e])
     across = f1 / d
     lag, hold = _rows(p, x, c, z0, z1, z2, one, two, first, second)
     for i in range(4):
@@ -223,9 +198,7 @@ def _curve(pairs, e, p, keep, work, H):
             for a in range(3):
                 H[3 * i + a, 3 * j + a] += side * c[i] * c[j]
     if m1 != 0.0:
-        u, v = work[6], work[7]
-        u[0], u[1], u[2], v[0], v[1], v[2] = u0, u1, u2, v0, v1, v2
-        _mollified(u, v, uu, uv, vv, crossed, m, m1, m2, f, f1, f2, keep, g, dc, H)
+        add_mollified(crossed(p, x), (m, m1, m2), (f, f1, f2), keep, g, dc, H)
 
 
 @inner
@@ -257,44 +230,3 @@ def _way(p, x, way, c, z0, z1, z2, out):
         out[3 * i + 1] = c[i] * a1 + w * z1
         out[3 * i + 2] = c[i] * a2 + w * z2
     return a0, a1, a2
-
-
-@inner
-def _mollified(u, v, uu, uv, vv, crossed, m, m1, m2, f, f1, f2, keep, g, dc, H):
-    """Add what the mollifier's derivatives bring. What bends downwards of it: f m'' and, with a = grad f, b = grad m,
-
-    a b' + b a' <= s a a' + b b'/s,     4 w (du x dv) <= 2 |w| (|du|^2 |v|/|u| + |dv|^2 |u|/|v|),     w = u x v.
-    """
-    for a in range(3):
-        bu, bv = 2.0 * (vv * u[a] - uv * v[a]), 2.0 * (uu * v[a] - uv * u[a])
-        dc[a], dc[3 + a], dc[6 + a], dc[9 + a] = -bu, bu, -bv, bv
-    mixed, bent = keep * f1 * m1, keep * f * m2
-    share, rest = 0.0, 1.0 - keep
-    if m > 0.0 and rest > 0.0 and f1 != 0.0:
-        share = m * f2 / (f1 * f1)
-        bent += rest * m1 * m1 / share
-        share *= rest * f1 * f1
-    for i in range(12):
-        for j in range(12):
-            H[i, j] += mixed * (g[i] * dc[j] + dc[i] * g[j]) + bent * dc[i] * dc[j] + share * g[i] * g[j]
-    w, weight = np.sqrt(crossed), 2.0 * f * m1
-    more_u, more_v = rest * w * np.sqrt(vv / uu), rest * w * np.sqrt(uu / vv)
-    for a in range(3):
-        for b in range(3):
-            same = 1.0 if a == b else 0.0
-            huu = weight * ((vv + more_u) * same - v[a] * v[b])
-            hvv = weight * ((uu + more_v) * same - u[a] * u[b])
-            huv = weight * ((1.0 + keep) * u[a] * v[b] - uv * same - keep * v[a] * u[b])
-            _four(H, a, b, 0, 0, huu)
-            _four(H, a, b, 6, 6, hvv)
-            _four(H, a, b, 0, 6, huv)
-            _four(H, b, a, 6, 0, huv)
-
-
-@inner
-def _four(H, a, b, i, j, h):
-    """A block by edges in the four blocks of their ends."""
-    H[i + a, j + b] += h
-    H[i + a, j + 3 + b] -= h
-    H[i + 3 + a, j + b] -= h
-    H[i + 3 + a, j + 3 + b] += h

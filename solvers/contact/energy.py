@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from solvers.contact import planes as contact_planes
 from solvers.contact.law import LAW
+from solvers.contact.planes import HalfSpaces, Rounded
 from solvers.contact.touching import Rows
 from solvers.energies.elements import Elements, Law
 from solvers.problem import Positions, Start
@@ -130,13 +131,10 @@ class Contact:
 
     def _planes(self, p: Positions, v: Positions, obstacle: Obstacle, frames: Array, way: float, when: float) -> Planes:
         """The half-spaces of one obstacle; when: the unknown's time within the step, 1 at its end."""
-        n, low, high, radius = len(p), obstacle.low, obstacle.high, obstacle.radius + self.thickness
-        vertices, offset, (normal, carried) = np.empty(n, np.int64), np.empty(n), np.empty((2, n, 3))
-        margin, work = self.margin + way, np.empty((5, 3))
-        k = contact_planes.planes(
-            p, v, self.time_step, frames, low, high, radius, margin, vertices, normal, offset, carried, work
-        )
-        vertices, normal, offset, carried = vertices[:k], normal[:k], offset[:k], carried[:k]
+        n, body = len(p), Rounded(obstacle.low, obstacle.high, obstacle.radius + self.thickness)
+        found = HalfSpaces(np.empty(n, np.int64), np.empty((n, 3)), np.empty(n), np.empty((n, 3)))
+        k = contact_planes.planes(p, v, self.time_step, frames, body, self.margin + way, found, np.empty((5, 3)))
+        vertices, normal, offset, carried = found.vertices[:k], found.normal[:k], found.offset[:k], found.carried[:k]
         depth, here = np.maximum(0.0, offset - _dots(normal, carried)), p[vertices]
         stiffness = self.stiffness[vertices]
         before = _dots(normal, here)

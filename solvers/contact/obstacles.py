@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.contact import boxes
-from solvers.contact.barrier import MOLLIFIED, Pairs, distances
+from solvers.contact.barrier import Pairs, distances
 from solvers.contact.boxes import Tree
+from solvers.contact.mollifier import MOLLIFIED
 from solvers.problem import Positions
 
 Array = NDArray[np.float64]

@@ -11,13 +11,34 @@ obstacle on the way, wherever it ends.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 
 _ITERATIONS = 40
 _CONTACT = 1e-6
 """Of R: so near to the obstacle a way has reached it."""
+
+
+class Rounded(NamedTuple):
+    """A box from low to high (3,) [m], and a radius R [m] around it."""
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    radius: float
+
+
+class HalfSpaces(NamedTuple):
+    """n.x >= d of vertices (k,), in the world at the step's end: normal (k, 3), offset d (k,) [m], and carried (k, 3)
+    [m]: where the vertex would be had it moved with the obstacle."""
+
+    vertices: NDArray[np.int64]
+    normal: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    carried: NDArray[np.float64]
 
 
 @kernel
@@ -55,14 +76,13 @@ def _extent(frame, c, x0, x1, x2, y0, y1, y2):
 
 
 @kernel
-def planes(p, v, dt, frames, low, high, radius, margin, vertices, normal, offset, carried, work):
-    """The half-spaces n.x >= d of the vertices that may come near one obstacle; returns how many, k.
+def planes(p, v, dt, frames, obstacle, margin, out, work):
+    """Write the half-spaces of the vertices that may come near one obstacle to the first k rows of `out`; returns k.
 
-    frames (2, 4, 3) as in `near`; low, high (3,) [m]: the corners of its box; radius: R [m]; margin [m]: a vertex
-    farther away than that and twice its way has none. The first k rows are written of vertices, normal (n, 3), offset
-    d [m], and carried (n, 3) [m]: where the vertex would be had it moved with the obstacle; all in the world, at the
-    step's end. work: (5, 3).
+    frames (2, 4, 3) as in `near`; obstacle: Rounded, in its frame; margin [m]: a vertex farther away than that and
+    twice its way has none; out: HalfSpaces of n rows; work: (5, 3).
     """
+    vertices, normal, offset, carried = out
     count = 0
     a, b, x, c, n = work[0], work[1], work[2], work[3], work[4]
     first, second = frames[0], frames[1]
@@ -74,11 +94,11 @@ def planes(p, v, dt, frames, low, high, radius, margin, vertices, normal, offset
                 a[k] += first[1 + k, j] * (p[i, j] - first[0, j])
                 b[k] += second[1 + k, j] * (p[i, j] + dt * v[i, j] - second[0, j])
             way += (b[k] - a[k]) ** 2
-        far = _nearest(a, low, high, c, n)
-        if not far <= radius + margin + 2.0 * np.sqrt(way):
+        far = _nearest(a, obstacle, c, n)
+        if not far <= obstacle.radius + margin + 2.0 * np.sqrt(way):
             continue
-        _separate(a, b, low, high, radius, far, x, c, n)
-        vertices[count], offset[count] = i, radius
+        _separate(a, b, obstacle, far, x, c, n)
+        vertices[count], offset[count] = i, obstacle.radius
         for j in range(3):
             normal[count, j], carried[count, j] = 0.0, second[0, j]
             for k in range(3):
@@ -91,10 +111,10 @@ def planes(p, v, dt, frames, low, high, radius, margin, vertices, normal, offset
 
 
 @inner
-def _separate(a, b, low, high, radius, far, x, c, n):
+def _separate(a, b, obstacle, far, x, c, n):
     """Newton's method along the way from a to b; c and n, the nearest point and the normal, are those at a, and then
     those of the half-space; x: scratch."""
-    begin, end, slope = 0.0, np.inf, _slope(a, b, n)
+    begin, end, slope, radius = 0.0, np.inf, _slope(a, b, n), obstacle.radius
     for _ in range(_ITERATIONS):
         if far <= (1.0 + _CONTACT) * radius or slope >= 0.0:
             break
@@ -105,7 +125,7 @@ def _separate(a, b, low, high, radius, far, x, c, n):
             s = 0.5 * (begin + end)
         for k in range(3):
             x[k] = a[k] + s * (b[k] - a[k])
-        there = _nearest(x, low, high, c, n)
+        there = _nearest(x, obstacle, c, n)
         steep = _slope(a, b, n)
         if steep < 0.0:
             begin, far, slope = s, there, steep
@@ -113,7 +133,7 @@ def _separate(a, b, low, high, radius, far, x, c, n):
             end = s
     for k in range(3):
         x[k] = a[k] + begin * (b[k] - a[k])
-    _nearest(x, low, high, c, n)
+    _nearest(x, obstacle, c, n)
 
 
 @inner
@@ -122,8 +142,9 @@ def _slope(a, b, n):
 
 
 @inner
-def _nearest(x, low, high, c, n):
-    """The distance from x to a box, negative inside, the nearest point of its surface to c, the normal there to n."""
+def _nearest(x, obstacle, c, n):
+    """The distance from x to the box, negative inside, the nearest point of its surface to c, the normal there to n."""
+    low, high, _ = obstacle
     square, least, axis, side = 0.0, np.inf, 0, 1.0
     for k in range(3):
         c[k] = min(max(x[k], low[k]), high[k])

@@ -136,7 +136,7 @@ class PairContact:
         which = np.empty(len(pairs.vertices), np.int64)
         which = which[: barrier.active(pairs, p, 1.0, which)]
         values = np.empty((len(which), 12, 12))
-        barrier.curve(pairs, which, p, keep, np.empty((9, 12)), values)
+        barrier.curve(pairs, which, p, keep, np.empty((6, 12)), values)
         vertices = pairs.vertices[which]
         if len(self.grip.vertices):
             vertices = np.concatenate([vertices, self.grip.vertices])

@@ -17,6 +17,7 @@ Chamberlain, Powell, Lemarechal and Pedersen 1982; as an active set, Hintermüll
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,17 @@ Newton = Callable[[Point], Positions | None]
 """The direction from a point, None where there is none without a change of the Hessian."""
 
 
+class Matrix(NamedTuple):
+    """Q over the free vertices. number (n,): of each vertex among them, or -1; starts, columns, entries: its rows by
+    those numbers, its columns by vertices; diagonal: of Q."""
+
+    number: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    entries: NDArray[np.float64]
+    diagonal: NDArray[np.float64]
+
+
 class Settling:
     """Newton's methods with contact, for one system."""
 
@@ -42,7 +54,7 @@ class Settling:
         Q, free = metric.inner, metric.system.free
         number = np.full(metric.system.vertices, -1)
         number[free] = np.arange(len(free))
-        self._matrix = number, Q.indptr.astype(np.int64), free[Q.indices], Q.data, metric.diagonal
+        self._matrix = Matrix(number, Q.indptr.astype(np.int64), free[Q.indices], Q.data, metric.diagonal)
 
     def settled(self, step: StepObjective, p: Positions) -> Positions:
         """p (n, 3) with what grips where friction has it; p itself where nothing grips."""
@@ -51,7 +63,7 @@ class Settling:
             planes = one.planes
             if planes.grip.any():
                 out = p.copy() if out is p else out
-                settle(*planes, one.slip, *self._matrix, out, step.gradient(out), _SWEEPS)
+                settle(planes, one.slip, self._matrix, out, step.gradient(out), _SWEEPS)
         return out
 
     def start(self, step: StepObjective, at: Point) -> Point:
@@ -95,29 +107,11 @@ def _pressed(step: StepObjective, p: Positions) -> NDArray[np.bool_]:
 
 
 @kernel
-def settle(
-    vertices,
-    normal,
-    offset,
-    anchor,
-    stiffness,
-    grip,
-    slip,
-    number,
-    starts,
-    columns,
-    entries,
-    diagonal,
-    p,
-    gradient,
-    sweeps,
-):
-    """Sweeps over the vertices with grip F > 0, moved in p (n, 3) across their normals.
-
-    vertices to grip: half-spaces, see `contact.energy`; slip [m]; number (n,): of each vertex among the free ones, or
-    -1; starts, columns, entries: the rows of Q by those numbers, its columns by vertices; diagonal: of Q;
-    gradient (n, 3): at p, friction's own part included; overwritten.
-    """
+def settle(planes, slip, matrix, p, gradient, sweeps):
+    """Sweeps over the vertices of half-spaces (`contact.energy`) with grip F > 0, moved in p (n, 3) across their
+    normals. slip [m]; matrix: Q; gradient (n, 3): at p, friction's own part included; overwritten."""
+    vertices, normal, _, anchor, _, grip = planes
+    number, starts, columns, entries, diagonal = matrix
     for _ in range(sweeps):
         for e in range(len(grip)):
             i = vertices[e]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers import memory
-from solvers.linear.block_factor import Fronts, factorise, solve, whole
+from solvers.linear.block_factor import Fronts, Scratch, factorise, solve, whole
 from solvers.linear.ordering import nested_dissection
 from solvers.linear.symbolic import Symbolic, analyse
 from solvers.problem import Unsupported
@@ -52,27 +52,27 @@ class BlockCholesky:
             )
         self._panels = np.zeros(f.panel[-1] + ROWS)
         waiting, filled, runs = (np.zeros(k, np.int64) for k in ((2, supernodes + 1), 2, (2, n + 1)))
-        self._scratch = np.zeros((2, room)), waiting, filled, np.zeros(TILE), np.zeros((TILE, TILE)), runs
-        largest = int((whole(3 * f.own) + whole(3 * below)).max(initial=0))
-        self._front = np.zeros(largest + ROWS)
+        front = np.zeros(int((whole(3 * f.own) + whole(3 * below)).max(initial=0)) + ROWS)
+        stacks, triangle = np.zeros((2, room)), np.zeros((TILE, TILE))
+        self._scratch = Scratch(front, stacks, waiting, filled, np.zeros(TILE), triangle, runs)
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
         """Factorise H with these blocks (b, 3, 3), in the order of the graph; False if it is not positive definite."""
-        return factorise(self._fronts, values, self._panels, _NOTHING, self._front, *self._scratch)
+        return factorise(self._fronts, values, self._panels, _NOTHING, self._scratch)
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """H^-1 b, both (n, 3), by what was factorised last."""
         x = np.array(b, order="C")
-        solve(self._fronts, self._panels, x, self._front, False)
+        solve(self._fronts, self._panels, x, self._scratch.front, False)
         return x
 
     def solve_anew(self, values: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """H^-1 b, H factorised with these blocks: sooner than one after the other. None if it is not positive
         definite."""
         x = np.array(b, order="C")
-        if not factorise(self._fronts, values, self._panels, x, self._front, *self._scratch):
+        if not factorise(self._fronts, values, self._panels, x, self._scratch):
             return None
-        solve(self._fronts, self._panels, x, self._front, True)
+        solve(self._fronts, self._panels, x, self._scratch.front, True)
         return x
 
 

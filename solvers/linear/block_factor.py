@@ -45,6 +45,37 @@ class Fronts(NamedTuple):
     diagonal: NDArray[np.int64]
 
 
+class Scratch(NamedTuple):
+    """What a factorisation writes to beside its panels, for n vertices and s supernodes.
+
+    front: a vector longer than the largest front; stacks (2, room): of updates, the numbers in use counted in filled
+    (2,); waiting (2, s + 1): supernodes on each, their count first; least (TILE,), triangle (TILE, TILE), runs
+    (2, n + 1).
+    """
+
+    front: NDArray[np.float64]
+    stacks: NDArray[np.float64]
+    waiting: NDArray[np.int64]
+    filled: NDArray[np.int64]
+    least: NDArray[np.float64]
+    triangle: NDArray[np.float64]
+    runs: NDArray[np.int64]
+
+
+class Dense(NamedTuple):
+    """The front of a supernode: own columns of vertices in panels, from base on, `stride` numbers each, rows below from
+    `head` on; the update of its parent, from begin on, in columns of `size`."""
+
+    own: int
+    head: int
+    stride: int
+    panels: NDArray[np.float64]
+    base: int
+    update: NDArray[np.float64]
+    begin: int
+    size: int
+
+
 def whole(rows: Any) -> Any:
     """The rows of so many whole vectors as hold these."""
     return (rows + ROWS - 1) // ROWS * ROWS
@@ -54,22 +85,20 @@ _whole = inner(whole)
 
 
 @kernel
-def factorise(fronts, values, panels, x, front, stacks, waiting, filled, least, triangle, runs):
+def factorise(fronts, values, panels, x, scratch):
     """Write L to `panels` from the blocks of the matrix, values (b, 3, 3); returns whether it is positive definite.
 
-    x (n, 3), or nothing: overwritten with L^-1 x while each panel is at hand; front: see `solve`; stacks (2, room):
-    of updates, the numbers in use counted in filled (2,); waiting (2, s + 1): supernodes on each, their count first;
-    least (TILE,), triangle (TILE, TILE), runs (2, n + 1): scratch.
+    x (n, 3), or nothing: overwritten with L^-1 x while each panel is at hand.
     """
+    stacks, waiting, filled = scratch.stacks, scratch.waiting, scratch.filled
     filled[:] = 0
     waiting[:, 0] = 0
     for s in range(len(fronts.own)):
         _, own, below, head, stride = _sizes(fronts, s)
-        size = stride - head
-        base, side = fronts.panel[s], fronts.stack[s]
-        update, begin = stacks[side], filled[side]
-        panels[base : fronts.panel[s + 1]] = 0.0
-        update[begin : begin + 3 * below * size] = 0.0
+        side = fronts.stack[s]
+        to = Dense(own, head, stride, panels, fronts.panel[s], stacks[side], filled[side], stride - head)
+        panels[to.base : fronts.panel[s + 1]] = 0.0
+        to.update[to.begin : to.begin + 3 * below * to.size] = 0.0
         _enter(fronts, s, values, panels, stride)
         other = 1 - side
         while waiting[other, 0] > 0 and fronts.parent[waiting[other, waiting[other, 0]]] == s:
@@ -77,17 +106,16 @@ def factorise(fronts, values, panels, x, front, stacks, waiting, filled, least, 
             waiting[other, 0] -= 1
             rows = fronts.start[c + 1] - fronts.start[c] - fronts.own[c]
             filled[other] -= 3 * rows * _whole(3 * rows)
-            _extend(fronts, c, rows, stacks[other], filled[other], own, head, stride, panels, base, update, begin,
-                    size, runs)  # fmt: skip
-        if not _eliminate(fronts, s, values, panels, head, stride, least, triangle):
+            _extend(fronts, c, stacks[other], filled[other], to, scratch.runs)
+        if not _eliminate(fronts, s, values, panels, stride, scratch.least, scratch.triangle):
             return False
         if len(x) > 0:
-            _forwards(fronts, s, panels, x, front)
-        _update(panels, base, 3 * own, head, stride, update, begin, 3 * below, size)
+            _forwards(fronts, s, panels, x, scratch.front)
+        _update(to, 3 * below)
         if fronts.parent[s] >= 0:
             waiting[side, 0] += 1
             waiting[side, waiting[side, 0]] = s
-            filled[side] += 3 * below * size
+            filled[side] += 3 * below * to.size
     return True
 
 
@@ -102,16 +130,18 @@ def _enter(fronts, s, values, panels, stride):
 
 
 @inner
-def _extend(fronts, c, rows, source, at, own, head, stride, panels, base, update, begin, size, runs):
-    """Add the update of a child c to its parent's front, in runs of members that are neighbours in both."""
-    first = fronts.start[c] + fronts.own[c]
+def _extend(fronts, c, source, at, to, runs):
+    """Add the update of a child c, which waits in `source`, to its parent's front, in runs of members that are
+    neighbours in both."""
+    own, first = to.own, fronts.start[c] + fronts.own[c]
+    rows = fronts.start[c + 1] - first
     height = _whole(3 * rows)
     count = 0
     for k in range(rows):
         q = fronts.within[first + k]
         if k == 0 or q != fronts.within[first + k - 1] + 1 or q == own:
             runs[0, count] = k
-            runs[1, count] = 3 * q if q < own else head + 3 * (q - own)
+            runs[1, count] = 3 * q if q < own else to.head + 3 * (q - own)
             count += 1
     runs[0, count] = rows
     run = 0
@@ -122,9 +152,10 @@ def _extend(fronts, c, rows, source, at, own, head, stride, panels, base, update
         for j in range(3):
             start = at + (3 * b + j) * height
             if q < own:
-                _add_runs(runs, run, count, b, source, start, panels, base + (3 * q + j) * stride)
+                _add_runs(runs, run, count, b, source, start, to.panels, to.base + (3 * q + j) * to.stride)
             else:
-                _add_runs(runs, run, count, b, source, start, update, begin + (3 * (q - own) + j) * size - head)
+                column = to.begin + (3 * (q - own) + j) * to.size - to.head
+                _add_runs(runs, run, count, b, source, start, to.update, column)
 
 
 @inner
@@ -137,7 +168,7 @@ def _add_runs(runs, run, count, b, source, start, target, column):
 
 
 @inner
-def _eliminate(fronts, s, values, panels, head, stride, least, triangle):
+def _eliminate(fronts, s, values, panels, stride, least, triangle):
     """Factorise the panel of a supernode; False at a pivot that is not positive."""
     base, width = fronts.panel[s], 3 * fronts.own[s]
     for tile in range(0, width, TILE):
@@ -145,11 +176,11 @@ def _eliminate(fronts, s, values, panels, head, stride, least, triangle):
         corner = base + tile * stride
         above = tile // ROWS * ROWS
         strips = (stride - above) // ROWS
-        left, row, to = base + above, base + tile, corner + above
+        left, row, here = base + above, base + tile, corner + above
         if columns == 6:
-            subtract_product(panels, left, row, stride, tile, panels, to, stride, strips, 6)
+            subtract_product(panels, left, row, stride, tile, panels, here, stride, strips, 6)
         else:
-            subtract_product(panels, left, row, stride, tile, panels, to, stride, strips, 3)
+            subtract_product(panels, left, row, stride, tile, panels, here, stride, strips, 3)
         for j in range(columns):
             v = fronts.members[fronts.start[s] + (tile + j) // 3]
             least[j] = _NO_DIGITS * values[fronts.diagonal[v], j % 3, j % 3]
@@ -160,24 +191,26 @@ def _eliminate(fronts, s, values, panels, head, stride, least, triangle):
         if not positive:
             return False
         if columns == 6:
-            divide(panels, to, stride, triangle, strips, 6)
+            divide(panels, here, stride, triangle, strips, 6)
         else:
-            divide(panels, to, stride, triangle, strips, 3)
+            divide(panels, here, stride, triangle, strips, 3)
         for j in range(columns):
             panels[corner + j * stride + tile + j] = triangle[j, j]
     return True
 
 
 @inner
-def _update(panels, base, width, head, stride, update, begin, columns, size):
+def _update(to, columns):
     """Subtract the product of a panel's rows below from the update."""
+    panels, stride, update, size = to.panels, to.stride, to.update, to.size
+    row, width = to.base + to.head, 3 * to.own
     for tile in range(0, columns, TILE):
         above = tile // ROWS * ROWS
-        row, to, strips = base + head, begin + tile * size + above, (size - above) // ROWS
+        here, strips = to.begin + tile * size + above, (size - above) // ROWS
         if columns - tile >= 6:
-            subtract_product(panels, row + above, row + tile, stride, width, update, to, size, strips, 6)
+            subtract_product(panels, row + above, row + tile, stride, width, update, here, size, strips, 6)
         else:
-            subtract_product(panels, row + above, row + tile, stride, width, update, to, size, strips, 3)
+            subtract_product(panels, row + above, row + tile, stride, width, update, here, size, strips, 3)
 
 
 @inner

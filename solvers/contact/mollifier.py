@@ -1,0 +1,91 @@
+"""What takes away the kink that the distance of two edges has where they are parallel (Li et al. 2020, "Incremental
+potential contact"): a factor of their energy, with e = 1e-3 |u|^2 |v|^2 at rest,
+
+    m(c) = (2 - c/e) c/e  for c < e, else 1;     c = |u x v|^2
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from solvers.compiling import inner
+
+MOLLIFIED = 1e-3
+"""Of |u|^2 |v|^2 at rest, the |u x v|^2 up to which edges count as nearly parallel (Li et al. 2020)."""
+
+
+class Crossed(NamedTuple):
+    """Two edges: u, v, |u|^2, u v, |v|^2 and c = |u x v|^2."""
+
+    u: tuple[float, float, float]
+    v: tuple[float, float, float]
+    uu: float
+    uv: float
+    vv: float
+    c: float
+
+
+@inner
+def crossed(p, x):
+    """Two edges x (4,)."""
+    a, b, c, d = x[0], x[1], x[2], x[3]
+    u0, u1, u2 = p[b, 0] - p[a, 0], p[b, 1] - p[a, 1], p[b, 2] - p[a, 2]
+    v0, v1, v2 = p[d, 0] - p[c, 0], p[d, 1] - p[c, 1], p[d, 2] - p[c, 2]
+    w0, w1, w2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+    uu, uv, vv = u0 * u0 + u1 * u1 + u2 * u2, u0 * v0 + u1 * v1 + u2 * v2, v0 * v0 + v1 * v1 + v2 * v2
+    return Crossed((u0, u1, u2), (v0, v1, v2), uu, uv, vv, w0 * w0 + w1 * w1 + w2 * w2)
+
+
+@inner
+def mollifier(c, e):
+    """m and its first two derivatives by c."""
+    if not c < e:
+        return 1.0, 0.0, 0.0
+    return (2.0 - c / e) * c / e, 2.0 * (1.0 - c / e) / e, -2.0 / (e * e)
+
+
+@inner
+def add_mollified(edges, factor, energy, keep, g, dc, H):
+    """Add what the mollifier's derivatives bring to H (12, 12); factor, energy: m, m', m'' and f, f', f''; keep: of
+    what bends downwards of it, which is f m'' and, with a = grad f, b = grad m,
+
+    a b' + b a' <= s a a' + b b'/s,     4 w (du x dv) <= 2 |w| (|du|^2 |v|/|u| + |dv|^2 |u|/|v|),     w = u x v.
+    """
+    u, v, uu, uv, vv, c = edges
+    m, m1, m2 = factor
+    f, f1, f2 = energy
+    for a in range(3):
+        bu, bv = 2.0 * (vv * u[a] - uv * v[a]), 2.0 * (uu * v[a] - uv * u[a])
+        dc[a], dc[3 + a], dc[6 + a], dc[9 + a] = -bu, bu, -bv, bv
+    mixed, bent = keep * f1 * m1, keep * f * m2
+    share, rest = 0.0, 1.0 - keep
+    if m > 0.0 and rest > 0.0 and f1 != 0.0:
+        share = m * f2 / (f1 * f1)
+        bent += rest * m1 * m1 / share
+        share *= rest * f1 * f1
+    for i in range(12):
+        for j in range(12):
+            H[i, j] += mixed * (g[i] * dc[j] + dc[i] * g[j]) + bent * dc[i] * dc[j] + share * g[i] * g[j]
+    w, weight = np.sqrt(c), 2.0 * f * m1
+    more_u, more_v = rest * w * np.sqrt(vv / uu), rest * w * np.sqrt(uu / vv)
+    for a in range(3):
+        for b in range(3):
+            same = 1.0 if a == b else 0.0
+            huu = weight * ((vv + more_u) * same - v[a] * v[b])
+            hvv = weight * ((uu + more_v) * same - u[a] * u[b])
+            huv = weight * ((1.0 + keep) * u[a] * v[b] - uv * same - keep * v[a] * u[b])
+            _four(H, a, b, 0, 0, huu)
+            _four(H, a, b, 6, 6, hvv)
+            _four(H, a, b, 0, 6, huv)
+            _four(H, b, a, 6, 0, huv)
+
+
+@inner
+def _four(H, a, b, i, j, h):
+    """A block by edges in the four blocks of their ends."""
+    H[i + a, j + b] += h
+    H[i + a, j + 3 + b] -= h
+    H[i + 3 + a, j + b] -= h
+    H[i + 3 + a, j + 3 + b] += h
