@@ -119,7 +119,8 @@ def speed(
     """Time a sweep's solvers in turns, beside a yardstick in C++ and the machine's own limits."""
     from harness.base.claim import claimed
     from harness.base.progress import display
-    from harness.config.load import load_sweep
+    from harness.config.load import load_sweep, require_stated
+    from harness.config.options import AUTO
     from harness.experiments.speed.comparison import run_speed
     from harness.report.site import keep
     from harness.report.speed.figures import figures
@@ -129,6 +130,9 @@ def speed(
     if not 0.0 < budget < math.inf:
         raise InputError(Mistake(f"came {budget:g}; wanted a number of seconds above 0", key="--budget"))
     sweep = load_sweep(config)
+    require_stated(sweep.runs())
+    if any(run.tolerance == AUTO for run in sweep.runs()):
+        raise InputError(Mistake("needs the steps before; give a number, or null", config, key="tolerance"))
     folder = claimed(results / sweep.name, config)
     how = {"again": again, "changed": changed, "isolated": not here}
     found = figures(run_speed(sweep, folder, display(err()), _say, budget=budget, **how))

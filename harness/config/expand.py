@@ -9,7 +9,7 @@ from typing import Any
 
 from harness.base.document import Document, Key, quote
 from harness.base.errors import did_you_mean
-from harness.config.options import OF_SCENE, OPTIONS
+from harness.config.options import AUTO, OF_ERROR, OF_SCENE, OPTIONS, Chosen
 from harness.config.sweep import Exclude, Include, Kept, RunSpec, SolverSpec, SweepFields
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
@@ -38,6 +38,7 @@ class Expansion:
         """The runs without duplicates, the grid's first; empty after mistakes were noted."""
         self._check_names()
         options = self.fields.options.model_dump(include=set(OPTIONS))
+        self._check_chosen()
         jobs = [(scene, self._sizes(scene), self.solvers, options) for scene in self.scenes]
         extra = [job for i, entry in enumerate(self.fields.include) for job in self._included(i, entry, options)]
         count = sum(len(s) * len(v) * prod(map(len, o.values())) for _, s, v, o in [*jobs, *extra])
@@ -63,6 +64,8 @@ class Expansion:
         kept = {name: getattr(self.fields.options, name) for name in Kept.model_fields}
         for size, solver, values in product(sizes, solvers, product(*options.values())):
             chosen: dict[str, Any] = dict(zip(options, values, strict=True))
+            if chosen["accuracy"] is not None:
+                chosen |= {name: Chosen.model_fields[name].default for name in OF_ERROR[:-1]} | {"first_guess": None}
             chosen["first_guess"] = chosen["first_guess"] or scene.guess(chosen["integrator"])
             chosen |= {name: getattr(scene, name) for name in OF_SCENE if chosen[name] is None}
             yield RunSpec.model_construct(
@@ -121,6 +124,18 @@ class Expansion:
                         if name not in names:
                             problem = f"came {quote(name)}; expected {did_you_mean(name, names)}"
                             self.document.report(problem, (part, i, key))
+
+    def _check_chosen(self) -> None:
+        """What an asked error chooses is not stated beside it; and neither can be had of a judged run."""
+        options = self.fields.options
+        if None not in options.accuracy:
+            for name in OF_ERROR:
+                if name in options.model_fields_set:
+                    self.document.report("is chosen for the `accuracy` asked; leave it out", ("options", name))
+        entries = [options, *self.fields.include]
+        if options.judge and any(AUTO in one.tolerance or set(one.accuracy) != {None} for one in entries):
+            problem = "grades steps by a tolerance that is stated; give one, and no `accuracy`, or leave `judge` out"
+            self.document.report(problem, ("options", "judge"))
 
     def _check_frames(self, runs: Sequence[RunSpec]) -> None:
         for i, frame in enumerate(self.fields.options.convergence_frames or ()):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -230,6 +230,14 @@ def _expanded(document: Document, scenes: dict[str, SceneSpec]) -> Sweep:
     if document.mistakes:
         raise document.error()
     return Sweep(document.path.stem, sweep.options, runs, sweep.reports)
+
+
+def require_stated(runs: Iterable[RunSpec]) -> None:
+    """Raise InputError for a run whose steps are chosen, where they are compared as they are stated."""
+    if any(run.accuracy is not None for run in runs):
+        raise InputError(
+            Mistake("chooses the steps of each run, which `springbench run` does; leave it out", key="accuracy")
+        )
 
 
 def misfits(scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:

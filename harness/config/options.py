@@ -17,6 +17,7 @@ AUTO: Literal["auto"] = "auto"
 
 Iterations = Annotated[int, Field(ge=1, le=100_000)]
 Tolerance = Annotated[float, Field(gt=0, lt=1)] | None
+Error = Annotated[float, Field(gt=0, lt=1)] | None
 Threads = Annotated[int, Field(ge=1, le=1024)]
 Rounds = Annotated[int, Field(ge=1, le=1000)]
 
@@ -41,8 +42,10 @@ class Chosen(Model):
 
     iterations: Annotated[Iterations, Option("{} it.", "max_iterations")] = 50
     """Iteration limit of a step."""
-    tolerance: Annotated[Tolerance, Option("tol. {}", "tolerance")] = None
-    """Relative tolerance that ends a step's iterations; null does all of them."""
+    tolerance: Annotated[Tolerance | Literal["auto"], Option("tol. {}", "tolerance")] = None
+    """Relative tolerance that ends a step's iterations; null does all of them; auto: what is left of the
+    residual adds at most a tenth to the step's own local error, as an embedded method or differences of the velocity
+    estimate it."""
     integrator: Annotated[IntegratorName, Option("{}", "integrator")] = "implicit-euler"
     """How time is integrated."""
     time_step: Annotated[TimeStep, Option("dt {:.3g}", "time_step", _OF_SCENE)]
@@ -63,6 +66,13 @@ class Chosen(Model):
     """Number of steps."""
     rounds: Annotated[Rounds, Option("{} rounds")] = 2
     """How often the timed part is repeated."""
+    accuracy: Annotated[Error, Option("error {}", "asked")] = None
+    """Relative error of the positions at the end to keep to, which chooses integrator, steps and tolerance for the
+    solver; null leaves them as they are stated."""
+
+
+OF_ERROR: tuple[str, ...] = ("integrator", "iterations", "tolerance", "first_guess")
+"""Those that an asked error chooses."""
 
 
 OPTIONS: dict[str, Option] = {

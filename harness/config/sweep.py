@@ -152,6 +152,8 @@ class RunSpec(Kept, Chosen):
         settings["integrator"] = identity(self.integrator)
         if self.timing == "exclusive":  # as it always was before there was another
             del settings["timing"]
+        if self.accuracy is None:
+            del settings["accuracy"]
         return json.dumps(settings, sort_keys=True, separators=(",", ":"))
 
     def run_id(self, machine: str) -> str:

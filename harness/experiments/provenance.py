@@ -28,8 +28,14 @@ def asked(run: RunSpec) -> dict[str, Any]:
         "own": json.dumps([plugin.identity() for plugin in run.own()]) if run.own() else None,
         **stated(run.solver.name),
         **{option.column: getattr(run, name) for name, option in OPTIONS.items() if option.column},
+        "tolerance": tolerance(run.tolerance),
         "threads": machine.threads(run.threads).number,
     }
+
+
+def tolerance(stated: float | str | None) -> float | None:
+    """As the column has it: 0 for `auto`."""
+    return 0.0 if isinstance(stated, str) else stated
 
 
 def provenance() -> dict[str, Any]:

@@ -22,12 +22,13 @@ from harness.base.files import replacing
 from harness.base.machine_lock import alone, beside, own_cores
 from harness.base.worker import Tick
 from harness.config.sweep import RunSpec
+from harness.experiments.asked.kept import keep_to_error
 from harness.experiments.code import code, parts, solver_class
 from harness.experiments.failure import failure
 from harness.experiments.plan import Files
-from harness.experiments.provenance import asked, common
+from harness.experiments.provenance import asked, common, tolerance
 from harness.experiments.standing import standing
-from harness.record.base import RecordingInfo
+from harness.record.base import Frame, RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
 from harness.record.verify import require_last
@@ -35,11 +36,12 @@ from harness.reference.grade import Graded
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
 from harness.simulation import times
+from harness.simulation.algebraic import stop_rule
 from harness.simulation.measure import Measured, Settings, digest, measure
 from harness.simulation.observe import observe, require_numbers
 from harness.simulation.step import prepare
 from solvers import sources
-from solvers.problem import Solver, StopRule
+from solvers.problem import Solver
 from solvers.registry import SOLVERS, load, minimises
 
 
@@ -74,6 +76,8 @@ def execute(
 
 
 def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
+    if run.accuracy is not None:
+        return _to_error(run, run.accuracy, files, tick, positions)
     with beside(tick):
         scene = build(run.scene, run.size, run.integrator)
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
@@ -82,10 +86,32 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
         told = times.rows(measured := measure(scene, _solver(run), settings, tick))
     with beside(tick):
         by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
-    require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=run.tolerance is not None)
+    require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=isinstance(run.tolerance, float))
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
     facts |= {"choice": measured.prepared.choice} | standing(run) | how
     return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
+
+
+def _to_error(run: RunSpec, error: float, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
+    """The rows of a run whose solver keeps to an error of its end: integrator and steps are chosen first."""
+    with _timed(run, tick) as how:
+        found = keep_to_error(run, error, tick)
+    told, seen, last = found.rows(), found.positions, dict[str, Any]()
+    with beside(tick):
+        if positions:
+            save_positions(positions, seen[1:])
+        if run.record:
+            chosen = {name: told[0][name] for name in ("status", "integrator", "estimated")}
+            recorder = _recorder(run, files, found.scene, chosen | {"milliseconds_per_step": 1e3 * found.median})
+            try:
+                for k, p in enumerate(seen):
+                    recorder.frame(Frame(k, found.scene.time(k), p, {}, float("nan"), 0))
+                recorder.close({})
+            finally:
+                recorder.abandon()
+            ends = run.frames, found.scene.time(run.frames), seen[-1]
+            last = {"recorded": require_last(files.recording, recorder.info, *ends)}
+    return [how | row | (last if row["frame"] == run.frames else {}) for row in told]
 
 
 @contextmanager
@@ -157,7 +183,7 @@ def _record_until(run: RunSpec, files: Files, failed: dict[str, Any]) -> None:
 
 
 def _settings(run: RunSpec) -> Settings:
-    return Settings(StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
+    return Settings(stop_rule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
 
 
 def _solver(run: RunSpec) -> Solver:
@@ -197,7 +223,7 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
     properties = {
         "sweep": run.sweep,
         **{name: value for name, value in asked(run).items() if value is not None},  # a property has no null
-        "tolerance": run.tolerance or 0.0,
+        "tolerance": tolerance(run.tolerance) or 0.0,
         "vertices": len(scene.mesh.rest),
         "springs": len(scene.springs.edges),
         "frames": run.frames,

@@ -64,7 +64,8 @@ class Graded(Passing):
             raise RunFailed(f"{told}; wanted |Q^-1 grad g|_Q, which is {residual:.3g} (or `minimises = False`)")
         if SLACK * found.residual / yardstick + round_off < least:
             raise RunFailed(f"{told}, where |Q^-1 grad g|_Q is {residual:.3g}")
-        if found.stopped == "tolerance" and least > SLACK * (stop.tolerance or 0.0) + round_off:
+        enough = max(stop.tolerance or 0.0, stop.within / yardstick if yardstick else 0.0)
+        if found.stopped == "tolerance" and least > SLACK * enough + round_off:
             raise RunFailed(f"{told} and says that it reached the tolerance, where {least:.3g} of the start's is left")
         return {"graded": reached}
 

@@ -61,7 +61,7 @@ _SUMMARY = """
 select run_id, any_value(scene), any_value("size"), any_value(solver), any_value(vertices), any_value(springs),
     coalesce(any_value(status) filter (status <> 'ok'), 'ok'), any_value(reason) filter (status <> 'ok'),
     any_value(to_json({'integrator': integrator, 'dt': time_step, 'guess': first_guess, 'iterations': max_iterations,
-                       'tolerance': tolerance, 'threads': threads})),
+                       'tolerance': tolerance, 'threads': threads, 'asked': asked})),
     any_value(parameters),
     1e3 * min(seconds) filter (phase = 'prepare' and round = 0),
     1e3 * median(seconds) filter (phase = 'prepare' and round > 0),
@@ -85,9 +85,15 @@ def runs(table: pa.Table) -> list[RunTimes]:
     return [RunTimes(*row) for row in answer(_SUMMARY, numbered)]
 
 
+def _stated(run: RunTimes) -> dict[str, Any]:
+    """A run's options; of one whose steps were chosen for an error that and what was chosen."""
+    options = json.loads(run.settings)
+    return {key: value for key, value in options.items() if value is not None or options["asked"] is None}
+
+
 def labels(found: Sequence[RunTimes]) -> dict[str, str]:
     """By run id, the solver's name and those of its settings in which the solver's runs of the scene differ."""
-    settings = {run.run_id: {**json.loads(run.settings), **json.loads(run.parameters or "{}")} for run in found}
+    settings = {run.run_id: _stated(run) | json.loads(run.parameters or "{}") for run in found}
     values: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     for run in found:
         for key, value in settings[run.run_id].items():

@@ -14,7 +14,7 @@ Hermite's cubic. Solvers with steps of their own choose them within a frame.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import ceil, inf, isfinite, log2
 from time import perf_counter
@@ -57,7 +57,8 @@ class Stuck(RunFailed):
 class Path:
     """A motion that kept to an error. positions (k + 1, n, 3) [m] at the start and at the end of each of k frames;
     steps accepted and rejected, shortest and longest [s]; factorisations; iterations of the steps' solves; wall
-    seconds, those of preparing the first steps apart."""
+    seconds, those of preparing the first steps apart; frames (k,): of them, in which each frame was reached, those of
+    one step in equal parts."""
 
     positions: Positions
     accepted: int
@@ -66,6 +67,7 @@ class Path:
     iterations: int
     steps: tuple[float, float]
     seconds: float
+    frames: tuple[float, ...]
 
 
 class Follower(Protocol):
@@ -151,7 +153,7 @@ class _Following:
         self._seen, self._before = [self._now.positions], (1.0, scene.system.time_step)
         self._accepted = self._rejected = self._iterations = 0
         self._lengths = inf, 0.0
-        self._began = perf_counter()
+        self._began, self._reached = perf_counter(), list[float]()
 
     def path(self) -> Path:
         """The motion."""
@@ -160,7 +162,7 @@ class _Following:
             if perf_counter() - self._began > self._limit:
                 raise TooSlow
         counts = self._accepted, self._rejected, self._ladder.made, self._iterations
-        return Path(np.array(self._seen), *counts, self._lengths, perf_counter() - self._began)
+        return Path(np.array(self._seen), *counts, self._lengths, self._reached[-1], shares(self._reached))
 
     def _one(self) -> None:
         """Try a step."""
@@ -215,10 +217,11 @@ class _Following:
 
     def _show(self, after: Motion, time: float, h: float) -> None:
         """The frames that end in a step."""
-        until = self._time(self._ticks)
+        until, reached = self._time(self._ticks), perf_counter() - self._began
         while len(self._seen) <= self._asked.frames and (len(self._seen) * self._span) <= until * (1.0 + 1e-12):
             part = min(1.0, (len(self._seen) * self._span - time) / h)
             self._seen.append(hermite(self._now, after, h, part))
+            self._reached.append(reached)
 
     def _stuck(self, ratio: float, time: float) -> Stuck:
         cause = "is not solved" if ratio == inf else f"errs by {ratio:.2g} times what it may"
@@ -234,6 +237,13 @@ def _solved(solution: Solution, within: float) -> bool:
     if solution.stopped == "stalled":
         return solution.residual <= _STALLED * within
     return solution.stopped != "iterations"
+
+
+def shares(reached: Sequence[float]) -> tuple[float, ...]:
+    """The wall seconds of each frame, by those at which it was reached: frames of one step share its own evenly."""
+    gone = np.diff(np.array(reached), prepend=0.0)
+    steps = np.cumsum(gone > 0.0)
+    return tuple(float(gone[steps == step].mean()) for step in steps)
 
 
 def hermite(before: Motion, after: Motion, h: float, part: float) -> Positions:

@@ -18,10 +18,11 @@ import numba
 import numpy as np
 
 from harness.scenes.bind import Scene
+from harness.simulation.algebraic import Stop
 from harness.simulation.clock import Clock, Watch, working
 from harness.simulation.contract import Contract
 from harness.simulation.step import Step, prepare, simulate, start
-from solvers.problem import Positions, Prepared, Solver, StopRule
+from solvers.problem import Positions, Prepared, Solver
 
 PHASE_REPEATS = 3
 """How often the local and the global step are timed in each frame, after calls that warm up."""
@@ -62,7 +63,7 @@ class Timing:
 class Settings:
     """How a scene is stepped and how often: the stop rule, first guess, frames and rounds of a run."""
 
-    stop: StopRule
+    stop: Stop
     first_guess: str
     frames: int
     rounds: int
@@ -117,7 +118,7 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
         if phases:
             with watch(ITERATION):
                 began = perf_counter()
-                done = max(1, prepared.solve(step.problem, settings.stop).iterations)
+                done = max(1, prepared.solve(step.problem, step.stop).iterations)
                 seconds = perf_counter() - began
             timings.append(Timing(ITERATION, step.index, 0, seconds / done, done))
         tick("warm up and phases")

@@ -66,6 +66,7 @@ def observe(
             "last_residual": s.residual,
             "residual_of": s.residual_of,
             "yardstick": s.yardstick,
+            "within": step.stop.within or None,
             "digest": digest(p),
             **(judge(step) if judge else {}),
         }

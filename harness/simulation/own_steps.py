@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from harness.scenes.bind import Scene
-from harness.simulation.controlled import Path, Stuck, TooSlow
+from harness.simulation.controlled import Path, Stuck, TooSlow, shares
 from harness.simulation.step import State, problem, start
 from solvers.integrators import Motion
 from solvers.problem import Positions, Solver, StepProblem, Unsupported
@@ -59,6 +59,7 @@ class Own:
         scene = self.scene
         ready, state = self._prepared(tolerance), start(scene)
         began = perf_counter()
+        reached = list[float]()
         seen, h, told = [state.now.positions], None, np.zeros((self.frames, 3))
         for k in range(self.frames):
             stated = problem(scene, state, "current")
@@ -69,12 +70,14 @@ class Own:
             told[k] = each[:3]
             h, state = float(told[k, 2]), State(Motion(p, v), None, k + 1)
             seen.append(p)
+            reached.append(perf_counter() - began)
             if perf_counter() - began > limit:
                 raise TooSlow
         accepted, rejected = (int(count) for count in told[:, :2].sum(axis=0))
         evaluations = (accepted + rejected) * ready.evaluations
         mean = scene.system.time_step * self.frames / accepted
-        return Path(np.array(seen), accepted, rejected, 0, evaluations, (mean, mean), perf_counter() - began)
+        counts = accepted, rejected, 0, evaluations
+        return Path(np.array(seen), *counts, (mean, mean), reached[-1], shares(reached))
 
     def _prepared(self, tolerance: float) -> Controlled:
         scene = self.scene

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import reduce
 
 from harness.scenes.bind import Scene
+from harness.simulation.algebraic import LocalErrors, Stated, Stop
 from harness.simulation.stages import Stages, require_mass
 from solvers.core.clearing import begun_free
 from solvers.integrators import IMPLICIT_EULER, Integrator, Motion
@@ -28,7 +29,8 @@ class State:
 class Step:
     """A step that was done: its problem, its solution, the state after it and all of its iterations.
 
-    A step of several unknowns has the problem and the solution of the last one; stages: those of all, in their order.
+    A step of several unknowns has the problem and the solution of the last one; stages: those of all, in their order;
+    stop: by which each was solved; error: of the motion, by an embedded method, None without one.
     """
 
     problem: StepProblem
@@ -36,6 +38,8 @@ class Step:
     state: State
     iterations: int
     stages: tuple[tuple[StepProblem, Solution], ...]
+    stop: StopRule
+    error: Motion | None = None
 
     @property
     def index(self) -> int:
@@ -95,15 +99,17 @@ def prepare(scene: Scene, solver: Solver) -> Prepared:
 
 
 def simulate(
-    scene: Scene, prepared: Prepared, stop: StopRule, *, first_guess: str, frames: int, state: State | None = None
+    scene: Scene, prepared: Prepared, stop: Stop, *, first_guess: str, frames: int, state: State | None = None
 ) -> Iterator[Step]:
     """The steps from a state (the scene's start if it is left out), one more each time it is asked, up to the frame
-    `frames`. prepared: by `prepare`."""
+    `frames`. prepared: by `prepare`. Raises Unsupported where a scene cannot be solved to the errors of its steps."""
     state = state or start(scene)
     step = _single if isinstance(scene.integrator, Integrator) else _staged
+    rules = Stated(stop) if isinstance(stop, StopRule) else LocalErrors(stop, scene, state.now, frames)
     while state.index < frames:
-        done = step(scene, prepared, stop, first_guess, state)
+        done = step(scene, prepared, rules.rule, first_guess, state)
         state = done.state
+        rules.done(state.now, done.error)
         yield done
 
 
@@ -116,7 +122,7 @@ def _single(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, 
     method = IMPLICIT_EULER if usual.history and state.before is None else usual
     before = Motion(stated.start.positions, stated.start.velocity)
     after = State(method.advance(stated.start, solution), before, state.index + 1)
-    return Step(stated, solution, after, solution.iterations, ((stated, solution),))
+    return Step(stated, solution, after, solution.iterations, ((stated, solution),), stop)
 
 
 def _staged(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, state: State) -> Step:
@@ -124,7 +130,7 @@ def _staged(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, 
     begun = _stages(scene, state)
     done = begun.done(prepared, stop, FIRST_GUESSES[first_guess])
     after = State(done.end.motion, begun.now, state.index + 1, done.end.acceleration)
-    return Step(*done.stages[-1], after, done.iterations, done.stages)
+    return Step(*done.stages[-1], after, done.iterations, done.stages, stop, done.end.error)
 
 
 def _stages(scene: Scene, state: State) -> Stages:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from harness.base import rows
 from harness.base.columns import SCHEMA
 from harness.base.errors import InputError
 from harness.cli import app
@@ -51,7 +52,7 @@ def test_a_value_on_the_command_line_means_what_it_means_in_a_file(
     monkeypatch.setattr(load, "load_any", loaded)
     values = {"iterations": "7", "tolerance": "1e-3", "integrator": "bdf2", "time_step": "1/60", "frames": "0x3"}
     values |= {"first_guess": "inertial", "threads": "auto", "rounds": "1"}
-    assert set(values) == set(OPTIONS)
+    assert set(values) == set(OPTIONS) - {"accuracy"}, "which would choose most of them"
     given = [part for name, text in values.items() for part in (f"--{name.replace('_', '-')}", text)]
     assert CliRunner().invoke(app, ["run", str(folder / "cloth.yaml"), *given]).exit_code == 2
     (run,) = asked.pop("runs")
@@ -65,3 +66,53 @@ def test_an_entry_states_what_it_lists_and_nothing_else(key: str, value: object)
     entry = Include.model_validate({key: value})
     assert entry.stated(key) == (tuple(value) if isinstance(value, list) else (value,))
     assert not any(entry.stated(other) for other in Include.model_fields if other != key)
+
+
+SWEEP = "scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [{}]\noptions: {{frames: 4, threads: 1, rounds: 1, {}}}\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("accuracy: 1e-2, integrator: bdf2", "options.integrator: is chosen for the `accuracy` asked"),
+        ("accuracy: [1e-2, 1e-3], tolerance: 1e-3", "options.tolerance: is chosen for the `accuracy` asked"),
+        ("accuracy: 2.0", "options.accuracy"),
+        ("accuracy: 1e-2, judge: true", "options.judge: grades steps by a tolerance that is stated"),
+        ("tolerance: auto, judge: true", "options.judge: grades steps by a tolerance that is stated"),
+        ("tolerance: automatic", "options.tolerance"),
+    ],
+)
+def test_what_an_error_or_auto_leaves_no_choice_of_is_refused(folder: Path, options: str, said: str) -> None:
+    (folder / "sweep.yaml").write_text(SWEEP.format("newton", options))
+    with pytest.raises(InputError) as refused:
+        load_any(folder / "sweep.yaml")
+    assert said in str(refused.value)
+
+
+def test_an_error_asked_beside_stated_steps_is_one_run_and_has_no_part_in_the_others_names(folder: Path) -> None:
+    (folder / "sweep.yaml").write_text(SWEEP.format("newton", "accuracy: [null, 1e-2], integrator: [bdf2, midpoint]"))
+    (folder / "plain.yaml").write_text(SWEEP.format("newton", "integrator: [bdf2, midpoint]"))
+    runs, plain = load_any(folder / "sweep.yaml").runs(), load_any(folder / "plain.yaml").runs()
+    assert [run.accuracy for run in runs] == [None, 0.01, None]
+    assert [run.identity() for run in runs if run.accuracy is None] == [run.identity() for run in plain]
+
+
+def test_a_sweep_keeps_to_an_error_and_its_rows_say_what_it_took(folder: Path) -> None:
+    (folder / "cloth.yaml").write_text(f"{CLOTH}  - {{kind: gravity}}\n  - {{kind: pins, at: [top_corners]}}\n")
+    (folder / "sweep.yaml").write_text(SWEEP.format("dormand-prince-8, xpbd", "accuracy: 1e-3"))
+    done = CliRunner().invoke(app, ["run", str(folder / "sweep.yaml"), "--here", "--results", str(folder / "results")])
+    assert done.exit_code == 1, done.output
+    assert "xpbd: tells no error of its steps" in done.output
+    (file,) = (folder / "results" / "sweep" / "rows").glob("*-dormand-prince-8-*.parquet")
+    found = [row for row in rows.read([file]).to_pylist() if row["phase"] == "step"]
+    assert [row["frame"] for row in found] == [1, 2, 3, 4]
+    assert all(0.0 < row["estimated"] <= row["asked"] == 1e-3 for row in found)
+    assert all(row["accepted"] > 0 and row["seconds"] > 0 and row["integrator"] == "own" for row in found)
+    assert found[-1]["recorded"], "the recording was read back"
+
+
+def test_speed_compares_steps_as_they_are_stated(folder: Path) -> None:
+    for options in ("accuracy: 1e-2", "tolerance: auto"):
+        (folder / "sweep.yaml").write_text(SWEEP.format("newton", options))
+        done = CliRunner().invoke(app, ["speed", str(folder / "sweep.yaml"), "--results", str(folder / "results")])
+        assert done.exit_code == 2, done.output

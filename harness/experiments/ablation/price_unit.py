@@ -16,7 +16,8 @@ from harness.experiments.core import do_all
 from harness.experiments.provenance import asked, provenance
 from harness.experiments.resume import wanted
 from harness.scenes.bind import build
-from solvers.problem import Solver, StopRule
+from harness.simulation.algebraic import stop_rule
+from solvers.problem import Solver
 from solvers.registry import EVERY, load
 
 
@@ -42,7 +43,7 @@ class Prices(OfEffects):
         """See OfEffects."""
         run = self.run
         solver: Solver = load(EVERY[run.solver.name])(**run.solver.parameters)
-        stop, told = StopRule(run.iterations, run.tolerance), list[Row]()
+        stop, told = stop_rule(run.iterations, run.tolerance), list[Row]()
         plain = build(only(run.scene), run.size)
         counts = {"vertices": len(plain.mesh.rest), "springs": len(plain.springs.edges)}
         with machine.pinned_threads(machine.threads(run.threads).number):

@@ -22,9 +22,10 @@ from harness.base.errors import InputError
 from harness.base.statistics import Interval, ratio
 from harness.scenes.bind import Scene, build
 from harness.scenes.spec import SceneSpec
+from harness.simulation.algebraic import Stop
 from harness.simulation.step import Step, prepare, simulate
 from solvers.energies.springs import Springs
-from solvers.problem import NotPositiveDefinite, ProjectiveEnergy, Solver, StopRule, Unsupported
+from solvers.problem import NotPositiveDefinite, ProjectiveEnergy, Solver, Unsupported
 
 PLAIN = {"springs", "gravity", "ether-drag", "pins"}
 ALL = "all"
@@ -85,7 +86,7 @@ def only(scene: SceneSpec, *kinds: str) -> SceneSpec:
     return scene.model_copy(update={"effects": tuple(e for e in scene.effects if e.kind in PLAIN.union(kinds))})
 
 
-def prices(scene: SceneSpec, size: int, solver: Solver, stop: StopRule, *, frames: int, rounds: int) -> Iterator[Price]:
+def prices(scene: SceneSpec, size: int, solver: Solver, stop: Stop, *, frames: int, rounds: int) -> Iterator[Price]:
     """The price of each effect by a solver; one that it refuses has none. frames: that count in a round."""
     for effect in priced(scene):
         try:
@@ -94,9 +95,7 @@ def prices(scene: SceneSpec, size: int, solver: Solver, stop: StopRule, *, frame
             yield Price(effect, refused=str(error))
 
 
-def price(
-    scene: SceneSpec, size: int, effect: str, solver: Solver, stop: StopRule, *, frames: int, rounds: int
-) -> Price:
+def price(scene: SceneSpec, size: int, effect: str, solver: Solver, stop: Stop, *, frames: int, rounds: int) -> Price:
     """The price of one effect by one solver; raises InputError, NotPositiveDefinite and Unsupported."""
     made = [build(only(scene, *kinds), size) for kinds in ((effect,), ())]
     ready = [prepare(one, solver) for one in made]

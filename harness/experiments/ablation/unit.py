@@ -21,6 +21,7 @@ from harness.experiments.failure import failure
 from harness.experiments.provenance import asked, provenance
 from harness.experiments.resume import wanted
 from harness.scenes.bind import Scene, build
+from harness.simulation.algebraic import stop_rule
 from harness.simulation.measure import Settings
 from solvers.problem import Solver, StopRule
 from solvers.registry import EVERY, SOLVERS, load
@@ -92,7 +93,7 @@ def run_ablation(
 
 def _measured(run: RunSpec, pairs: bool, tick: Tick) -> list[Row]:
     """The rows. Raises Unsupported and what else the whole scene's solver raises."""
-    settings = Settings(StopRule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
+    settings = Settings(stop_rule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
     solver: Solver = load(EVERY[run.solver.name])(**run.solver.parameters)
     with machine.pinned_threads(machine.threads(run.threads).number):
         found = turns(variants(run.scene, pairs=pairs), run.size, run.integrator, solver, settings, tick)

@@ -73,13 +73,9 @@ COLUMNS = (
     Column("error", _REAL, "", "|p(T) - reference(T)| / |reference(T) - p(0)|, Frobenius norms, vertices not pinned"),
     Column("error_rms_m", _REAL, "m", "root mean square distance of a vertex from the reference at the horizon"),
     Column("iterations_done", _INT, "", "iterations done in all steps together"),
-    Column("asked", _REAL, "", "the error that was asked for, as `error`"),
-    Column("estimated", _REAL, "", "the error, estimated by a motion to a closer tolerance"),
-    Column("local_tolerance_m", _REAL, "m", "what each step may err by, root mean square over the free coordinates"),
-    Column("accepted", _INT, "", "steps that kept to it"),
-    Column("rejected", _INT, "", "steps that did not, and were done again"),
-    Column("factorisations", _INT, "", "factors made for steps of different lengths; 0 of explicit methods"),
-    Column("estimate_seconds", _REAL, "s", "wall time of all that was simulated to choose and to estimate"),
+    *as_in_runs(
+        "asked", "estimated", "local_tolerance_m", "accepted", "rejected", "factorisations", "estimate_seconds"
+    ),
     *PROVENANCE,
 )
 

@@ -20,7 +20,7 @@ from harness.config.accuracy import Case, CurveSpec, WorkSpec, moment_name
 from harness.experiments.accuracy.failures import lost as ended
 from harness.experiments.accuracy.rows import SCHEMA
 from harness.experiments.accuracy.solves import GradedStep, curve_rows
-from harness.experiments.accuracy.work import work_rows
+from harness.experiments.accuracy.work import options, work_rows
 from harness.experiments.provenance import provenance
 from harness.reference.store import Store
 from harness.reference.trajectory import Trajectory
@@ -206,7 +206,7 @@ class WorkUnit:
         """See Unit."""
         spec = self.spec
         row: Row = {"kind": "work", "status": lost.status, "reason": str(lost), "horizon": spec.horizon}
-        return _written(self.home, spec, [row | dict(spec.options)])
+        return _written(self.home, spec, [row | options(spec)])
 
 
 def _written(home: Home, spec: CurveSpec | WorkSpec, found: Sequence[Row]) -> str:

@@ -17,13 +17,15 @@ import numpy as np
 from harness.base import machine
 from harness.config.accuracy import WorkSpec
 from harness.experiments.accuracy.failures import OverTime, lost
+from harness.experiments.provenance import tolerance
 from harness.reference.frozen import bind
 from harness.reference.trajectory import Trajectory
 from harness.scenes.bind import Scene
+from harness.simulation.algebraic import stop_rule
 from harness.simulation.clock import Clock, Watch
 from harness.simulation.measure import Diverged
 from harness.simulation.step import prepare, simulate
-from solvers.problem import Positions, Prepared, Solver, StopRule
+from solvers.problem import Positions, Prepared, Solver
 from solvers.registry import EVERY, load
 
 Row = dict[str, Any]
@@ -37,7 +39,7 @@ def work_rows(spec: WorkSpec, trajectory: Trajectory | Exception, tick: Callable
 
     trajectory: the reference up to the horizon, or why there is none; tick: called after each round.
     """
-    shared: Row = {"kind": "work", "status": "ok", **spec.options, "horizon": spec.horizon}
+    shared: Row = {"kind": "work", "status": "ok", **options(spec), "horizon": spec.horizon}
     try:
         if isinstance(trajectory, Exception):
             raise trajectory
@@ -45,6 +47,11 @@ def work_rows(spec: WorkSpec, trajectory: Trajectory | Exception, tick: Callable
             return [shared | _simulated(spec, trajectory, tick)]
     except Exception as error:  # whatever a solver raises, the others go on
         return [shared | lost(error)]
+
+
+def options(spec: WorkSpec) -> Row:
+    """The columns of a simulation's options."""
+    return {**spec.options, "tolerance": tolerance(spec.options["tolerance"])}
 
 
 def _simulated(spec: WorkSpec, trajectory: Trajectory, tick: Callable[[], None]) -> Row:
@@ -81,7 +88,7 @@ def _run(
     """
     seconds, iterations, p, watch = 0.0, 0, scene.mesh.rest, Watch(spec.how.threads)
     clock = Clock(watch)
-    stop = StopRule(spec.options["iterations"], spec.options["tolerance"])
+    stop = stop_rule(spec.options["iterations"], spec.options["tolerance"])
     limit = spec.how.time_limit if limit is None else limit
     run = simulate(scene, prepared, stop, first_guess=spec.options["first_guess"], frames=frames)
     for _ in range(frames):

@@ -28,6 +28,7 @@ from harness.base import machine, rows, shelf, statistics
 from harness.base.errors import InputError, Mistake
 from harness.base.progress import Display
 from harness.config.load import load_any
+from harness.config.options import AUTO
 from harness.config.sweep import RunSpec
 from harness.experiments.archive.merge import sweeps
 from harness.experiments.archive.publish import SUMS, config_of
@@ -147,6 +148,9 @@ def _spec(config: Path, of_run: Sequence[Row], own_code: bool) -> RunSpec | None
     names = {"iterations": "max_iterations"} | {n: n for n in ("tolerance", "integrator", "time_step", "first_guess")}
     options = {name: first[column] for name, column in names.items()}
     options |= {"frames": max(row["frame"] for row in steps), "rounds": 1 + max(row["round"] for row in steps)}
+    options["tolerance"] = AUTO if options["tolerance"] == 0.0 else options["tolerance"]
+    if first["asked"] is not None:
+        options = {name: options[name] for name in ("time_step", "frames", "rounds")} | {"accuracy": first["asked"]}
     sizes = [first["size"]] if first["size"] else []
     scene = {"solvers": [first["solver"]], "sizes": sizes, **options}
     for asked in ({}, scene | {"threads": "auto"}, scene | {"threads": first["threads"]}):

@@ -8,13 +8,14 @@ with its error is known from its order: a step is in proportion to error^(1/orde
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf
 
 import numpy as np
 
 from harness.base.errors import RunFailed
+from harness.config.sweep import SolverSpec
 from harness.experiments.asked.ways import Asked, Way, ways
 from harness.reference.growth import Growth, growth
 from harness.simulation.controlled import Path, Stuck, TooSlow
@@ -27,10 +28,10 @@ WIDE = 1 / 3
 CLOSER = 1 / 50
 """Of a tolerance, that of the motion that errors are estimated by."""
 DOUBT = 1.25
-"""What an estimate is multiplied by: the closer motion errs too, by a tenth of it where the order is 4, by a sixth
-where stability rules the steps and its own are hardly shorter."""
-_FINER = 1.3
-"""Times as many steps, at which a motion counts as closer: an order of 8 takes 1.6 times as many for 1/50."""
+"""What an estimate is multiplied by: the closer motion errs too, by a tenth of it, and by a sixth where stability rules
+the steps and its own are hardly shorter."""
+_FINER = 10.0
+"""Times as exact, by the order and the number of steps, at which a motion counts as closer."""
 _MOVES, _CLOSINGS = 6, 3
 _PATIENCE = 4.0
 """Times the fastest so far, what a way may take."""
@@ -77,9 +78,16 @@ def foresee(asked: Asked, error: float, say: Callable[[str], None]) -> Growth:
     return seen
 
 
-def search(asked: Asked, error: float, seen: Growth, say: Callable[[str], None]) -> Answer:
-    """The cheapest way that keeps to a relative error at the horizon. Raises RunFailed where none does."""
-    return _Search(asked, error, seen, say).answer()
+def search(
+    asked: Asked,
+    error: float,
+    seen: Growth,
+    say: Callable[[str], None],
+    pairs: Sequence[tuple[str, SolverSpec]] = (),
+) -> Answer:
+    """The cheapest way that keeps to a relative error at the horizon; pairs: see `ways`. Raises RunFailed where none
+    does."""
+    return _Search(asked, error, seen, say).answer(pairs)
 
 
 class _Search:
@@ -88,10 +96,10 @@ class _Search:
         self._free = asked.bound(asked.frame, "own").system.free
         self._seconds = 0.0
 
-    def answer(self) -> Answer:
+    def answer(self, pairs: Sequence[tuple[str, SolverSpec]]) -> Answer:
         self._say("ways to the error:")
         tolerance = 0.2 * self._error * self._seen.scale
-        raced = self._race(ways(self._asked, self._say), tolerance)
+        raced = self._race(ways(self._asked, self._say, pairs), tolerance)
         closer = self._closer(raced)
         graded = sorted((self._graded(one, closer) for one in raced), key=self._promise)
         for one in graded:
@@ -125,7 +133,7 @@ class _Search:
         found = best
         for _ in range(_CLOSINGS):  # where frames or stability rule the steps, a closer tolerance may change nothing
             found = self._run(best.way, CLOSER * found.tolerance)
-            if found.path.accepted >= _FINER * best.path.accepted:
+            if (found.path.accepted / best.path.accepted) ** best.way.follower.order >= _FINER:
                 break
         return found
 

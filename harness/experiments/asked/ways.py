@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from harness.base.errors import InputError, RunFailed
 from harness.config.load import misfits
+from harness.config.sweep import SolverSpec
 from harness.experiments.asked.halving import halved
 from harness.reference.frozen import bind
 from harness.scenes.bind import Scene
@@ -16,7 +17,7 @@ from harness.simulation.own_steps import Own
 from solvers.contact.touching import without_contact
 from solvers.integrators import INTEGRATORS, RungeKutta
 from solvers.problem import NotPositiveDefinite, Unsupported
-from solvers.registry import SOLVERS, about, load
+from solvers.registry import EVERY, SOLVERS, about, load, minimises
 
 _ONCE = 1e-2
 """Of the mesh's size: the tolerance of what only compiles."""
@@ -80,39 +81,49 @@ class Way:
         return self.solver if self.integrator == "own" else f"{self.integrator} with {self.solver}"
 
 
-def tried() -> list[tuple[str, str]]:
+def tried() -> list[tuple[str, SolverSpec]]:
     """Integrators and solvers by name: those that choose their own steps, and those that minimise what the integrator
     with an error states that has the highest order, and the highest of its stages."""
     pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded}
     best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].starts))
     told = {name: about(load(target), name) for name, target in SOLVERS.items()}
-    return [("own" if one.own_steps else best, name) for name, one in told.items() if one.to_error]
+    return [("own" if one.own_steps else best, SolverSpec(name, {})) for name, one in told.items() if one.to_error]
 
 
-def ways(asked: Asked, say: Callable[[str], None]) -> list[Way]:
+def tried_by(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
+    """What one solver can do of that, with all integrators that tell an error. Raises Unsupported for nothing."""
+    one = about(load(EVERY[solver.name]), solver.name)
+    if one.own_steps:
+        return [("own", solver)]
+    if not minimises(load(EVERY[solver.name])):
+        raise Unsupported(f"{solver.name}: tells no error of its steps and does not minimise those of an integrator")
+    return [(name, solver) for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded]
+
+
+def ways(asked: Asked, say: Callable[[str], None], pairs: Sequence[tuple[str, SolverSpec]] = ()) -> list[Way]:
     """Those that know the scene, warmed up: what they compile counts against nobody; others are told, with the reason.
-    Raises RunFailed for none."""
+    pairs: of integrators and solvers, all that are tried if left out. Raises RunFailed for none."""
     found, reasons = list[Way](), list[str]()
-    for integrator, solver in tried():
-        way = Way(integrator, solver, _follower(asked, integrator, solver))
+    for integrator, solver in pairs or tried():
+        way = Way(integrator, solver.name, _follower(asked, integrator, solver))
         try:
             _warm(asked, integrator, solver)
             found.append(way)
         except (Unsupported, NotPositiveDefinite) as error:
-            reasons.append(f"{way}: {str(error).removeprefix(f'{solver}: ')}")
+            reasons.append(f"{way}: {str(error).removeprefix(f'{solver.name}: ')}")
             say(f"  not by {reasons[-1]}")
     if not found:
         raise RunFailed(f"no method that keeps to an error knows this scene: {'; '.join(reasons)}")
     return found
 
 
-def _follower(asked: Asked, integrator: str, solver: str, frames: int | None = None) -> Follower:
-    made, frames = load(SOLVERS[solver])(), frames or asked.frames
+def _follower(asked: Asked, integrator: str, solver: SolverSpec, frames: int | None = None) -> Follower:
+    made, frames = load(EVERY[solver.name])(**solver.parameters), frames or asked.frames
     if integrator == "own":
         return Own(asked.bound(asked.frame, integrator), made, frames)
     return Implicit(lambda h: asked.bound(h, integrator), made, asked.frame * frames, frames)
 
 
-def _warm(asked: Asked, integrator: str, solver: str) -> None:
+def _warm(asked: Asked, integrator: str, solver: SolverSpec) -> None:
     size = asked.bound(asked.frame, "own").mesh.size or 1.0
     _follower(asked, integrator, solver, 1).follow(_ONCE * size)

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from harness.base.errors import InputError
-from harness.config.load import DEFAULT_SOLVER, load_any
+from harness.config.load import DEFAULT_SOLVER, load_any, require_stated
 from harness.config.sweep import RunSpec
 from harness.experiments.gates.turns import CALL, Clock, Timed
 from harness.scenes.bind import build
+from harness.simulation.algebraic import stop_rule
 from harness.simulation.step import prepare, simulate
-from solvers.problem import Positions, Solver, StopRule
+from solvers.problem import Positions, Solver
 from solvers.registry import SOLVERS, load
 
 CLOCKS: dict[Clock, Callable[[], float]] = {"cpu": time.process_time, "wall": time.perf_counter}
@@ -59,11 +60,12 @@ def _steps(scene: Path, given: Given, size: int | None, options: dict[str, Any])
     runs = load_any(scene, solvers=asked, sizes=[size] if size else [], **more).runs()
     if len(runs) != 1:
         raise InputError(f"{scene}: a gate is on one run; came {len(runs)}")
+    require_stated(runs)
     (run,) = runs
     named = isinstance(given, (str, Mapping))
     solver: Solver = load(SOLVERS[run.solver.name])(**run.solver.parameters) if named else given
     bound = build(run.scene, run.size, run.integrator)
-    prepared, stop = prepare(bound, solver), StopRule(run.iterations, run.tolerance)
+    prepared, stop = prepare(bound, solver), stop_rule(run.iterations, run.tolerance)
 
     def positions(frames: int) -> Positions:
         p = bound.mesh.rest

@@ -142,9 +142,16 @@ class WorkPoint:
     @property
     def setting(self) -> str:
         """What was chosen, in words."""
-        stop = f"{self.iterations} iterations" if self.tolerance is None else f"tolerance {self.tolerance:g}"
+        stop = stop_words(self.tolerance, self.iterations)
         steps = "" if self.own_steps else f"{self.integrator}, "
         return f"{self.label}, {steps}dt {step_words(self.time_step)}, {stop}"
+
+
+def stop_words(tolerance: float | None, iterations: int) -> str:
+    """What ends a step's iterations."""
+    if tolerance is None:
+        return f"{iterations} iterations"
+    return f"tolerance {tolerance:g}" if tolerance else "tolerance auto"
 
 
 @dataclass(frozen=True, slots=True)

@@ -146,7 +146,7 @@ def _draw(stem: Path, mesh: str, works: list[WorkPoint], marked: dict[str, Mark]
 
 def _sizes(works: Iterable[WorkPoint]) -> dict[float | None, float]:
     """Sizes of the marks by tolerance, larger for tighter ones; None: fixed iterations, the least."""
-    tolerances = sorted({work.tolerance for work in works if work.tolerance}, reverse=True)
+    tolerances = sorted({work.tolerance for work in works if work.tolerance is not None}, reverse=True)
     return {None: 2.8, **{tolerance: 4.4 + 1.6 * k for k, tolerance in enumerate(tolerances)}}
 
 
@@ -190,7 +190,9 @@ def _meanings(sizes: dict[float | None, float]) -> list[tuple[Line2D, str]]:
 
 
 def _stop(tolerance: float | None) -> str:
-    return "fixed iterations" if tolerance is None else f"tolerance {power(tolerance)}"
+    if tolerance is None:
+        return "fixed iterations"
+    return f"tolerance {power(tolerance)}" if tolerance else "tolerance auto"
 
 
 def _notes(works: Sequence[WorkPoint]) -> list[str]:

@@ -18,6 +18,7 @@ from harness.report.accuracy.measured import (
     WorkPoint,
     by_other_code,
     older,
+    stop_words,
     without_short,
 )
 from harness.report.accuracy.profiles import iteration_ratios, judged, least_ratios, not_shown, share, yardstick
@@ -148,10 +149,12 @@ def work(folder: Path) -> list[Entry]:
         here = [w for w in known if (w.scene, w.size) == mesh[:2]]
         for integrator in dict.fromkeys(w.integrator for w in here):
             mine = [w for w in here if w.integrator == integrator]
-            tolerances = sorted({w.tolerance for w in mine if w.tolerance}, reverse=True)
+            tolerances = sorted({w.tolerance for w in mine if w.tolerance is not None}, reverse=True)
             said = ["Joined points differ in the time step alone."]
             if len(tolerances) > 1:
-                said.append(f"Larger marks: tighter tolerances, {', '.join(map(power, tolerances))}.")
+                said.append(
+                    f"Larger marks: tighter tolerances, {', '.join(power(t) if t else 'auto' for t in tolerances)}."
+                )
             plots.append(
                 Plot(
                     *((mesh[0], str(mesh[1])), (integrator,), f"{mesh[2]}, {quantity(mine[0].horizon)} s", integrator),
@@ -178,7 +181,7 @@ def _chains(works: Sequence[WorkPoint], marked: dict[str, Mark], tolerances: Seq
     for (label, tolerance, iterations, _), members in chains.items():
         members.sort(key=lambda one: one.time_step)
         x, y = np.array([one.seconds for one in members]), np.array([one.error for one in members])
-        setting = f"tolerance {tolerance:g}" if tolerance else f"{iterations} iterations"
+        setting = stop_words(tolerance, iterations)
         grown = 1.0 + 0.25 * tolerances.index(tolerance) if tolerance in tolerances else 1.0
         hollow = np.array([older(one) for one in members])
         yield Series(label, marked[label], x, y, older=hollow, setting=setting, grown=grown)

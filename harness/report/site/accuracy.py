@@ -14,7 +14,7 @@ import numpy as np
 
 from harness.report.accuracy.convergence import GUESSES
 from harness.report.accuracy.growth import TARGET, growths
-from harness.report.accuracy.measured import Curve, Measurements, WorkPoint, by_other_code, step_words
+from harness.report.accuracy.measured import Curve, Measurements, WorkPoint, by_other_code, step_words, stop_words
 from harness.report.accuracy.pictures import nearest, place
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
@@ -144,7 +144,7 @@ def _work(table: Measurements) -> Item:
     items: list[Item] = []
     for (mesh, label, integrator, tolerance, iterations, _), members in chains.items():
         members.sort(key=lambda work: work.time_step)
-        stop = f"{iterations} iterations" if tolerance is None else f"tolerance {tolerance:g}"
+        stop = stop_words(tolerance, iterations)
         items.append(
             {
                 "label": label,

@@ -30,7 +30,8 @@ _NEEDED = ("run_id", "scene", "size", "solver", "phase", "status")
 _MORE = """
 select run_id, any_value(file) as unit, any_value(family) as family, any_value(reference) as reference,
     any_value(integrator) as integrator, any_value(time_step) as time_step, any_value(first_guess) as first_guess,
-    any_value(max_iterations) as max_iterations, any_value(tolerance) as tolerance, any_value(threads) as threads,
+    any_value(max_iterations) as max_iterations, any_value(tolerance) as tolerance,
+    any_value(asked) as asked, any_value(estimated) as estimated, any_value(threads) as threads,
     max(frame) as frames, 1 + max("round") filter (phase = 'step') as rounds,
     sum(seconds) filter (phase in ('step', 'prepare')) as took,
     arg_max(digest, frame) filter (digest is not null) as digest,
@@ -91,12 +92,23 @@ def references(pairs: Any) -> dict[str, dict[str, str]]:
     return {s: {"cited": cited(reference), "bibtex": bibtex([reference])} for s, reference in known.items()}
 
 
-_EXACT = ("time_step", "tolerance")
+_EXACT = ("time_step", "tolerance", "asked")
 """What a command line asks for to the last digit."""
 
 _SHOWN = (
     *("run_id", "unit", "scene", "size", "solver", "label", "options", "plain", "family", "vertices", "springs"),
-    *("integrator", "time_step", "first_guess", "max_iterations", "tolerance", "threads", "frames", "rounds"),
+    *(
+        "integrator",
+        "time_step",
+        "first_guess",
+        "max_iterations",
+        "tolerance",
+        "asked",
+        "estimated",
+        "threads",
+        "frames",
+        "rounds",
+    ),
     *("status", "reason", "stopped", "iterations", "residual", "cold", "warm", "step", "lower", "upper", "least"),
     *("local", "global", "largest_strain", "strain_99", "penetration", "interrupted", "adds_up", "timing", "digest"),
     *(

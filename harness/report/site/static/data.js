@@ -50,9 +50,12 @@ Object.assign(springbench, (() => {
     const sweep = sweepOf(row.slug), scene = sweep.scenes[row.scene];
     const whole = `springbench run ${quoted(sweep.config || `${sweep.name}.yaml`)}`;
     if (!scene || !row.plain || row.own) return `${whole} --again`;
+    const chosen = row.asked !== null && row.asked !== undefined;
+    const stated = {
+      iterations: row.max_iterations, tolerance: row.tolerance === 0 ? "auto" : row.tolerance, integrator: row.integrator, "first-guess": row.first_guess,
+    };
     const options = {
-      size: row.size || null, solver: row.solver, iterations: row.max_iterations, tolerance: row.tolerance,
-      integrator: row.integrator, "time-step": row.time_step && (Math.abs(Math.round(1 / row.time_step) * row.time_step - 1) < 1e-12 ? `1/${Math.round(1 / row.time_step)}` : row.time_step), "first-guess": row.first_guess, threads: row.threads,
+      size: row.size || null, solver: row.solver, ...(chosen ? { accuracy: row.asked } : stated), "time-step": row.time_step && (Math.abs(Math.round(1 / row.time_step) * row.time_step - 1) < 1e-12 ? `1/${Math.round(1 / row.time_step)}` : row.time_step), threads: row.threads,
       frames: row.frames, rounds: row.rounds,
     };
     const told = Object.entries(options).filter(([, value]) => value !== null && value !== undefined);

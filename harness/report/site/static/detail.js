@@ -37,7 +37,7 @@ Object.assign(springbench, (() => {
     const own = Object.entries(JSON.parse(row.parameters || "{}"));
     return list([
       ["mesh", `${number(row.vertices, 6)} vertices, ${number(row.springs, 6)} springs`], ["integrator", row.integrator], ["time step", row.time_step && step(row.time_step)],
-      ["first guess", row.first_guess], ["iterations at most", row.max_iterations], ["tolerance", row.tolerance],
+      ["first guess", row.first_guess], ["iterations at most", row.max_iterations], ["tolerance", row.tolerance === 0 ? "auto" : row.tolerance], ["error asked", row.asked], ["estimated", row.estimated],
       ["threads", row.threads], ["frames, rounds", row.frames && `${row.frames}, ${row.rounds}`], ...own.map(([name, value]) => [name, String(value)]),
     ]);
   }

@@ -1,0 +1,92 @@
+"""A run of a sweep that keeps to an error of its end (`accuracy`): its solver is the one stated, the rest is chosen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from harness.base.errors import RunFailed
+from harness.base.worker import Tick
+from harness.config.sweep import RunSpec
+from harness.experiments.asked.search import Answer, foresee, search
+from harness.experiments.asked.ways import Asked, tried_by
+from harness.scenes.bind import Scene
+from harness.simulation.controlled import Path
+from harness.simulation.measure import digest
+from harness.simulation.observe import intersections, strain_of
+from solvers.problem import Positions
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kept:
+    """scene: bound with the frame as its step; answer: how the error is kept; rounds: the same motion, timed again."""
+
+    scene: Scene
+    answer: Answer
+    asked: float
+    rounds: tuple[Path, ...]
+    said: list[str] = field(default_factory=list[str])
+
+    @property
+    def positions(self) -> Positions:
+        """At the start and after each frame, (frames + 1, n, 3) [m]."""
+        return self.rounds[0].positions
+
+    @property
+    def median(self) -> float:
+        """Wall seconds of a frame."""
+        return float(np.median([seconds for path in self.rounds for seconds in path.frames]))
+
+    def rows(self) -> list[dict[str, Any]]:
+        """A row for each frame of each round."""
+        best, path, scene = self.answer.best, self.answer.best.path, self.scene
+        shared = {
+            "phase": "step",
+            "status": "ok",
+            "reason": self.answer.note or None,
+            "vertices": scene.system.vertices,
+            "springs": len(scene.springs.edges),
+            "integrator": best.way.integrator,
+            "max_iterations": None,
+            "first_guess": None,
+            "asked": self.asked,
+            "estimated": best.estimated,
+            "local_tolerance_m": best.tolerance,
+            "accepted": path.accepted,
+            "rejected": path.rejected,
+            "factorisations": path.factorisations,
+            "estimate_seconds": self.answer.seconds,
+            "choice": "; ".join([f"{best.way} of {1 + len(self.answer.others)} ways", *self.said]),
+        }
+        seen = [self._seen(k, p) for k, p in enumerate(self.positions) if k]
+        return [
+            shared
+            | columns
+            | {"round": number, "seconds": seconds, "pass_seconds": one.seconds, "summed_seconds": sum(one.frames)}
+            for number, one in enumerate(self.rounds)
+            for columns, seconds in zip(seen, one.frames, strict=True)
+        ]
+
+    def _seen(self, frame: int, p: Positions) -> dict[str, Any]:
+        crossed = intersections(self.scene, p, self.scene.time(frame))
+        return {"frame": frame, **strain_of(self.scene, p), "intersections": crossed, "digest": digest(p)}
+
+
+def keep_to_error(run: RunSpec, error: float, tick: Tick) -> Kept:
+    """The cheapest way of the run's solver, done as often as the run has rounds. Raises RunFailed, Unsupported and what
+    the solver raises; RunFailed where a round ends elsewhere, to the last bit."""
+    pairs = tried_by(run.solver)
+    asked = Asked.of(run.scene, run.size, run.frames * run.scene.time_step)
+    said = list[str]()
+    tick("choosing steps")
+    answer = search(asked, error, foresee(asked, error, said.append), lambda line: tick("choosing steps"), pairs)
+    best, rounds = answer.best, list[Path]()
+    for _ in range(run.rounds):
+        rounds.append(best.way.follower.follow(best.tolerance))
+        if not np.array_equal(rounds[-1].positions, best.path.positions):
+            raise RunFailed("a round ended at other positions than the one before")
+        for _ in range(run.frames):
+            tick("timed pass")
+    return Kept(asked.bound(asked.frame, "own"), answer, error, tuple(rounds), said)
