@@ -6,7 +6,7 @@ One table holds all kinds of rows, which `kind` tells apart:
     minimum   a minimum of it that is known; branch 0 is the lowest
     prepare   the time in which a solver prepares for it
     curve     an iterate of a solver on it: energy, errors, stationarity, and when it came
-    work      a simulation of the horizon: its error, and the wall time that it took
+    work      a simulation of the horizon: its error, the wall time that it took, and the CPU time of its best round
     asked     a simulation to an error that was asked for (`springbench run SCENE --error`)
     peer      the same by another library's integrator (`--peers`), whose name is `solver`
 
@@ -69,6 +69,7 @@ COLUMNS = (
     Column("iterations", _INT, "", "the iteration limit, of a step of work or of a curve"),
     *as_in_runs("tolerance"),
     Column("horizon", _REAL, "s", "simulated time"),
+    *as_in_runs("cpu_seconds"),
     Column("seconds_per_simulated", _REAL, "", "median over the rounds of wall seconds per simulated second"),
     Column("error", _REAL, "", "|p(T) - reference(T)| / |reference(T) - p(0)|, Frobenius norms, vertices not pinned"),
     Column("error_rms_m", _REAL, "m", "root mean square distance of a vertex from the reference at the horizon"),

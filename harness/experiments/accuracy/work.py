@@ -17,6 +17,7 @@ import numpy as np
 from harness.base import machine
 from harness.config.accuracy import WorkSpec
 from harness.experiments.accuracy.failures import OverTime, lost
+from harness.experiments.accuracy.scales import stiffness_ratio
 from harness.experiments.provenance import tolerance
 from harness.reference.frozen import bind
 from harness.reference.trajectory import Trajectory
@@ -60,6 +61,7 @@ def _simulated(spec: WorkSpec, trajectory: Trajectory, tick: Callable[[], None])
     solver: Solver = load(EVERY[spec.solver.name])(**spec.solver.parameters)
     prepared = prepare(scene, solver)
     row: Row = {"vertices": scene.system.vertices, "springs": len(scene.springs.edges)}
+    row["stiffness_ratio"] = stiffness_ratio(scene.system, scene.springs.stiffness)
     frames = round(spec.horizon / case.scene.time_step)
     seconds: list[float] = []
     row["interrupted"] = False
@@ -67,6 +69,7 @@ def _simulated(spec: WorkSpec, trajectory: Trajectory, tick: Callable[[], None])
     for _ in range(spec.how.rounds):
         p, iterations, watched = _run(spec, scene, prepared, frames)
         seconds.append(watched["summed_seconds"])
+        row["cpu_seconds"] = min(row.get("cpu_seconds", inf), watched["cpu_seconds"])
         row["interrupted"] |= watched["interrupted"]
         row["iterations_done"] = iterations
         tick()
