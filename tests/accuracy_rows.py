@@ -112,6 +112,7 @@ def work(scene: str, size: int, solvers: Sequence[str] = ("numba", "hybrid", "xp
                         shared(scene, size, solver=solver, parameters="{}", kind="work", problem="t")
                         | {"integrator": integrator, "time_step": dt, "tolerance": tolerance, "iterations": iterations}
                         | {"horizon": 1.0, "seconds": [cost] * 3, "seconds_per_simulated": cost, "error": error}
+                        | {"cpu_seconds": 0.9 * cost, "stiffness_ratio": 1e3 * dt**2, "vertices": size**2}
                         | {"error_rms_m": 0.1 * error, "first_guess": "assignment", "iterations_done": 1500}
                     )
 

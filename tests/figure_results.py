@@ -38,6 +38,30 @@ def accuracy(folder: Path) -> Path:
     return made.write(folder, [*rows, *made.work("net", 10), *made.paper(1.3)])
 
 
+def winners(folder: Path) -> Path:
+    """Simulations of five stiffnesses on three meshes: explicit methods pay for stiffness, high orders for steps."""
+    rows: list[dict[str, Any]] = []
+    methods = (
+        ("numba", "implicit-euler", 1, 1.0),
+        ("newton", "esdirk-4", 4, 8.0),
+        ("dormand-prince-8", "own", 8, 12.0),
+    )
+    for size in (9, 17, 33):
+        for stiffness in (30, 300, 3000, 30000, 300000):
+            for solver, integrator, order, price in methods:
+                number = stiffness * size**2 / 100.0
+                for steps in (10, 40, 160):
+                    least = 2.0 * number**0.5 if integrator == "own" else 1.0
+                    cost = price * max(steps, least) * 1e-6 * size**2
+                    row = made.shared(f"sway-{stiffness}", size, solver=solver, parameters="{}", kind="work")
+                    row |= {"integrator": integrator, "time_step": 1.0 / steps, "iterations": 50, "horizon": 1.0}
+                    row |= {"minimises": integrator != "own", "family": "explicit" if integrator == "own" else "other"}
+                    row |= {"seconds": [cost], "seconds_per_simulated": cost, "cpu_seconds": cost, "vertices": size**2}
+                    row |= {"error": (0.3 / steps) ** order, "stiffness_ratio": 900.0 * number / steps**2}
+                    rows.append(row)
+    return made.write(folder, rows)
+
+
 def sweep(folder: Path, sizes: tuple[int, ...] = (8, 16, 32)) -> Path:
     """Runs of all solvers at these sizes, judged, of four cases of two families; one of them failed."""
     cases = ("geometry-flat", "geometry-line", "numbers-large", "numbers-small")

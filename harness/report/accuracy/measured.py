@@ -109,7 +109,8 @@ class Curve:
 class WorkPoint:
     """One simulation of a horizon [s]: its relative error, and wall seconds a simulated second (nan if it failed).
 
-    family, reference, minimises, own_steps: what the solver states of itself; code: by which it was measured.
+    family, reference, minimises, own_steps: what the solver states of itself; code: by which it was measured; cpu: CPU
+    seconds a simulated second of the best round; stiffness: k/m [1/s^2] of the median spring and the mean free vertex.
     """
 
     scene: str
@@ -130,6 +131,9 @@ class WorkPoint:
     error: float
     error_rms: float
     seconds: float
+    cpu: float
+    vertices: int
+    stiffness: float
     status: str
     reason: str
     code: str

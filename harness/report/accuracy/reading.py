@@ -160,6 +160,9 @@ def _work(row: _Row, label: _Label) -> WorkPoint:
         error=_number(row["error"]),
         error_rms=_number(row["error_rms_m"]),
         seconds=_number(row["seconds_per_simulated"]),
+        cpu=_number(row["cpu_seconds"]) / _number(row["horizon"]),
+        vertices=row["vertices"] or 0,
+        stiffness=_number(row["stiffness_ratio"]) / row["time_step"] ** 2,
         reason=row["reason"] or "",
         code=row["code"] or "",
     )

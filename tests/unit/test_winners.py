@@ -1,0 +1,75 @@
+"""The map of winners: families, prices of errors, and what its cells say."""
+
+from __future__ import annotations
+
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.report.accuracy.reading import read
+from harness.report.accuracy.winners import NOBODY, Cell, cells, family
+from harness.report.figures.of_winners import winners
+from tests import accuracy_rows as made
+from tests import figure_results
+
+
+def row(solver: str, integrator: str, error: float, cpu: float, **other: Any) -> dict[str, Any]:
+    """A simulation of half a second of a mesh of 81 vertices, k/m = 900 /s^2."""
+    told = {
+        "integrator": integrator,
+        "error": error,
+        "cpu_seconds": cpu,
+        "seconds_per_simulated": 9.9,
+        "seconds": [9.9],
+    }
+    told |= {"horizon": 0.5, "time_step": 0.01, "iterations": 50, "stiffness_ratio": 0.09, "vertices": 81}
+    return made.shared("net", 9, solver=solver, parameters="{}", kind="work") | {"minimises": True} | told | other
+
+
+ROWS = (
+    row("numba", "implicit-euler", 0.05, 0.1),
+    row("newton", "midpoint", 2e-3, 0.4),
+    row("newton", "midpoint", 2e-5, 4.0),
+    row("rodas", "own", 5e-4, 0.3, minimises=False, family="linearly implicit"),
+    row("newton", "sdirk-4", 1e-9, 0.01, status="uncertified"),
+)
+
+
+@pytest.fixture
+def found(tmp_path: Path) -> dict[float, Cell]:
+    return {cell.error: cell for cell in cells(read(made.write(tmp_path, ROWS)).works)}
+
+
+def test_the_cheapest_by_processor_time_within_the_error_wins(found):
+    assert [found[10.0**-k].winner for k in range(1, 6)] == [
+        "implicit, order 1",
+        "linearly implicit",
+        "linearly implicit",
+        "implicit, order 2",
+        NOBODY,
+    ]
+    assert found[0.1].prices["implicit, order 2"].cpu == 0.8, "seconds a simulated second, the cheaper of the two"
+
+
+def test_a_cell_tells_how_far_ahead_its_winner_is(found):
+    assert found[0.1].ahead == pytest.approx(3.0)
+    assert found[1e-4].ahead == inf
+    assert not found[1e-8].prices, "what no reference certifies wins nothing"
+
+
+def test_the_stiffness_number_is_that_of_a_frame_whatever_the_step(found):
+    assert found[0.1].number == pytest.approx(1.0)
+
+
+def test_an_integrator_from_outside_is_a_family_by_its_name(tmp_path):
+    (work,) = read(made.write(tmp_path, [row("newton", "mine:METHOD", 0.1, 1.0)])).works
+    assert family(work) == "mine:METHOD"
+
+
+def test_each_number_of_vertices_is_a_grid_of_errors_by_stiffness(tmp_path):
+    panels = [entry.make() for entry in winners(figure_results.winners(tmp_path))]
+    assert [panel.title for panel in panels] == ["81 vertices", "289 vertices", "1\u2009089 vertices"]
+    assert {len({cell.column for cell in panel.cells}) for panel in panels} == {5}
+    assert {len({cell.row for cell in panel.cells}) for panel in panels} == {8}
