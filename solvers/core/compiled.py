@@ -261,7 +261,7 @@ class _Iterating(Iterating):
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
         """See Iterating."""
         made = self._prepared
-        fixed = made.plan, made.bundles, self._edges, made.form, made.rows, *made.work, *self._arrays
+        fixed = made.plan, made.bundles, self._edges, made.form, made.rows, *made.work, tuple(self._arrays)
         answer = step_ends.solve(*fixed, limits, made.threads(), made.team, self.positions)
         self._arrays[-1] = self.positions  # where the next ones go on
         return answer

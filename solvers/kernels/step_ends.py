@@ -98,13 +98,13 @@ def start(rows, vectors, p, positions, pin_targets):
 
 
 @kernel
-def solve(
-    plan, bundles, edges, form, rows, vectors, right, p, target, force, pin_targets, guess, limits, threads, team, out
-):
-    """A whole step; limits: see `solvers.kernels.loop`.
+def solve(plan, bundles, edges, form, rows, vectors, right, p, given, limits, threads, team, out):
+    """A whole step; given: target, force, targets of pins and first guess; limits: see `solvers.kernels.loop`. What an
+    iteration needs is not handed on as one: tuples of tuples cost a small step 3 %.
 
     Returns the count of iterations, the residual [J^(1/2)] and what ended them.
     """
+    target, force, pin_targets, guess = given
     state(rows, target, force, pin_targets, right)
     start(rows, vectors, p, guess, pin_targets)
     count, residual, x = iterate(plan, bundles, edges, form, vectors, right, p, limits, threads, team)

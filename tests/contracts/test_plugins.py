@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import venv
 import zipfile
 from pathlib import Path
 
@@ -115,15 +116,20 @@ def springbench(folder: Path, *arguments: str, code: int = 0) -> str:
     return told.stdout + told.stderr
 
 
+def packed(folder: Path) -> Path:
+    """The package `somebodys`, ready to be installed."""
+    wheel = folder / "somebodys-4.2-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for name, content in WHEEL.items():
+            archive.writestr(name, content)
+        archive.writestr(f"{ABOUT}/RECORD", "".join(f"{name},,\n" for name in [*WHEEL, f"{ABOUT}/RECORD"]))
+    return wheel
+
+
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of packages in which the package `somebodys` was installed."""
-    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("installed")
-    wheel = source / "somebodys-4.2-py3-none-any.whl"
-    with zipfile.ZipFile(wheel, "w") as packed:
-        for name, content in WHEEL.items():
-            packed.writestr(name, content)
-        packed.writestr(f"{ABOUT}/RECORD", "".join(f"{name},,\n" for name in [*WHEEL, f"{ABOUT}/RECORD"]))
+    wheel, target = packed(tmp_path_factory.mktemp("source")), tmp_path_factory.mktemp("installed")
     options = ["--quiet", "--no-deps", "--no-index", "--no-compile", "--target", str(target)]
     subprocess.run([sys.executable, "-m", "pip", "install", *options, str(wheel)], check=True)
     return target
@@ -175,6 +181,22 @@ def test_a_sweep_runs_own_code_and_says_whose_it_is(way: str, beside: Path, inst
     springbench(beside, "query", "select own from rows")
     springbench(beside, "report", "results/sweep")
     assert not ran(), "rows are read without the code that they are of"
+
+
+@pytest.mark.long
+def test_a_fresh_environment_takes_both_packages_and_sweeps_with_them(tmp_path: Path):
+    """This project and somebody's, with all that they need, from the package index."""
+    venv.create(tmp_path / "fresh", with_pip=True)
+    bin, env = tmp_path / "fresh" / "bin", {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    wanted = [str(ROOT), str(packed(tmp_path))]
+    subprocess.run([bin / "python", "-m", "pip", "install", "--quiet", *wanted], check=True, env=env)
+    configs(tmp_path, WAYS["entry-point"])
+    subprocess.run([bin / "springbench", "run", "sweep.yaml"], cwd=tmp_path, check=True, env=env)
+    (rows,) = (tmp_path / "results" / "sweep" / "rows").glob("*.parquet")
+    row = pq.read_table(rows).to_pylist()[0]
+    assert (row["status"], row["solver"], row["integrator"]) == ("ok", "mine", "euler"), row["reason"]
+    assert {module for _, module, _ in json.loads(row["own"])} == {"somebodys"}
+    assert (tmp_path / "results" / "sweep" / "told.txt").exists()
 
 
 def test_a_changed_file_is_another_run(beside: Path):
