@@ -49,33 +49,13 @@ def observe(
     found: dict[int, dict[str, Any]] = {}
 
     def look(step: Step, residual: float) -> None:
-        p, s = step.positions, step.solution
-        crossed = intersections(scene, p, scene.time(step.index))
-        terms = step.problem.terms(s.positions)
-        found[step.index] = {
-            **{f"energy_{name}": terms[name] for name in _OWN if name in terms},
-            "energy_effects": sum(value for name, value in terms.items() if name not in _OWN),
-            "objective": sum(terms.values()),
-            **strain_of(scene, p),
-            "penetration": penetration(scene, p, scene.time(step.index)),
-            "intersections": crossed,
-            "iterations": step.iterations,
-            "stages": len(step.stages),
-            "stopped": stopped(step),
-            "residual": residual,
-            "last_residual": s.residual,
-            "residual_of": s.residual_of,
-            "yardstick": s.yardstick,
-            "within": step.stop.within or None,
-            "digest": digest(p),
-            **(judge(step) if judge else {}),
-        }
+        terms = step.problem.terms(step.solution.positions)
+        found[step.index] = told = columns(scene, step, terms, residual) | (judge(step) if judge else {})
         if stored is not None:
-            stored[step.index - 1] = p
+            stored[step.index - 1] = step.positions
         if recorder:
-            forces = acting(step)
-            told = terms, residual, step.iterations, forces, crossed
-            recorder.frame(Frame(step.index, scene.time(step.index), p, *told))
+            drawn = terms, residual, step.iterations, acting(step), told["intersections"]
+            recorder.frame(Frame(step.index, scene.time(step.index), step.positions, *drawn))
 
     with ThreadPoolExecutor(1) as beside:
         looked: Future[None] | None = None
@@ -95,6 +75,28 @@ def observe(
         if looked:
             looked.result()
     return found
+
+
+def columns(scene: Scene, step: Step, terms: Mapping[str, float], residual: float) -> dict[str, Any]:
+    """What a step's rows tell of its solution; terms: of the objective [J]; residual [J^(1/2)]: at its positions."""
+    p, s = step.positions, step.solution
+    return {
+        **{f"energy_{name}": terms[name] for name in _OWN if name in terms},
+        "energy_effects": sum(value for name, value in terms.items() if name not in _OWN),
+        "objective": sum(terms.values()),
+        **strain_of(scene, p),
+        "penetration": penetration(scene, p, scene.time(step.index)),
+        "intersections": intersections(scene, p, scene.time(step.index)),
+        "iterations": step.iterations,
+        "stages": len(step.stages),
+        "stopped": stopped(step),
+        "residual": residual,
+        "last_residual": s.residual,
+        "residual_of": s.residual_of,
+        "yardstick": s.yardstick,
+        "within": step.stop.within or None,
+        "digest": digest(p),
+    }
 
 
 def acting(step: Step) -> dict[str, Positions]:

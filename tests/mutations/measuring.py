@@ -109,8 +109,8 @@ MEASURING = (
     Mutation(
         "frame-of-the-start",
         "harness/simulation/observe.py",
-        "scene.time(step.index), p, *told",
-        "scene.time(step.index), step.problem.start.positions, *told",
+        "scene.time(step.index), step.positions, *drawn",
+        "scene.time(step.index), step.problem.start.positions, *drawn",
         (_LIES,),
         ("sparse", "other positions"),
     ),
