@@ -41,12 +41,14 @@ _NEAREST = 0.3
 
 
 class Box:
-    """The box that the positions stay in, and what of them a camera must see; it begins with those at rest.
+    """The box that the positions stay in, and what of them a camera must see.
 
-    aspect: of the view, its width over its height.
+    aspect: of the view, its width over its height; first: what is seen first, the positions at rest if left out.
     """
 
-    def __init__(self, rest: NDArray[np.floating], aspect: float = 1.0) -> None:
+    def __init__(
+        self, rest: NDArray[np.floating], aspect: float = 1.0, *, first: NDArray[np.floating] | None = None
+    ) -> None:
         self._low, self._high, self._aspect = rest.min(axis=0), rest.max(axis=0), aspect
         self._limit = 10 * np.linalg.norm(self._high - self._low)
         side, room = np.outer(_SHARES, [aspect * _HALF_VIEW, _HALF_VIEW]).T
@@ -55,7 +57,7 @@ class Box:
         up, down = np.array([zero, one, room]), np.array([zero, -one, _BELOW * room])
         self._directions = np.hstack([right, left, up, down, [[0, 0], [0, 0], [1, -1]]]).T @ _AXES
         self._ends = np.full(len(self._directions), -np.inf)
-        self._see(rest)
+        self._see(rest if first is None else first)
 
     def add(self, p: NDArray[np.floating]) -> None:
         """Widen the box to positions (n, 3) [m], unless they have blown up beyond showing."""

@@ -81,10 +81,12 @@ class RerunRecorder:
 
     def frame(self, frame: Frame) -> None:
         """Record one frame; its arrays are only read."""
-        if not self._frames:
-            self._begin()
         with np.errstate(over="ignore"):
             p = frame.positions.astype(np.float32)
+        if not self._frames:
+            self._begin()
+            if np.isfinite(p).all():
+                self._box = Box(self._info.mesh.rest, first=p)
         strain, of_vertex = self._shading.strains(frame.positions)
         self._stream.set_time("frame", sequence=frame.index)
         self._stream.set_time("time", duration=frame.time)

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
-from math import ceil
+from math import ceil, sqrt
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +18,19 @@ from matplotlib.lines import Line2D
 
 from harness.record.base import Replay
 from harness.report.frames import drawable_frames, shown_limit
-from harness.report.page import count, header, headline, new_page, paste, quantity, save, shorten, strain_scale, text
+from harness.report.page import (
+    count,
+    header,
+    headline,
+    made_by,
+    new_page,
+    paste,
+    quantity,
+    save,
+    shorten,
+    strain_scale,
+    text,
+)
 from harness.report.render import Studio, area_vectors, frame_all, natural_angles, shape, spacing, spring_strain
 from harness.report.solids import seen
 from harness.report.style import HEIGHT, MUTED, RC, RULE, WIDTH, Mark, marks
@@ -66,7 +78,9 @@ def draw_comparison(replays: Mapping[str, Replay], path: Path) -> None:
             if len(panels) > 1:
                 text(page, left + 2, top + 16, shorten(heading, int(across / 9)), size=11.5, weight="bold")
             _panel(page, studio, panel, left, top + _HEADING, grid, looks)
-        save(page, path, used=min(_TOP + rows * down + 12, HEIGHT))
+        used = min(_TOP + rows * down + 12, HEIGHT)
+        made_by(page, replays.values(), used - 12)
+        save(page, path, used=used)
 
 
 def _shape(finite: Sequence[Replay]) -> float:
@@ -76,7 +90,7 @@ def _shape(finite: Sequence[Replay]) -> float:
 
 
 def _layout(panels: int, tiles: int, aspect: float) -> _Grid:
-    """The grid in which scenes of this width / height are largest."""
+    """The grid in which scenes of this width / height are largest, places that stay empty counted against it."""
 
     def grid(panel_columns: int, tile_columns: int) -> _Grid:
         columns = panel_columns * tile_columns
@@ -86,7 +100,12 @@ def _layout(panels: int, tiles: int, aspect: float) -> _Grid:
         return _Grid(panel_columns, tile_columns, max(width, 48), max(min(height, int(width / aspect)), 48))
 
     choices = [grid(p, t) for p, t in product(range(1, panels + 1), range(1, tiles + 1))]
-    return max(choices, key=lambda g: min(g.width, aspect * g.height))
+
+    def worth(g: _Grid) -> float:
+        cells = g.tile_columns * ceil(tiles / g.tile_columns) * g.panel_columns * ceil(panels / g.panel_columns)
+        return min(g.width, aspect * g.height) * sqrt(panels * tiles / cells)
+
+    return max(choices, key=worth)
 
 
 def _title(page: Figure, panels: Mapping[str, Sequence[tuple[str, Replay]]]) -> None:

@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs say nothing of most keywords.
-"""The picture of one run: its final frame large, five earlier ones beside it, the scale of strain above.
+"""The picture of one run: its final frame large, four earlier ones beside it, the scale of strain above.
 
 The scale is that of the strains that are seen: most of a mesh would be grey on one that a pin's neighbours set, and
 all of it one colour on one that is too short.
@@ -26,6 +26,7 @@ from harness.report.page import (
     count,
     header,
     headline,
+    made_by,
     new_page,
     paste,
     quantity,
@@ -41,7 +42,7 @@ from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, RULE, WIDTH
 _LEFT, _TOP, _RIGHT, _HEIGHT = 36, 114, WIDTH - 36, 750
 _WIDEST, _SLIMMEST = 1180, 420  # of the final frame; the earlier ones have the rest
 _RULE, _GAP, _CAPTION = 44, 12, 24
-_EARLIER = 5
+_EARLIER = 4  # any grid that they are put in is full
 
 
 class Box(NamedTuple):
@@ -93,6 +94,7 @@ def draw_run(replay: Replay, path: Path, *, camera: tuple[float, float] | None =
         page = new_page()
         header(page, headline(replay), [*_facts(replay), *_strain(replay, shown)])
         strain_scale(page, replay.strain_range, pins=len(replay.pinned) > 0)
+        made_by(page, [replay], HEIGHT - 12)
         if len(shown):
             _frames(page, replay, shown, camera)
         total = len(replay.frames)

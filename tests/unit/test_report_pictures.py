@@ -108,7 +108,7 @@ def boxes(monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[Box, list[Box]]
 
 @needs_opengl
 @pytest.mark.parametrize("make", [cloth, lambda: cloth(triangles=False), chain], ids=["cloth", "net", "chain"])
-def test_a_run_is_drawn_large_and_five_frames_before_it(
+def test_a_run_is_drawn_large_and_four_frames_before_it(
     make: Callable[[], Replay], boxes: Callable[[], tuple[Box, list[Box]]], tmp_path: Path
 ) -> None:
     draw_run(make(), tmp_path / "run.png")

@@ -16,6 +16,7 @@ from harness.report.accuracy.measured import Curve, Measurements, Values, withou
 from harness.report.accuracy.paper import FAR, FIGURE_2, ITERATIONS, Comparison, comparisons
 from harness.report.accuracy.profiles import least_ratios
 from harness.report.accuracy.times import STEPS, TARGETS, crossings, power, races, reach, seconds_to
+from harness.report.page import factor
 from harness.report.references import cited
 
 Chapters = dict[str, list[str]]
@@ -144,7 +145,7 @@ def _profiles(table: Measurements) -> Iterator[str]:
 
 def _times_of(values: Values) -> str:
     worst = float(np.max(values))
-    return f"{worst:.2g} times" if np.isfinite(worst) else "never reaching, against"
+    return f"{factor(worst)} times" if np.isfinite(worst) else "never reaching, against"
 
 
 def _works(table: Measurements) -> Iterator[str]:

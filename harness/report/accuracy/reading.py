@@ -15,6 +15,7 @@ from harness.base import shelf
 from harness.base.errors import InputError, Mistake
 from harness.base.rows import read as read_rows
 from harness.report.accuracy.measured import Curve, Measurements, Problem, Values, WorkPoint
+from harness.report.page import commits
 
 ROUND_OFF = 100 * float(np.finfo(np.float64).eps)
 """An energy this share of its terms' magnitude below g* is a lower minimum and not round-off: sums of up to 1e5
@@ -189,8 +190,7 @@ def _labels(rows: Sequence[_Row]) -> _Label:
 def _machine(rows: Sequence[_Row]) -> tuple[str, ...]:
     cpus, threads = (sorted({row[key] for row in rows if row[key] is not None}) for key in ("cpu", "threads"))
     count = [f"{', '.join(map(str, threads))} thread{'s' if threads != [1] else ''}"] if threads else []
-    commits = sorted({row["commit"] for row in rows if row["commit"] is not None})
-    made = [f"commit {commits[0]:.7}" if len(commits) == 1 else f"{len(commits)} commits"] if commits else []
+    made = commits(row["commit"] for row in rows)
     return (*cpus[:2], *count, *made)
 
 

@@ -58,7 +58,9 @@ def _curve(ax: Axes, series: Series) -> None:
             (marks,) = ax.plot(
                 series.x[chosen], series.y[chosen], linestyle="none", **mark(look, series.grown, hollow=hollow)
             )
-            if many:
+            if series.steps:
+                marks.set_markevery((0.1, 0.3))  # a step is no measurement: marks but tell the curves apart
+            elif many:
                 marks.set_markevery(0.14)
 
 

@@ -37,7 +37,7 @@ for ax, (panel, how) in zip(axes.flat, PANELS.items()):
         style = {{"drawstyle": "steps-post"}} if how["steps"] else {{}}
         ax.plot(x, y, color=color, linestyle=dash if how["joined"] else "none", linewidth=1.1, **style)
         face = ["white" if row["other_code"] == "True" else color for row in mine]
-        if len(mine) <= 12:  # more marks than that hide the curve
+        if len(mine) <= 12 and not how["steps"]:  # more marks than that hide the curve, and a step is no measurement
             ax.scatter(x, y, 13, marker=marker, facecolors=face, edgecolors=color, linewidths=0.8, zorder=3)
         if how["across"]:
             ax.hlines(y, low, high, color=color, alpha=0.4)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,6 +25,8 @@ Say = Callable[[str], None]
 
 _PICTURES = 3
 """So many pictures of a sweep stand in the overview."""
+
+_HASH = re.compile(r"-[0-9a-f]{12}$")
 
 
 class Overview(NamedTuple):
@@ -183,7 +186,9 @@ def _pictures(folder: Folder) -> list[dict[str, str]]:
     found = sorted((folder.path / "pictures").glob("*.png"), key=_worth, reverse=True)
     found += [p for name in ("convergence", "work") for p in sorted((folder.path / "report").glob(f"{name}/*.png"))][:2]
     shown = [path for path in found if path.stem != "timing"][:_PICTURES]
-    return [{"path": p.relative_to(folder.path).as_posix(), "words": p.stem.replace("-", " ")} for p in shown]
+    return [
+        {"path": p.relative_to(folder.path).as_posix(), "words": _HASH.sub("", p.stem).replace("-", " ")} for p in shown
+    ]
 
 
 def _worth(path: Path) -> tuple[bool, int, str]:

@@ -49,7 +49,7 @@ def read(folder: Folder) -> pa.Table:
 
 
 def table_of(folder: Folder, table: pa.Table) -> list[Run]:
-    """The runs in rows, in their order: what each was, how it ended, and its times [ms]."""
+    """The runs in rows, by scene, size and solver: what each was, how it ended, and its times [ms]."""
     there = {
         part: _files(folder.path / part, suffix) for part, suffix in (("pictures", ".png"), ("recordings", ".rrd"))
     }
@@ -63,6 +63,7 @@ def table_of(folder: Folder, table: pa.Table) -> list[Run]:
         told["options"] = names[run.run_id].removeprefix(run.solver).removeprefix(", ")
         told |= {part[:-1]: int(told["unit"] in files) for part, files in there.items()}
         found.append(told)
+    found.sort(key=lambda run: (run["scene"], run["size"] or 0, run["label"]))
     for run, how in zip(found, _other_code(found), strict=True):
         run["by"] = how
     return found

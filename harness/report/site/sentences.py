@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from harness.report.learned import SAME
-from harness.report.page import quantity
+from harness.report.page import factor, quantity
 
 Run = dict[str, Any]
 
@@ -42,13 +42,13 @@ def _race(group: Sequence[Run]) -> Iterator[dict[str, Any]]:
     yield {"words": f"{words}.", "runs": [first["run_id"], *(run["run_id"] for run in others[:3])]}
     worse = [run for run in known if run not in equal and run["step"] < first["step"]]
     for run in sorted(worse, key=lambda run: run["step"])[:2]:
-        far = quantity(run["residual"] / lowest) if lowest else "many"
+        far = factor(run["residual"] / lowest) if lowest else "many"
         words = f"{where}: {run['label']} is faster, {quantity(run['step'])} ms, and ends {far} times further away."
         yield {"words": words, "runs": [run["run_id"], first["run_id"]]}
 
 
 def _times(run: Run, first: Run) -> str:
-    return f"{run['step'] / first['step']:.2g} times as long"
+    return f"{factor(run['step'] / first['step'])} times as long"
 
 
 def _unconverged(found: Sequence[Run]) -> Iterator[dict[str, Any]]:

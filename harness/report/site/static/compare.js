@@ -24,14 +24,14 @@
 
   function table(rows, series) {
     const differing = FIELDS.filter(([key]) => rows.length > 1 && new Set(rows.map(row => row[key])).size > 1);
-    const same = FIELDS.filter(field => !differing.includes(field)).map(([key, words]) => [words, rows[0][key]]).filter(([key, v]) => v !== null && v !== undefined && v !== "{}" && key !== "commit");
+    const same = FIELDS.filter(field => !differing.includes(field)).map(([key, words]) => [words, rows[0][key]]).filter(([key, v]) => v !== null && v !== undefined && v !== "{}").map(([words, v]) => [words, words === "commit" ? springbench.commit(v) : v]);
     const line = (words, cells) => element("tr", {}, element("th", { scope: "row" }, words), ...cells.map(cell => element("td", {}, cell ?? "–")));
     const against = rows.map((row, k) => {
       const found = k && series[k] && series[0] ? ratio(series[k], series[0]) : null;
       return k ? (found ? `${number(found[0])} (${number(found[1])} to ${number(found[2])})` : "–") : "1";
     });
     const body = [
-      ...differing.map(([key, words]) => line(words, rows.map(row => (key === "commit" ? (row[key] || "").slice(0, 10) : key === "parameters" ? Object.entries(JSON.parse(row[key])).map(pair => pair.join(" ")).join(", ") || "–" : String(row[key] ?? "–"))))),
+      ...differing.map(([key, words]) => line(words, rows.map(row => (key === "commit" ? springbench.commit(row[key]) : key === "parameters" ? Object.entries(JSON.parse(row[key])).map(pair => pair.join(" ")).join(", ") || "–" : String(row[key] ?? "–"))))),
       line("status", rows.map(row => state(row.status))), line("ms a step, quartiles", rows.map(row => (row.step === null ? "–" : `${number(row.step)} (${number(row.lower)} to ${number(row.upper)})`))),
       rows.length > 1 && line("times the first, frame by frame, 95 %", against), line("least ms", rows.map(row => number(row.least))), line("prepare ms, cold, warm", rows.map(row => `${number(row.cold)}, ${number(row.warm)}`)),
       line("iterations, stopped by", rows.map(row => `${number(row.iterations)}, ${row.stopped || "–"}`)), line("last residual", rows.map(row => fixed(row.residual))), line("largest strain", rows.map(row => percent(row.largest_strain))),

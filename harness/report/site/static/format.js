@@ -26,6 +26,13 @@ Object.assign(springbench, (() => {
     return Math.abs(whole * dt - 1) < 1e-4 ? `1/${whole} s` : `${number(1e3 * dt)} ms`;
   };
 
+  // By which code and on which machine figures were made: each pair once, the newest of them first.
+  const commit = text => (text || "unknown").slice(0, 10) + (/dirty/.test(text) ? "-dirty" : "");
+  function madeBy(some, most = 2) {
+    const told = [...new Set(some.map(one => `${one.cpu || "unknown processor"} (machine ${(one.machine || "unknown").slice(0, 6)}), code ${commit(one.commit)}`))];
+    return `made on ${told.slice(0, most).join("; on ")}${told.length > most ? `; and by ${told.length - most} more` : ""}`;
+  }
+
   // A solver's colour as it stands out from the page: lighter on dark, darker on light where it is pale.
   function colour(hex) {
     const parts = [1, 3, 5].map(k => parseInt(hex.slice(k, k + 2), 16));
@@ -73,5 +80,5 @@ Object.assign(springbench, (() => {
     return element(`span.state.${kind}`, {}, element("span", { "aria-hidden": "true" }, `${SIGNS[words] || "×"} `), plain || words);
   }
 
-  return { number, count, percent, fixed, many, duration, day, step, colour, glyph, state };
+  return { commit, madeBy, number, count, percent, fixed, many, duration, day, step, colour, glyph, state };
 })());

@@ -1,7 +1,7 @@
 // The first view: what was run, by which code and where, what is known now, what failed and why.
 "use strict";
 (() => {
-  const { element, put, address, many, count, duration, day, state } = springbench;
+  const { element, put, address, commit, many, count, duration, day, state } = springbench;
 
   function facts(sweep) {
     const told = [];
@@ -23,7 +23,7 @@
   function made(sweep) {
     return sweep.made.slice(0, 3).map(m => element("div", {},
       `${m.cpu || "unknown processor"}, ${many(m.cores || 0, "core")}, ${m.memory_gib ?? "?"} GiB`, element("br"),
-      element("span.muted", {}, `code `, element("code", {}, (m.commit || "unknown").slice(0, 10) + (/dirty/.test(m.commit) ? "-dirty" : "")),
+      element("span.muted", {}, `code `, element("code", {}, commit(m.commit)),
         ` · machine ${(m.machine || "unknown").slice(0, 6)} · ${day(m.from) === day(m.to) ? day(m.to) : `${day(m.from)} to ${day(m.to)}`}`)));
   }
 

@@ -44,8 +44,8 @@
   springbench.views.plots = async (content, query, index) => {
     const sweeps = index.sweeps.filter(sweep => plotsOf(sweep).length);
     const box = element("div.plots"), top = element("div.choice.aside"), tabs = element("div.tabs", { role: "navigation", "aria-label": "Plots" });
-    const title = element("h1"), note = element("p.muted"), choice = element("div.choice"), body = element("div"), point = element("section.point", { hidden: true, tabIndex: -1, "aria-label": "The chosen point" });
-    box.append(element("div.headline", {}, title, top), tabs, note, choice, body, point);
+    const title = element("h1"), note = element("p.muted"), by = element("p.by"), choice = element("div.choice"), body = element("div"), point = element("section.point", { hidden: true, tabIndex: -1, "aria-label": "The chosen point" });
+    box.append(element("div.headline", {}, title, top), tabs, note, choice, body, by, point);
     content.append(box);
     let last = "", current = null, pointed = "";
 
@@ -63,6 +63,7 @@
         title.textContent = chart.title;
         const mixed = chart.items?.some(item => (Array.isArray(item.older) ? item.older.some(Boolean) : item.older));
         note.textContent = [chart.note, mixed && "Hollow marks: measured by other code than the newest rows."].filter(Boolean).join(" ");
+        by.textContent = `${sweep.name}: ${springbench.madeBy(sweep.made)}.`;
         top.hidden = sweeps.length < 2;
         top.replaceChildren(element("label.field", {}, element("span", {}, "Results"), element("select", { onchange: event => { location.hash = address("plots", { sweep: event.target.value }); } },
           ...sweeps.map(one => element("option", { value: one.slug, selected: one === sweep }, one.name)))));

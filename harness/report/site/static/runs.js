@@ -1,7 +1,7 @@
 // All runs in a table: sorted, filtered, chosen to be compared; the whole of what is shown stands in the URL.
 "use strict";
 (() => {
-  const { element, change, address, number, count, percent, fixed, glyph, state, many, save, picture } = springbench;
+  const { element, change, address, madeBy, number, count, percent, fixed, glyph, state, many, save, picture } = springbench;
   const words = (row, key) => row[key] ?? "";
   const shot = row => {
     const src = picture(row);
@@ -15,7 +15,7 @@
     { id: "check", width: "34px", title: "Compare", sort: false, show: (row, on) => element("span.box", { "aria-label": on ? "chosen to compare" : "not chosen" , role: "img"}, on ? "✓" : "") },
     { id: "shot", width: "76px", spare: 4, title: "Picture", sort: false, show: shot },
     { id: "sweep", width: "minmax(96px, 1fr)", spare: 5, title: "Results", show: row => row.sweep },
-    { id: "scene", width: "minmax(104px, 1.3fr)", title: "Scene", show: row => row.scene },
+    { id: "scene", width: "minmax(120px, 2fr)", title: "Scene", show: row => row.scene },
     { id: "size", width: "58px", title: "Size", numeric: true, show: row => row.size || "–" },
     { id: "solver", width: "minmax(150px, 2fr)", title: "Solver", meaning: "and the options in which its runs differ", show: row => element("span.who", {}, glyph(row.mark), row.solver, row.options && element("span.options", {}, row.options)) },
     { id: "status", width: "minmax(104px, 1fr)", title: "Status", show: row => element("span", {}, state(row.status), row.by && " ", marked(row)) },
@@ -83,7 +83,7 @@
       return { key, input, field: element("label.field", { for: input.id }, element("span", {}, title), input) };
     });
     const clear = element("button.quiet", { type: "button", onclick: () => { location.hash = address("runs", { sel: now.get("sel"), sort: now.get("sort") }); } }, "Clear");
-    const total = element("p.total", { role: "status" });
+    const total = element("p.total", { role: "status" }), by = element("p.by");
     const downloads = element("span.downloads");
     const more = element("details.more", { open: LIMITS.some(([key]) => query.get(`max-${key}`)) }, element("summary", {}, "Limits"), element("div.fields", {}, ...limits.map(l => l.field)));
     const filters = element("details.filters", { open: innerWidth > 760 }, element("summary", {}, "Filters"),
@@ -105,7 +105,7 @@
     });
     const panel = element("aside.panel", { hidden: true, "aria-label": "Run", tabIndex: -1 });
     content.append(element("div.runs", {}, element("div.left", {}, element("h1.unseen", {}, "Runs"), filters,
-      element("div.toolbar", {}, total, downloads), table.grid, chosen), panel));
+      element("div.toolbar", {}, total, by, downloads), table.grid, chosen), panel));
     let opened = null, asked = null;
 
     async function update(next) {
@@ -119,6 +119,7 @@
         changes.rows = shown;
         changes.sort = [sort.replace("-", ""), sort.startsWith("-")];
         total.textContent = shown.length === all.length ? many(all.length, "run") : `${count(shown.length)} of ${many(all.length, "run")}`;
+        by.textContent = shown.length ? madeBy([...shown].sort((a, b) => (b.started || "").localeCompare(a.started || ""))) : "";
         for (const { key, select } of facets) {
           const sizes = new Map();
           for (const row of all) if (fits(row, next, key)) sizes.set(value(row, key), (sizes.get(value(row, key)) || 0) + 1);
