@@ -180,6 +180,13 @@ def test_a_run_says_what_it_was_and_how_to_repeat_it_by_keys_alone(tab: Tab, pag
     assert "times the first" in shown.inner_text("table")
 
 
+@pytest.mark.parametrize("view", list(VIEWS.values()), ids=list(VIEWS))
+def test_every_view_says_by_which_code_and_machine(tab: Tab, page: str, view: str):
+    said = tab.open(page, view).inner_text("main")
+    assert "A processor" in said
+    assert "1" * 10 in said or "0" * 10 in said, "the commit"
+
+
 def test_a_failure_is_told_in_words_with_the_number_of_its_runs(tab: Tab, page: str):
     shown = tab.open(page)
     row = shown.get_by_role("row").filter(has_text="unsupported")
