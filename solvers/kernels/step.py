@@ -39,7 +39,8 @@ class Plan(NamedTuple):
     squares, panels, places, chunks: a factor's (see `solvers.linear.supernodal`); top (3,): the first and last of the
     top's rows, and the number of groups; blocks (b, 7): of each its first and last slot and bundle, its first chunk,
     and the last for the passes forwards and backwards; of_group (groups + 2,): the first block of each group and of the
-    top; visits: twice the block that a group goes down to, or up from (one more), from visits_of (groups + 1,) on;
+    top; visits: what groups do, in turn: 2 b is the pass backwards over block b, 2 b + 1 its local step and its pass
+    forwards; those of group g begin at visits_of[g] (groups + 1,);
     held: m/dt^2 + w [N/m] of each row, plus what quadratic forms add to its diagonal; measure: the diagonal part of
     |e|_Q^2 in each lane of the bundles: `held` without the pins, and half of each spring to an exactly pinned vertex,
     because no bundle of that vertex counts the other half; loose: 1 for the rows of vertices that no pin holds, else 0;
