@@ -132,15 +132,21 @@ def separate(pointers, neighbours, owner, number, piece, dist, field, queue):
                         best, best_block, best_field, best_cut = cost, block, k, cut + low[k]
     if best_block < 0 or best > 0.4 * size:
         return np.empty(0, np.int8)
-    side = np.empty(size, np.int8)
     _combine(dist, _FIELDS[best_block], piece, field, low, high)
-    for i in range(size):
+    return _sides(pointers, neighbours, owner, number, piece, field[:, best_field], best_cut)
+
+
+@part
+def _sides(pointers, neighbours, owner, number, piece, field, cut):
+    """Of each vertex 0 where its field is at most `cut`, 1 where it is more, 2 on the separator."""
+    side = np.empty(len(piece), np.int8)
+    for i in range(len(piece)):
         v = piece[i]
-        side[i] = 1 if field[v, best_field] > best_cut else 0
+        side[i] = 1 if field[v] > cut else 0
         if side[i] == 0:
             for e in range(pointers[v], pointers[v + 1]):
                 u = neighbours[e]
-                if owner[u] == number and field[u, best_field] > best_cut:
+                if owner[u] == number and field[u] > cut:
                     side[i] = 2
     return side
 
