@@ -54,7 +54,8 @@ class Place:
         size = self.reach + sum(opinion.reach for opinion in self.side.opinions)
         moves = [motion for effect in self.side.declared.effects if (motion := getattr(effect, "motion", None))]
         end = self.stated.moment.time + self.stated.moment.time_step
-        return max([size, *(blur(motion, size, end) / EPS for motion in moves)])
+        held = float(np.abs(self.stated.held).max(initial=0.0))  # where the mesh is all in one point, they are not
+        return max([size, held, *(blur(motion, size, end) / EPS for motion in moves)])
 
 
 def differ(name: str, ours: Any, theirs: Any, size: float) -> Iterator[Finding]:

@@ -16,6 +16,7 @@ Friction is that of pairs in range where the step starts (Li et al. 2020, sectio
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
@@ -27,23 +28,31 @@ from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, 
 from harness.simulation.opinion.derivatives import Values, Wide, length, wide
 
 Indices = NDArray[np.int64]
+Grip = tuple[Indices, Wide, Wide, Wide]
 _SIDES = ((1, 2), (1, 3), (2, 3))
 
 
 def self_contact(effect: Any, declared: Declared) -> Opinion:
     """The barrier of all pairs that share no vertex."""
+    return barriers(effect, [Touching(declared)])
+
+
+def barriers(effect: Any, parts: Sequence[Touching]) -> Opinion:
+    """The barriers of an effect between all that its parts find, and their friction."""
     t, r = effect.thickness, effect.thickness if effect.range is None else effect.range
-    mesh = Touching(declared)
 
     def needs(resists: Array) -> Begin:
         k = np.full(len(resists), effect.stiffness) if effect.stiffness else 0.1 * np.asarray(resists, float)
-        if not effect.friction:
-            return lambda moment: mesh.values(t, r, k)
 
         def begin(moment: Moment) -> Values:
-            pressed, slip = mesh.values(t, r, k), effect.creep * (moment.until - moment.time)
-            grips = [mesh.grip(moment.p, t, r, k, edges) for edges in (False, True)]
-            return lambda x: np.concatenate([pressed(x), *(effect.friction * rubbed(x, *grip, slip) for grip in grips)])
+            found, slip = list[Values](), effect.creep * (moment.until - moment.time)
+            for part in parts:
+                found.append(part.values(t, r, k, moment.until))
+                if effect.friction:
+                    begun = part.whole(moment.p, moment.time)
+                    grips = [part.grip(begun, t, r, k, edges) for edges in (False, True)]
+                    found += [part.rubs(effect.friction, grip, slip, moment.until) for grip in grips]
+            return lambda x: np.concatenate([values(x) for values in found])
 
         return begin
 
@@ -51,11 +60,11 @@ def self_contact(effect: Any, declared: Declared) -> Opinion:
 
 
 class Touching:
-    """A mesh's points, edges and triangles."""
+    """A mesh's points, edges and triangles. rest (n, 3) [m]: what lengths at rest are taken of."""
 
     def __init__(self, declared: Declared) -> None:
         mesh = declared.mesh
-        self.rest = np.asarray(mesh.rest, float)
+        self.rest: Array = np.asarray(mesh.rest, float)
         self.triangles = mesh.triangles
         covered = set(mesh.triangles.ravel().tolist())
         found = {tuple(sorted(pair)) for t in mesh.triangles.tolist() for pair in combinations(t, 2)}
@@ -65,32 +74,28 @@ class Touching:
         self.edges = np.array(sorted(found), int).reshape(-1, 2)
         self.points = np.unique(np.append(self.edges, self.triangles))[:, None]
 
+    def whole(self, x: Wide, time: float) -> Wide:
+        """Where all are that pairs may name, those of the mesh at x (n, 3) [m] first, at a time [s]."""
+        return x
+
     def near(self, x: Array, reach: float) -> tuple[Indices, Indices]:
-        """Points with triangles, and edges with edges, (k, 4) each, that may be nearer than `reach` [m] at x (n, 3)."""
-        return self._near(x, self.points, self.triangles, reach), self._near(x, self.edges, self.edges, reach)
+        """Points with triangles, and edges with edges, (k, 4) each, that are nearer than `reach` [m] at x (N, 3)."""
+        return near(x, self.points, self.triangles, reach), near(x, self.edges, self.edges, reach)
 
-    @staticmethod
-    def _near(x: Array, one: Indices, two: Indices, reach: float) -> Indices:
-        if not (len(one) and len(two)):
-            return np.empty((0, 4), int)
-        middles = [x[part].mean(axis=1) for part in (one, two)]
-        radii = [
-            np.linalg.norm(x[part] - at[:, None], axis=2).max() for part, at in zip((one, two), middles, strict=True)
-        ]
-        tree: Any = cKDTree(middles[1])
-        lists: list[list[int]] = tree.query_ball_point(middles[0], (reach + sum(radii)) * (1 + 1e-9)).tolist()
-        i = np.repeat(np.arange(len(one)), [len(found) for found in lists])
-        j = np.array([j for found in lists for j in sorted(found)], int)
-        apart = (one[i][:, :, None] != two[j][:, None, :]).all(axis=(1, 2))
-        apart &= (i < j) | (one is not two)
-        rows = np.concatenate([one[i[apart]], two[j[apart]]], axis=1)
-        far = length(_between(rows, x, one is two))
-        return rows[far < reach]
+    def apart(self, rows: Indices, edges: bool) -> Wide:
+        """How far pairs are apart at rest (k,) [m]."""
+        return length(_between(rows, wide(self.rest), edges))
 
-    def values(self, t: float, r: float, k: Array) -> Values:
-        """The energies [J] of thickness t and range r [m], with stiffnesses k (n,) [N/m]."""
+    def nearest(self, x: Array, reach: float) -> float:
+        """The least distance of pairs at x (N, 3) [m], or `reach` where it is larger."""
+        least = [length(_between(rows, x, k == 1)) for k, rows in enumerate(self.near(x, reach))]
+        return float(np.concatenate(least).min(initial=reach))
+
+    def values(self, t: float, r: float, k: Array, time: float) -> Values:
+        """The energies [J] of thickness t and range r [m], with stiffnesses k (n,) [N/m], at a time [s]."""
 
         def of(x: Wide) -> Wide:
+            x = self.whole(x, time)
             real = np.asarray(np.real(x), float)
             if not np.isfinite(real).all():
                 return wide([np.inf])
@@ -112,15 +117,20 @@ class Touching:
 
     def _of(self, rows: Indices, x: Wide, t: float, r: float, k: Array, edges: bool) -> tuple[Wide, Wide, Wide]:
         """In what proportion t and r are smaller, m, and k [N/m], (k,) each."""
-        share = length(_between(rows, wide(self.rest), edges)) / (wide(t) + wide(r))
+        share = self.apart(rows, edges) / (wide(t) + wide(r))
         scale, m = np.where(share < 1, (1 - wide(1e-12)) * share, 1), wide(np.ones(len(rows)))
         if edges:
             c, e = _crossed(rows, x), _sides(rows, wide(self.rest)) / 1000
             m = np.where(np.real(c) < e, (2 - c / e) * (c / e), 1)
-        return scale, m, wide(k[rows].mean(axis=1))
+        own = rows < len(k)
+        return scale, m, wide(np.where(own, k[np.where(own, rows, 0)], 0).sum(axis=1)) / own.sum(axis=1)
 
-    def grip(self, p: Wide, t: float, r: float, k: Array, edges: bool) -> tuple[Indices, Wide, Wide, Wide]:
-        """Of pairs in range at p (n, 3) [m]: rows (g, 4), c (g, 4), z (g, 3) [m] and the force (g,) [N]."""
+    def rubs(self, friction: float, grip: Grip, slip: float, time: float) -> Values:
+        """What pairs that grip take to slip [J], at a time [s]."""
+        return lambda x: friction * rubbed(self.whole(x, time), *grip, slip)
+
+    def grip(self, p: Wide, t: float, r: float, k: Array, edges: bool) -> Grip:
+        """Of pairs in range at p (N, 3) [m]: rows (g, 4), c (g, 4), z (g, 3) [m] and the force (g,) [N]."""
         rows = self.near(np.asarray(p, float), t + r)[int(edges)]
         z, four = _between(rows, p, edges), np.arange(4 * len(rows)).reshape(-1, 4)
         d = length(z)
@@ -136,6 +146,24 @@ class Touching:
         at = np.where(inside, at, 1)
         force = m * stiff * scale * r * ((1 - at) ** 2 / at - 2 * (1 - at) * np.log(at))
         return rows, np.stack(weights, axis=1), z, np.where(inside, force, 0)
+
+
+def near(x: Array, one: Indices, two: Indices, reach: float) -> Indices:
+    """Those of one (a, i) with those of two (b, j), by vertices (k, 4), that share none and are nearer than `reach` [m]
+    at x (N, 3): points and triangles, or edges and edges."""
+    if not (len(one) and len(two)):
+        return np.empty((0, 4), int)
+    middles = [x[part].mean(axis=1) for part in (one, two)]
+    radii = [np.linalg.norm(x[part] - at[:, None], axis=2).max() for part, at in zip((one, two), middles, strict=True)]
+    tree: Any = cKDTree(middles[1])
+    lists: list[list[int]] = tree.query_ball_point(middles[0], (reach + sum(radii)) * (1 + 1e-9)).tolist()
+    i = np.repeat(np.arange(len(one)), [len(found) for found in lists])
+    j = np.array([j for found in lists for j in sorted(found)], int)
+    apart = (one[i][:, :, None] != two[j][:, None, :]).all(axis=(1, 2))
+    apart &= (i < j) | (one is not two)
+    rows = np.concatenate([one[i[apart]], two[j[apart]]], axis=1)
+    far = length(_between(rows, x, one.shape[1] == 2))
+    return rows[far < reach]
 
 
 def rubbed(x: Wide, rows: Indices, weights: Wide, z: Wide, force: Wide, slip: float) -> Wide:
@@ -207,7 +235,6 @@ def gathered(effect: Any, declared: Declared, p: Array) -> Array:
     mesh, r = Touching(declared), effect.thickness if effect.range is None else effect.range
     wanted = effect.thickness + r
     reach = max(wanted, 2.0 * declared.mesh.spacing)
-    least = [length(_between(rows, wide(p), k == 1)) for k, rows in enumerate(mesh.near(p, reach))]
-    nearest = float(np.concatenate(least).min(initial=reach))
+    nearest = mesh.nearest(p, reach)
     share = (effect.thickness + 0.5 * r) / max(wanted, nearest)
     return p.mean(axis=0) + share * (p - p.mean(axis=0))

@@ -11,7 +11,7 @@ import numpy as np
 from harness.scenes.bind import Scene
 from harness.scenes.effects.table import EFFECTS
 from harness.scenes.spec import SceneSpec
-from harness.simulation.opinion import contact, edges, forces, self_contact, surfaces, vertices
+from harness.simulation.opinion import contact, edges, forces, self_contact, surface_contact, surfaces, vertices
 from harness.simulation.opinion.declared import Array, Begin, Declared, Opinion
 from harness.simulation.opinion.outside import from_outside, resistance
 
@@ -30,6 +30,7 @@ _OPINIONS: dict[str, Callable[[Any, Declared], Opinion]] = {
     "self-contact": self_contact.self_contact,
     "springs": edges.springs,
     "strain-limits": edges.strain_limits,
+    "surface-contact": surface_contact.surface_contact,
     "wind": forces.wind,
 }
 

@@ -1,0 +1,81 @@
+"""Contact with surfaces of obstacles once more: the barrier of `self_contact` between a mesh and each obstacle, points
+with triangles both ways and edges with edges; k is the mean of the mesh's vertices in a pair.
+
+What triangles an obstacle has is declared (`harness.scenes.shapes`); where they are is told by the second opinion's own
+motion. In a step they are where they are at the unknown's time, and what grips was in range where both start.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from harness.simulation.opinion.declared import Array, Declared, Opinion
+from harness.simulation.opinion.derivatives import Wide, wide
+from harness.simulation.opinion.motion import place
+from harness.simulation.opinion.self_contact import Indices, Touching, barriers, near
+
+_SOME = 200
+"""Steps, none longer than the mesh's spacing."""
+
+
+def surface_contact(effect: Any, declared: Declared) -> Opinion:
+    """The barriers between the mesh and all obstacles."""
+    return barriers(effect, against(effect, declared))
+
+
+def against(effect: Any, declared: Declared) -> list[Against]:
+    """The mesh with each obstacle."""
+    shapes = effect.shapes(np.asarray(declared.mesh.rest, float))
+    return [Against(declared, one.motion, *shape) for one, shape in zip(effect.obstacles, shapes, strict=True)]
+
+
+class Against(Touching):
+    """A mesh, and an obstacle's points (o, 3) [m], as declared, and triangles (f, 3), whose vertices follow the
+    mesh's."""
+
+    def __init__(self, declared: Declared, motion: Any, points: Array, triangles: Indices) -> None:
+        super().__init__(declared)
+        n = len(self.rest)
+        self._declared, self._motion, self._faces = wide(points), motion, triangles + n
+        sides = {tuple(sorted(pair)) for corners in triangles.tolist() for pair in combinations(corners, 2)}
+        self._sides = n + np.array(sorted(sides), int)
+        self._corners = n + np.unique(triangles)[:, None]
+        self.rest = np.concatenate([self.rest, points])
+
+    def obstacle(self, time: float) -> Wide:
+        """Where the obstacle's points are at a time [s], (o, 3) [m]."""
+        return place(self._motion, time).there(self._declared)
+
+    def whole(self, x: Wide, time: float) -> Wide:
+        """See Touching."""
+        return np.concatenate([x, self.obstacle(time)])
+
+    def near(self, x: Array, reach: float) -> tuple[Indices, Indices]:
+        """See Touching."""
+        points = near(x, self.points, self._faces, reach), near(x, self._corners, self.triangles, reach)
+        return np.concatenate(points), near(x, self.edges, self._sides, reach)
+
+    def apart(self, rows: Indices, edges: bool) -> Wide:
+        """See Touching: what is at rest is not beside the obstacle."""
+        return wide(np.full(len(rows), np.inf))
+
+
+def brought(effect: Any, which: int, declared: Declared, p: Array, time: float, rng: np.random.Generator) -> Array:
+    """Positions (n, 3) [m] as a whole outside of one of the obstacles, and so near to it that some pair is in range, at
+    a time [s]: from far away along a random way, each time by what is free."""
+    one, reach = against(effect, declared)[which], effect.thickness if effect.range is None else effect.range
+    there = np.asarray(one.obstacle(time), float)
+    way, middle = rng.normal(size=3), 0.5 * (there.max(axis=0) + there.min(axis=0))
+    way /= np.linalg.norm(way)
+    at = p - p.mean(axis=0)
+    out = float(((there - middle) @ way).max() - (at @ way).min()) + effect.thickness + reach  # a plane between them
+    wanted = effect.thickness + reach * rng.uniform(0.3, 0.7)
+    for _ in range(_SOME):
+        free = one.nearest(np.concatenate([middle + out * way + at, there]), wanted + declared.mesh.spacing) - wanted
+        if free < 1e-3 * reach:
+            break
+        out -= free
+    return middle + out * way + at
