@@ -70,8 +70,7 @@ class RerunRecorder:
         self._curves: dict[int, tuple[Sequence[float], Sequence[float]]] = {}  # residual and objective, by frame
         self._energies: dict[str, dict[int, float]] = {}
         self._arrow: dict[str, float] = {}  # metres a newton
-        application = blueprint.application(info)
-        self._file = PartialFile(path, application, info.run_id, info.title)
+        self._file = PartialFile(path, blueprint.application(info), info.run_id, info.title)
         self._stream = self._file.stream
 
     @property
@@ -148,9 +147,8 @@ class RerunRecorder:
 
     def _log_once(self) -> None:
         info, mesh = self._info, self._info.mesh
-        known = {**info.properties, **declared(info.obstacles)}
-        facts: dict[str, Any] = {key: [value] for key, value in known.items()}
-        self._stream.send_property("run", rr.AnyValues(**facts))
+        known: dict[str, Any] = {**info.properties, **declared(info.obstacles)}
+        self._stream.send_property("run", rr.AnyValues(**{key: [value] for key, value in known.items()}))
         network: dict[str, Any] = {
             "layout": LAYOUT,
             "time_step": info.time_step,
