@@ -23,6 +23,7 @@ from harness.config.command_line import taking
 from harness.experiments.ablation.command import ablate
 from harness.experiments.accuracy.command import recommend
 from harness.experiments.archive.command import compact, merge, publish, verify
+from harness.experiments.asked.goals_command import goals
 from harness.experiments.figure import figure
 from harness.experiments.gallery import gallery
 from harness.experiments.gates.command import gate
@@ -195,6 +196,7 @@ def report(
 
 app.command(cls=taking("frames", "iterations", "tolerance", "rounds"))(ablate)
 app.command()(recommend)
+app.command()(goals)
 app.command()(compact)
 app.command()(merge)
 app.command()(publish)

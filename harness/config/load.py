@@ -70,6 +70,8 @@ def load_any(
     document.opens = opens
     if {"curves", "work"} & set(document.data):
         raise InputError(Mistake("is an accuracy config; run it with `springbench accuracy`", path))
+    if "goals" in document.data:
+        raise InputError(Mistake("has goals; run it with `springbench goals`", path))
     if "scenes" in document.data:
         if solvers or sizes or asked:
             raise InputError(Mistake("is a sweep, which says itself what to run; change the file instead", path))

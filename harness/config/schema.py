@@ -1,5 +1,4 @@
-"""The JSON Schema (draft 2020-12) of scenes, sweeps and accuracy configs, for editors; made of the models that check
-them."""
+"""The JSON Schema (draft 2020-12) of scenes, sweeps, accuracy configs and goals, for editors; made of their models."""
 
 from __future__ import annotations
 
@@ -11,6 +10,7 @@ from pydantic.json_schema import models_json_schema
 
 from harness.base.model import Model
 from harness.config.accuracy import AccuracyFields
+from harness.config.goals import GoalsFields
 from harness.config.solvers import parameters_model
 from harness.config.sweep import SweepFields
 from harness.scenes.effects.table import EFFECTS
@@ -21,7 +21,7 @@ from solvers.registry import OPTIONAL, SOLVERS, load
 
 
 def schema() -> dict[str, Any]:
-    """The schema of a config: a scene, a sweep or an accuracy config; it names every mesh, effect and solver."""
+    """The schema of a config: a scene, a sweep, an accuracy config or goals; it names every mesh, effect and solver."""
     mesh = _one_of({kind: load(target) for kind, target in MESHES.items()}, "kind")
     effect = _one_of({kind: load(target) for kind, target in EFFECTS.items()}, "kind")
     shipped = {**SOLVERS, **OPTIONAL}
@@ -39,7 +39,7 @@ def schema() -> dict[str, Any]:
         create_model(name, __base__=base, solvers=(listed, ...))
         for name, base in (("Sweep", SweepFields), ("Accuracy", AccuracyFields))
     ]
-    models = (scene, *others)
+    models = (scene, *others, GoalsFields)
     _, document = models_json_schema([(model, "validation") for model in models])
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -19,8 +19,8 @@ from harness.scenes.bind import build
 
 ROOT = Path(__file__).resolve().parents[2]
 ASSIGNMENT = ROOT.parent / "shared" / "scenes"
-OF_ACCURACY = {"curves:", "work:"}
-CONFIGS = [p for p in sorted((ROOT / "configs").glob("*.yaml")) if not OF_ACCURACY & {*p.read_text().splitlines()}]
+OTHERS = {"curves:", "work:", "goals:"}
+CONFIGS = [p for p in sorted((ROOT / "configs").glob("*.yaml")) if not OTHERS & {*p.read_text().splitlines()}]
 CONFIGS += [*sorted((ROOT / "configs" / "scenes").glob("*.yaml"))]
 
 CLOTH = """

@@ -9,6 +9,7 @@ One table holds all kinds of rows, which `kind` tells apart:
     work      a simulation of the horizon: its error, the wall time that it took, and the CPU time of its best round
     asked     a simulation to an error that was asked for (`springbench run SCENE --error`)
     peer      the same by another library's integrator (`--peers`), whose name is `solver`
+    goal      the processor time of the cheapest way to an error, beside another's (`springbench goals`)
 
 Rows hold energies and errors of positions, never gaps: whoever reads them computes gaps from `g`, `g0` and the
 lowest `g` of the minima, so that a better minimum needs no new measurement.
@@ -23,7 +24,7 @@ from harness.base.columns import OF_SOLVER, PROVENANCE, Column, as_in_runs, sche
 _TEXT, _INT, _REAL, _YES = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 
 COLUMNS = (
-    Column("kind", _TEXT, "", "problem, minimum, prepare, curve, work, asked or peer"),
+    Column("kind", _TEXT, "", "problem, minimum, prepare, curve, work, asked, peer or goal"),
     Column("unit", _TEXT, "", "hash of all that determines the unit's result and timing"),
     *as_in_runs("sweep", "scene", "size", "vertices", "springs", "solver", "parameters", "integrator", "time_step"),
     *OF_SOLVER,
@@ -77,6 +78,10 @@ COLUMNS = (
     *as_in_runs(
         "asked", "estimated", "local_tolerance_m", "accepted", "rejected", "factorisations", "estimate_seconds"
     ),
+    Column("against", _TEXT, "", "of a goal: what was held against it, the best of its kind"),
+    Column("against_error", _REAL, "", "its error, estimated as that of the goal"),
+    Column("against_seconds", _REAL, "s", "its processor time, in turns with that of the goal (`cpu_seconds`)"),
+    Column("wanted", _REAL, "", "the part of that which is wanted"),
     *PROVENANCE,
 )
 

@@ -7,7 +7,7 @@ is the one asked.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from math import inf
 from time import perf_counter, thread_time
@@ -50,10 +50,12 @@ class Peer:
     seconds: float
     ratio: float
     reason: str = ""
+    processor: float = inf
+    """Seconds of processor time."""
 
 
-def peers(asked: Asked, error: float, answer: Answer) -> Iterator[Peer]:
-    """One after the other; what one cannot do is told by its reason. Raises Unintegrable where the scene has no
+def peers(asked: Asked, error: float, answer: Answer, names: Iterable[str] = PEERS) -> Iterator[Peer]:
+    """These one after the other; what one cannot do is told by its reason. Raises Unintegrable where the scene has no
     equations of motion."""
     scene = asked.bound(asked.frame, "newmark")
     fields = {compiled: Field(scene, compiled=compiled) for compiled in (True, False)}
@@ -61,7 +63,7 @@ def peers(asked: Asked, error: float, answer: Answer) -> Iterator[Peer]:
     began = thread_time()
     answer.best.way.follower.follow(answer.best.tolerance)
     beside = _Beside(asked, error, answer, scene, fields, thread_time() - began)
-    yield from map(beside.peer, PEERS)
+    yield from map(beside.peer, names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +105,13 @@ class _Beside:
             solved = solve(_limited(field, cpu + MOST), (0.0, self.asked.horizon), field.start, method, **more)
         except TooSlow:
             return Peer(name, inf, inf, inf, f"takes more than {MOST:g} s")
-        seconds, ratio = perf_counter() - began, (thread_time() - cpu) / self.ours
+        seconds, processor = perf_counter() - began, thread_time() - cpu
         if not solved.success:
             return Peer(name, inf, inf, inf, str(solved.message))
         p, _ = field.motion(self.asked.horizon, solved.y[:, -1])
         q = self.answer.closer.path.positions
         away, moved = (float(np.linalg.norm((x - q[-1])[free])) for x in (p, q[0]))
-        return Peer(name, away / moved, seconds, ratio)
+        return Peer(name, away / moved, seconds, processor / self.ours, processor=processor)
 
 
 def _limited(field: Field, until: float) -> Callable[[float, State], State]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from harness.report.accuracy.measured import older
 from harness.report.accuracy.reading import read
 from harness.report.accuracy.winners import NOBODY, cells, families
 from harness.report.figures.entry import Entry, ready
@@ -15,6 +14,7 @@ _NOTE = (
     "Columns: k dt²/m at dt = 1/30 s; rows: error of the positions at the end, relative to the way from the start. "
     "Figures: how many times as much processor time the next family takes; · where it reaches no such error."
 )
+_DOTTED = "Dot: measured by other code than the others."
 _NONE = "#e9e7e2"
 
 
@@ -24,6 +24,7 @@ def winners(folder: Path) -> list[Entry]:
     found = cells(table.works)
     looks = families(found)
     colors = {name: look.color for name, look in looks.items()} | {NOBODY: _NONE}
+    dotted = any(work.code != table.newest for cell in found for work in cell.prices.values())
     panels: list[Grid] = []
     for vertices in dict.fromkeys(cell.vertices for cell in found):
         mine = [cell for cell in found if cell.vertices == vertices]
@@ -35,12 +36,12 @@ def winners(folder: Path) -> list[Entry]:
                         *(f"{cell.error:.0e}".replace("e-0", "e-"), f"{quantity(cell.number)}", cell.winner),
                         colors[cell.winner],
                         _ahead(cell.ahead) if cell.prices else "",
-                        bool(cell.prices) and older(cell.prices[cell.winner]),
+                        bool(cell.prices) and cell.prices[cell.winner].code != table.newest,
                     )
                     for cell in mine
                 ],
                 list(colors.items()),
-                notes=[_NOTE],
+                notes=[_NOTE, *([_DOTTED] if dotted else [])],
                 machine=", ".join(table.machine),
             )
         )

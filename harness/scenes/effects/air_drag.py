@@ -7,6 +7,7 @@ what stops a vertex in one step, and keep their order. Wind on triangles drags a
 the air.
 """
 
+from math import inf
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -26,6 +27,7 @@ ALIVE = 0.1
 class AirDrag(Model):
     """Drag of the air on the vertices, spread as the mass is."""
 
+    exact_to: ClassVar[float] = inf
     damps: ClassVar[bool] = True
 
     kind: Literal["air-drag"] = "air-drag"

@@ -1,6 +1,7 @@
 """Attachments: springs of zero rest length from vertices to points that may move, E = sum_i k_i/2 |p_i - q_i(t)|^2."""
 
-from typing import Literal
+from math import inf
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from solvers.problem import Positions
 
 class Attachments(Selection):
     """Ties every vertex that any of its selectors names to a point of its own, softly, unlike pins."""
+
+    exact_to: ClassVar[float] = inf
 
     kind: Literal["attachments"] = "attachments"
     stiffness: NonNegativeFloat

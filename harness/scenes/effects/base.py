@@ -100,7 +100,9 @@ class Contribution:
 class Effect(Protocol):
     """A pydantic model with a literal `kind`.
 
-    Its class may state `damps`, a class variable, True where it takes energy out of any motion; and
+    Its class states `exact_to`, a class variable: the order of the error, by steps, up to which integrators keep their
+    own with it; infinite where it is smooth and they take it where it acts. One that does not say so promises nothing.
+    It may state `damps`, a class variable, True where it takes energy out of any motion; and
     `called_for(seen: Seen) -> str`, a class method: by what evidence the motion of a scene that does not list it asks
     for it, "" where it does not.
     """

@@ -1,6 +1,7 @@
 """Bending: the quadratic energy of surfaces that hardly stretch (Bergou et al. 2006), flat at rest."""
 
-from typing import Literal
+from math import inf
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ SHARP = np.deg2rad(60.0)
 
 class Bending(Model):
     """Resists bending of the mesh's triangles. Their rest state is flat whatever the mesh's shape is: a tube opens."""
+
+    exact_to: ClassVar[float] = inf
 
     kind: Literal["bending"] = "bending"
     stiffness: NonNegativeFloat

@@ -1,6 +1,7 @@
 """The assignment's external force: the same newtons on every vertex, whatever its mass."""
 
-from typing import Literal
+from math import inf
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from harness.scenes.mesh.base import Mesh
 
 class ConstantForce(Model):
     """One force on every vertex. It is gravity only where every vertex weighs the same."""
+
+    exact_to: ClassVar[float] = inf
 
     kind: Literal["constant-force"] = "constant-force"
     force: Vector

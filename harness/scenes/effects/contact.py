@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,8 @@ class Contact(Model):
     The stiffness k of contact follows from the depth tolerance. A vertex that arrives with the speed v ends at most
     v dt Q_ii / k deep, with Q_ii all that inertia and springs resist with, so k_i = 4 Q_ii max(1, v dt / tolerance).
     """
+
+    exact_to: ClassVar[float] = 1.0
 
     kind: Literal["contact"] = "contact"
     obstacles: tuple[AnyObstacle, ...] = Field(min_length=1)

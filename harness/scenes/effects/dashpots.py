@@ -1,5 +1,6 @@
 """Dashpots: damping along the mesh's springs, f = -c n n'(v_i - v_j), by a rule of `scenes.material` like springs."""
 
+from math import inf
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ from solvers.energies import dashpots
 class Dashpots(Model):
     """Damping of the speed at which springs change their length; motion of the mesh as a whole is not damped."""
 
+    exact_to: ClassVar[float] = inf
     damps: ClassVar[bool] = True
 
     kind: Literal["dashpots"] = "dashpots"

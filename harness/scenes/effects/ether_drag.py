@@ -4,7 +4,7 @@ So a step is split, at order 1. Integrators that take forces at their unknowns h
 f = -c M v, and keep their order.
 """
 
-from math import exp
+from math import exp, inf
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -21,6 +21,7 @@ from solvers.problem import Positions
 class EtherDrag(Model):
     """Damping of the velocity relative to space at rest, the same at any time step."""
 
+    exact_to: ClassVar[float] = inf
     damps: ClassVar[bool] = True
 
     kind: Literal["ether-drag"] = "ether-drag"

@@ -1,6 +1,7 @@
 """Gas: a fixed amount of it in a closed mesh, E = -p0 V0 ln(V/V0)."""
 
-from typing import Literal
+from math import inf
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from solvers.energies import gas
 
 class Gas(Model):
     """Gas at constant temperature in a closed mesh, with nothing outside: p V stays what it is at rest."""
+
+    exact_to: ClassVar[float] = inf
 
     kind: Literal["gas"] = "gas"
     pressure: NonNegativeFloat

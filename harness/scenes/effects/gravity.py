@@ -1,6 +1,7 @@
 """Gravity: f_i = m_i g."""
 
-from typing import Literal
+from math import inf
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from harness.scenes.mesh.base import Mesh
 
 class Gravity(Model):
     """Weight on every vertex: its mass times one acceleration."""
+
+    exact_to: ClassVar[float] = inf
 
     kind: Literal["gravity"] = "gravity"
     acceleration: Vector = (0.0, -9.81, 0.0)

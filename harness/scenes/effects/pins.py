@@ -1,7 +1,7 @@
 """Pins: chosen vertices are held at their rest positions, which may move, by a penalty w/2 |p - q|^2 or exactly."""
 
 from math import inf
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from harness.scenes.selection import Selection
 
 class Pins(Selection):
     """Holds every vertex that any of its selectors names."""
+
+    exact_to: ClassVar[float] = inf
 
     kind: Literal["pins"] = "pins"
     weight: PositiveFloat | Literal["exact"] = Field(default=1e10)

@@ -6,6 +6,7 @@ strain limits and attachments have no share.
 """
 
 from collections.abc import Sequence
+from math import inf
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -24,6 +25,7 @@ from solvers.problem import Energy, LaggedEnergy
 class Rayleigh(Model):
     """Damping in proportion to masses and to stiffness."""
 
+    exact_to: ClassVar[float] = inf
     damps: ClassVar[bool] = True
 
     kind: Literal["rayleigh"] = "rayleigh"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ class SelfContact(Model):
     proportion to their distance there, so that a mesh may be as fine as it likes. Vertices that are in no edge and no
     triangle meet nothing.
     """
+
+    exact_to: ClassVar[float] = 1.0
 
     kind: Literal["self-contact"] = "self-contact"
     thickness: Annotated[PositiveFloat, Field(le=1e9)] = 0.002

@@ -1,6 +1,7 @@
 """Springs: one linear spring for each of the mesh's, its stiffness by a rule of `harness.scenes.material`."""
 
-from typing import Literal
+from math import inf
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from solvers.energies import springs
 
 class Springs(Model):
     """Springs k/2 (length - rest length)^2 along the mesh's edges; those of no stiffness are left out."""
+
+    exact_to: ClassVar[float] = inf
 
     kind: Literal["springs"] = "springs"
     rule: Literal["continuum", "fixed", "liu2013"] = "continuum"

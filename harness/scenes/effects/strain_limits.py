@@ -1,6 +1,6 @@
 """Strain limits: springs that resist only beyond a shortest and a longest length (Bouaziz et al. 2014)."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ STRETCH = 0.1
 
 class StrainLimits(Model):
     """Limits how far the mesh's springs along and across its cells stretch and shrink, with a stated stiffness."""
+
+    exact_to: ClassVar[float] = 1.0
 
     kind: Literal["strain-limits"] = "strain-limits"
     longest: float = Field(default=1.1, ge=1.0, le=1e6)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ class SurfaceContact(Model):
     Planes, spheres, capsules and boxes are met as triangles too: those of round ones lie a tenth of the thickness
     inside at most.
     """
+
+    exact_to: ClassVar[float] = 1.0
 
     kind: Literal["surface-contact"] = "surface-contact"
     obstacles: tuple[AnySurface, ...] = Field(min_length=1)

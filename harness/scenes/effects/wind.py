@@ -22,7 +22,8 @@ in newtons, or in metres a second on triangles.
 """
 
 from collections.abc import Callable
-from typing import Literal
+from math import inf
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,8 @@ _WAVES = 16
 
 class Wind(Model):
     """A field that blows on the mesh."""
+
+    exact_to: ClassVar[float] = inf
 
     kind: Literal["wind"] = "wind"
     field: Literal["constant", "gusts", "assignment"] = "constant"

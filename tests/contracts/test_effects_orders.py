@@ -1,0 +1,117 @@
+"""Each effect states the order up to which it is exact; here that is measured, effect by integrator.
+
+What is smooth keeps every integrator's order. What begins and ends within steps has order 1, whatever the integrator's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from math import inf, isinf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.reference.trajectory import Trajectory, integrate
+from harness.scenes.bind import Scene, build
+from harness.scenes.effects.table import EFFECTS
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.surfaces import Balloon
+from harness.scenes.spec import SceneSpec
+from harness.simulation.step import prepare, simulate
+from solvers.integrators import INTEGRATORS
+from solvers.methods.newton import Newton
+from solvers.plugins import load
+from solvers.problem import StopRule
+
+END = 0.3
+MEASURED = ("implicit-euler", "midpoint", "esdirk-4")
+SPRINGS = {"kind": "springs", "stretch": 20.0}
+HELD = {"kind": "pins", "at": ["first"], "weight": "exact"}
+HUNG = {"kind": "pins", "at": ["top"], "weight": "exact"}
+GRAVITY = {"kind": "gravity"}
+SWUNG = HELD | {"motion": {"keys": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0]}]}}
+DOWN = (0.5, 1.0, 2.0)
+
+
+CHAIN = Chain()
+
+
+@dataclass(frozen=True)
+class Case:
+    """An effect beside others on a mesh of a size, thrown with a velocity [m/s]; steps that resolve its vibrations."""
+
+    effects: tuple[dict[str, Any], ...]
+    mesh: Any = CHAIN
+    size: int = 4
+    velocity: tuple[float, float, float] = DOWN
+    steps: int = 16
+
+
+SMOOTH: dict[str, Case] = {
+    "springs": Case((SPRINGS, HELD)),
+    "gravity": Case((SPRINGS, GRAVITY, HELD)),
+    "pins": Case((SPRINGS, GRAVITY, SWUNG)),
+    "constant-force": Case((SPRINGS, {"kind": "constant-force", "force": [0.5, -1.0, 2.0]}, HELD)),
+    "attachments": Case((SPRINGS, {"kind": "attachments", "at": ["first"], "stiffness": 30.0})),
+    "air-drag": Case((SPRINGS, GRAVITY, {"kind": "air-drag", "coefficient": 2.0}, HELD)),
+    "ether-drag": Case((SPRINGS, GRAVITY, {"kind": "ether-drag", "rate": 3.0}, HELD), velocity=(0.0, 0.0, 0.0)),
+    "dashpots": Case((SPRINGS, GRAVITY, {"kind": "dashpots", "stretch": 0.4}, HELD)),
+    "rayleigh": Case((SPRINGS, GRAVITY, {"kind": "rayleigh", "mass": 0.5, "stiffness": 0.02}, HELD)),
+    "bending": Case((SPRINGS, {"kind": "bending", "stiffness": 0.05}, HUNG), Grid(), 4, steps=64),
+    "wind": Case((SPRINGS, {"kind": "wind", "field": "assignment", "strength": 0.5}, HUNG), Grid(), 4, steps=64),
+    "gas": Case(({"kind": "springs", "stretch": 40.0}, {"kind": "gas", "pressure": 100.0}), Balloon(), 3, steps=96),
+}
+PLANE = {"kind": "contact", "obstacles": [{"kind": "plane", "point": [0, -0.05, 0]}]}
+ROUGH: dict[str, Case] = {"contact": Case((SPRINGS, GRAVITY, PLANE, HELD), velocity=(0.0, 0.0, 0.0))}
+"""Those of order 1. `self-contact` and `surface-contact` are held against the same law where they are refined
+(`tests/unit`); strain limits have corners where they begin."""
+
+
+def scene(case: Case, integrator: str, steps: int) -> Scene:
+    listed = tuple(load(EFFECTS[effect["kind"]]).model_validate(effect) for effect in case.effects)
+    given: dict[str, Any] = {"mesh": case.mesh, "effects": listed, "velocity": case.velocity, "time_step": END / steps}
+    return build(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), case.size, integrator)
+
+
+@cache
+def truth(effect: str) -> Trajectory:
+    return integrate(scene(SMOOTH[effect], "esdirk-4", 4), [END])
+
+
+def end(case: Case, integrator: str, steps: int) -> np.ndarray:
+    made = scene(case, integrator, steps)
+    stop = StopRule(100, 1e-13)
+    *_, last = simulate(made, prepare(made, Newton()), stop, first_guess="inertial", frames=steps)
+    return last.positions
+
+
+def test_every_effect_states_it() -> None:
+    stated = {name: load(target).exact_to for name, target in EFFECTS.items()}
+    assert {name for name, order in stated.items() if isinf(order)} == set(SMOOTH)
+    assert {name for name, order in stated.items() if order == 1.0} >= set(ROUGH)
+
+
+@pytest.mark.parametrize("integrator", MEASURED)
+@pytest.mark.parametrize("effect", [pytest.param(e, marks=[pytest.mark.long] * (e == "gas")) for e in SMOOTH])
+def test_integrators_keep_their_order_up_to_it(effect, integrator):
+    order, case = INTEGRATORS[integrator].order, SMOOTH[effect]
+    errors = [truth(effect).error(0, end(case, integrator, n)) for n in (case.steps, 2 * case.steps)]
+    stated = min(order, load(EFFECTS[effect]).exact_to)
+    # The next term of the error is smaller by a time step times the fastest frequency; signs may make it larger.
+    assert np.log2(errors[0] / errors[1]) > stated - 0.35
+
+
+@pytest.mark.parametrize("effect", ROUGH)
+def test_what_begins_within_steps_has_order_1_whatever_the_integrators(effect):
+    case = ROUGH[effect]
+    for integrator in ("implicit-euler", "bdf2"):
+        true = end(case, integrator, 768)  # its own limit: that of a bounce depends on the integrator
+        errors = [np.linalg.norm(end(case, integrator, n) - true) for n in (12, 96)]
+        order = np.log2(errors[0] / errors[1]) / 3.0
+        # Where in a step contact begins scatters single errors; over a factor of 8 that counts for little.
+        assert 0.6 < order < 1.7, (integrator, order)
+    assert load(EFFECTS[effect]).exact_to < inf
