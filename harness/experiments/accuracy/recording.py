@@ -40,10 +40,10 @@ class Step(Protocol):
 def record(spec: CurveSpec, graded: Step, scene: Scene, first_guess: str, curve: Curve, folder: Path) -> Path:
     """Write the recording of a curve under `folder`/recordings and return its path. Raises RunFailed."""
     path = folder / "recordings" / f"{spec.label()}-{first_guess}.rrd"
-    problem = graded.frozen.problem
+    problem, here = graded.frozen.problem, machine.describe()
     info = RecordingInfo(
         title=f"{spec.case.title}, {graded.moment}: {spec.solver.name} from the {first_guess} positions",
-        run_id=f"{spec.unit_id(machine.describe().id)}-{first_guess}",
+        run_id=f"{spec.unit_id(here.id)}-{first_guess}",
         mesh=scene.mesh,
         springs=scene.springs.edges,
         rest_lengths=scene.springs.rest_length,
@@ -59,6 +59,8 @@ def record(spec: CurveSpec, graded: Step, scene: Scene, first_guess: str, curve:
             "problem": graded.frozen.digest,
             "first_guess": first_guess,
             "status": curve.status,
+            "cpu": here.cpu,
+            "commit": machine.commit(),
         },
         iterates=True,
     )

@@ -153,18 +153,24 @@ def _beside(row: dict[str, Any], asked: Asked, error: float, answer: Answer, say
 
 def _record(path: Path, name: str, asked: Asked, answer: Answer) -> Path:
     """The recording of the motion at its frames, and of what was asked."""
-    scene, best = asked.bound(asked.frame, "own"), answer.best
+    scene, best, here = asked.bound(asked.frame, "own"), answer.best, machine.describe()
     properties = {"scene": name, "size": asked.size, "solver": best.way.solver, "integrator": best.way.integrator}
     info = RecordingInfo(
         title=f"{name} {asked.size or ''}".strip() + f" - {best.way}, estimated error {best.estimated:.1g}",
-        run_id=f"{path.stem}-{machine.describe().id}",
+        run_id=f"{path.stem}-{here.id}",
         mesh=scene.mesh,
         springs=scene.springs.edges,
         rest_lengths=scene.springs.rest_length,
         pinned=scene.system.pins.vertices,
         time_step=asked.frame,
         strain_range=0.1,
-        properties={**properties, "status": "ok", "estimated": best.estimated},
+        properties={
+            **properties,
+            "status": "ok",
+            "estimated": best.estimated,
+            "cpu": here.cpu,
+            "commit": machine.commit(),
+        },
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     recorder = RerunRecorder(path, info)
