@@ -43,7 +43,8 @@ _NEAREST = 0.3
 class Box:
     """The box that the positions stay in, and what of them a camera must see.
 
-    aspect: of the view, its width over its height; first: what is seen first, the positions at rest if left out.
+    aspect: of the view, its width over its height; first: what is seen first, the positions at rest if left out
+    or not finite.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class Box:
         up, down = np.array([zero, one, room]), np.array([zero, -one, _BELOW * room])
         self._directions = np.hstack([right, left, up, down, [[0, 0], [0, 0], [1, -1]]]).T @ _AXES
         self._ends = np.full(len(self._directions), -np.inf)
-        self._see(rest if first is None else first)
+        self._see(rest if first is None or not np.isfinite(first).all() else first)
 
     def add(self, p: NDArray[np.floating]) -> None:
         """Widen the box to positions (n, 3) [m], unless they have blown up beyond showing."""

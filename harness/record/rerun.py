@@ -84,8 +84,7 @@ class RerunRecorder:
             p = frame.positions.astype(np.float32)
         if not self._frames:
             self._begin()
-            if np.isfinite(p).all():
-                self._box = Box(self._info.mesh.rest, first=p)
+            self._box = Box(self._info.mesh.rest, first=p)
         strain, of_vertex = self._shading.strains(frame.positions)
         self._stream.set_time("frame", sequence=frame.index)
         self._stream.set_time("time", duration=frame.time)
