@@ -146,8 +146,8 @@ class RerunRecorder:
 
     def _log_once(self) -> None:
         info, mesh = self._info, self._info.mesh
-        known: dict[str, Any] = {**info.properties, **declared(info.obstacles)}
-        self._stream.send_property("run", rr.AnyValues(**{key: [value] for key, value in known.items()}))
+        facts: dict[str, Any] = {k: [v] for k, v in {**info.properties, **declared(info.obstacles)}.items()}
+        self._stream.send_property("run", rr.AnyValues(**facts))
         network: dict[str, Any] = {
             "layout": LAYOUT,
             "time_step": info.time_step,
