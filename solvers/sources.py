@@ -89,19 +89,21 @@ def of_class(made: type) -> set[Path]:
         codes = (getattr(value, "__code__", None) for value in vars(base).values())
         files = {code.co_filename for code in codes if code}
         files.add(getattr(sys.modules.get(base.__module__), "__file__", None))
-        own |= {file for file in files if file and not _library(Path(file))}
+        own |= {file for file in files if file and not _library(file)}
     return {Path(file).resolve() for file in own if file and file.endswith(".py") and os.path.isfile(file)}
 
 
 def known(path: str) -> bool:
     """Whether a file is of this project or of an installed library, and not somebody's own."""
-    return _own(path) or _library(Path(path)) or path.startswith("<")
+    return _own(path) or _library(path) or path.startswith("<")
 
 
-def _library(path: Path) -> bool:
-    return not _own(str(path)) and any(folder in _INSTALLED for folder in map(str, path.resolve().parents))
+@cache
+def _library(path: str) -> bool:
+    return not _own(path) and any(folder in _INSTALLED for folder in map(str, Path(path).resolve().parents))
 
 
+@cache
 def _name(path: str) -> str:
     """The path as it is in every checkout."""
     return os.path.relpath(path, ROOT) if _own(path) else os.path.basename(path)
@@ -114,7 +116,8 @@ def _own(path: str) -> bool:
 def _content(path: str) -> bytes:
     """What a source holds, as a digest; one that only this process has where it was changed since it was first seen."""
     try:
-        first, held = _FIRST.setdefault(path, _stamp(path)), _held(path)
+        first = _FIRST.get(path) or _FIRST.setdefault(path, _stamp(path))
+        held = _held(path)
         if _stamp(path) == first:
             return held
     except OSError:  # it was removed

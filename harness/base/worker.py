@@ -31,6 +31,9 @@ returns."""
 DUMP = signal.SIGUSR1
 """Makes a worker say where it is."""
 
+_THOROUGH = 64
+"""After so many pieces what earlier ones left is looked through too: a cache may have let go of it since."""
+
 _PARENT_DIES = 1
 """`PR_SET_PDEATHSIG`: Linux sends a process a signal when its parent dies."""
 
@@ -66,6 +69,7 @@ def serve(
     ready()
     gc.freeze()  # what the parent had need not be looked through after each piece
     me = os.getpid()
+    pieces = 0
     with suppress(EOFError, ConnectionError):
         while (asked := calls.recv()) is not None:
             piece, limits = asked
@@ -73,7 +77,11 @@ def serve(
             if os.getpid() != me:  # a copy of this process that the piece has made
                 os._exit(0)
             calls.send(answer)
+            pieces += 1
+            if pieces % _THOROUGH == 0:
+                gc.unfreeze()
             gc.collect()  # now, and not while the next piece is timed
+            gc.freeze()  # compiled kernels leave 10^5 objects, which take longer to look through than a short run
 
 
 def _tie(parent: int) -> None:

@@ -6,14 +6,15 @@ and a picture is drawn from the recording alone, so what a kill leaves undone is
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.base import machine, shelf
 from harness.config.sweep import RunSpec
-from harness.experiments.code import Part, code, parts
+from harness.experiments.code import code, parts
 from harness.experiments.resume import DONE, MISSING, Standing
 from harness.record.sound import whole_messages
 
@@ -65,7 +66,7 @@ class PlannedRun:
 
 def plan(runs: Iterable[RunSpec], folder: Path, machines: Sequence[str | None] = (None,)) -> list[PlannedRun]:
     """Each run with its files and what is there already; machines: the ids of those on which it may have been done."""
-    codes: dict[frozenset[Part], str] = {}
+    code_of = _codes()
     planned: list[PlannedRun] = []
     placed = [(run, [Files.of(run, folder, on) for on in machines]) for run in runs]
     heads = _heads([files.rows for _, some in placed for files in some])
@@ -80,9 +81,7 @@ def plan(runs: Iterable[RunSpec], folder: Path, machines: Sequence[str | None] =
             limits = there["time_limit"], there["memory_limit"]
             if state in _LIMITED and limits != (run.time_limit, run.memory_limit):
                 state = MISSING  # who failed within other limits has said nothing of these
-            if (made_of := parts(run)) not in codes:
-                codes[made_of] = code(made_of)
-            older = there["code"] != codes[made_of]
+            older = there["code"] != code_of(run)
         if state == DONE and run.record:
             damage = _unfit(files.recording)
             state = MISSING if damage or not files.recording.exists() else DONE
@@ -106,7 +105,14 @@ def _unfit(recording: Path) -> str:
     return "" if whole else f"{recording} is cut before its end"
 
 
+def _codes() -> Callable[[RunSpec], str]:
+    """The digest of the code of runs, which is found once for all that are put together from the same parts."""
+    of_parts = cache(code)
+    return lambda run: of_parts(parts(run))
+
+
 def of_other_code(runs: Iterable[RunSpec], table: pa.Table) -> set[str]:
     """The ids of those runs whose rows in the table were made by other code than today's."""
+    code_of = _codes()
     here, made = machine.describe().id, dict(zip(*(table[c].to_pylist() for c in ("run_id", "code")), strict=True))
-    return {name for run in runs if made.get(name := run.run_id(here)) != code(parts(run))}
+    return {name for run in runs if made.get(name := run.run_id(here)) != code_of(run)}
