@@ -16,17 +16,19 @@ import multiprocessing
 import os
 import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import time
+from time import monotonic, sleep, time
 from typing import Any, NamedTuple
 from uuid import uuid4
 
 import distributed
 from distributed import Client, Future, KilledWorker
+from distributed.utils import silence_logging_cmgr
 
 from harness.base import machine
 from harness.base.errors import InputError, Mistake, RunFailed
@@ -36,7 +38,7 @@ from harness.base.workers import Lost, Workers
 from harness.config.sweep import RunSpec
 from harness.experiments.core import TABLES, ready, watched
 from harness.experiments.plan import Files
-from harness.experiments.scheduler import PATIENCE, reach, scheduler
+from harness.experiments.scheduler import PATIENCE, SILENCE, reach, scheduler
 from harness.experiments.sweep import RunUnit
 from solvers.plugins import Plugin, load
 
@@ -45,6 +47,11 @@ CLOCKS = 60.0
 
 _TRIES = 4
 """How often a run is handed out whose worker is lost."""
+
+_GONE = "the scheduler is gone; what was done is kept, and the same command does the rest"
+
+_ASK, _LOOK = 1.0, 0.05
+"""Seconds between two questions which workers there are, and between two looks at tasks when none has ended."""
 
 _AHEAD = 4
 """Tasks that wait at the scheduler for each thread of the workers: more would be kept there for nothing."""
@@ -101,7 +108,8 @@ def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Gen
         except (OSError, ValueError) as error:
             why = f"no scheduler answers within {PATIENCE:g} s ({' '.join(str(error).split())[:200]})"
             raise InputError(Mistake(f"{on}: {why}; start one with `dask scheduler`", key="--on")) from None
-        with client, client.as_current():
+        # Its log would put tracebacks beside what the user is told of a scheduler that is gone.
+        with silence_logging_cmgr(SILENCE), client, client.as_current():
             try:
                 client.wait_for_workers(1, timeout=PATIENCE if address is on else 60 * PATIENCE)
             except TimeoutError:
@@ -167,6 +175,7 @@ def do_on(
         folder / f".{uuid4().hex}.partial"
     )  # who sees it shares the folder; a killed client's goes as partial files do
     left, tries, excluded = list(enumerate(units))[::-1], dict[int, int](), set[str]()
+    threads, asked = dict[str, int](), 0.0
     going: dict[Future, tuple[int, RunUnit]] = {}
     fixed = folder.resolve(), token.name, machine.code_hash(), [dict(table) for table in TABLES]
     display.begin(len(units), 0.0)
@@ -174,7 +183,9 @@ def do_on(
     try:
         token.touch()
         while left or going:
-            workers = {name: threads for name, threads in _threads(client).items() if name not in excluded}
+            if not threads or monotonic() - asked > _ASK:
+                threads, asked = _threads(client), monotonic()
+            workers = {name: many for name, many in threads.items() if name not in excluded}
             while left and len(going) < _AHEAD * max(1, sum(workers.values())):
                 number, unit = left.pop()
                 if why := another(unit):
@@ -184,12 +195,15 @@ def do_on(
                 only = list(workers) if excluded and workers else None
                 task = client.submit(_do, unit, *fixed, key=key, pure=False, workers=only)
                 going[task] = number, unit
-            with suppress(TimeoutError, distributed.TimeoutError):
-                distributed.wait(list(going), timeout=1.0, return_when="FIRST_COMPLETED")
+            ended = [task for task in going if task.done()]
+            if not ended:
+                sleep(_LOOK)
             looks.tick("")
-            for task in [task for task in going if task.done()]:
+            answers = _answers(client, ended)
+            for task in ended:
                 number, unit = going.pop(task)
-                again = _ended(task, unit, folder, display, excluded, last=tries.get(number, 1) >= _TRIES)
+                last = tries.get(number, 1) >= _TRIES
+                again = _ended(task, answers.get(task), unit, folder, display, excluded, last=last)
                 if again:
                     tries[number] = tries.get(number, 1) + 1
                     left.append((number, unit))
@@ -200,13 +214,34 @@ def do_on(
         display.end()
 
 
-def _ended(task: Future, unit: RunUnit, folder: Path, display: Display, excluded: set[str], *, last: bool) -> bool:
-    """Keep what a task left; whether its run is to be done again. last: no more."""
+def _answers(client: Client, ended: Sequence[Future]) -> dict[Future, Done]:
+    """What tasks returned, fetched together; those that failed are missing, and all where one is lost meanwhile."""
+    finished = [task for task in ended if task.status == "finished"]
+    try:
+        found: Any = client.gather(finished)
+    except (KilledWorker, CancelledError):
+        return {}
+    except OSError:
+        raise RunFailed(_GONE) from None
+    return dict(zip(finished, found, strict=True))
+
+
+def _ended(
+    task: Future,
+    answer: Done | None,
+    unit: RunUnit,
+    folder: Path,
+    display: Display,
+    excluded: set[str],
+    *,
+    last: bool,
+) -> bool:
+    """Keep what a task left; whether its run is to be done again. answer: if known already; last: no more."""
     if task.status in ("cancelled", "lost"):
-        raise RunFailed("the scheduler is gone; what was done is kept, and the same command does the rest")
+        raise RunFailed(_GONE)
     run = display.run(unit.title, 1, 0.0)
     try:
-        done: Done = task.result()
+        done: Done = answer or task.result()
     except KilledWorker as error:
         if last:
             run.finished(unit.lost(Lost("killed", f"its worker was lost again and again: {error}")))
@@ -223,8 +258,11 @@ def _ended(task: Future, unit: RunUnit, folder: Path, display: Display, excluded
 
 
 def _threads(client: Client) -> dict[str, int]:
-    """How many tasks each worker does at a time."""
-    found: Any = client.nthreads()
+    """How many tasks each worker does at a time. Raises RunFailed."""
+    try:
+        found: Any = client.nthreads()
+    except OSError:
+        raise RunFailed(_GONE) from None
     return found
 
 

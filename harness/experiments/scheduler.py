@@ -21,7 +21,7 @@ from harness.base.errors import InputError, Mistake
 PATIENCE = 10.0
 """Seconds in which a scheduler has to answer, and to have a worker."""
 
-_SILENCE = logging.CRITICAL
+SILENCE = logging.CRITICAL
 """What Dask says of workers that end is not for the user, who is told what became of runs."""
 
 
@@ -32,7 +32,7 @@ def scheduler(on: str) -> Generator[Any]:
     if kind == "local":
         if not many.isdecimal() or not 1 <= int(many) <= 1024:
             raise InputError(Mistake(f"came {on}; wanted local:N with a number of workers", key="--on"))
-        quiet: Any = {"dashboard_address": None, "silence_logs": _SILENCE}
+        quiet: Any = {"dashboard_address": None, "silence_logs": SILENCE}
         with LocalCluster(n_workers=int(many), threads_per_worker=1, **quiet) as found:
             yield found
     elif on.endswith((".yaml", ".yml")):

@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Collection, Generator, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -171,12 +171,12 @@ def open_recording(path: Path) -> Generator[Source]:
         came = f"begins with {start!r}" if start else "is empty"
         raise InputError(Mistake(f"{came} and so is not a Rerun recording (.rrd)", file=path))
     require_sound(path, _try)
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+    with ExitStack() as kept, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of files without a footer: `complete` says so
         complete, end = whole_messages(path)
         readable = path
         if not complete and end < path.stat().st_size:  # the library reads nothing of a file cut within a message
-            readable = Path(folder) / path.name
+            readable = Path(kept.enter_context(tempfile.TemporaryDirectory())) / path.name
             shutil.copyfile(path, readable)
             os.truncate(readable, end)
         try:

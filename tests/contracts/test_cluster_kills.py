@@ -1,0 +1,146 @@
+"""A scheduler and workers as processes of their own: whoever is killed, and whichever disk is full, no run is lost."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any, NamedTuple
+
+import pytest
+
+from harness.base import rows
+from tests.contracts.test_cluster_runs import SWEEP
+from tests.own_solvers import SCENE
+
+ROOT = Path(__file__).resolve().parents[2]
+RUNS, PATIENCE = 12, 240.0
+
+pytestmark = pytest.mark.long
+
+
+FAR = """
+from pathlib import Path
+from harness.experiments import cluster
+do = cluster._do
+cluster._do = lambda unit, folder, *rest: do(unit, Path("/elsewhere"), *rest)
+"""
+"""A worker that does not see the client's folder."""
+
+FULL = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))\n"
+"""A worker that cannot write the rows of a run."""
+
+
+class Farm(NamedTuple):
+    """The processes of a cluster, and its address."""
+
+    address: str
+    scheduler: subprocess.Popen[str]
+    workers: list[subprocess.Popen[str]]
+
+
+@contextmanager
+def farm(folder: Path, preloads: Sequence[str]) -> Generator[Farm]:
+    """A scheduler, and a worker for each code that goes first there."""
+    folder.mkdir()
+    found, begun = folder / "scheduler.json", list[subprocess.Popen[str]]()
+
+    def begin(what: str, *more: object) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{what}", "--scheduler-file", found, "--no-dashboard"]
+        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        begun.append(subprocess.Popen([*map(str, [*command, *more])], cwd=ROOT, text=True, **quiet))
+        return begun[-1]
+
+    try:
+        scheduler = begin("scheduler", "--host", "127.0.0.1", "--port", 0)
+        wait_for(found.exists)
+        for number, code in enumerate(preloads):
+            (folder / f"first{number}.py").write_text(code or "pass")
+            local = "--local-directory", folder / f"local{number}"
+            begin("worker", "--nthreads", 1, "--no-nanny", "--preload", folder / f"first{number}.py", *local)
+        yield Farm(json.loads(found.read_text())["address"], scheduler, begun[1:])
+    finally:
+        for process in begun:
+            process.kill()
+            process.wait()
+
+
+def wait_for(holds: Any) -> None:
+    until = monotonic() + PATIENCE
+    while not holds():
+        assert monotonic() < until
+        sleep(0.02)
+
+
+class Sweep(NamedTuple):
+    config: Path
+    rows: Path
+
+    @classmethod
+    def made(cls, folder: Path) -> Sweep:
+        (folder / "scene.yaml").write_text(SCENE)
+        (folder / "sweep.yaml").write_text(SWEEP)
+        return cls(folder / "sweep.yaml", folder / "r" / "sweep" / "rows")
+
+    def begin(self, address: str) -> subprocess.Popen[str]:
+        command = ["run", str(self.config), "--results", str(self.rows.parents[1]), "--on", address]
+        return subprocess.Popen(
+            [sys.executable, "-m", "harness.cli", *command], cwd=ROOT, stdout=-1, stderr=-2, text=True
+        )
+
+    def done(self) -> dict[str, tuple[int, int]]:
+        """The runs that have rows: which file, and when it was written."""
+        there = [path for path in self.rows.glob("*.parquet") if not path.name.startswith(".")]
+        return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in there}
+
+    def finished(self, address: str, before: dict[str, tuple[int, int]]) -> str:
+        """Go on to the end, with nothing done again that was there; what was said."""
+        said = self.begin(address)
+        words, _ = said.communicate(timeout=PATIENCE)
+        assert said.returncode == 0, words
+        after = self.done()
+        assert before.items() <= after.items()
+        assert len(after) == RUNS
+        assert set(rows.read(self.rows / name for name in after)["status"].to_pylist()) == {"ok"}
+        assert not [*self.rows.parent.rglob("*partial*")]
+        return " ".join(words.split())
+
+
+def test_a_scheduler_that_is_killed_ends_the_command_with_that_and_the_next_does_the_rest(tmp_path: Path):
+    sweep = Sweep.made(tmp_path)
+    with farm(tmp_path / "one", ["", ""]) as first:
+        client = sweep.begin(first.address)
+        wait_for(sweep.done)
+        first.scheduler.kill()
+        said, _ = client.communicate(timeout=PATIENCE)
+    assert client.returncode == 1, said
+    assert "the scheduler is gone" in " ".join(said.split())
+    assert "Traceback" not in said
+    with farm(tmp_path / "two", ["", ""]) as second:
+        sweep.finished(second.address, sweep.done())
+
+
+def test_a_client_that_is_killed_leaves_what_was_done_and_the_workers_to_the_next(tmp_path: Path):
+    sweep = Sweep.made(tmp_path)
+    with farm(tmp_path / "one", ["", ""]) as found:
+        client = sweep.begin(found.address)
+        wait_for(sweep.done)
+        client.kill()
+        client.communicate()
+        before = sweep.done()
+        there = re.search(rf"(\d+) of {RUNS} runs are there already", sweep.finished(found.address, before))
+    assert there
+    assert int(there[1]) >= len(before)  # workers end what they have at hand, and see the folder here
+
+
+def test_a_disk_that_is_full_on_one_worker_sends_its_runs_to_the_others(tmp_path: Path):
+    sweep = Sweep.made(tmp_path)
+    with farm(tmp_path / "one", [FAR + FULL, FAR]) as found:
+        said = sweep.finished(found.address, {})
+    assert "is done elsewhere" in said
+    assert "File too large" in said

@@ -1,0 +1,193 @@
+# pyright: reportUnknownMemberType=false
+"""Many workers and many runs, simulated: what a cluster's scheduler and its client bear.
+
+    python -m tests.many_workers [WORKERS] [RUNS] [FOLDER]        1,000 and 100,000 if left out
+
+Three processes: the client, which is the command as it is; Dask's scheduler; and all workers, as coroutines. A run's
+own process is left out, with what it measures: in its place stands `Dummy`, which writes rows as a run does. All else
+is the real code. Workers do not see the client's folder, so rows travel by the scheduler.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import cache
+from math import ceil
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import monotonic, process_time
+from typing import Any, NamedTuple
+
+import dask.config
+import psutil
+
+from harness.base import rows
+from harness.config.load import load_any
+from harness.config.sweep import RunSpec
+from harness.experiments import cluster
+from harness.experiments.code import code, parts
+from harness.experiments.provenance import common
+from harness.experiments.sweep import run_sweep
+from tests.displays import Quiet
+from tests.own_solvers import SCENE
+
+SOLVERS = ("sparse", "numba", "anderson", "lbfgs", "xpbd")
+SIZES = range(3, 23)
+MOST = 10_000
+"""Runs of a config."""
+THREADS, FRAMES = 4, 3
+"""Threads that all workers share, and steps that a run tells of."""
+
+QUIET = {"distributed.worker.profile.enabled": False, "distributed.admin.system-monitor.interval": "1h"}
+"""What Dask looks at in each worker by itself; here it would be looked at in one process a thousand times."""
+
+
+class Bears(NamedTuple):
+    """What a process took: MiB at most, seconds of CPU, and messages that came, as (number, bytes)."""
+
+    peak: float
+    cpu: float
+    messages: tuple[int, int] = (0, 0)
+
+
+class Dummy:
+    """In place of a run's process: writes the rows of a run that was not done."""
+
+    def __init__(self, ready: object, *, fork: bool) -> None: ...
+
+    def do(self, piece: Any, tick: object, limits: object) -> str:
+        unit = piece.args[0]
+        same = common(unit.run) | {"code": _code(parts(unit.run)), "phase": "step", "status": "ok", "seconds": 1e-3}
+        rows.write(unit.files.rows, [same | {"frame": frame} for frame in range(1, FRAMES + 1)])
+        return "1 ms a step"
+
+
+_code = cache(code)
+
+
+def scheduler(pipe: Connection) -> None:
+    """Be the scheduler until the pipe ends, and count the messages that come."""
+    from distributed import Scheduler
+    from distributed.comm.tcp import TCP
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+
+    counted, read = [0, 0], TCP.read
+
+    async def counting(self: TCP, deserializers: Any = None) -> Any:
+        found = await read(self, deserializers)
+        counted[0] += len(found) if isinstance(found, tuple | list) else 1
+        return found
+
+    async def serve() -> None:
+        async with Scheduler(host="127.0.0.1", port=0, dashboard=False) as served:
+            pipe.send(served.address)
+            await _ended(pipe)
+
+    TCP.read = counting  # type: ignore[method-assign]
+    with suppress(Exception):  # workers that leave in the same second
+        asyncio.run(serve())
+    sent = psutil.Process().io_counters()
+    pipe.send(_bears((counted[0], sent.read_chars + sent.write_chars)))
+
+
+def workers(pipe: Connection, address: str, count: int) -> None:
+    """Be so many workers until the pipe ends."""
+    from distributed import Worker
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    do: Any = cluster._do
+
+    def far(unit: object, folder: Path, *rest: object) -> Any:
+        return do(unit, Path("/elsewhere"), *rest)
+
+    cluster._do, cluster.Workers = far, Dummy  # type: ignore[assignment, misc]
+
+    async def serve(home: str) -> None:
+        own: Any = {"nthreads": 1, "dashboard": False, "memory_limit": 0, "executor": ThreadPoolExecutor(THREADS)}
+        for begun in range(0, count, 50):
+            some = range(begun, min(count, begun + 50))
+            await asyncio.gather(*(Worker(address, local_directory=f"{home}/{number}", **own) for number in some))
+        pipe.send(count)
+        await _ended(pipe)
+
+    with TemporaryDirectory() as home, suppress(Exception), dask.config.set(QUIET):
+        asyncio.run(serve(home))
+    pipe.send(_bears())
+
+
+async def _ended(pipe: Connection) -> None:
+    while not pipe.poll():
+        await asyncio.sleep(0.2)
+
+
+def _bears(messages: tuple[int, int] = (0, 0)) -> Bears:
+    import resource
+
+    return Bears(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, process_time(), messages)
+
+
+class Counting(Quiet):
+    """Prints how far it is at each tenth."""
+
+    def __init__(self, runs: int) -> None:
+        super().__init__()
+        self._tenth, self._began = max(1, runs // 10), monotonic()
+
+    def finished(self, outcome: str) -> None:
+        super().finished(outcome)
+        if not self.finished_units % self._tenth:
+            took, here = monotonic() - self._began, psutil.Process().memory_info().rss / 2**20
+            print(f"{self.finished_units:,} runs after {took:.0f} s; client {here:.0f} MiB", flush=True)
+
+
+def _part(folder: Path, part: int) -> list[RunSpec]:
+    """The runs of a config, of which several make the sweep: none may ask for more than `MOST`."""
+    each = MOST // len(SOLVERS) // len(SIZES)
+    options = {"iterations": list(range(1 + each * part, 1 + each * (part + 1))), "rounds": 1, "frames": FRAMES}
+    options |= {"record": False, "pictures": False}
+    asked = {"scenes": ["scene.yaml"], "sizes": list(SIZES), "solvers": list(SOLVERS), "options": options}
+    (folder / "sweep.yaml").write_text(json.dumps(asked))
+    return load_any(folder / "sweep.yaml").runs()
+
+
+def simulate(count: int, runs: int, folder: Path) -> dict[str, Any]:
+    """Do so many dummy runs by so many workers; what each process bore, and how long each part took."""
+    (folder / "scene.yaml").write_text(SCENE)
+    began, context = monotonic(), get_context("spawn")
+    found = [run for part in range(ceil(runs / MOST)) for run in _part(folder, part)][:runs]
+    told: dict[str, Any] = {"workers": count, "runs": len(found), "expanded_seconds": monotonic() - began}
+    (mine, theirs), (ours, others) = context.Pipe(), context.Pipe()
+    processes = [context.Process(target=scheduler, args=(theirs,))]
+    processes[0].start()
+    address = mine.recv()
+    processes.append(context.Process(target=workers, args=(others, address, count)))
+    processes[1].start()
+    ours.recv()
+    told["workers_seconds"], before = monotonic() - began - told["expanded_seconds"], process_time()
+    done, display = monotonic(), Counting(runs)
+    table = run_sweep("sweep", found, folder / "r", display, print, on=address)
+    told |= {"seconds": monotonic() - done, "rows": len(table), "client": _bears()._asdict()}
+    told["client"]["cpu"] -= before
+    told["runs_per_second"] = runs / told["seconds"]
+    for name, pipe, process in zip(("workers", "scheduler"), (ours, mine), processes[::-1], strict=True):
+        pipe.send(None)
+        told[f"{name}_bore"] = pipe.recv()._asdict()
+        process.join(60.0)
+        process.kill()
+    return told
+
+
+if __name__ == "__main__":
+    numbers = [int(word) for word in sys.argv[1:3]] + [1000, 100_000][len(sys.argv[1:3]) :]
+    with TemporaryDirectory() as temporary:
+        place = Path(sys.argv[3]) if len(sys.argv) > 3 else Path(temporary)
+        (place / "r").mkdir(parents=True, exist_ok=True)
+        print(json.dumps(simulate(numbers[0], numbers[1], place), indent=1))
