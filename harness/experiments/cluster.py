@@ -171,13 +171,11 @@ def do_on(
 ) -> None:
     """Do the runs of units on a client's workers; their files come to `folder`. another: see `core.do_together`. Raises
     InputError, CannotWrite, RunFailed where the scheduler is gone."""
-    token = (
-        folder / f".{uuid4().hex}.partial"
-    )  # who sees it shares the folder; a killed client's goes as partial files do
+    token = folder / "rows" / f".{uuid4().hex}.partial"  # who sees it shares the folder; it goes as such files do
     left, tries, excluded = list(enumerate(units))[::-1], dict[int, int](), set[str]()
     threads, asked = dict[str, int](), 0.0
     going: dict[Future, tuple[int, RunUnit]] = {}
-    fixed = folder.resolve(), token.name, machine.code_hash(), [dict(table) for table in TABLES]
+    fixed = folder.resolve(), f"rows/{token.name}", machine.code_hash(), [dict(table) for table in TABLES]
     display.begin(len(units), 0.0)
     looks = display.run(f"{len(units)} runs on {client.scheduler.address if client.scheduler else 'a cluster'}", 1, 0.0)
     try:

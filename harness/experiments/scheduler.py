@@ -9,6 +9,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from shutil import which
 from socket import create_connection
 from typing import Any
 from urllib.parse import urlsplit
@@ -67,6 +68,10 @@ def _batch(path: Path) -> Any:
     made = getattr(dask_jobqueue, f"{kind}Cluster", None)
     if made is None:
         raise InputError(Mistake(f"{kind}: dask-jobqueue has no {kind}Cluster", path, key="kind"))
+    submit = str(getattr(made.job_cls, "submit_command", "")).partition(" ")[0]
+    if submit and not which(submit):
+        why = f"{kind}: this machine has no {submit}; start the command where jobs can be submitted"
+        raise InputError(Mistake(why, path, key="kind"))
     try:
         found = made(**options)
     except (TypeError, ValueError) as error:

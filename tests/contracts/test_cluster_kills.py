@@ -1,4 +1,4 @@
-"""A scheduler and workers as processes of their own: whoever is killed, and whichever disk is full, no run is lost."""
+"""A scheduler and workers as processes of their own: whoever is killed, no run is lost."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic, sleep
@@ -24,18 +24,6 @@ RUNS, PATIENCE = 12, 240.0
 pytestmark = pytest.mark.long
 
 
-FAR = """
-from pathlib import Path
-from harness.experiments import cluster
-do = cluster._do
-cluster._do = lambda unit, folder, *rest: do(unit, Path("/elsewhere"), *rest)
-"""
-"""A worker that does not see the client's folder."""
-
-FULL = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))\n"
-"""A worker that cannot write the rows of a run."""
-
-
 class Farm(NamedTuple):
     """The processes of a cluster, and its address."""
 
@@ -45,8 +33,8 @@ class Farm(NamedTuple):
 
 
 @contextmanager
-def farm(folder: Path, preloads: Sequence[str]) -> Generator[Farm]:
-    """A scheduler, and a worker for each code that goes first there."""
+def farm(folder: Path) -> Generator[Farm]:
+    """A scheduler and two workers."""
     folder.mkdir()
     found, begun = folder / "scheduler.json", list[subprocess.Popen[str]]()
 
@@ -59,10 +47,8 @@ def farm(folder: Path, preloads: Sequence[str]) -> Generator[Farm]:
     try:
         scheduler = begin("scheduler", "--host", "127.0.0.1", "--port", 0)
         wait_for(found.exists)
-        for number, code in enumerate(preloads):
-            (folder / f"first{number}.py").write_text(code or "pass")
-            local = "--local-directory", folder / f"local{number}"
-            begin("worker", "--nthreads", 1, "--no-nanny", "--preload", folder / f"first{number}.py", *local)
+        for number in range(2):
+            begin("worker", "--nthreads", 1, "--no-nanny", "--local-directory", folder / f"local{number}")
         yield Farm(json.loads(found.read_text())["address"], scheduler, begun[1:])
     finally:
         for process in begun:
@@ -113,7 +99,7 @@ class Sweep(NamedTuple):
 
 def test_a_scheduler_that_is_killed_ends_the_command_with_that_and_the_next_does_the_rest(tmp_path: Path):
     sweep = Sweep.made(tmp_path)
-    with farm(tmp_path / "one", ["", ""]) as first:
+    with farm(tmp_path / "one") as first:
         client = sweep.begin(first.address)
         wait_for(sweep.done)
         first.scheduler.kill()
@@ -121,13 +107,13 @@ def test_a_scheduler_that_is_killed_ends_the_command_with_that_and_the_next_does
     assert client.returncode == 1, said
     assert "the scheduler is gone" in " ".join(said.split())
     assert "Traceback" not in said
-    with farm(tmp_path / "two", ["", ""]) as second:
+    with farm(tmp_path / "two") as second:
         sweep.finished(second.address, sweep.done())
 
 
 def test_a_client_that_is_killed_leaves_what_was_done_and_the_workers_to_the_next(tmp_path: Path):
     sweep = Sweep.made(tmp_path)
-    with farm(tmp_path / "one", ["", ""]) as found:
+    with farm(tmp_path / "one") as found:
         client = sweep.begin(found.address)
         wait_for(sweep.done)
         client.kill()
@@ -136,11 +122,3 @@ def test_a_client_that_is_killed_leaves_what_was_done_and_the_workers_to_the_nex
         there = re.search(rf"(\d+) of {RUNS} runs are there already", sweep.finished(found.address, before))
     assert there
     assert int(there[1]) >= len(before)  # workers end what they have at hand, and see the folder here
-
-
-def test_a_disk_that_is_full_on_one_worker_sends_its_runs_to_the_others(tmp_path: Path):
-    sweep = Sweep.made(tmp_path)
-    with farm(tmp_path / "one", [FAR + FULL, FAR]) as found:
-        said = sweep.finished(found.address, {})
-    assert "is done elsewhere" in said
-    assert "File too large" in said

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from time import time
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -96,4 +98,22 @@ def test_where_there_is_no_cluster_that_is_said(on: str, said: str, monkeypatch:
     monkeypatch.setattr(cluster, "PATIENCE", 0.3)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=said), cluster.cluster(on, [], print):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("described", "said"),
+    [
+        ("{kind: HAND, jobs: 2}", "this machine has no submit-by-hand"),
+        ("{kind: OTHER, jobs: 2}", "dask-jobqueue has no OTHERCluster"),
+        ("{kind: HAND}", "wanted a mapping"),
+    ],
+)
+def test_a_batch_system_that_is_not_there_is_said(
+    described: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    hand = SimpleNamespace(job_cls=SimpleNamespace(submit_command="submit-by-hand --now"))
+    monkeypatch.setitem(sys.modules, "dask_jobqueue", SimpleNamespace(HANDCluster=hand))
+    (tmp_path / "batch.yaml").write_text(described)
+    with pytest.raises(InputError, match=said), cluster.cluster(str(tmp_path / "batch.yaml"), [], print):
         pass
