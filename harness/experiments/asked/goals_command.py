@@ -16,8 +16,6 @@ def goals(
     results: Results = Path("results"),
 ) -> None:
     """Hold the cheapest way to an error against a peer, or against the best steps of one length."""
-    from fractions import Fraction
-
     from rich.table import Table
 
     from harness.base import machine, rows
@@ -36,7 +34,7 @@ def goals(
     with machine.pinned_threads(1):
         for one in met(asked, say):
             found.append(one)
-            wanted = f"1/{Fraction(1 / one.goal.wanted).limit_denominator(10)}"
+            wanted = f"1/{1 / one.goal.wanted:.2g}"
             ratio = f"1/{1 / one.ratio:.3g}" if not one.reason else "–"
             verdict = one.reason or ("holds" if one.holds else "does not hold")
             cells = f"{one.scene} {one.size or ''}", f"{one.goal.error:g}", one.way, one.other, ratio, wanted, verdict
