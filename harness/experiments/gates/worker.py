@@ -46,7 +46,6 @@ class Worker:
         extra: so much more work than the run asks for, as a part of its iterations: a planted slowdown.
         """
         from harness.scenes.bind import build
-        from harness.simulation.algebraic import stop_rule
         from harness.simulation.step import prepare, simulate
         from solvers.problem import StopRule
         from solvers.registry import SOLVERS, load
@@ -56,7 +55,13 @@ class Worker:
         self._pin(threads)
         scene = build(run.scene, run.size, run.integrator)
         prepared = prepare(scene, load(SOLVERS[run.solver.name])(**run.solver.parameters))
-        frames, stop = min(frames, run.frames), stop_rule(run.iterations, run.tolerance)
+        frames = min(frames, run.frames)
+        if isinstance(run.tolerance, str):  # `auto`, which older revisions do not know
+            from harness.simulation.algebraic import stop_rule
+
+            stop: Any = stop_rule(run.iterations, run.tolerance)
+        else:
+            stop = StopRule(run.iterations, run.tolerance)
         done: list[int] = []
 
         def work() -> Any:
