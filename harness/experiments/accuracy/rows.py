@@ -80,7 +80,7 @@ COLUMNS = (
     ),
     Column("against", _TEXT, "", "of a goal: what was held against it, the best of its kind"),
     Column("against_error", _REAL, "", "its error, estimated as that of the goal"),
-    Column("against_seconds", _REAL, "s", "its processor time, in turns with that of the goal (`cpu_seconds`)"),
+    Column("against_seconds", _REAL, "s", "its processor time, in the process of the goal's (`cpu_seconds`)"),
     Column("wanted", _REAL, "", "the part of that which is wanted"),
     *PROVENANCE,
 )

@@ -1,8 +1,8 @@
 """Time for the same error, side by side: the cheapest way that is known now, and what it is held against.
 
-Both are done in turns in one process on one core, and told by processor time, preparing included: its least of some
-rounds. What is held against it are a peer, or steps of one length, which are shortened by the square root of two until
-their end errs by no more than was asked, for each integrator, solver and tolerance; the cheapest of those counts.
+Both are done one after the other in one process on one core, told by processor time, preparing included: its least of
+some rounds. What is held against it are a peer, or steps of one length, which are shortened by the square root of two
+until their end errs by no more than was asked, for each integrator, solver and tolerance; the cheapest of those counts.
 """
 
 from __future__ import annotations
