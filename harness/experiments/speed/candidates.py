@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numba
 
+from harness.config.options import AUTO
 from harness.config.sweep import RunSpec
 from harness.experiments.speed import limits
 from harness.experiments.speed.rest import Rest, apart, precision
@@ -107,8 +108,9 @@ class SolverCandidate:
 
     def _step(self) -> None:
         assert self._prepared is not None
-        stop = StopRule(self.run.iterations, self.run.tolerance)
-        self._positions = self._prepared.solve(self._problem, stop).positions
+        tolerance = self.run.tolerance
+        assert tolerance != AUTO, "the command refuses it: a step alone has no error of its own"
+        self._positions = self._prepared.solve(self._problem, StopRule(self.run.iterations, tolerance)).positions
 
     def _columns(self, phase: str, times: int) -> dict[str, Any]:
         done = {"iterations": times}
