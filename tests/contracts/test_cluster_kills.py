@@ -23,6 +23,19 @@ RUNS, PATIENCE = 12, 240.0
 
 pytestmark = pytest.mark.long
 
+FAR = """
+from pathlib import Path
+from harness.experiments import cluster
+if cluster._do.__name__ == "_do":  # Dask loads it twice
+    def far(unit, folder, *rest, do=cluster._do):
+        return do(unit, Path("/elsewhere"), *rest)
+    cluster._do = far
+"""
+"""A worker that does not see the client's folder."""
+
+FULL = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))\n"
+"""One that cannot write the rows of a run."""
+
 
 class Farm(NamedTuple):
     """The processes of a cluster, and its address."""
@@ -33,8 +46,8 @@ class Farm(NamedTuple):
 
 
 @contextmanager
-def farm(folder: Path) -> Generator[Farm]:
-    """A scheduler and two workers."""
+def farm(folder: Path, loaded: tuple[str, str] = ("", "")) -> Generator[Farm]:
+    """A scheduler and two workers, and what they load first."""
     folder.mkdir()
     found, begun = folder / "scheduler.json", list[subprocess.Popen[str]]()
 
@@ -47,8 +60,10 @@ def farm(folder: Path) -> Generator[Farm]:
     try:
         scheduler = begin("scheduler", "--host", "127.0.0.1", "--port", 0)
         wait_for(found.exists)
-        for number in range(2):
-            begin("worker", "--nthreads", 1, "--no-nanny", "--local-directory", folder / f"local{number}")
+        for number, code in enumerate(loaded):
+            first, place = folder / f"first{number}.py", folder / f"local{number}"
+            first.write_text(code)
+            begin("worker", "--nthreads", 1, "--no-nanny", "--local-directory", place, "--preload", first)
         yield Farm(json.loads(found.read_text())["address"], scheduler, begun[1:])
     finally:
         for process in begun:
@@ -122,3 +137,11 @@ def test_a_client_that_is_killed_leaves_what_was_done_and_the_workers_to_the_nex
         there = re.search(rf"(\d+) of {RUNS} runs are there already", sweep.finished(found.address, before))
     assert there
     assert int(there[1]) >= len(before)  # workers end what they have at hand, and see the folder here
+
+
+def test_a_disk_that_is_full_on_one_worker_sends_its_runs_to_the_other(tmp_path: Path):
+    sweep = Sweep.made(tmp_path)
+    with farm(tmp_path / "one", (FAR + FULL, FAR)) as found:
+        said = sweep.finished(found.address, {})
+    assert "is done elsewhere" in said
+    assert "File too large" in said
