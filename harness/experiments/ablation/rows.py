@@ -22,7 +22,7 @@ COLUMNS = (
     Column("name", _TEXT, "", "the effects left out, joined by +; `solver` or `time-step`; a price's effect, or `all`"),
     *as_in_runs("scene", "size", "vertices", "springs", "solver", "parameters", "own", "time_step", "integrator"),
     *OF_SOLVER,
-    *as_in_runs("first_guess", "max_iterations", "tolerance", "threads"),
+    *as_in_runs("first_guess", "max_iterations", "tolerance", "asked", "threads"),
     Column("frames", _INT, "", "steps simulated"),
     Column("rounds", _INT, "", "how often each of them was timed"),
     Column(
