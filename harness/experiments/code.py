@@ -13,6 +13,9 @@ from solvers.registry import EVERY, load
 Part = Path | type | Plugin
 """The file of a solver; the class of a mesh or an effect, which is there already; somebody's own code."""
 
+TO_ERROR = "harness.experiments.asked.kept:keep_to_error"
+"""What does a run that keeps to an error; other runs depend on none of it."""
+
 _RUN = Path(__file__).with_name("run.py")
 """What does a run, whatever its parts."""
 
@@ -24,12 +27,13 @@ def solver_class(run: RunSpec) -> Any:
 
 def parts(run: RunSpec) -> frozenset[Part]:
     """What a run is put together from by name: the solver's file, the classes of the mesh and the effects, the file of
-    a judge's reference. Neither solvers nor somebody's own code are imported."""
+    a judge's reference, and what keeps to an error. Neither solvers nor somebody's own code are imported."""
     named = {"mesh": run.scene.mesh, **{f"effects[{i}]": effect for i, effect in enumerate(run.scene.effects)}}
     shipped = [type(part) for place, part in named.items() if place not in run.scene.own]
     solver = [] if isinstance(run.solver.name, Plugin) else [run.solver.name]
     judge = ["newton"] if run.judge else []
-    return frozenset([*map(_file_of, [*solver, *judge]), *shipped, *run.own()])
+    kept = [] if run.accuracy is None else [Path(source_of(TO_ERROR.partition(":")[0]) or _RUN)]
+    return frozenset([*map(_file_of, [*solver, *judge]), *kept, *shipped, *run.own()])
 
 
 def code(parts: frozenset[Part]) -> str:

@@ -22,8 +22,7 @@ from harness.base.files import replacing
 from harness.base.machine_lock import alone, beside, own_cores
 from harness.base.worker import Tick
 from harness.config.sweep import RunSpec
-from harness.experiments.asked.kept import keep_to_error
-from harness.experiments.code import code, parts, solver_class
+from harness.experiments.code import TO_ERROR, code, parts, solver_class
 from harness.experiments.failure import failure
 from harness.experiments.plan import Files
 from harness.experiments.provenance import asked, common, tolerance
@@ -95,7 +94,7 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
 def _to_error(run: RunSpec, error: float, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
     """The rows of a run whose solver keeps to an error of its end: integrator and steps are chosen first."""
     with _timed(run, tick) as how:
-        found = keep_to_error(run, error, tick)
+        found = load(TO_ERROR)(run, error, tick)
     told, seen, last = found.rows(), found.positions, dict[str, Any]()
     with beside(tick):
         if positions:

@@ -41,7 +41,7 @@ work:
   - {size: 4, horizon: 0.2, time_step: [1/30, 1/60], iterations: 20, rounds: 2, time_limit: 100}
 """
 UNITS = 2 * 2 + 2 * 3
-TIMES = ("seconds", "interrupted", "cold", "seconds_per_simulated", "started", "commit", "code")
+TIMES = ("seconds", "cpu_seconds", "interrupted", "cold", "seconds_per_simulated", "started", "commit", "code")
 """Columns that tell how long something took, and when and by which state of the code it was done."""
 
 

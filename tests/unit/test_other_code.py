@@ -82,7 +82,9 @@ def test_a_run_depends_on_its_own_solver_and_effects_and_on_no_others(tmp_path: 
     assert {"methods/local_global.py", "effects/springs.py", "effects/gravity.py", "mesh/grid.py"} <= names
     others = {str(file) for name in ("xpbd", "vbd", "newton") for file in sources.of_class(load(SOLVERS[name]))}
     assert not reached & others
-    assert not names & {"effects/wind.py", "effects/gas.py", "mesh/chain.py", "harness/cli.py", "report/page.py"}
+    assert not names & {"effects/wind.py", "effects/gas.py", "mesh/chain.py", "harness/cli.py", "asked/search.py"}
+    to_error = parts(run.model_copy(update={"accuracy": 0.1}))
+    assert {"kept.py"} == {file.name for part in to_error - parts(run) for file in files(part)}
 
 
 def test_the_code_of_a_run_covers_what_its_solver_compiles_in_another_language(
