@@ -18,7 +18,7 @@ from harness.simulation.opinion.declared import Array, Declared
 from harness.simulation.opinion.derivatives import wide
 from harness.simulation.opinion.motion import place
 from harness.simulation.opinion.self_contact import gathered
-from harness.simulation.opinion.surface_contact import brought
+from harness.simulation.opinion.surface_contact import against, brought
 from harness.simulation.step import State, start
 
 POINTS = 20
@@ -42,9 +42,7 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[Point]:
     begun = start(scene).now
     touching = [(effect, one) for effect in declared.of_kind("contact") for one in effect.obstacles]
     apart = declared.of_kind("self-contact")
-    beside = [
-        (effect, which) for effect in declared.of_kind("surface-contact") for which in range(len(effect.obstacles))
-    ]
+    beside = [(effect, one) for effect in declared.of_kind("surface-contact") for one in against(effect, declared)]
     # What forces may do in a step is limited where there are obstacles (`margin` of `solvers.contact.energy`).
     limit = 0.05 * scene.mesh.size if touching else np.inf
     for k in range(POINTS):
@@ -59,8 +57,8 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[Point]:
             effect, one = touching[k % len(touching)]
             p = _brought(effect, one, p, scene.time(index), rng)
         if beside:  # where the obstacle is at the step's start, or at its end
-            effect, which = beside[k % len(beside)]
-            p = brought(effect, which, declared, p, scene.time(index) + dt * (k // 2 % 2), rng)
+            effect, one = beside[k % len(beside)]
+            p = brought(effect, one, p, scene.mesh.spacing, scene.time(index) + dt * (k // 2 % 2), rng)
         before = p - dt * v + some * rng.normal(size=rest.shape), v + some / dt * rng.normal(size=rest.shape)
         shift = some * rng.normal(size=rest.shape)
         far = np.linalg.norm(shift, axis=1).max()

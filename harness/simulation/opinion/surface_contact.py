@@ -63,10 +63,10 @@ class Against(Touching):
         return wide(np.full(len(rows), np.inf))
 
 
-def brought(effect: Any, which: int, declared: Declared, p: Array, time: float, rng: np.random.Generator) -> Array:
+def brought(effect: Any, one: Against, p: Array, spacing: float, time: float, rng: np.random.Generator) -> Array:
     """Positions (n, 3) [m] as a whole outside of one of the obstacles, and so near to it that some pair is in range, at
-    a time [s]: from far away along a random way, each time by what is free."""
-    one, reach = against(effect, declared)[which], effect.thickness if effect.range is None else effect.range
+    a time [s]: from far away along a random way, each time by what is free. spacing [m]: of the mesh."""
+    reach = effect.thickness if effect.range is None else effect.range
     there = np.asarray(one.obstacle(time), float)
     way, middle = rng.normal(size=3), 0.5 * (there.max(axis=0) + there.min(axis=0))
     way /= np.linalg.norm(way)
@@ -74,7 +74,7 @@ def brought(effect: Any, which: int, declared: Declared, p: Array, time: float, 
     out = float(((there - middle) @ way).max() - (at @ way).min()) + effect.thickness + reach  # a plane between them
     wanted = effect.thickness + reach * rng.uniform(0.3, 0.7)
     for _ in range(_SOME):
-        free = one.nearest(np.concatenate([middle + out * way + at, there]), wanted + declared.mesh.spacing) - wanted
+        free = one.nearest(np.concatenate([middle + out * way + at, there]), wanted + spacing) - wanted
         if free < 1e-3 * reach:
             break
         out -= free
