@@ -22,7 +22,7 @@ from harness.experiments.asked.search import Answer, foresee, search
 from harness.experiments.asked.ways import Asked
 from harness.simulation.algebraic import Stop, stop_rule
 from harness.simulation.step import prepare, simulate
-from solvers.problem import NotPositiveDefinite, Positions, Solver, Unsupported
+from solvers.problem import NotPositiveDefinite, Solver, Unsupported
 from solvers.registry import EVERY, load
 
 ROUNDS = 3
@@ -85,10 +85,8 @@ def _met(goal: Goal, name: str, asked: Asked, say: Callable[[str], None]) -> Met
     best = answer.best
     other = _peer(goal, asked, answer) if goal.peer else _steps(goal, asked, answer, say)
     ours = min(_timed(lambda: best.way.follower.follow(best.tolerance)) for _ in range(ROUNDS))
-    vertices = best.path.positions.shape[1]
-    found = Met(goal, name, asked.size, vertices, str(best.way), best.estimated, ours)
     return Met(
-        *(goal, name, asked.size, vertices, found.way, found.estimated, ours),
+        *(goal, name, asked.size, best.path.positions.shape[1], str(best.way), best.estimated, ours),
         *(other.name, other.error, other.seconds),
     )
 
@@ -121,7 +119,7 @@ def _steps(goal: Goal, asked: Asked, answer: Answer, say: Callable[[str], None])
                     again = integrator, solver, stop, frames
                 break
     if again is None:
-        raise RunFailed("no steps of one length keep to the error within 20 s of processor time")
+        raise RunFailed(f"no steps of one length keep to the error within {_LONGEST:g} s of processor time")
     say(f"  held against {best.name}")
     least = min(_run(asked, answer, *again, inf)[1] for _ in range(ROUNDS))
     return _Other(best.name, best.error, least)
@@ -141,14 +139,7 @@ def _run(
         p = step.positions
         if thread_time() - began > limit or not np.isfinite(p).all():
             return inf, inf
-    return _error(p, answer, scene.system.free), thread_time() - began
-
-
-def _error(p: Positions, answer: Answer, free: np.ndarray) -> float:
-    """By the motion that the answer's own error was estimated by."""
-    q = answer.closer.path.positions
-    away, moved = (float(np.linalg.norm((x - q[-1])[free])) for x in (p, q[0]))
-    return away / moved
+    return answer.error(p, scene.system.free), thread_time() - began
 
 
 def _timed(call: Callable[[], object]) -> float:

@@ -109,9 +109,7 @@ class _Beside:
         if not solved.success:
             return Peer(name, inf, inf, inf, str(solved.message))
         p, _ = field.motion(self.asked.horizon, solved.y[:, -1])
-        q = self.answer.closer.path.positions
-        away, moved = (float(np.linalg.norm((x - q[-1])[free])) for x in (p, q[0]))
-        return Peer(name, away / moved, seconds, processor / self.ours, processor=processor)
+        return Peer(name, self.answer.error(p, free), seconds, processor / self.ours, processor=processor)
 
 
 def _limited(field: Field, until: float) -> Callable[[float, State], State]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from math import inf
 
 import numpy as np
+from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
 from harness.config.sweep import SolverSpec
@@ -57,6 +58,12 @@ class Answer:
     closer: Found
     seconds: float
     note: str
+
+    def error(self, p: Positions, free: NDArray[np.int64]) -> float:
+        """Of the end p (n, 3) [m] of another motion by the closer one, relative to its way, over the free vertices."""
+        q = self.closer.path.positions
+        away, moved = (float(np.linalg.norm((x - q[-1])[free])) for x in (p, q[0]))
+        return away / moved
 
 
 def foresee(asked: Asked, error: float, say: Callable[[str], None]) -> Growth:
