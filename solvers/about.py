@@ -26,7 +26,8 @@ class About:
     family: methods of one family share a colour; those of LOCAL_GLOBAL do the same iterations. own_steps: whether it
     integrates a frame in substeps of its own, whatever the integrator of the run. first: whether it is the one of its
     family to take first. to_error: whether it is tried where an error is asked for: one with steps of its own chooses
-    them by their error (`within`), others minimise what an integrator with an error states.
+    them by their error (`within`), others minimise what an integrator with an error states. even: whether its own steps
+    have one length instead, and can be had shorter (`refined`).
     """
 
     family: str
@@ -34,6 +35,7 @@ class About:
     own_steps: bool = False
     first: bool = False
     to_error: bool = False
+    even: bool = False
 
 
 LIU_2013 = Reference(

@@ -48,7 +48,12 @@ COLUMNS = (
     Column("threads", _INT, "", "threads of Numba and of BLAS"),
     Column("asked", _REAL, "", "the relative error at the end that was asked for; null: steps as they are stated"),
     Column("estimated", _REAL, "", "where one was: that error, estimated by a motion to a closer tolerance"),
-    Column("local_tolerance_m", _REAL, "m", "what each step may err by, root mean square over the free coordinates"),
+    Column(
+        "local_tolerance_m",
+        _REAL,
+        "m",
+        "what each step may err by, root mean square over the free coordinates; null: steps of one length",
+    ),
     Column("accepted", _INT, "", "steps that kept to it"),
     Column("rejected", _INT, "", "steps that did not, and were done again"),
     Column("factorisations", _INT, "", "factors made for steps of different lengths; 0 of explicit methods"),

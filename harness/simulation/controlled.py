@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import ceil, inf, isfinite, log2
 from time import perf_counter
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -71,15 +71,30 @@ class Path:
 
 
 class Follower(Protocol):
-    """A way to follow the motion; order: by which its error falls with the step."""
+    """A way to follow the motion; order: by which its error falls with the step; even: whether its steps have one
+    length. A setting is the error [m] that each step may have, or, of even steps, how many times as many as the longest
+    there are."""
+
+    even: ClassVar[bool] = False
 
     @property
     def order(self) -> int:
         """Of the error."""
         ...
 
-    def follow(self, tolerance: float, *, limit: float = inf) -> Path:
-        """The motion up to the horizon, each step's error at most `tolerance` [m]; limit: wall seconds.
+    def first(self, tolerance: float) -> float:
+        """The setting to begin with, where steps may err by a tolerance [m]."""
+        return 1.0 if self.even else tolerance
+
+    def changed(self, setting: float, ratio: float) -> float:
+        """The setting at which the error of the end is about so many times as large: that of a step of h is of order
+        h^(order + 1). There are no longer even steps than the longest."""
+        if self.even:
+            return max(1.0, setting * ratio ** (-1.0 / self.order))
+        return setting * ratio ** ((self.order + 1.0) / self.order)
+
+    def follow(self, setting: float, *, limit: float = inf) -> Path:
+        """The motion up to the horizon; limit: wall seconds.
 
         Raises TooSlow, Stuck."""
         ...
@@ -114,7 +129,7 @@ def _bytes(prepared: Prepared) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Implicit:
+class Implicit(Follower):
     """By an integrator with an embedded error. bound: the scene at a length of steps [s]; frames: within the
     horizon [s]."""
 
@@ -128,9 +143,9 @@ class Implicit:
         """See Follower."""
         return self.bound(self.horizon).integrator.order
 
-    def follow(self, tolerance: float, *, limit: float = inf) -> Path:
+    def follow(self, setting: float, *, limit: float = inf) -> Path:
         """See Follower. Raises Unsupported for an integrator without an error, and for filters of the velocity."""
-        return _Following(self, tolerance, limit).path()
+        return _Following(self, setting, limit).path()
 
 
 class _Following:

@@ -1,25 +1,27 @@
-"""Motion that keeps to an error by a solver that chooses its own steps within frames (`own_steps` of its `about`)."""
+"""Motion that keeps to an error by a solver with steps of its own within frames (`own_steps` of its `about`): they
+are chosen by their error, or have one length, the longest that is stable or shorter.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf
 from time import perf_counter
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
 from harness.scenes.bind import Scene
-from harness.simulation.controlled import Path, Stuck, TooSlow, shares
+from harness.simulation.controlled import Follower, Path, Stuck, TooSlow, shares
 from harness.simulation.step import State, problem, start
 from solvers.integrators import Motion
-from solvers.problem import Positions, Solver, StepProblem, Unsupported
+from solvers.problem import Positions, Prepared, Solver, StepProblem, Unsupported
 
 
-@runtime_checkable
-class Controlled(Protocol):
-    """A prepared solver that can choose its steps within a frame by their error."""
+class _Stepping(Protocol):
+    """A prepared solver with steps of its own."""
 
     @property
     def order(self) -> int:
@@ -31,18 +33,32 @@ class Controlled(Protocol):
         """Of the forces, in a step."""
         ...
 
-    def within(self, tolerance: float) -> Controlled:
-        """The same with an error of each step [m]. Raises Unsupported where it chooses none."""
-        ...
-
     def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, Sequence[float]]:
         """Positions [m] and velocities [m/s] at the frame's end, and steps accepted, rejected and the last one's length
         [s]; h: the first one's."""
         ...
 
 
+@runtime_checkable
+class Controlled(_Stepping, Protocol):
+    """It can choose its steps within a frame by their error."""
+
+    def within(self, tolerance: float) -> Controlled:
+        """The same with an error of each step [m]. Raises Unsupported where it chooses none."""
+        ...
+
+
+@runtime_checkable
+class Even(_Stepping, Protocol):
+    """Its steps within a frame have one length, the longest that is stable."""
+
+    def refined(self, times: float) -> Even:
+        """The same with so many times the steps."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
-class Own:
+class Own(Follower):
     """By a solver that chooses its steps within frames. scene: its step is a frame, its integrator `own`."""
 
     scene: Scene
@@ -52,12 +68,16 @@ class Own:
     @property
     def order(self) -> int:
         """See Follower."""
+        return self._order
+
+    @cached_property
+    def _order(self) -> int:
         return self._prepared(1.0).order
 
-    def follow(self, tolerance: float, *, limit: float = inf) -> Path:
+    def follow(self, setting: float, *, limit: float = inf) -> Path:
         """See Follower. Raises Unsupported as the solver does, and for what changes in a frame."""
         scene = self.scene
-        ready, state = self._prepared(tolerance), start(scene)
+        ready, state = self._prepared(setting), start(scene)
         began = perf_counter()
         reached = list[float]()
         seen, h, told = [state.now.positions], None, np.zeros((self.frames, 3))
@@ -79,7 +99,7 @@ class Own:
         counts = accepted, rejected, 0, evaluations
         return Path(np.array(seen), *counts, (mean, mean), reached[-1], shares(reached))
 
-    def _prepared(self, tolerance: float) -> Controlled:
+    def _prepared(self, setting: float) -> _Stepping:
         scene = self.scene
         changes = [
             what
@@ -88,7 +108,21 @@ class Own:
         ]
         if changes:
             raise Unsupported(f"takes {' and '.join(changes)} as even within a frame, which is of order 1")
-        ready = self.solver.prepare(scene.system)
+        return self._set(self.solver.prepare(scene.system), setting)
+
+    def _set(self, ready: Prepared, setting: float) -> _Stepping:
         if not isinstance(ready, Controlled):
             raise Unsupported("the method chooses no steps by an error")
-        return ready.within(tolerance)
+        return ready.within(setting)
+
+
+@dataclass(frozen=True, eq=False)
+class OwnEven(Own):
+    """By a solver whose steps have one length."""
+
+    even: ClassVar[bool] = True
+
+    def _set(self, ready: Prepared, setting: float) -> _Stepping:
+        if not isinstance(ready, Even):
+            raise Unsupported("the number of its steps in a frame cannot be set")
+        return ready.refined(setting)

@@ -107,8 +107,8 @@ class _Controlled(Explicit):
         return self._prepared(system, 1, self.error)
 
 
-def _about(authors: str, year: int, title: str, doi: str = "") -> About:
-    return About("explicit", Reference(authors, year, title, doi), own_steps=True)
+def _about(authors: str, year: int, title: str, doi: str = "", *, even: bool = False) -> About:
+    return About("explicit", Reference(authors, year, title, doi), own_steps=True, to_error=True, even=even)
 
 
 _HAIRER = _about(
@@ -122,6 +122,7 @@ _BLANES_MOAN = _about(
     2002,
     "Practical symplectic partitioned Runge-Kutta and Runge-Kutta-Nyström methods",
     "10.1016/S0377-0427(01)00492-7",
+    even=True,
 )
 
 
@@ -135,6 +136,7 @@ class VelocityVerlet(_Fixed):
         1982,
         "A computer simulation method for the calculation of equilibrium constants",
         "10.1063/1.442716",
+        even=True,
     )
     coefficients: ClassVar[Composition | Tableau] = VERLET
 
@@ -162,7 +164,7 @@ class RungeKutta4(_Fixed):
     """Kutta's method of order 4, four evaluations a substep."""
 
     name: ClassVar[str] = "runge-kutta-4"
-    about: ClassVar[About] = _HAIRER
+    about: ClassVar[About] = replace(_HAIRER, to_error=False, even=True)
     coefficients: ClassVar[Composition | Tableau] = RUNGE_KUTTA_4
 
 
@@ -171,14 +173,11 @@ class Tsitouras5(_Controlled):
     """Tsitouras's pair of orders 5 and 4, six evaluations a substep."""
 
     name: ClassVar[str] = "tsitouras-5"
-    about: ClassVar[About] = replace(
-        _about(
-            "Tsitouras, Charalampos",
-            2011,
-            "Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying assumption",
-            "10.1016/j.camwa.2011.06.002",
-        ),
-        to_error=True,
+    about: ClassVar[About] = _about(
+        "Tsitouras, Charalampos",
+        2011,
+        "Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying assumption",
+        "10.1016/j.camwa.2011.06.002",
     )
     coefficients: ClassVar[Composition | Tableau] = TSITOURAS_5
 
@@ -188,7 +187,7 @@ class DormandPrince8(_Controlled):
     """Dormand and Prince's method of order 8 with errors of orders 5 and 3, twelve evaluations a substep."""
 
     name: ClassVar[str] = "dormand-prince-8"
-    about: ClassVar[About] = replace(_HAIRER, to_error=True)
+    about: ClassVar[About] = _HAIRER
 
     def method(self) -> Composition | Tableau:
         """The coefficients; SciPy has them."""
@@ -231,9 +230,9 @@ class PreparedExplicit(Iterative):
             raise Unsupported("the method chooses no steps by an error")
         return replace(self, tolerance=tolerance)
 
-    def refined(self, times: int) -> PreparedExplicit:
-        """The same with so many times the substeps."""
-        return replace(self, substeps=times * self.substeps)
+    def refined(self, times: float) -> PreparedExplicit:
+        """The same with so many times the substeps, rounded up."""
+        return replace(self, substeps=ceil(times * self.substeps))
 
     def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, NDArray[np.float64]]:
         """Positions and velocities (n, 3) at the step's end, and what `integrate` tells. h: the first substep [s] of a

@@ -34,9 +34,10 @@ from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.chain import Chain
 from harness.scenes.spec import SceneSpec
 from harness.simulation.controlled import Implicit, Stuck, hermite
-from harness.simulation.own_steps import Own
+from harness.simulation.own_steps import Own, OwnEven
 from harness.simulation.step import prepare, simulate
 from solvers.integrators import Motion
+from solvers.methods.explicit import VelocityVerlet
 from solvers.methods.newton import Newton
 from solvers.methods.rosenbrock import Rodas
 from solvers.problem import StopRule
@@ -47,6 +48,8 @@ MOVED = Pins.model_validate(
     {"at": ["first"], "weight": "exact", "motion": {"keys": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0]}]}}
 )
 END, FRAMES = 0.5, 10
+OWN = ["velocity-verlet", "blanes-moan-4", "blanes-moan-6", "tsitouras-5", "dormand-prince-8", "rodas"]
+"""What is tried of the methods with steps of their own."""
 
 
 def chain(*effects: Any, size: int = 5) -> SceneSpec:
@@ -161,7 +164,7 @@ def test_the_pattern_of_the_jacobian_holds_all_that_differs_from_zero():
 def test_ways_are_what_solvers_and_integrators_say_of_themselves():
     assert {(integrator, solver.name) for integrator, solver in tried()} == {
         *(("esdirk-4", solver) for solver in ("lbfgs", "newton")),
-        *(("own", solver) for solver in ("tsitouras-5", "dormand-prince-8", "rodas")),
+        *(("own", solver) for solver in OWN),
     }
 
 
@@ -176,12 +179,22 @@ def test_methods_that_would_lose_their_order_are_named_with_the_reason(effect, w
     held = () if effect is MOVED else (HELD,)
     told, asked = list[str](), Asked(chain(Springs(stretch=40.0), effect, *held), 5, 0.1, 2)
     assert {way.integrator for way in ways(asked, told.append)} == {"esdirk-4"}
-    assert [line.split(":")[0].removeprefix("  not by ") for line in told] == [
-        "tsitouras-5",
-        "dormand-prince-8",
-        "rodas",
-    ]
+    assert [line.split(":")[0].removeprefix("  not by ") for line in told] == OWN
     assert all(what in line for line in told)
+
+
+def test_steps_of_one_length_are_no_longer_than_is_stable_and_as_short_as_the_error_asks_for():
+    """Of order 2: the step that a hundredth of the error asks for is a tenth."""
+    even, truth = (
+        OwnEven(build(SWINGING, 5, "own"), VelocityVerlet(), FRAMES),
+        integrate(build(SWINGING, 5, "own"), [END]),
+    )
+    assert even.first(1e-3) == even.changed(1.0, 100.0) == 1.0
+    assert even.changed(4.0, 0.01) == pytest.approx(40.0)
+    coarse, fine = (even.follow(setting) for setting in (4.0, even.changed(4.0, 0.01)))
+    assert fine.accepted == pytest.approx(10 * coarse.accepted, rel=0.1)  # whole numbers of steps in a frame
+    errors = [truth.error(0, path.positions[-1]) for path in (coarse, fine)]
+    assert errors[1] == pytest.approx(0.01 * errors[0], rel=0.2)
 
 
 def test_a_rosenbrock_method_keeps_to_an_error_that_is_asked_for():

@@ -84,7 +84,7 @@ def keep_to_error(run: RunSpec, error: float, tick: Tick) -> Kept:
     answer = search(asked, error, foresee(asked, error, said.append), lambda line: tick("choosing steps"), pairs)
     best, rounds = answer.best, list[Path]()
     for _ in range(run.rounds):
-        rounds.append(best.way.follower.follow(best.tolerance))
+        rounds.append(best.again())
         if not np.array_equal(rounds[-1].positions, best.path.positions):
             raise RunFailed("a round ended at other positions than the one before")
         for _ in range(run.frames):

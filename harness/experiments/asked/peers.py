@@ -61,7 +61,7 @@ def peers(asked: Asked, error: float, answer: Answer, names: Iterable[str] = PEE
     fields = {compiled: Field(scene, compiled=compiled) for compiled in (True, False)}
     fields[True].witness()  # compiles
     began = thread_time()
-    answer.best.way.follower.follow(answer.best.tolerance)
+    answer.best.again()
     beside = _Beside(asked, error, answer, scene, fields, thread_time() - began)
     yield from map(beside.peer, names)
 
@@ -79,7 +79,7 @@ class _Beside:
 
     def peer(self, name: str) -> Peer:
         """The first tolerance that keeps to the error and is not far more exact, or the cheapest of those tried."""
-        order, tolerance = PEERS[name][1], 10.0 * self.answer.closer.tolerance
+        order, tolerance = PEERS[name][1], 0.2 * self.answer.tolerance
         found = Peer(name, inf, inf, inf, "its error does not come down to the one asked")
         for _ in range(_TRIES):
             one = self._tried(name, tolerance)

@@ -1,6 +1,6 @@
-"""The cheapest way to an error: all ways are run, the best one's tolerance is moved until its error is the one asked.
+"""The cheapest way to an error: all ways are run, the best one's setting is moved until its error is the one asked.
 
-    estimate = |p(T) - q(T)| / |q(T) - p(0)|,    q the same motion to a much closer tolerance
+    estimate = |p(T) - q(T)| / |q(T) - p(0)|,    q the same motion to a much smaller error
 
 in Frobenius norms over the vertices that are not pinned, as errors are told everywhere. How the cost of a way grows
 with its error is known from its order: a step is in proportion to error^(1/order).
@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import inf
+from math import inf, sqrt
+from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,38 +24,49 @@ from harness.simulation.controlled import Path, Stuck, TooSlow
 from solvers.problem import Positions
 
 AIM = 0.6
-"""Of the error asked, what a tolerance is chosen for: estimates scatter."""
+"""Of the error asked, what a setting is chosen for: estimates scatter."""
 WIDE = 1 / 3
 """An error below this part of the one asked was bought for too much, if a cheaper way is stable."""
 CLOSER = 1 / 50
-"""Of a tolerance, that of the motion that errors are estimated by."""
+"""Of a step's error, that of the motion that errors are estimated by."""
 DOUBT = 1.25
 """What an estimate is multiplied by: the closer motion errs too, by a tenth of it, and by a sixth where stability rules
 the steps and its own are hardly shorter."""
 _FINER = 10.0
 """Times as exact, by the order and the number of steps, at which a motion counts as closer."""
 _MOVES, _CLOSINGS = 6, 3
-_PATIENCE = 4.0
-"""Times the fastest so far, what a way may take."""
+_AT_FIRST, _PATIENCE = 1.0, 4.0
+"""Seconds that a way may take, so many times as many if none ends within them; and times the fastest so far."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """A way, its tolerance [m], the path that it gave, and its estimated relative error."""
+    """A way, its setting (`Follower`), the path that it gave, and its estimated relative error."""
 
     way: Way
-    tolerance: float
+    setting: float
     path: Path
     estimated: float
+
+    @property
+    def tolerance(self) -> float | None:
+        """Of the error of a step [m]; None where steps have one length."""
+        return None if self.way.follower.even else self.setting
+
+    def again(self) -> Path:
+        """The same once more."""
+        return self.way.follower.follow(self.setting)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """best: what keeps to the error; others: the other ways at the first tolerance; closer: by which errors were
-    estimated; seconds: wall time of all that was simulated besides; note: why it is far more exact than was asked."""
+    """best: what keeps to the error; others: the other ways at their first settings, which the tolerance [m] gave;
+    closer: by which errors were estimated; seconds: wall time of all that was done besides; note: why it is far more
+    exact than was asked."""
 
     best: Found
     others: tuple[Found, ...]
+    tolerance: float
     closer: Found
     seconds: float
     note: str
@@ -101,55 +113,71 @@ class _Search:
     def __init__(self, asked: Asked, error: float, seen: Growth, say: Callable[[str], None]) -> None:
         self._asked, self._error, self._seen, self._say = asked, error, seen, say
         self._free = asked.bound(asked.frame, "own").system.free
-        self._seconds = 0.0
 
     def answer(self, pairs: Sequence[tuple[str, SolverSpec]]) -> Answer:
         self._say("ways to the error:")
         tolerance = 0.2 * self._error * self._seen.scale
-        raced = self._race(ways(self._asked, self._say, pairs), tolerance)
+        known = ways(self._asked, self._say, pairs)
+        began = perf_counter()
+        raced = self._race(known, tolerance)
         closer = self._closer(raced)
         graded = sorted((self._graded(one, closer) for one in raced), key=self._promise)
         for one in graded:
             self._say(f"  {one.way}: {one.path.seconds:.3g} s, an error of {one.estimated:.1e}")
-        best, closer, note = self._moved(graded[0], closer)
-        return Answer(best, tuple(graded[1:]), closer, self._seconds - best.path.seconds, note)
+        best, note = self._moved(graded[0], closer)
+        besides = perf_counter() - began - best.path.seconds
+        return Answer(best, tuple(graded[1:]), tolerance, closer, besides, note)
 
-    def _run(self, way: Way, tolerance: float, limit: float = inf) -> Found:
-        path = way.follower.follow(tolerance, limit=limit)
-        self._seconds += path.seconds
-        return Found(way, tolerance, path, inf)
+    @staticmethod
+    def _run(way: Way, setting: float, limit: float = inf) -> Found:
+        return Found(way, setting, way.follower.follow(setting, limit=limit), inf)
 
     def _race(self, ways: list[Way], tolerance: float) -> list[Found]:
         """Those that end, none of which takes much longer than the fastest."""
-        found, stuck, limit = list[Found](), list[Stuck](), inf
-        for way in ways:
-            try:
-                found.append(self._run(way, tolerance, limit))
-                limit = max(1.0, _PATIENCE * min(one.path.seconds for one in found))
-            except Stuck as error:
-                stuck.append(error)
-            except TooSlow:
-                self._say(f"  {way}: given up after {limit:.3g} s, for it is slower than others")
+        found, stuck, limit = list[Found](), list[Stuck](), _AT_FIRST
+        while ways and not found:
+            late = list[tuple[Way, float]]()
+            for way in ways:
+                try:
+                    found.append(self._run(way, way.follower.first(tolerance), limit))
+                    limit = max(_AT_FIRST, _PATIENCE * min(one.path.seconds for one in found))
+                except Stuck as error:
+                    stuck.append(error)
+                except TooSlow:
+                    late.append((way, limit))
+            ways, limit = [way for way, _ in late], _PATIENCE * limit
+            for way, given in late if found else ():
+                self._say(f"  {way}: given up after {given:.3g} s, for it is slower than others")
         if not found:
             raise stuck[0]
         return found
 
     def _closer(self, raced: list[Found]) -> Found:
-        """The same motion to a closer tolerance, by what is the cheapest there."""
-        best = min(raced, key=lambda one: one.path.seconds * CLOSER ** (-1.0 / one.way.follower.order))
-        found = best
+        """The same motion with a much smaller error, by what is the cheapest there and keeps to an error, if any does:
+        by so much smaller a one that it can tell the error asked."""
+        best = min(raced, key=lambda one: (one.way.follower.even, self._cost(one, CLOSER)))
+        follower, found = best.way.follower, best
+        part = CLOSER ** (follower.order / (follower.order + 1.0))
         for _ in range(_CLOSINGS):  # where frames or stability rule the steps, a closer tolerance may change nothing
-            found = self._run(best.way, CLOSER * found.tolerance)
-            if (found.path.accepted / best.path.accepted) ** best.way.follower.order >= _FINER:
+            found = self._run(best.way, follower.changed(found.setting, part))
+            if (found.path.accepted / best.path.accepted) ** follower.order >= _FINER:
                 break
+        begun = self._graded(best, found)
+        if AIM * self._error < begun.estimated < inf:
+            found = self._run(best.way, follower.changed(found.setting, AIM * self._error / begun.estimated))
         return found
+
+    @staticmethod
+    def _cost(one: Found, part: float) -> float:
+        """Seconds with a part of the error of a step."""
+        return one.path.seconds * part ** (-1.0 / one.way.follower.order)
 
     def _graded(self, one: Found, closer: Found) -> Found:
         p, q = one.path.positions, closer.path.positions
         moved = self._apart(q[-1], q[0])
-        least = closer.tolerance / self._seen.scale
+        least = (closer.tolerance or 0.0) / self._seen.scale
         estimated = max(DOUBT * self._apart(p[-1], q[-1]) / moved, least) if moved else inf
-        return Found(one.way, one.tolerance, one.path, estimated)
+        return Found(one.way, one.setting, one.path, estimated if estimated < inf else inf)
 
     def _apart(self, p: Positions, q: Positions) -> float:
         return float(np.linalg.norm((p - q)[self._free]))
@@ -157,36 +185,42 @@ class _Search:
     def _promise(self, one: Found) -> float:
         """The seconds that a way would take to the error asked; where it is more exact than that, those that it took,
         for explicit steps may be as long as is stable already."""
-        return one.path.seconds * max(1.0, one.estimated / (AIM * self._error)) ** (1.0 / one.way.follower.order)
+        return self._cost(one, min(1.0, AIM * self._error / one.estimated)) if one.estimated < inf else inf
 
-    def _moved(self, one: Found, closer: Found) -> tuple[Found, Found, str]:
-        """The way at the tolerance that gives the error asked."""
-        best, closings = None if one.estimated > self._error else one, 0
+    def _moved(self, one: Found, closer: Found) -> tuple[Found, str]:
+        """The way at the setting that gives the error asked, and why it is far more exact, if it is."""
+        best, above = None if one.estimated > self._error else one, None
         for _ in range(_MOVES):
             if best and best.estimated >= WIDE * self._error:
-                return best, closer, ""
-            order = one.way.follower.order
-            ratio = AIM * self._error / max(one.estimated, 1e-3 * AIM * self._error)
-            factor = min(100.0, max(1e-3, ratio ** ((order + 1.0) / order)))
-            following = self._run(one.way, one.tolerance * factor)
-            if following.tolerance * CLOSER < 0.5 * closer.tolerance and closings < _CLOSINGS:
-                closer, closings = self._run(closer.way, CLOSER * following.tolerance), closings + 1
-            before, one = one, self._graded(following, closer)
-            if best and (one.estimated > self._error or one.path.seconds > 0.9 * best.path.seconds):
-                return best, closer, _STABLE
-            if one.estimated <= self._error:
+                return best, ""
+            setting = self._next(one, best, above)
+            if setting == one.setting:
+                return one, _STABLE
+            before, one = one, self._graded(self._run(one.way, setting), closer)
+            if one.estimated > self._error:
+                if best is None and one.estimated > 0.5 * before.estimated and setting < 0.1 * before.setting:
+                    raise self._nothing(min(one, before, key=lambda x: x.estimated))
+                above = one
+            elif best and one.path.seconds > 0.9 * best.path.seconds:
+                return best, _STABLE
+            else:
                 best = one
-            elif best is None and one.estimated > 0.5 * before.estimated and factor < 0.1:
-                raise self._nothing(min(one, before, key=lambda x: x.estimated))
         if best is None:
             raise self._nothing(one)
-        return best, closer, ""
+        return best, _STABLE if best.estimated < WIDE * self._error else ""
+
+    def _next(self, one: Found, best: Found | None, above: Found | None) -> float:
+        """The setting to try after one that errs too much or too little: between both where they are known."""
+        if best and above:
+            return sqrt(best.setting * above.setting)
+        ratio = AIM * self._error / max(one.estimated, 1e-3 * AIM * self._error)
+        return one.way.follower.changed(one.setting, min(30.0, max(1e-3, ratio)))
 
     def _nothing(self, nearest: Found) -> RunFailed:
+        at = f" at {nearest.tolerance:.1e} m a step" if nearest.tolerance else f" with {nearest.path.accepted} steps"
         return RunFailed(
-            f"no tolerance keeps to an error of {self._error:g}: {nearest.way} reached {nearest.estimated:.1g} at "
-            f"{nearest.tolerance:.1e} m a step, and closer tolerances do not come nearer; ask for a larger --error or "
-            "a shorter --horizon"
+            f"no steps keep to an error of {self._error:g}: {nearest.way} reached {nearest.estimated:.1g}{at}, and "
+            "shorter ones do not come nearer; ask for a larger --error or a shorter --horizon"
         )
 
 

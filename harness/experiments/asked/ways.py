@@ -13,7 +13,7 @@ from harness.reference.frozen import bind
 from harness.scenes.bind import Scene
 from harness.scenes.spec import SceneSpec
 from harness.simulation.controlled import Follower, Implicit
-from harness.simulation.own_steps import Own
+from harness.simulation.own_steps import Own, OwnEven
 from solvers.contact.touching import without_contact
 from solvers.integrators import INTEGRATORS, RungeKutta
 from solvers.problem import NotPositiveDefinite, Unsupported
@@ -82,12 +82,13 @@ class Way:
 
 
 def tried() -> list[tuple[str, SolverSpec]]:
-    """Integrators and solvers by name: those that choose their own steps, and those that minimise what the integrator
+    """Integrators and solvers by name: those with steps of their own, and those that minimise what the integrator
     with an error states that has the highest order, and the highest of its stages."""
     pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded}
     best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].starts))
     told = {name: about(load(target), name) for name, target in SOLVERS.items()}
-    return [("own" if one.own_steps else best, SolverSpec(name, {})) for name, one in told.items() if one.to_error]
+    found = [("own" if one.own_steps else best, SolverSpec(name, {})) for name, one in told.items() if one.to_error]
+    return sorted(found, key=lambda pair: pair[0] != "own")
 
 
 def tried_by(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
@@ -120,10 +121,12 @@ def ways(asked: Asked, say: Callable[[str], None], pairs: Sequence[tuple[str, So
 def _follower(asked: Asked, integrator: str, solver: SolverSpec, frames: int | None = None) -> Follower:
     made, frames = load(EVERY[solver.name])(**solver.parameters), frames or asked.frames
     if integrator == "own":
-        return Own(asked.bound(asked.frame, integrator), made, frames)
+        own = OwnEven if about(load(EVERY[solver.name]), solver.name).even else Own
+        return own(asked.bound(asked.frame, integrator), made, frames)
     return Implicit(lambda h: asked.bound(h, integrator), made, asked.frame * frames, frames)
 
 
 def _warm(asked: Asked, integrator: str, solver: SolverSpec) -> None:
     size = asked.bound(asked.frame, "own").mesh.size or 1.0
-    _follower(asked, integrator, solver, 1).follow(_ONCE * size)
+    once = _follower(asked, integrator, solver, 1)
+    once.follow(once.first(_ONCE * size))
