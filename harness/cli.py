@@ -292,6 +292,9 @@ def _check_positions(path: Path | None) -> None:
 def main() -> None:
     """The console script."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for some in every installed package
+    # Typer makes a parser of every command that it knows, a tenth of what it takes to list.
+    asked = [c for c in app.registered_commands if c.callback and (c.name or c.callback.__name__) in sys.argv[1:2]]
+    app.registered_commands = asked or app.registered_commands
     app()
 
 

@@ -24,6 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 """The folder of the project's packages."""
 
 PACKAGES = ("solvers", "harness")
+_STARTS = tuple(f"{ROOT / package}{os.sep}" for package in PACKAGES)
 
 COMPILED = (".c", ".cc", ".cpp", ".cu", ".cuh", ".f90", ".h", ".hpp")
 """Names of sources that a Python source of the same name compiles end so."""
@@ -81,6 +82,14 @@ def reached(source: str) -> frozenset[str]:
     return frozenset(found)
 
 
+def everything(package: str) -> str:
+    """SHA-256, in hexadecimal digits, of all sources of one of PACKAGES, whatever imports them."""
+    start, told = f"{ROOT / package}{os.sep}", hashlib.sha256()
+    for path in sorted(path for path in _FIRST if path.startswith(start)):
+        told.update(f"{_name(path)}\0".encode() + _content(path))
+    return told.hexdigest()
+
+
 def of_class(made: type) -> set[Path]:
     """The files that a class is written in, wherever they lie, and those of what it inherits, libraries apart."""
     own = {getattr(sys.modules.get(made.__module__), "__file__", None)}
@@ -110,7 +119,7 @@ def _name(path: str) -> str:
 
 
 def _own(path: str) -> bool:
-    return any(path.startswith(f"{ROOT / package}{os.sep}") for package in PACKAGES)
+    return path.startswith(_STARTS)
 
 
 def _content(path: str) -> bytes:

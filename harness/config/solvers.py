@@ -1,14 +1,17 @@
 """The solvers of a config, with all of their parameters; they are the fields of a solver's dataclass.
 
 A solver brings Numba and its kernels along, most of what `springbench list` would take. So what a shipped one said of
-its parameters is kept in the user's cache, by the digest of all sources that it depends on: a change of any asks anew.
+its parameters is kept in the user's cache, by the digest of all sources of solvers: a change of any asks anew, and
+checkouts of other sources keep theirs beside it.
 """
 
 from __future__ import annotations
 
 import json
+import time
 from contextlib import suppress
 from dataclasses import MISSING, fields
+from functools import cache
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -20,8 +23,11 @@ from harness.base.model import Model
 from harness.config.own import chosen, opened
 from harness.config.sweep import SolverSpec
 from solvers import sources
-from solvers.plugins import Plugin, load, source_of
+from solvers.plugins import Plugin, load
 from solvers.registry import EVERY
+
+_KEPT_FOR = 30 * 86400.0
+"""Seconds."""
 
 
 def solvers_of(document: Document) -> list[SolverSpec]:
@@ -72,10 +78,14 @@ def parameters_model(name: str, solver: type) -> type[Model]:
     return create_model(name, __base__=Model, __doc__=solver.__doc__, **given)
 
 
-def _kept_file(name: str) -> Path | None:
+def _kept_file(name: str) -> Path:
     """Where the parameters of a shipped solver that a config names alone are kept."""
-    source = source_of(EVERY[name].partition(":")[0])
-    return users_cache("parameters") / f"{name}-{sources.digest([source])[:16]}.json" if source else None
+    return users_cache("parameters") / f"{name}-{_of_sources()[:16]}.json"
+
+
+@cache
+def _of_sources() -> str:
+    return sources.everything("solvers")
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -87,10 +97,11 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def _keep(path: Path, parameters: dict[str, Any]) -> None:
-    """Keep parameters in the place of those by other sources, where there is a place."""
+    """Keep parameters where there is a place; what was kept long ago goes, and is asked anew if somebody wants it."""
     with suppress(OSError, CannotWrite):
         path.parent.mkdir(parents=True, exist_ok=True)
-        for older in path.parent.glob(path.stem[:-16] + "?" * 16 + ".json"):
-            older.unlink(missing_ok=True)
+        for older in path.parent.glob("*.json"):
+            if time.time() - older.stat().st_mtime > _KEPT_FOR:
+                older.unlink(missing_ok=True)
         with replacing(path) as partial:
             partial.write_text(json.dumps(parameters))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
@@ -12,13 +13,14 @@ import pytest
 from typer.testing import CliRunner
 
 from harness.cli import app
+from harness.config import solvers
 from harness.config.load import load_any
 from harness.experiments import run as run_module
 from harness.experiments.code import code, files, parts
 from harness.experiments.plan import Files
 from solvers import sources
 from solvers.registry import OPTIONAL, SOLVERS, load
-from tests.own_solvers import OPTIONS, Own, own
+from tests.own_solvers import OPTIONS, SCENE, Own, own
 
 
 @pytest.fixture
@@ -110,6 +112,24 @@ def test_pictures_are_drawn_later_without_a_run_done_again(tmp_path: Path, monke
     assert "2 of 2 runs are there already" in told
     assert started(made) == before
     assert len([*(tmp_path / "r" / "sweep" / "pictures").glob("scene-4-*-????????????.png")]) == 2
+
+
+def test_parameters_by_other_sources_are_kept_beside_each_other_for_a_while(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    (tmp_path / "sweep.yaml").write_text("scenes: [scene.yaml]\nsolvers: [sparse]\n")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for checkout in "ab":
+        monkeypatch.setattr(solvers, "_of_sources", lambda checkout=checkout: 16 * checkout)
+        load_any(tmp_path / "sweep.yaml", opens=False)
+    kept = {path.stem: path for path in (tmp_path / "springbench" / "parameters").iterdir()}
+    assert set(kept) == {f"sparse-{16 * checkout}" for checkout in "ab"}
+
+    os.utime(kept.pop(f"sparse-{16 * 'a'}"), (0, 0))
+    monkeypatch.setattr(solvers, "_of_sources", lambda: 16 * "c")
+    load_any(tmp_path / "sweep.yaml", opens=False)
+    assert {path.stem[-1] for path in (tmp_path / "springbench" / "parameters").iterdir()} == {"b", "c"}
 
 
 def test_the_file_of_a_class_is_known_however_its_module_was_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
