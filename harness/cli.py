@@ -7,11 +7,10 @@ Exit codes: 0 all is well, 1 a run failed or a gate found a regression, 2 the us
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -29,6 +28,12 @@ from harness.experiments.gallery import gallery
 from harness.experiments.gates.command import gate
 from harness.experiments.gates.history_command import history
 from harness.experiments.gates.study_command import study
+from harness.experiments.speed.command import speed
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from harness.config.load import Sweep
 
 app = typer.Typer(
     cls=Commands,
@@ -71,79 +76,43 @@ def run(
     from harness.base.claim import claimed
     from harness.base.progress import display
     from harness.config.load import load_any
+    from harness.experiments.sweep import run_sweep
+
+    _check_positions(positions)
+    of_error = {"horizon": horizon, "check": check, "peers": peers}
+    if error is not None:
+        from harness.experiments.asked.command import run_to_error
+
+        others = {"solver": solver, "on": on, "workers": workers, **given.obj}
+        wanted: dict[str, Any] = {"sizes": size or (), "positions": positions, "others": others}
+        raise typer.Exit(0 if run_to_error(config, error, results, _say, **of_error, **wanted) else 1)
+    if unfit := next((key for key, value in of_error.items() if value), None):
+        raise InputError(Mistake("is of a run with --error; leave it out", key=f"--{unfit}"))
+    sweep = load_any(config, solvers=solver or (), sizes=size or (), **given.obj)
+    folder = claimed(results / sweep.name, config)
+    how: dict[str, Any] = {"again": again, "changed": changed, "positions": positions, "isolated": not here}
+    table = run_sweep(sweep.name, sweep.runs(), folder, display(err()), _say, at_once=workers, on=on, **how)
+    raise typer.Exit(1 if _told(sweep, table, config, results, folder) else 0)
+
+
+def _told(sweep: Sweep, table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
+    """What the rows of a sweep say, and the reports on them; returns a line for each run that failed."""
     from harness.experiments.plan import of_other_code
-    from harness.experiments.sweep import failures, run_sweep
+    from harness.experiments.sweep import failures
     from harness.report.learned import closing
     from harness.report.named import draw_reports
     from harness.report.site import keep
     from harness.report.timing_table import summary_table
 
-    _check_positions(positions)
-    if error is not None:
-        from harness.experiments.asked.command import run_to_error
-
-        others = {"solver": solver, "on": on, "workers": workers, **given.obj}
-        wanted: dict[str, Any] = {"horizon": horizon, "sizes": size or (), "check": check, "beside": peers}
-        wanted |= {"positions": positions, "others": others}
-        raise typer.Exit(0 if run_to_error(config, error, results, _say, **wanted) else 1)
-    for key, value in {"--horizon": horizon, "--check": check, "--peers": peers}.items():
-        if value:
-            raise InputError(Mistake("is of a run with --error; leave it out", key=key))
-    sweep = load_any(config, solvers=solver or (), sizes=size or (), **given.obj)
-    folder = claimed(results / sweep.name, config)
-    runs = sweep.runs()
-    how: dict[str, Any] = {"again": again, "changed": changed, "positions": positions, "isolated": not here}
-    how |= {"at_once": workers, "on": on}
-    table = run_sweep(sweep.name, runs, folder, display(err()), _say, **how)
-    out().print(summary_table(table, of_other_code(runs, table)))
+    out().print(summary_table(table, of_other_code(sweep.runs(), table)))
     _say(f"rows, recordings and pictures are in {folder}")
     for path in draw_reports(sweep.reports, table, folder):
         _say(f"reported in {path}")
     keep(results, folder, _say, quiet=True)
     failed = failures(table)
-    for line in failed:
+    for line in (*failed, *closing(table, config, results, folder)):
         _say(line)
-    for line in closing(table, config, results, folder):
-        _say(line)
-    raise typer.Exit(1 if failed else 0)
-
-
-@app.command()
-def speed(
-    config: Config,
-    results: Results = Path("results"),
-    budget: Annotated[float, typer.Option(help="Seconds that a candidate may take at a size.")] = 210.0,
-    again: Again = False,
-    changed: Changed = False,
-    here: InThisProcess = False,
-) -> None:
-    """Time a sweep's solvers in turns, beside a yardstick in C++ and the machine's own limits."""
-    from harness.base.claim import claimed
-    from harness.base.progress import display
-    from harness.config.load import load_sweep, require_stated
-    from harness.config.options import AUTO
-    from harness.experiments.speed.comparison import run_speed
-    from harness.report.site import keep
-    from harness.report.speed.figures import figures
-    from harness.report.speed.pictures import draw
-    from harness.report.speed.table import remarks, speed_table
-
-    if not 0.0 < budget < math.inf:
-        raise InputError(Mistake(f"came {budget:g}; wanted a number of seconds above 0", key="--budget"))
-    sweep = load_sweep(config)
-    require_stated(sweep.runs())
-    if any(run.tolerance == AUTO for run in sweep.runs()):
-        raise InputError(Mistake("needs the steps before; give a number, or null", config, key="tolerance"))
-    folder = claimed(results / sweep.name, config)
-    how = {"again": again, "changed": changed, "isolated": not here}
-    found = figures(run_speed(sweep, folder, display(err()), _say, budget=budget, **how))
-    out().print(speed_table(found))
-    for line in remarks(found):
-        _say(line)
-    draw(found, folder / "pictures")
-    _say(f"rows and pictures are in {folder}")
-    keep(results, folder, _say)
-    raise typer.Exit(1 if any(f.status in ("failed", "diverged") for f in found) else 0)
+    return failed
 
 
 @app.command()
@@ -195,6 +164,7 @@ def report(
 
 
 app.command(cls=taking("frames", "iterations", "tolerance", "rounds"))(ablate)
+app.command()(speed)
 app.command()(recommend)
 app.command()(goals)
 app.command()(compact)

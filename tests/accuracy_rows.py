@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.base.stated import stated
-from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.report.accuracy.paper import FIGURE_2, FIGURE_3, ITERATIONS
 
 # The gap falls by `rate` an iteration (Newton: squares); an iteration takes `cost` and preparing `setup` seconds a

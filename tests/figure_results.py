@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from harness.base import rows as base_rows
 from harness.base.columns import SCHEMA
-from harness.experiments.ablation.rows import SCHEMA as ABLATION
+from harness.experiments.ablation.ablation_rows import SCHEMA as ABLATION
 from tests import accuracy_rows as made
 from tests import gate_results
 from tests.recordings import info, record

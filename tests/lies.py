@@ -12,8 +12,8 @@ import pytest
 
 from harness.scenes.bind import build
 from harness.scenes.effects.base import Contribution, Pin, Steady
-from harness.scenes.effects.table import EFFECTS
-from harness.scenes.mesh.table import MESHES
+from harness.scenes.effects.effect_names import EFFECTS
+from harness.scenes.mesh.mesh_names import MESHES
 from harness.scenes.spec import SceneSpec
 from harness.simulation.opinion.second import second_opinion
 from solvers.contact.energy import Contact

@@ -20,8 +20,8 @@ from harness.config.solvers import solvers_of
 from harness.config.sweep import Options, RunSpec, SweepFields
 from harness.scenes.assignment import FORCE, PIN_WEIGHT, TIME_STEP, read_assignment
 from harness.scenes.bind import build
-from harness.scenes.effects import table as effect_table
-from harness.scenes.mesh import table as mesh_table
+from harness.scenes.effects import effect_names
+from harness.scenes.mesh import mesh_names
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import NAME, SceneFile, SceneSpec
@@ -112,7 +112,7 @@ def scene_from_assignment(path: Path) -> SceneSpec:
         mesh_digest=_digest(mesh),
         time_step=TIME_STEP,
         frames=ASSIGNMENT_FRAMES,
-        effects=tuple(load(effect_table.EFFECTS[effect["kind"]])(**effect) for effect in effects),
+        effects=tuple(load(effect_names.EFFECTS[effect["kind"]])(**effect) for effect in effects),
         first_guess="assignment",
         path=path,
     )
@@ -156,7 +156,7 @@ def _digest(source: Any) -> str:
     return digest.hexdigest()
 
 
-_PARTS = {"mesh": (mesh_table.EVERY, UnopenedMesh), "effect": (effect_table.EVERY, UnopenedEffect)}
+_PARTS = {"mesh": (mesh_names.EVERY, UnopenedMesh), "effect": (effect_names.EVERY, UnopenedEffect)}
 
 
 def _part(document: Document, what: str, data: Any, at: Key, own: dict[str, tuple[Plugin, dict[str, Any]]]) -> Any:

@@ -13,8 +13,8 @@ from harness.config.accuracy import AccuracyFields
 from harness.config.goals import GoalsFields
 from harness.config.solvers import parameters_model
 from harness.config.sweep import SweepFields
-from harness.scenes.effects.table import EFFECTS
-from harness.scenes.mesh.table import MESHES
+from harness.scenes.effects.effect_names import EFFECTS
+from harness.scenes.mesh.mesh_names import MESHES
 from harness.scenes.spec import SceneFile
 from solvers.plugins import PATTERN
 from solvers.registry import OPTIONAL, SOLVERS, load

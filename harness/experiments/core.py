@@ -20,8 +20,8 @@ from harness.base.holding import TAKEN, Claims
 from harness.base.machine_lock import alone
 from harness.base.progress import Display, Run
 from harness.base.workers import Limits, Lost, Tick
-from harness.scenes.effects.table import EFFECTS
-from harness.scenes.mesh.table import MESHES
+from harness.scenes.effects.effect_names import EFFECTS
+from harness.scenes.mesh.mesh_names import MESHES
 from solvers.registry import SOLVERS
 
 TABLES = (SOLVERS, EFFECTS, MESHES)

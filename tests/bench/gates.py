@@ -16,8 +16,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from harness.experiments.gates.abba import Clock
 from harness.experiments.gates.sequential import ALPHA
-from harness.experiments.gates.turns import Clock
 from harness.record.base import RecordingInfo
 from harness.record.rerun import RerunRecorder
 from harness.scenes.bind import Scene, build

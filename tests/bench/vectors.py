@@ -22,8 +22,8 @@ from numba import njit  # noqa: TID251
 from scipy.sparse import csr_array
 
 from harness.base.machine import describe, pinned_threads
+from harness.experiments.gates.abba import CALL, Turn, orders
 from harness.experiments.gates.sequential import interval
-from harness.experiments.gates.turns import CALL, Turn, orders
 from harness.simulation.step import problem, start
 from solvers.kernels import accelerate, accelerate_springs, accelerate_step, springs, vbd
 from solvers.linear import block, block_factor, multigrid_kernels, supernodal, supernodal_solve

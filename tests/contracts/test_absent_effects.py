@@ -13,7 +13,7 @@ import pytest
 
 from harness.config.load import load_scene
 from harness.scenes.bind import build
-from harness.scenes.effects.table import EFFECTS
+from harness.scenes.effects.effect_names import EFFECTS
 from solvers.matrices import assemble
 from tests.effects import BEND, DASHPOTS, DRAG, LIMITS, cloth
 
@@ -49,7 +49,7 @@ class Hidden:
 sys.meta_path.insert(0, Hidden())
 import harness
 if {load}:
-    from harness.scenes.effects.table import EFFECTS
+    from harness.scenes.effects.effect_names import EFFECTS
     from solvers.registry import load
     for target in EFFECTS.values():
         load(target)

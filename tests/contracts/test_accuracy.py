@@ -15,7 +15,7 @@ from harness.base import rows
 from harness.base.progress import Display
 from harness.cli import main
 from harness.config.accuracy_load import load_accuracy
-from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.accuracy.studies import run_accuracy
 from harness.record.reader import read_replay
 from harness.reference import store

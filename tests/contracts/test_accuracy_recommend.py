@@ -20,8 +20,8 @@ from harness.cli import main
 from harness.config.load import load_any, load_scene
 from harness.experiments.accuracy import recommend as module
 from harness.experiments.accuracy import work
+from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.accuracy.recommend import Recommendation, recommend
-from harness.experiments.accuracy.rows import SCHEMA
 from harness.experiments.accuracy.units import references, trajectory_of
 from tests.displays import Quiet
 

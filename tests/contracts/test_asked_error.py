@@ -14,7 +14,7 @@ from harness.base import rows
 from harness.base.errors import RunFailed
 from harness.cli import app
 from harness.config.load import load_scene
-from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.asked import ways as module
 from harness.experiments.asked.halving import halved
 from harness.experiments.asked.peers import PEERS, pattern

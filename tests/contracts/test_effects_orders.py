@@ -16,7 +16,7 @@ import pytest
 
 from harness.reference.trajectory import Trajectory, integrate
 from harness.scenes.bind import Scene, build
-from harness.scenes.effects.table import EFFECTS
+from harness.scenes.effects.effect_names import EFFECTS
 from harness.scenes.mesh.chain import Chain
 from harness.scenes.mesh.grid import Grid
 from harness.scenes.mesh.surfaces import Balloon

@@ -27,7 +27,7 @@ from harness.report.style import marks
 from harness.report.timing_plot import draw_timing
 from harness.report.timing_table import summary_table
 from harness.scenes.effects.base import Contribution, Seen, steady
-from harness.scenes.effects.table import EFFECTS
+from harness.scenes.effects.effect_names import EFFECTS
 from harness.scenes.mesh.base import Mesh
 from solvers.about import About, Reference
 from solvers.methods.local_global import SparseLocalGlobal

@@ -12,8 +12,8 @@ from tempfile import TemporaryDirectory
 
 from tests.mutations import runner
 from tests.mutations.base import ROOT, Mutation, Stale
+from tests.mutations.planted import TABLE
 from tests.mutations.runner import Copy, Outcome, examine
-from tests.mutations.table import TABLE
 
 
 def arguments() -> argparse.Namespace:

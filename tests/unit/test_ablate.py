@@ -17,9 +17,9 @@ from harness.base.columns import COLUMNS as RUN_COLUMNS
 from harness.base.columns import Column
 from harness.cli import app
 from harness.config.load import load_any, load_scene
+from harness.experiments.ablation.ablation_rows import COLUMNS
 from harness.experiments.ablation.command import SOLVER
-from harness.experiments.ablation.rows import COLUMNS
-from harness.experiments.ablation.turns import Contender, cost
+from harness.experiments.ablation.side_by_side import Contender, cost
 from harness.experiments.ablation.unit import run_ablation
 from harness.experiments.ablation.variants import Variant, variants
 from harness.report.ablation import read, sentences, verdict

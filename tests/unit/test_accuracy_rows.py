@@ -8,7 +8,7 @@ import pytest
 
 from harness.base import columns, rows
 from harness.base.columns import COLUMNS as RUN_COLUMNS
-from harness.experiments.accuracy.rows import COLUMNS, SCHEMA
+from harness.experiments.accuracy.accuracy_rows import COLUMNS, SCHEMA
 from harness.report.query import answer
 
 README = Path(__file__).resolve().parents[2] / "results" / "README.md"

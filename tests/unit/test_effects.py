@@ -11,11 +11,11 @@ from pydantic import ValidationError
 from harness.base.errors import InputError
 from harness.scenes.effects.base import Contribution
 from harness.scenes.effects.constant_force import ConstantForce
+from harness.scenes.effects.effect_names import EFFECTS
 from harness.scenes.effects.ether_drag import EtherDrag
 from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
-from harness.scenes.effects.table import EFFECTS
 from harness.scenes.effects.wind import Wind
 from harness.scenes.material import spring_stiffness
 from harness.scenes.mesh.chain import Chain

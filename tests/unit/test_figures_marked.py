@@ -17,7 +17,7 @@ from harness.report.figures.canvas import texts
 from harness.report.speed import size_plot
 from harness.report.speed.figures import figures as speed_figures
 from harness.report.speed.pictures import draw
-from harness.report.speed.table import speed_table
+from harness.report.speed.speed_table import speed_table
 from harness.report.style import OLDER, PAGE, marks
 from tests import accuracy_rows
 from tests import figure_results as made

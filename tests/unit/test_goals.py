@@ -12,7 +12,7 @@ from harness.base.errors import InputError
 from harness.cli import app
 from harness.config.goals import load_goals
 from harness.config.load import load_any
-from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.asked.peers import PEERS
 from solvers.registry import EVERY
 

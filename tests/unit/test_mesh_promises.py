@@ -13,9 +13,9 @@ from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
 from harness.scenes.mesh.chain import Chain
 from harness.scenes.mesh.generator import MAX_VERTICES, Generator
 from harness.scenes.mesh.grid import Grid, Net
+from harness.scenes.mesh.mesh_names import MESHES
 from harness.scenes.mesh.solids import Block, Tower
 from harness.scenes.mesh.surfaces import Balloon, Skirt
-from harness.scenes.mesh.table import MESHES
 from solvers import memory
 
 ROUND_OFF = 1e-12

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from tests.mutations.base import ROOT, Mutation, Stale
+from tests.mutations.planted import TABLE
 from tests.mutations.runner import PYTEST, Copy, examine
-from tests.mutations.table import TABLE
 
 
 def test_there_are_sixty_of_them_and_each_has_a_name_of_its_own():

@@ -6,7 +6,7 @@ import pytest
 
 from harness.base import rows
 from harness.base.errors import InputError
-from harness.experiments.ablation.rows import SCHEMA
+from harness.experiments.ablation.ablation_rows import SCHEMA
 from harness.report.query import answer
 
 

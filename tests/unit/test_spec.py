@@ -224,7 +224,7 @@ def test_a_scene_imports_the_effects_that_it_names_and_no_others(folder: Path) -
     done = subprocess.run(
         [sys.executable, "-c", code, str(folder / "cloth.yaml")], capture_output=True, text=True, check=True, cwd=ROOT
     )
-    expected = {"harness.scenes.effects.base", "harness.scenes.effects.table", "harness.scenes.effects.springs"}
+    expected = {"harness.scenes.effects.base", "harness.scenes.effects.effect_names", "harness.scenes.effects.springs"}
     assert set(json.loads(done.stdout)) == expected
 
 

@@ -16,14 +16,14 @@ from harness.base.errors import InputError, RunFailed
 from harness.base.holding import alone
 from harness.config.load import load_any, load_sweep
 from harness.config.sweep import RunSpec, SolverSpec
-from harness.experiments.speed import candidates, limits, turns
+from harness.experiments.speed import candidates, limits, round_robin
 from harness.experiments.speed.candidates import Reading, average
 from harness.experiments.speed.comparison import run_speed
 from harness.experiments.speed.rest import apart, rest_of
-from harness.experiments.speed.turns import PREPARES, Past, measure, name, predicted
+from harness.experiments.speed.round_robin import PREPARES, Past, measure, name, predicted
 from harness.report.speed.counts import count
 from harness.report.speed.figures import figures
-from harness.report.speed.table import remarks, speed_table
+from harness.report.speed.speed_table import remarks, speed_table
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Unsupported
 from tests.displays import Quiet
@@ -110,7 +110,7 @@ def test_one_that_would_take_too_long_is_left_out_with_a_row_that_says_so():
 def test_a_long_preparation_is_not_repeated(monkeypatch: pytest.MonkeyPatch):
     calls: list[str] = []
     slow, quick = Scripted("a", calls), Scripted("b", calls)
-    monkeypatch.setattr(turns, "LONG", 0.7)
+    monkeypatch.setattr(round_robin, "LONG", 0.7)
     monkeypatch.setattr(slow, "prepare", lambda: calls.append("prepare a") or 1.0)
     found, _ = measure([slow, quick], COUNTS, {}, budget=10.0)
     assert [calls.count(f"prepare {name}") for name in "ab"] == [1, PREPARES]

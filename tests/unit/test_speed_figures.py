@@ -10,7 +10,7 @@ import pytest
 from harness.base.columns import SCHEMA
 from harness.report.speed.counts import count
 from harness.report.speed.figures import Figures, Machine, figures
-from harness.report.speed.table import exponents, remarks
+from harness.report.speed.speed_table import exponents, remarks
 
 
 def machine_row(phase: str, seconds: float, *, bytes: float = 0.0, flops: float = 0.0, working_set: float = 0.0):

@@ -11,7 +11,7 @@ from harness.base import machine, rows
 from harness.base.errors import InputError
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.sweep import RunSpec
-from harness.experiments.ablation.rows import SCHEMA
+from harness.experiments.ablation.ablation_rows import SCHEMA
 from harness.experiments.failure import failure
 from harness.experiments.resume import Standing, standings
 

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from harness.experiments.ablation.difference import rest_length
 from harness.scenes.bind import Scene
 from harness.scenes.effects.base import Seen
-from harness.scenes.effects.table import EFFECTS
+from harness.scenes.effects.effect_names import EFFECTS
 from solvers.registry import load
 
 NEAR = 0.5

@@ -13,8 +13,8 @@ from harness.config.load import Sweep
 from harness.config.sweep import RunSpec
 from harness.experiments.ablation.base import OfEffects, Row
 from harness.experiments.ablation.difference import States, difference, rest_length
+from harness.experiments.ablation.side_by_side import Contender, cost, motion, seconds, turns
 from harness.experiments.ablation.suggest import seen, suggestions
-from harness.experiments.ablation.turns import Contender, cost, motion, seconds, turns
 from harness.experiments.ablation.variants import variants
 from harness.experiments.core import do_all
 from harness.experiments.failure import failure

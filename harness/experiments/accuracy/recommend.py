@@ -27,7 +27,7 @@ from harness.config.load import load_scene
 from harness.config.options import OF_STEPS
 from harness.config.solvers import solvers_of
 from harness.config.sweep import SolverSpec
-from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.accuracy.studies import run_accuracy
 from harness.experiments.accuracy.units import references, trajectory_of
 from harness.experiments.accuracy.work import work_rows

@@ -15,7 +15,7 @@ from harness.base import holding, machine, rows
 from harness.base.progress import Display
 from harness.config.accuracy import CurveSpec, WorkSpec
 from harness.config.accuracy_load import Accuracy
-from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.accuracy.units import CurveUnit, Home, StepsUnit, WorkUnit
 from harness.experiments.core import do_all, require_threads
 from harness.experiments.resume import Standing, standings, wanted

@@ -17,8 +17,8 @@ from harness.base.errors import InputError
 from harness.base.stated import stated
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.accuracy import Case, CurveSpec, WorkSpec, moment_name
+from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.accuracy.failures import lost as ended
-from harness.experiments.accuracy.rows import SCHEMA
 from harness.experiments.accuracy.solves import GradedStep, curve_rows
 from harness.experiments.accuracy.work import options, work_rows
 from harness.experiments.provenance import provenance

@@ -13,9 +13,9 @@ from harness.base.claim import claimed
 from harness.base.errors import InputError, Mistake, RunFailed
 from harness.base.stated import stated
 from harness.config.load import load_scene
-from harness.experiments.accuracy.rows import SCHEMA
+from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.accuracy.units import references
-from harness.experiments.asked.peers import peers
+from harness.experiments.asked.peers import peers as peers_of
 from harness.experiments.asked.search import Answer, foresee, search
 from harness.experiments.asked.ways import Asked
 from harness.experiments.provenance import provenance
@@ -38,13 +38,13 @@ def run_to_error(
     horizon: float | None = None,
     sizes: Sequence[int] = (),
     check: bool = False,
-    beside: bool = False,
+    peers: bool = False,
     positions: Path | None = None,
     others: Mapping[str, Any] | None = None,
 ) -> bool:
     """Simulate the scene in a file to a relative error at a horizon [s], and say what it took.
 
-    sizes: of the mesh, one at most; check: whether the reference grades it; beside: whether peers are timed as well;
+    sizes: of the mesh, one at most; check: whether the reference grades it; peers: whether theirs are timed as well;
     positions: where to store those of the frames; others: options that were given besides, which are refused. Returns
     whether what was checked holds. Raises InputError, RunFailed.
     """
@@ -68,7 +68,7 @@ def run_to_error(
     recording = _record(folder / "recordings" / f"{label}.rrd", config.stem, asked, answer)
     row = _row(config.stem, asked, error, answer) | {"error": measured, "recording": f"recordings/{recording.name}"}
     (folder / "accuracy").mkdir(exist_ok=True)
-    found = [row, *(_beside(row, asked, error, answer, say) if beside else ())]
+    found = [row, *(_beside(row, asked, error, answer, say) if peers else ())]
     rows.write(folder / "accuracy" / f"{label}.parquet", [one | {"unit": label} for one in found], SCHEMA)
     if positions:
         save_positions(positions, path.positions[1:])
@@ -139,7 +139,7 @@ def _beside(row: dict[str, Any], asked: Asked, error: float, answer: Answer, say
     shared = {name: row[name] for name in _SHARED} | provenance()
     found = list[dict[str, Any]]()
     say("beside it, on the same machine in the same process, to the same error:")
-    for peer in peers(asked, error, answer):
+    for peer in peers_of(asked, error, answer):
         told = f"{peer.ratio:.3g} times the processor time, an error of {peer.estimated:.1g}"
         say(f"  {peer.name}: {peer.reason or told}")
         became = {"status": "failed", "reason": peer.reason} if peer.reason else {"status": "ok"}

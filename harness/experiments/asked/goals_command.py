@@ -21,7 +21,7 @@ def goals(
     from harness.base import machine, rows
     from harness.base.claim import claimed
     from harness.config.goals import load_goals
-    from harness.experiments.accuracy.rows import SCHEMA
+    from harness.experiments.accuracy.accuracy_rows import SCHEMA
     from harness.experiments.asked.goals import Met, met
     from harness.experiments.asked.peers import PEERS
     from harness.experiments.provenance import provenance

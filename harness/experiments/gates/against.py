@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from harness.base.errors import InputError
+from harness.experiments.gates.abba import CALL, Result, Timed, confirmed
 from harness.experiments.gates.agreement import difference
 from harness.experiments.gates.pair import Held, Side, Worker, changes, workers
 from harness.experiments.gates.sequential import ALPHA, Answer, Rule
-from harness.experiments.gates.turns import CALL, Result, Timed, confirmed
 
 LIMIT = 1.03
 """The ratio of times from which on something counts as slower."""

@@ -78,9 +78,9 @@ def _table(path: Path, budget: float) -> int:
 
 
 def _options(budget: float | None, limit: float | None, clock: str | None) -> Any:
+    from harness.experiments.gates.abba import BUDGET
     from harness.experiments.gates.against import LIMIT, Options
     from harness.experiments.gates.sequential import Rule
-    from harness.experiments.gates.turns import BUDGET
 
     if clock not in (None, "cpu", "wall"):
         raise InputError(f"--clock: came {clock}; wanted cpu or wall")

@@ -21,10 +21,10 @@ from harness.base.machine import pinned_threads
 from harness.base.model import Model
 from harness.base.yaml import read_yaml
 from harness.config.options import Iterations, Tolerance
+from harness.experiments.gates.abba import Clock, Result, Timed, confirmed
 from harness.experiments.gates.agreement import AGREEMENT, difference
 from harness.experiments.gates.scenes import calls_of, pair, timed
 from harness.experiments.gates.sequential import ALPHA, Rule
-from harness.experiments.gates.turns import Clock, Result, Timed, confirmed
 from harness.scenes.spec import Frames, IntegratorName, Size
 from solvers.problem import NotPositiveDefinite, Unsupported
 

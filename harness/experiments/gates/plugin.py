@@ -24,8 +24,8 @@ import pytest
 if TYPE_CHECKING:
     from pytest_benchmark.fixture import BenchmarkFixture
 
+    from harness.experiments.gates.abba import Result
     from harness.experiments.gates.scenes import Given, Work
-    from harness.experiments.gates.turns import Result
 
 UNDECIDED = pytest.StashKey[bool]()
 EXIT_UNDECIDED = 13
@@ -62,10 +62,10 @@ class Race:
         CPU time, or what one waits. budget: seconds, else --race-budget. error: the probability of a wrong answer, .1 %
         if left out. told: goes to the benchmark's JSON as it is. Returns what was found, None where nothing is timed.
         """
+        from harness.experiments.gates.abba import playing
         from harness.experiments.gates.agreement import difference
         from harness.experiments.gates.scenes import calls_of, timed
         from harness.experiments.gates.sequential import ALPHA, Answer, Rule
-        from harness.experiments.gates.turns import playing
 
         rule, benchmark = Rule(limit, error or ALPHA), cast(Any, self._benchmark)
         answer: Any = benchmark.pedantic(candidate) if benchmark.disabled else candidate()

@@ -12,7 +12,7 @@ from typing import Any
 from harness.base.errors import InputError
 from harness.config.load import DEFAULT_SOLVER, load_any, require_stated
 from harness.config.sweep import RunSpec
-from harness.experiments.gates.turns import CALL, Clock, Timed
+from harness.experiments.gates.abba import CALL, Clock, Timed
 from harness.scenes.bind import build
 from harness.simulation.algebraic import stop_rule
 from harness.simulation.step import prepare, simulate

@@ -25,10 +25,10 @@ from scipy.stats import mannwhitneyu
 
 from harness.base import columns, rows
 from harness.base.errors import InputError
+from harness.experiments.gates.abba import orders
 from harness.experiments.gates.against import Options, Request, started
 from harness.experiments.gates.pair import Side
 from harness.experiments.gates.sequential import Answer, Rule
-from harness.experiments.gates.turns import orders
 
 COLUMNS = (
     columns.Column("gate", pa.string(), "", "what takes turns"),

@@ -28,7 +28,7 @@ from harness.experiments.resume import MISSING, Standing, standings, wanted
 from harness.experiments.speed import yardstick
 from harness.experiments.speed.candidates import Candidate, MachineCandidate, SolverCandidate, YardstickCandidate
 from harness.experiments.speed.rest import precision, rest_of
-from harness.experiments.speed.turns import PREPARES, Past, measure, name
+from harness.experiments.speed.round_robin import PREPARES, Past, measure, name
 from harness.report.speed.figures import MACHINE, YARDSTICK
 from harness.scenes.bind import build
 from harness.simulation.step import problem, start

@@ -1,4 +1,4 @@
-"""The rows of an accuracy measurement as problems, curves and simulations (`harness/experiments/accuracy/rows.py`).
+"""The rows of an accuracy measurement as problems, curves and simulations (`harness.experiments.accuracy`).
 
 The gap of an energy g is (g - g*)/(g0 - g*): g0 at the current positions (in the paper's reproduction at the inertial
 target), g* of the lowest minimum that is known. Rows hold energies, so a lower minimum mends all gaps at once.

@@ -12,7 +12,7 @@ from harness.report.site.marks import drawn
 from harness.report.site.runs import MACHINE
 from harness.report.site.script import number
 from harness.report.speed.figures import Figures, figures
-from harness.report.speed.table import remarks
+from harness.report.speed.speed_table import remarks
 from harness.report.style import looks
 
 _LINEAR = {"rangemode": "tozero"}

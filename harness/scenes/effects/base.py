@@ -109,7 +109,7 @@ class Effect(Protocol):
 
     @property
     def kind(self) -> str:
-        """The effect's name in `harness.scenes.effects.table`."""
+        """The effect's name in `harness.scenes.effects.effect_names`."""
         ...
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:

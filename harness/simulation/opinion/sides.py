@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from harness.scenes.bind import Scene
-from harness.scenes.effects.table import EFFECTS
+from harness.scenes.effects.effect_names import EFFECTS
 from harness.scenes.spec import SceneSpec
 from harness.simulation.opinion import contact, edges, forces, self_contact, surface_contact, surfaces, vertices
 from harness.simulation.opinion.declared import Array, Begin, Declared, Opinion

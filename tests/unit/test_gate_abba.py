@@ -7,8 +7,8 @@ from random import Random
 
 import pytest
 
+from harness.experiments.gates.abba import ORDERS, Result, Turn, confirmed, orders, race
 from harness.experiments.gates.sequential import Answer, Interval, Rule
-from harness.experiments.gates.turns import ORDERS, Result, Turn, confirmed, orders, race
 
 RULE = Rule(1.03)
 
