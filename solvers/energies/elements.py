@@ -32,12 +32,22 @@ class Elements(NamedTuple):
         return cls(edges, np.tile([1.0, -1.0], (len(edges), 1)), np.column_stack(numbers))
 
 
+class One(NamedTuple):
+    """phi of one element: `inner` functions of the numbers (m, q), the element e and z0, z1, z2; `rise` has s0, s1, s2
+    too. They return phi, its first derivatives (3), its second (6), and phi(z + s) - phi(z)."""
+
+    value: Any
+    gradient: Any
+    curvature: Any
+    rise: Any
+
+
 class Law(NamedTuple):
     """phi of one element, as passes over all of them.
 
     value(elements, p) [J]; add_gradient(elements, p, out): adds it [N] to `out`, (n, 3); rise(elements, p, q): from p
     to q [J]; curve(elements, p, out): writes the second derivatives, xx, xy, xz, yy, yz, zz of each element [N/m], to
-    `out` (m, 6); constant: whether they do not depend on p.
+    `out` (m, 6); constant: whether they do not depend on p; one: the functions that it is made of.
     """
 
     value: Callable[..., float]
@@ -45,14 +55,11 @@ class Law(NamedTuple):
     rise: Callable[..., float]
     curve: Callable[..., None]
     constant: bool
+    one: One
 
     @classmethod
     def of(cls, value: Any, gradient: Any, curvature: Any, rise: Any, *, constant: bool = False) -> Law:
-        """The passes of `inner` functions.
-
-        They take the numbers (m, q), the element e and z0, z1, z2; `rise` then s0, s1, s2. They return phi, its first
-        derivatives (3), its second (6), and phi(z + s) - phi(z).
-        """
+        """The passes of the functions of `One`."""
 
         @kernel
         def values(elements, p):
@@ -94,7 +101,7 @@ class Law(NamedTuple):
                 xx, xy, xz, yy, yz, zz = curvature(elements.numbers, e, z0, z1, z2)
                 out[e, 0], out[e, 1], out[e, 2], out[e, 3], out[e, 4], out[e, 5] = xx, xy, xz, yy, yz, zz
 
-        return cls(values, add_gradient, rises, curve, constant)
+        return cls(values, add_gradient, rises, curve, constant, One(value, gradient, curvature, rise))
 
 
 @inner

@@ -4,12 +4,14 @@
 
 A vertex's block and gradient are those of its springs and of what presses and grips. What begins to press on the way is
 found by a few repetitions, each from the last one's end. A step that raises the energy gives way to one of a larger
-block, in the end of one that majorises everything.
+block, in the end of one that majorises everything. What else acts on the vertices is told by two functions (see
+`solvers.kernels.stencils`).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,28 +197,37 @@ def _rise(bundles, s, b, lane, i, p, x, d, held, load):
     return total
 
 
-@inner
-def move(bundles, s, b, unknowns, p, right, majorant):
-    """Move the vertices of a bundle to lower energies, one after another: none is joined to another."""
-    for lane in range(LANES):
-        i = bundles.own[LANES * b + lane] // 4
-        if i >= unknowns:
-            continue
-        at, most = RIGHT * b + lane, majorant[LANES * b + lane]
-        h = right[at + 3 * LANES]
-        x = p[4 * i], p[4 * i + 1], p[4 * i + 2]
-        load = right[at] - h * x[0], right[at + LANES] - h * x[1], right[at + 2 * LANES] - h * x[2]
-        gradient, block = _springs(bundles, b, lane, p, x, h, load)
-        for level in range(_EXACT, _EVERYTHING + 1):
-            if level == _MAJORANT:
-                block = most, 0.0, 0.0, most, 0.0, most
-            d, definite, before = (0.0, 0.0, 0.0), True, -1
-            for _ in range(_PASSES):
-                slope, whole, who = _pushed(s, i, x, d, level, gradient, block)
-                if who == before:
+def moving(felt: Any, risen: Any) -> Callable[..., None]:
+    """Moves the vertices of a bundle to lower energies, one after another: none is joined to another.
+
+    felt(beside, i, p, gradient, block) adds what else row i feels, risen(beside, i, p, d) tells its rise by a step d.
+    """
+
+    def move(bundles, s, beside, b, unknowns, p, right, majorant):
+        for lane in range(LANES):
+            i = bundles.own[LANES * b + lane] // 4
+            if i >= unknowns:
+                continue
+            at, most = RIGHT * b + lane, majorant[LANES * b + lane]
+            h = right[at + 3 * LANES]
+            x = p[4 * i], p[4 * i + 1], p[4 * i + 2]
+            load = right[at] - h * x[0], right[at + LANES] - h * x[1], right[at + 2 * LANES] - h * x[2]
+            gradient, block = _springs(bundles, b, lane, p, x, h, load)
+            gradient, block = felt(beside, i, p, gradient, block)
+            for level in range(_EXACT, _EVERYTHING + 1):
+                if level == _MAJORANT:
+                    block = most, 0.0, 0.0, most, 0.0, most
+                d, definite, before = (0.0, 0.0, 0.0), True, -1
+                for _ in range(_PASSES):
+                    slope, whole, who = _pushed(s, i, x, d, level, gradient, block)
+                    if who == before:
+                        break
+                    before = who
+                    d, definite = _solved(whole, slope)
+                if not definite:
+                    continue
+                if _rise(bundles, s, b, lane, i, p, x, d, h, load) + risen(beside, i, p, d) <= 0.0:
+                    p[4 * i], p[4 * i + 1], p[4 * i + 2] = x[0] + d[0], x[1] + d[1], x[2] + d[2]
                     break
-                before = who
-                d, definite = _solved(whole, slope)
-            if definite and _rise(bundles, s, b, lane, i, p, x, d, h, load) <= 0.0:
-                p[4 * i], p[4 * i + 1], p[4 * i + 2] = x[0] + d[0], x[1] + d[1], x[2] + d[2]
-                break
+
+    return move

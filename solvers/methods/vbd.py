@@ -3,10 +3,12 @@
     B_i d_i = -grad_i g(p),   p_i += d_i,   B_i = held_i I + sum over its springs of k (nn' + max(0, 1 - r/l) (I - nn'))
 
 with n the direction and l the length of a spring; compressed springs lose their negative lateral curvature, so B_i is
-positive definite. A quadratic form adds its own entry of the diagonal, and contact its exact second derivatives: it
-acts on single vertices. The paper skips the line search. Here a step that would raise the energy gives way to that of
-the majorant (held_i + sum of k) I, which cannot: so no sweep raises the objective.
-Vertices go by colour: none is joined by a spring or a form to another of its colour.
+positive definite. A quadratic form adds its own entry of the diagonal, contact its exact second derivatives, for it
+acts on single vertices, and a projective energy of elements (strain limits, dashpots) those of its elements that a
+vertex belongs to. The paper skips the line search. Here a step that would raise the energy gives way to that of
+the majorant (held_i + sum of k) I, which cannot: so no sweep raises the objective. What has no such majorant, because
+it is no projective energy, is refused.
+Vertices go by colour: none is joined by a spring, a form or an element to another of its colour.
 
 Sweeps are accelerated by Chebyshev's semi-iteration with the spectral radius rho (Wang 2015),
 
@@ -30,6 +32,7 @@ from solvers.contact.touching import ContactEnergy, touching, without_contact
 from solvers.core import colouring, vertex_terms
 from solvers.core.driver import Iterating, Iterative, largest
 from solvers.core.parts import Parts, split
+from solvers.core.vertex_elements import Beside
 from solvers.kernels import vbd as kernels
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.half_spaces import HalfSpaces
@@ -47,7 +50,7 @@ _FAR = 1e100
 
 @dataclass(frozen=True)
 class VertexBlockDescent:
-    """Vertex block descent over springs, quadratic forms and contact.
+    """Vertex block descent over springs, quadratic forms, elements of projective energies, and contact.
 
     spectral_radius: rho of the acceleration, at least 0 and less than 1; 0 does not accelerate.
     """
@@ -74,12 +77,16 @@ class VertexBlockDescent:
     def prepare(self, system: System) -> PreparedVertexBlockDescent:
         """Raises Unsupported for other energies, NotPositiveDefinite."""
         bare, n = without_contact(system), system.vertices
-        parts = split(bare)
-        unknown = {*parts.unknown, *(type(energy).__name__ for energy in (*parts.limits, *parts.dashpots))}
+        parts, beside = split(bare), Beside.of(system)
+        unknown = {*parts.unknown} - {type(energy).__name__ for energy in beside.energies}
         if unknown:
-            raise Unsupported(f"vbd: knows springs, quadratic forms and contact, not {', '.join(sorted(unknown))}")
+            raise Unsupported(
+                f"vbd: {', '.join(sorted(unknown))} states no elements of a projective energy, and so neither whose "
+                "neighbours its vertices are nor a bound of the second derivatives: a vertex's step needs both, to go "
+                "while its neighbours rest and to fall back on what cannot rise"
+            )
         measure = CompiledLocalGlobal().prepare(system)
-        coloured = colouring.of_vertices(parts.whole.edges, n)
+        coloured = colouring.of_vertices(np.concatenate([parts.whole.edges, beside.pairs()]), n)
         colour = np.empty(n, np.int64)
         colour[coloured.order] = np.repeat(np.arange(coloured.colours), np.diff(coloured.start))
         pinned = system.pins.vertices[system.pins.exact]
@@ -90,12 +97,14 @@ class VertexBlockDescent:
         bundles, _ = Bundles.of(parts.whole, row, colour, coloured.colours, n, n + 1)
         held, majorant = np.zeros(n + 2), np.ones(n + 2)
         held[: len(order)] = majorant[: len(order)] = (vertex_terms.held(system) + parts.held)[order]
+        majorant[: len(order)] += beside.diagonal()[order]
         ends = np.repeat(bundles.own.reshape(-1, LANES), np.diff(bundles.start), axis=0)
         np.add.at(majorant, ends.ravel() // 4, bundles.each()[1])
         shares = Shares.of(bundles, held, row[pinned])
         return PreparedVertexBlockDescent(
             system,
             parts,
+            beside.among(row, n + 2),
             self.spectral_radius,
             kernels.Blocks(bundles, shares, len(order), bundles.in_lanes(majorant)),
             row,
@@ -108,12 +117,14 @@ class VertexBlockDescent:
 
 @dataclass(frozen=True, eq=False)
 class PreparedVertexBlockDescent(Iterative):
-    """parts: of the energies; blocks: of the free vertices; row (n,): where each vertex is in them; held: what
-    inertia and pins hold each row with [N/m]; trace: of the majorant, over vertices that no pin holds [N/m]; measure:
-    one iteration of local-global from p tells the residual at p, and is asked for nothing else."""
+    """parts: of the energies; beside: those of elements; blocks: of the free vertices; row (n,): where each vertex is
+    in them; held: what inertia and pins hold each row with [N/m]; trace: of the majorant, over vertices that no pin
+    holds [N/m]; measure: one iteration of local-global from p tells the residual at p, and is asked for nothing else.
+    """
 
     system: System
     parts: Parts
+    beside: Beside
     spectral_radius: float
     blocks: kernels.Blocks
     row: NDArray[np.int64]
@@ -164,6 +175,7 @@ class PreparedVertexBlockDescent(Iterative):
 class _Iterating(Iterating):
     def __init__(self, prepared: PreparedVertexBlockDescent, problem: StepProblem, guess: Positions) -> None:
         contacts, blocks = touching(problem), prepared.blocks
+        self._beside = prepared.beside.begun(problem)
         self._prepared, self._gauge = prepared, prepared.gauge(problem, contacts)
         pull = vertex_terms.pull(replace(problem, force=prepared.parts.force(problem)))
         p, y = (prepared.in_rows(x) for x in (vertex_terms.placed(guess, problem), pull))
@@ -171,8 +183,8 @@ class _Iterating(Iterating):
         self._spaces = prepared.spaces(contacts) if contacts else None
         p[-4] = _FAR
         entries = int(np.diff(blocks.bundles.start).max(initial=0))
-        scratch = aligned(NUMBERS * LANES * entries)
-        self._work = kernels.Work(p.copy(), p.copy(), np.zeros_like(p), scratch, np.zeros(1), np.full(1, np.nan))
+        scratch = aligned(NUMBERS * LANES * entries), aligned(9 * LANES)
+        self._work = kernels.Work(p.copy(), p.copy(), np.zeros_like(p), *scratch, np.zeros(1), np.full(1, np.nan))
         self._rows, self.positions = p, guess
 
     def advance(self) -> bool:
@@ -193,7 +205,14 @@ class _Iterating(Iterating):
 
     def _sweep(self, iterations: int) -> None:
         made = self._prepared
-        kernels.iterate(
-            made.blocks, self._spaces, self._right, made.spectral_radius, self._work, self._rows, iterations
+        made.beside.kernel(
+            made.blocks,
+            self._spaces,
+            self._beside,
+            self._right,
+            made.spectral_radius,
+            self._work,
+            self._rows,
+            iterations,
         )
         self.positions = self._rows.reshape(-1, 4)[made.row, :3].copy()

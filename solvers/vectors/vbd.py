@@ -107,16 +107,21 @@ def _rise(v: Eights, springs: Bundle, near: Any, load: list[Any], weight: Any, d
     return builder.load(rises)
 
 
+def _given(v: Eights, springs: Bundle, number: Any, x: Any, right: Any) -> tuple[list[Any], list[Any], list[Any], Any]:
+    """The places of a bundle's vertices, where they are, what pulls at them beside springs, and what holds them."""
+    places = v.places(springs.own, number)
+    centre = v.gather(x, places)
+    *constants, weight = v.right(right, number)
+    return places, centre, [v.subtract_product(c, weight, p) for c, p in zip(constants, centre, strict=True)], weight
+
+
 def _bundle(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, majorant: Any, near: Any) -> Any:
     """A bundle's code: moves its vertices in x, and returns whether a spring is too short, when it moves none."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bundles, number, x, right, majorant, near = unpacked(context, builder, signature, args)
         v, springs = Eights(context, builder), Bundle.of(builder, bundles, number)
-        places = v.places(springs.own, number)
-        centre = v.gather(x, places)
-        *constants, weight = v.right(right, number)
-        load = [v.subtract_product(here, weight, p) for here, p in zip(constants, centre, strict=True)]
+        places, centre, load, weight = _given(v, springs, number, x, right)
         force, block, short = _model(v, springs, near, x, centre, load, weight)
         d, definite = _newton(v, block, [builder.fsub(_ZERO, component) for component in force])
         falls = builder.fcmp_ordered("<=", _rise(v, springs, near, load, weight, d), _ZERO)
@@ -132,4 +137,42 @@ def _bundle(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, major
     return types.boolean(bundles, number, x, right, majorant, near), generate
 
 
-descend: Any = intrinsic(_bundle)  # Numba passes the first argument itself, which type checkers do not know
+def _modelled(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, near: Any, sums: Any) -> Any:
+    """A bundle's code: writes minus the gradients (3) and the blocks (6) of its vertices to `sums`, eight numbers each,
+    and returns whether a spring is too short."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        bundles, number, x, right, near, sums = unpacked(context, builder, signature, args)
+        v, springs = Eights(context, builder), Bundle.of(builder, bundles, number)
+        _, centre, load, weight = _given(v, springs, number, x, right)
+        force, block, short = _model(v, springs, near, x, centre, load, weight)
+        for k, value in enumerate([*force, *block]):
+            v.store(value, builder.gep(sums, [I64(LANES * k)]))
+        return short
+
+    return types.boolean(bundles, number, x, right, near, sums), generate
+
+
+def _stepped(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, near: Any, sums: Any) -> Any:
+    """A bundle's code: writes the Newton steps (3) by what `sums` tell behind the gradients there, and behind them by
+    how much those steps raise the energy of all that `_modelled` knew, infinite where a block is not definite."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        bundles, number, x, right, near, sums = unpacked(context, builder, signature, args)
+        v, springs = Eights(context, builder), Bundle.of(builder, bundles, number)
+        _, _, load, weight = _given(v, springs, number, x, right)
+        at = [builder.gep(sums, [I64(LANES * k)]) for k in range(9)]
+        told = [v.load(pointer, WIDE) for pointer in at]
+        d, definite = _newton(v, told[3:], [builder.fsub(_ZERO, component) for component in told[:3]])
+        rise = builder.select(definite, _rise(v, springs, near, load, weight, d), constant(float("inf")))
+        for value, pointer in zip([*d, rise], at[3:7], strict=True):
+            v.store(value, pointer)
+        return context.get_dummy_value()
+
+    return types.void(bundles, number, x, right, near, sums), generate
+
+
+# Numba passes the first argument itself, which type checkers do not know.
+descend: Any = intrinsic(_bundle)
+model: Any = intrinsic(_modelled)
+step: Any = intrinsic(_stepped)

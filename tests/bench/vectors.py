@@ -138,8 +138,8 @@ def of_dots() -> Iterator[Case]:
 
 def of_vbd() -> Iterator[Case]:
     """Over colours."""
-    blocks, spaces, right, _, work, p, _ = given(vbd, "iterate", solving("vbd"))
-    yield Case("sweep", vbd._sweep, (blocks, spaces, right, p, work), {"descend": plain.newton}, (3,))
+    blocks, spaces, beside, right, _, work, p, _ = given(vbd, "iterate", solving("vbd"))
+    yield Case("sweep", vbd._sweep, (blocks, spaces, beside, right, p, work), {"descend": plain.newton}, (4,))
 
 
 def of_supernodal() -> Iterator[Case]:

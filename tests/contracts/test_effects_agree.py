@@ -24,8 +24,7 @@ INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 TAKE_ALL = {"newton", "newton-cg", "hybrid", "lbfgs"}
 PROJECTIVE = {"sparse", "numba", "anderson", "chebyshev"}
 CONTACT = {*PROJECTIVE, *TAKE_ALL, "vbd"}
-BY_BLOCKS = {"bending", "air drag", "attachments", "contact"}
-"""Who takes what: blocks are those of `vbd`; those not named take springs only."""
+"""Who takes what; those not named take springs only."""
 STOP = StopRule(5000, 1e-11)
 NOISE = np.random.default_rng(0)
 
@@ -33,9 +32,7 @@ NOISE = np.random.default_rng(0)
 def takes(solver: str, scene: str) -> bool:
     if "contact" in scene:
         return solver in CONTACT
-    if solver == "vbd":
-        return scene in BY_BLOCKS
-    return solver in TAKE_ALL or (solver in PROJECTIVE and "gas" not in scene)
+    return solver in TAKE_ALL or (solver in {*PROJECTIVE, "vbd"} and "gas" not in scene)
 
 
 @cache

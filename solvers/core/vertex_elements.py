@@ -1,0 +1,98 @@
+"""Energies of elements for methods that go vertex by vertex: whose neighbours they make, and what bounds them.
+
+Where one vertex moves, a projective energy, w_e/2 |(A p)_e - d_e|^2, rises by no more than its gradient and the
+diagonal of A'WA tell: that is its share of the vertex's majorant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers import matrices
+from solvers.energies.elements import Elements, Law
+from solvers.kernels import vbd as plain
+from solvers.problem import LaggedEnergy, ProjectiveEnergy, StepProblem, System
+
+if TYPE_CHECKING:
+    from solvers.kernels.stencils import Around
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """The projective energies of a system that state the law of their elements.
+
+    numbers: which of the system's energies they are; around: their elements by rows, one for each law, once they are
+    known.
+    """
+
+    system: System
+    numbers: tuple[int, ...] = ()
+    around: tuple[Around, ...] = field(default=())
+
+    @classmethod
+    def of(cls, system: System) -> Beside:
+        """Those of a system."""
+        known = (k for k, e in enumerate(system.energies) if hasattr(e, "law") and isinstance(e, ProjectiveEnergy))
+        return cls(system, tuple(known))
+
+    @property
+    def energies(self) -> list[Any]:
+        """The energies."""
+        return [self.system.energies[k] for k in self.numbers]
+
+    def pairs(self) -> NDArray[np.int64]:
+        """Every two vertices of an element, (., 2)."""
+        found = [np.empty((0, 2), np.int64)]
+        for energy in self.energies:
+            vertices = energy.elements.vertices
+            found += [vertices[:, [i, j]] for i, j in zip(*np.triu_indices(vertices.shape[1], 1), strict=True)]
+        return np.concatenate(found)
+
+    def diagonal(self) -> NDArray[np.float64]:
+        """The diagonal of A'WA (n,) [N/m], whatever the step."""
+        total = np.zeros(self.system.vertices)
+        for share in matrices.shares(self.system, self.energies):
+            total += share.diagonal()
+        return total
+
+    def among(self, row: NDArray[np.int64], rows: int) -> Beside:
+        """The same, with its vertices in rows `row` (n,), of so many."""
+        if not self.numbers:
+            return self
+        from solvers.kernels.stencils import Around  # for those who need it
+
+        return replace(self, around=tuple(Around.of(one, row, rows) for one in self._joined(self.energies)))
+
+    def begun(self, problem: StepProblem) -> tuple[Around, ...] | None:
+        """The elements by rows as they are in a step, None without any."""
+        if not any(isinstance(energy, LaggedEnergy) for energy in self.energies):
+            return self.around or None
+        joined = self._joined([problem.energies[k] for k in self.numbers])
+        return tuple(
+            around._replace(numbers=np.ascontiguousarray(one.numbers))
+            for around, one in zip(self.around, joined, strict=True)
+        )
+
+    @cached_property
+    def kernel(self) -> Any:
+        """`solvers.kernels.vbd.iterate` with these energies."""
+        if not self.numbers:
+            return plain.iterate
+        from solvers.kernels.vbd_elements import iterating
+
+        return iterating(*self._laws)
+
+    @cached_property
+    def _laws(self) -> list[Law]:
+        """Each law once."""
+        return list({id(energy.law): energy.law for energy in self.energies}.values())
+
+    def _joined(self, energies: list[Any]) -> list[Elements]:
+        """The elements of the energies, by their laws."""
+        of_law = [[e.elements for e in energies if e.law is law] for law in self._laws]
+        return [Elements(*(np.concatenate(arrays) for arrays in zip(*some, strict=True))) for some in of_law]

@@ -1,0 +1,104 @@
+"""Vertex block descent with energies of elements: each vertex's own share of them, descent, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice, pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from solvers.compiling import kernel
+from solvers.core.vertex_elements import Beside
+from solvers.kernels.stencils import Vertices, named
+from solvers.methods.newton import Newton
+from solvers.methods.vbd import VertexBlockDescent
+from solvers.problem import StopRule, Unsupported
+from tests.effects import BEND, DASHPOTS, FLOOR, LIMITS, RAYLEIGH, SCENES, cloth, stepped
+
+METHODS = {"plain": VertexBlockDescent(0.0), "accelerated": VertexBlockDescent()}
+EFFECTS = {
+    "strain limits": (LIMITS,),
+    "dashpots": (DASHPOTS,),
+    "rayleigh": (RAYLEIGH, BEND),
+    "both, and contact": (LIMITS, DASHPOTS, FLOOR),
+}
+NOISE = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("effect", ["strain limits", "dashpots"])
+def test_a_vertex_feels_what_the_oracle_says(effect):
+    """Value, gradient, diagonal blocks of the Hessian, and the rise by a step of one vertex."""
+    problem = stepped(cloth(*EFFECTS[effect]))
+    n = problem.system.vertices
+    p, d = problem.current, 0.01 * NOISE.normal(size=(n, 3))
+    beside = Beside.of(problem.system)
+    around = beside.among(np.arange(n), n).begun(problem)
+    energy: Any = problem.energies[beside.numbers[0]]
+    total, felt, risen = Vertices.of([energy.law])
+
+    def tell(around, p, d, gradient, block, rises, value):
+        value[0] = total(around, p)
+        for i in range(len(rises)):
+            gradient[i], block[i] = felt(around, i, p, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+            rises[i] = risen(around, i, p, (d[i, 0], d[i, 1], d[i, 2]))
+
+    gradient, block, rises, value = (np.empty(shape) for shape in ((n, 3), (n, 6), n, 1))
+    kernel(named([energy.law], tell))(around, np.pad(p, ((0, 0), (0, 1))).ravel(), d, gradient, block, rises, value)
+    wanted = np.zeros_like(p)
+    energy.add_gradient(p, wanted)
+    blocks = energy.hessian(p).toarray().reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+    assert np.abs(wanted).max() > 0.1
+    np.testing.assert_allclose(value[0], energy.value(p), rtol=1e-12)
+    np.testing.assert_allclose(gradient, wanted, atol=1e-12 * np.abs(wanted).max())
+    np.testing.assert_allclose(block, blocks[:, *np.triu_indices(3)], atol=1e-12 * np.abs(blocks).max())
+    for i in range(n):
+        moved = p.copy()
+        moved[i] += d[i]
+        assert rises[i] == pytest.approx(energy.value(moved) - energy.value(p), abs=1e-12 * energy.value(p))
+
+
+@pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_no_iteration_raises_the_objective_and_the_end_is_newtons_minimum(method, effect):
+    problem = stepped(cloth(*EFFECTS[effect]))
+    prepared = method.prepare(problem.system)
+    tangle = replace(problem, first_guess=NOISE.normal(size=problem.current.shape))
+    one_point = replace(problem, first_guess=np.zeros_like(problem.current))
+    for given in (problem, tangle, one_point):
+        path = [p.copy() for p in islice(prepared.iterates(given), 40)]
+        for before, after in pairwise(path):
+            assert given.value(after) <= given.value(before) + 1e-13 * given.magnitude(before)  # a hundred terms
+    wanted = Newton().prepare(problem.system).solve(problem, StopRule(100, 1e-12)).positions
+    near = replace(problem, first_guess=wanted + 1e-3 * NOISE.normal(size=wanted.shape))
+    found = prepared.solve(near, StopRule(4000)).positions
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)  # what a linear rate leaves
+    assert np.array_equal(found, method.prepare(problem.system).solve(near, StopRule(4000)).positions)
+
+
+def test_vertices_of_one_element_have_different_colours():
+    """Elements that join vertices which no spring joins."""
+    problem = stepped(cloth(DASHPOTS))
+    system = problem.system
+    beside = Beside.of(system)
+    far = [
+        replace(energy, edges=np.array([[0, 35], [5, 30]]), stiffness=energy.stiffness[:2], offset=energy.offset[:2],
+                direction=energy.direction[:2])
+        for energy in beside.energies
+    ]  # fmt: skip
+    apart = replace(system, energies=(*(e for e in system.energies if e not in beside.energies), *far))
+    made = VertexBlockDescent().prepare(apart)
+    bundle = {int(place) // 4: k // 8 for k, place in enumerate(made.blocks.bundles.own)}
+    assert all(bundle[int(made.row[i])] != bundle[int(made.row[j])] for i, j in ((0, 35), (5, 30)))
+
+
+def test_kernels_of_different_laws_have_different_names():
+    energies: list[Any] = [energy for effect in (LIMITS, DASHPOTS) for energy in stepped(cloth(effect)).energies]
+    names = {named([energy.law], lambda: None).__qualname__ for energy in energies if hasattr(energy, "law")}
+    assert len(names) == 2
+
+
+def test_what_has_no_bound_on_its_curvature_is_refused_and_the_refusal_says_so():
+    with pytest.raises(Unsupported, match=r"Gas.*bound of the second derivatives"):
+        VertexBlockDescent().prepare(SCENES["gas"]().system)
