@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, NamedTuple, Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
@@ -26,8 +27,8 @@ class Goal(Model):
     """Mesh sizes; each scene's default if left out."""
     horizon: Annotated[float, Field(gt=0, le=1e4)]
     """Simulated time [s]."""
-    error: Annotated[float, Field(gt=0, lt=1)]
-    """Relative to the displacement at the horizon."""
+    error: Many[Annotated[float, Field(gt=0, lt=1)]]
+    """Relative to the displacement at the horizon; of several, each is a goal."""
     peer: str | None = None
     """Another library's integrator, by name (`springbench run SCENE --error E --peers` has them all)."""
     integrator: Many[IntegratorName] | None = None
@@ -38,6 +39,8 @@ class Goal(Model):
     """... and these tolerances: the steps are shortened until the error is the one asked."""
     iterations: Iterations = 500
     """Iteration limit of such a step."""
+    graded: bool = False
+    """Whether errors are those by the reference; then the one that was asked for has to be kept to, too."""
     wanted: PositiveFloat
     """The part of its processor time that is wanted."""
 
@@ -59,14 +62,22 @@ class GoalsFields(Model):
     """One after the other."""
 
 
+class OneGoal(NamedTuple):
+    """A goal with the name of one scene, one size, None for the default, and one error."""
+
+    goal: Goal
+    scene: str
+    size: int | None
+    error: float
+
+
 @dataclass(frozen=True, slots=True)
 class Goals:
-    """A checked config: its name, its scenes, and each goal with the name of its scene and a size, None for the
-    default."""
+    """A checked config: its name, its scenes, and its goals one by one."""
 
     name: str
     scenes: dict[str, SceneSpec]
-    goals: Sequence[tuple[Goal, str, int | None]]
+    goals: Sequence[OneGoal]
 
 
 def load_goals(path: Path, peers: Sequence[str], solvers: Sequence[str]) -> Goals:
@@ -87,5 +98,7 @@ def load_goals(path: Path, peers: Sequence[str], solvers: Sequence[str]) -> Goal
                     document.report(f"came {name!r}; wanted one of {', '.join(known)}", ("goals", i, key))
     if fields is None or document.mistakes:
         raise document.error()
-    every = [(goal, scene, size) for goal in fields.goals for scene in goal.scene for size in goal.size or (None,)]
+    every = [
+        OneGoal(goal, *one) for goal in fields.goals for one in product(goal.scene, goal.size or (None,), goal.error)
+    ]
     return Goals(path.stem, scenes, every)

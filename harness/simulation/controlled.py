@@ -17,7 +17,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import ceil, inf, isfinite, log2
-from time import perf_counter
+from time import perf_counter, thread_time
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -46,7 +46,7 @@ _FINEST = 60
 
 
 class TooSlow(Exception):
-    """The wall seconds that were allowed are over."""
+    """The processor seconds that were allowed are over."""
 
 
 class Stuck(RunFailed):
@@ -58,7 +58,7 @@ class Path:
     """A motion that kept to an error. positions (k + 1, n, 3) [m] at the start and at the end of each of k frames;
     steps accepted and rejected, shortest and longest [s]; factorisations; iterations of the steps' solves; wall
     seconds, those of preparing the first steps apart; frames (k,): of them, in which each frame was reached, those of
-    one step in equal parts."""
+    one step in equal parts; processor: seconds of this thread, preparing included."""
 
     positions: Positions
     accepted: int
@@ -68,6 +68,7 @@ class Path:
     steps: tuple[float, float]
     seconds: float
     frames: tuple[float, ...]
+    processor: float
 
 
 class Follower(Protocol):
@@ -94,7 +95,7 @@ class Follower(Protocol):
         return setting * ratio ** ((self.order + 1.0) / self.order)
 
     def follow(self, setting: float, *, limit: float = inf) -> Path:
-        """The motion up to the horizon; limit: wall seconds.
+        """The motion up to the horizon; limit: processor seconds.
 
         Raises TooSlow, Stuck."""
         ...
@@ -152,7 +153,7 @@ class _Following:
     """One motion by steps of the ladder."""
 
     def __init__(self, asked: Implicit, tolerance: float, limit: float) -> None:
-        self._asked, self._tolerance, self._limit = asked, tolerance, limit
+        self._asked, self._tolerance, self._limit, self._cpu = asked, tolerance, limit, thread_time()
         self._ladder = _Ladder(asked.bound, asked.solver, asked.horizon)
         self._span = asked.horizon / asked.frames
         self._level = ceil(log2(max(1.0, asked.horizon / self._span)))
@@ -174,10 +175,11 @@ class _Following:
         """The motion."""
         while self._ticks < 1 << _FINEST:
             self._one()
-            if perf_counter() - self._began > self._limit:
+            if thread_time() - self._cpu > self._limit:
                 raise TooSlow
         counts = self._accepted, self._rejected, self._ladder.made, self._iterations
-        return Path(np.array(self._seen), *counts, self._lengths, self._reached[-1], shares(self._reached))
+        shared, processor = shares(self._reached), thread_time() - self._cpu
+        return Path(np.array(self._seen), *counts, self._lengths, self._reached[-1], shared, processor)
 
     def _one(self) -> None:
         """Try a step."""

@@ -30,8 +30,8 @@ Array = NDArray[np.float64]
 class Forces(NamedTuple):
     """bundles: of the springs at unpinned vertices; right: the constant force [N], as `Bundles.right` has it; a
     quadratic form as `solvers.kernels.forms.Form` has it: pairs (k, 2), weight (k,), held (n,), or empty; inverse:
-    1/m (n,) [1/kg], 0 for the pinned; drag: c (n,) [1/s]; pins (q,): vertices that move evenly from `begin` to `end`,
-    (q, 3) [m]."""
+    1/m [1/kg], 0 for the pinned, and drag: c [1/s], both in rows of four; pins (q,): vertices that move evenly from
+    `begin` to `end`, (q, 3) [m]."""
 
     bundles: Bundles
     right: Array
@@ -60,9 +60,8 @@ def pull(forces, p, out):
             f = w * (p[i + c] - p[j + c])
             out[i + c] -= f
             out[j + c] += f
-    for i in range(len(forces.inverse)):
-        for k in range(4 * i, 4 * i + 3):
-            out[k] *= forces.inverse[i]
+    for k in range(len(out)):
+        out[k] *= forces.inverse[k]
 
 
 @inner
@@ -77,8 +76,8 @@ def carry(forces, part, p):
 def compose(forces, drifts, kept, gained, count, h, p, v, acceleration):
     """`count` steps of h [s]: drift 0, kick 0, drift 1, ..., the last drift, of p and v, which take the result.
 
-    drifts (k + 1,): parts of h; kept and gained (k, n): what is left of a velocity by a kick, and what it gains of the
-    acceleration [s], both exact for drag; acceleration: scratch.
+    drifts (k + 1,): parts of h; kept and gained (k, rows): what is left of a velocity by a kick, and what it gains of
+    the acceleration [s], both exact for drag; acceleration: scratch.
     """
     known = False
     for step in range(count):
@@ -94,9 +93,8 @@ def compose(forces, drifts, kept, gained, count, h, p, v, acceleration):
                 if not known:
                     pull(forces, p, acceleration)
                     known = True
-                for i in range(len(forces.inverse)):
-                    for c in range(4 * i, 4 * i + 3):
-                        v[c] = kept[k, i] * v[c] + gained[k, i] * acceleration[c]
+                for i in range(len(v)):
+                    v[i] = kept[k, i] * v[i] + gained[k, i] * acceleration[i]
 
 
 class Coefficients(NamedTuple):
@@ -150,10 +148,8 @@ def _stage(stages, s, h, p, v, at):
 def _evaluate(forces, s, q, w, at):
     """Write q' and w' of stage s to `at`."""
     pull(forces, q, at.pulls[s])
-    for i in range(len(forces.inverse)):
-        for c in range(4 * i, 4 * i + 3):
-            at.pulls[s, c] -= forces.drag[i] * w[c]
     for i in range(len(q)):
+        at.pulls[s, i] -= forces.drag[i] * w[i]
         at.speeds[s, i] = w[i]
 
 
@@ -161,9 +157,9 @@ def _evaluate(forces, s, q, w, at):
 def _squares(forces, weights, span, at):
     """The sum of squares of an error by its weights: of positions, and of velocities by what they move in `span`."""
     total = 0.0
-    for i in range(len(forces.inverse)):
+    for i in range(0, len(forces.inverse), 4):
         if forces.inverse[i] != 0.0:
-            for c in range(4 * i, 4 * i + 3):
+            for c in range(i, i + 3):
                 x = y = 0.0
                 for j in range(len(weights)):
                     x += weights[j] * at.speeds[j, c]
@@ -191,7 +187,7 @@ def integrate(forces, stages, steps, p, v, at, told):
     the time reached [s].
     """
     free = 0
-    for i in range(len(forces.inverse)):
+    for i in range(0, len(forces.inverse), 4):
         free += 3 * (forces.inverse[i] != 0.0)
     frame, power, end = steps.frame, stages.power, len(stages.a) - 1
     t, before, h = 0.0, 1.0, steps.first

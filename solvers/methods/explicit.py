@@ -242,9 +242,9 @@ class PreparedExplicit(Iterative):
         p, v = rows_of_four(start.positions, far=True), rows_of_four(start.velocity)
         v.reshape(-1, 4)[pins] = 0.0
         force = rows_of_four(problem.force + self.parts.load)
-        inverse = np.divide(1.0, s.mass, out=np.zeros(s.vertices), where=s.unpinned)
+        inverse = _of_rows(np.divide(1.0, s.mass, out=np.zeros(s.vertices), where=s.unpinned))
         right, x = self.parts.bundles.right(np.zeros(s.vertices + 2), force), self.parts
-        forces = Forces(x.bundles, right, x.pairs, x.weight, x.held, inverse, x.drag, pins.copy(), begin, end)
+        forces = Forces(x.bundles, right, x.pairs, x.weight, x.held, inverse, _of_rows(x.drag), pins.copy(), begin, end)
         told = np.array([self.substeps, 0.0, frame / self.substeps, frame])
         if isinstance(self.method, Composition):
             self._compose(forces, self.method, p, v)
@@ -284,3 +284,8 @@ class PreparedExplicit(Iterative):
                 f"{told[2]:.3g} s: after {told[3]:.6g} of {frame:.6g} s of the frame the forces are too sudden, or "
                 "round-off is larger; ask for a larger error"
             )
+
+
+def _of_rows(of_vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What each vertex has, for all numbers of its row of four; nothing for the rows that fill up bundles."""
+    return rows_of_four(np.repeat(of_vertices[:, None], 3, axis=1))

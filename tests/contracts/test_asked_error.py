@@ -175,18 +175,20 @@ def test_ways_are_what_solvers_and_integrators_say_of_themselves():
         (AirDrag(law="quadratic", coefficient=0.5), "forces of place, speed and time"),
     ],
 )
-def test_methods_that_would_lose_their_order_are_named_with_the_reason(effect, what):
+def test_methods_that_would_lose_their_order_without_telling_are_named_with_the_reason(effect, what):
     held = () if effect is MOVED else (HELD,)
     told, asked = list[str](), Asked(chain(Springs(stretch=40.0), effect, *held), 5, 0.1, 2)
-    assert {way.integrator for way in ways(asked, told.append)} == {"esdirk-4"}
-    assert [line.split(":")[0].removeprefix("  not by ") for line in told] == OWN
+    found = ways(asked, told.append)
+    assert {way.solver: way.follower.order for way in found if way.integrator == "own"} == dict.fromkeys(OWN[:3], 1)
+    assert {way.integrator for way in found} == {"own", "esdirk-4"}
+    assert [line.split(":")[0].removeprefix("  not by ") for line in told] == OWN[3:]
     assert all(what in line for line in told)
 
 
 def test_steps_of_one_length_are_no_longer_than_is_stable_and_as_short_as_the_error_asks_for():
     """Of order 2: the step that a hundredth of the error asks for is a tenth."""
     even, truth = (
-        OwnEven(build(SWINGING, 5, "own"), VelocityVerlet(), FRAMES),
+        OwnEven(build(SWINGING, 5, "own"), VelocityVerlet(), FRAMES, lambda h: build(SWINGING.stepped(h), 5, "own")),
         integrate(build(SWINGING, 5, "own"), [END]),
     )
     assert even.first(1e-3) == even.changed(1.0, 100.0) == 1.0
@@ -195,6 +197,17 @@ def test_steps_of_one_length_are_no_longer_than_is_stable_and_as_short_as_the_er
     assert fine.accepted == pytest.approx(10 * coarse.accepted, rel=0.1)  # whole numbers of steps in a frame
     errors = [truth.error(0, path.positions[-1]) for path in (coarse, fine)]
     assert errors[1] == pytest.approx(0.01 * errors[0], rel=0.2)
+
+
+def test_forces_of_the_speed_are_even_within_pieces_of_a_frame_as_short_as_the_error_asks_for():
+    spec = chain(Springs(stretch=40.0), AirDrag(law="quadratic", coefficient=0.5), HELD)
+    even = OwnEven(build(spec, 5, "own"), VelocityVerlet(), FRAMES, lambda h: build(spec.stepped(h), 5, "own"))
+    truth = integrate(build(spec, 5, "own"), [END])
+    assert even.changed(2.0, 0.25) == 8.0
+    coarse, fine = (even.follow(setting) for setting in (2.0, 16.0))
+    assert coarse.positions.shape == fine.positions.shape == (FRAMES + 1, 5, 3)
+    errors = [truth.error(0, path.positions[-1]) for path in (coarse, fine)]
+    assert errors[1] < errors[0] / 7  # an eighth of what is of order 1, less of what the substeps leave
 
 
 def test_a_rosenbrock_method_keeps_to_an_error_that_is_asked_for():

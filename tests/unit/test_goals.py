@@ -13,6 +13,8 @@ from harness.cli import app
 from harness.config.goals import load_goals
 from harness.config.load import load_any
 from harness.experiments.accuracy.accuracy_rows import SCHEMA
+from harness.experiments.asked import held
+from harness.experiments.asked.goals import Met
 from harness.experiments.asked.peers import PEERS
 from solvers.registry import EVERY
 
@@ -27,7 +29,7 @@ effects:
   - {kind: gravity}
   - {kind: pins, at: [first], weight: exact}
 """
-SHIPPED = Path(__file__).resolve().parents[2] / "configs" / "goals.yaml"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
 def config(folder: Path, goals: str) -> Path:
@@ -37,14 +39,20 @@ def config(folder: Path, goals: str) -> Path:
 
 
 def test_the_shipped_goals_are_sound_and_name_their_schema() -> None:
-    goals = load_goals(SHIPPED, list(PEERS), list(EVERY)).goals
-    assert [(name, size) for _, name, size in goals][:4] == [
+    goals = load_goals(CONFIGS / "goals.yaml", list(PEERS), list(EVERY)).goals
+    assert [(one.scene, one.size) for one in goals][:4] == [
         ("chain", 9),
         ("net", 9),
         ("hanging-cloth", 9),
         ("hanging-cloth", 17),
     ]
-    assert SHIPPED.read_text().splitlines()[0] == "# yaml-language-server: $schema=schema.json"
+    controlled = load_goals(CONFIGS / "controlled.yaml", list(PEERS), list(EVERY)).goals
+    assert len({one.scene for one in controlled}) == 11
+    assert len(controlled) == 3 * 11
+    assert all(one.goal.graded for one in controlled)
+    for name in ("goals", "controlled"):
+        first = (CONFIGS / f"{name}.yaml").read_text().splitlines()[0]
+        assert first == "# yaml-language-server: $schema=schema.json"
 
 
 @pytest.mark.parametrize(
@@ -71,7 +79,10 @@ def test_other_commands_name_the_one_for_goals(tmp_path: Path) -> None:
 
 
 def test_goals_are_timed_beside_a_peer_and_steps_of_one_length(tmp_path: Path) -> None:
-    against = ("peer: scipy-dop853-numpy, wanted: 1000", "integrator: midpoint, solver: newton, wanted: 1e-9")
+    against = (
+        "peer: scipy-dop853-numpy, wanted: 1000",
+        "integrator: midpoint, solver: newton, wanted: 1e-9, graded: true",
+    )
     path = config(
         tmp_path, "[" + ", ".join(f"{{scene: spring, horizon: 0.2, error: 1e-3, {a}}}" for a in against) + "]"
     )
@@ -84,3 +95,30 @@ def test_goals_are_timed_beside_a_peer_and_steps_of_one_length(tmp_path: Path) -
         assert row["kind"] == "goal"
         assert max(row["estimated"], row["against_error"]) <= row["asked"] == 1e-3
         assert min(row["cpu_seconds"], row["against_seconds"]) > 0.0
+    ungraded, graded = found
+    assert ungraded["error"] is None
+    assert 0.0 < graded["error"] <= graded["estimated"]
+
+
+def test_what_takes_too_long_is_a_bound_of_the_goal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(held, "LONGEST", 0.0)
+    path = config(
+        tmp_path, "[{scene: spring, horizon: 0.2, error: 1e-3, integrator: midpoint, solver: newton, wanted: 1e-9}]"
+    )
+    done = CliRunner().invoke(app, ["goals", str(path), "--results", str(tmp_path / "results")])
+    assert done.exit_code == 1, done.output
+    assert "an error of" in done.output
+    assert "at most" in done.output
+    (row,) = rows.read([tmp_path / "results" / "mine" / "accuracy" / "goals.parquet"], SCHEMA).to_pylist()
+    assert "given up after" in row["against"]
+    assert row["against_error"] is None
+    assert row["against_seconds"] > 0.0
+
+
+def test_a_graded_error_is_near_the_one_asked_or_it_is_said_why_not() -> None:
+    (one, *_) = load_goals(CONFIGS / "controlled.yaml", list(PEERS), list(EVERY)).goals
+    times = {"seconds": 1.0, "other_seconds": 1.0}
+    cases = {(2.1, ""): False, (2.0, ""): True, (0.3, ""): False, (0.3, "unstable"): True}
+    for (part, note), holds in cases.items():
+        assert Met(one, 9, error=part * one.error, note=note, **times).holds == holds
+    assert not Met(one, 9, error=one.error, seconds=1.6, other_seconds=1.0).holds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +23,7 @@ def goals(
     from harness.base.claim import claimed
     from harness.config.goals import load_goals
     from harness.experiments.accuracy.accuracy_rows import SCHEMA
+    from harness.experiments.accuracy.units import references
     from harness.experiments.asked.goals import Met, met
     from harness.experiments.asked.peers import PEERS
     from harness.experiments.provenance import provenance
@@ -29,28 +31,43 @@ def goals(
 
     asked = load_goals(config, list(PEERS), list(EVERY))
     folder = claimed(results / asked.name, config)
-    table = Table("", "error", "way", "against", "times its cost", "wanted", "")
+    table = Table("", "asked", "error", "way", "against", "times its cost", "wanted", "")
     found = list[Met]()
     with machine.pinned_threads(1):
-        for one in met(asked, say):
+        for one in met(asked, references(results), say):
             found.append(one)
-            wanted = f"1/{1 / one.goal.wanted:.2g}"
-            ratio = f"1/{1 / one.ratio:.3g}" if not one.reason else "–"
-            verdict = one.reason or ("holds" if one.holds else "does not hold")
-            cells = f"{one.scene} {one.size or ''}", f"{one.goal.error:g}", one.way, one.other, ratio, wanted, verdict
-            say(f"  {ratio} of the processor time, wanted {wanted}: {verdict}")
-            table.add_row(*cells)
+            wanted, ratio = _part(one.asked.goal.wanted), "–" if one.reason else _part(one.ratio, at_most=one.bound)
+            verdict = one.reason or ("holds" if one.holds else "does not hold") + (f": {one.note}" if one.note else "")
+            error = f"{one.estimated:.1g} estimated" if one.error is None else f"{one.error:.2g}"
+            say(f"  an error of {error}, {ratio} of the processor time, wanted {wanted}: {verdict}")
+            cells = f"{one.asked.scene} {one.size or ''}", f"{one.asked.error:g}", "" if one.reason else error, one.way
+            table.add_row(*cells, one.other, ratio, wanted, verdict)
     (folder / "accuracy").mkdir(exist_ok=True)
     shared = {"kind": "goal", "sweep": asked.name, "threads": 1} | provenance()
     written = [
         shared
-        | {"status": "failed" if one.reason else "ok", "reason": one.reason or None, "scene": one.scene}
-        | {"size": one.size, "vertices": one.vertices, "horizon": one.goal.horizon, "asked": one.goal.error}
+        | {
+            "status": "failed" if one.reason else "ok",
+            "reason": one.reason or one.note or None,
+            "scene": one.asked.scene,
+        }
+        | {"error": one.error}
+        | {"size": one.size, "vertices": one.vertices, "horizon": one.asked.goal.horizon, "asked": one.asked.error}
         | {"solver": one.way, "estimated": one.estimated, "cpu_seconds": one.seconds, "against": one.other}
-        | {"against_error": one.other_error, "against_seconds": one.other_seconds, "wanted": one.goal.wanted}
+        | {
+            "against_error": one.other_error if isfinite(one.other_error) else None,
+            "against_seconds": one.other_seconds,
+            "wanted": one.asked.goal.wanted,
+        }
         for one in found
     ]
     rows.write(folder / "accuracy" / "goals.parquet", written, SCHEMA)
     out().print(table)
     say(f"rows are in {folder / 'accuracy'}")
     raise typer.Exit(0 if all(one.holds for one in found) else 1)
+
+
+def _part(ratio: float, *, at_most: bool = False) -> str:
+    """Of a cost, in words."""
+    told = f"1/{1 / ratio:.3g}" if ratio < 1.0 else f"{ratio:.3g}"
+    return f"at most {told}" if at_most else told

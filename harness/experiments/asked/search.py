@@ -23,10 +23,13 @@ from harness.reference.growth import Growth, growth
 from harness.simulation.controlled import Path, Stuck, TooSlow
 from solvers.problem import Positions
 
-AIM = 0.6
+AIM = 0.65
 """Of the error asked, what a setting is chosen for: estimates scatter."""
+_AIM_EVEN = 0.85
+"""Where steps have one length, and the error falls by their order."""
 WIDE = 1 / 3
-"""An error below this part of the one asked was bought for too much, if a cheaper way is stable."""
+"""An error below this part of the one asked was bought for too much, if a cheaper way is stable; DOUBT times as much,
+where it is estimated."""
 CLOSER = 1 / 50
 """Of a step's error, that of the motion that errors are estimated by."""
 DOUBT = 1.25
@@ -36,7 +39,7 @@ _FINER = 10.0
 """Times as exact, by the order and the number of steps, at which a motion counts as closer."""
 _MOVES, _CLOSINGS = 6, 3
 _AT_FIRST, _PATIENCE = 1.0, 4.0
-"""Seconds that a way may take, so many times as many if none ends within them; and times the fastest so far."""
+"""Processor seconds that a way may take, so many times as many if none ends within them, or as the cheapest takes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,7 +143,7 @@ class _Search:
             for way in ways:
                 try:
                     found.append(self._run(way, way.follower.first(tolerance), limit))
-                    limit = max(_AT_FIRST, _PATIENCE * min(one.path.seconds for one in found))
+                    limit = max(_AT_FIRST, _PATIENCE * min(one.path.processor for one in found))
                 except Stuck as error:
                     stuck.append(error)
                 except TooSlow:
@@ -169,8 +172,8 @@ class _Search:
 
     @staticmethod
     def _cost(one: Found, part: float) -> float:
-        """Seconds with a part of the error of a step."""
-        return one.path.seconds * part ** (-1.0 / one.way.follower.order)
+        """Processor seconds with a part of the error of a step."""
+        return one.path.processor * part ** (-1.0 / one.way.follower.order)
 
     def _graded(self, one: Found, closer: Found) -> Found:
         p, q = one.path.positions, closer.path.positions
@@ -183,15 +186,15 @@ class _Search:
         return float(np.linalg.norm((p - q)[self._free]))
 
     def _promise(self, one: Found) -> float:
-        """The seconds that a way would take to the error asked; where it is more exact than that, those that it took,
-        for explicit steps may be as long as is stable already."""
+        """The processor seconds that a way would take to the error asked; where it is more exact than that, those that
+        it took, for explicit steps may be as long as is stable already."""
         return self._cost(one, min(1.0, AIM * self._error / one.estimated)) if one.estimated < inf else inf
 
     def _moved(self, one: Found, closer: Found) -> tuple[Found, str]:
         """The way at the setting that gives the error asked, and why it is far more exact, if it is."""
         best, above = None if one.estimated > self._error else one, None
         for _ in range(_MOVES):
-            if best and best.estimated >= WIDE * self._error:
+            if best and best.estimated >= DOUBT * WIDE * self._error:
                 return best, ""
             setting = self._next(one, best, above)
             if setting == one.setting:
@@ -201,19 +204,20 @@ class _Search:
                 if best is None and one.estimated > 0.5 * before.estimated and setting < 0.1 * before.setting:
                     raise self._nothing(min(one, before, key=lambda x: x.estimated))
                 above = one
-            elif best and one.path.seconds > 0.9 * best.path.seconds:
+            elif best and one.path.processor > 0.9 * best.path.processor:
                 return best, _STABLE
             else:
                 best = one
         if best is None:
             raise self._nothing(one)
-        return best, _STABLE if best.estimated < WIDE * self._error else ""
+        return best, _STABLE if best.estimated < DOUBT * WIDE * self._error else ""
 
     def _next(self, one: Found, best: Found | None, above: Found | None) -> float:
         """The setting to try after one that errs too much or too little: between both where they are known."""
         if best and above:
             return sqrt(best.setting * above.setting)
-        ratio = AIM * self._error / max(one.estimated, 1e-3 * AIM * self._error)
+        aim = (_AIM_EVEN if one.way.follower.even else AIM) * self._error
+        ratio = aim / max(one.estimated, 1e-3 * aim)
         return one.way.follower.changed(one.setting, min(30.0, max(1e-3, ratio)))
 
     def _nothing(self, nearest: Found) -> RunFailed:

@@ -121,8 +121,8 @@ def ways(asked: Asked, say: Callable[[str], None], pairs: Sequence[tuple[str, So
 def _follower(asked: Asked, integrator: str, solver: SolverSpec, frames: int | None = None) -> Follower:
     made, frames = load(EVERY[solver.name])(**solver.parameters), frames or asked.frames
     if integrator == "own":
-        own = OwnEven if about(load(EVERY[solver.name]), solver.name).even else Own
-        return own(asked.bound(asked.frame, integrator), made, frames)
+        scene, even = asked.bound(asked.frame, integrator), about(load(EVERY[solver.name]), solver.name).even
+        return OwnEven(scene, made, frames, lambda h: asked.bound(h, integrator)) if even else Own(scene, made, frames)
     return Implicit(lambda h: asked.bound(h, integrator), made, asked.frame * frames, frames)
 
 
