@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 
 from harness.base import machine
 from harness.report.ablation import Row, known_error, of_kind
+from harness.report.origin import machine_and_commit
 from harness.report.page import axes, header, new_page, quantity, save, text, ticks
 from harness.report.style import INK, MUTED, PAGE, RC, RULE, WARNING, numbered
 
@@ -47,6 +48,7 @@ def draw_ablation(rows: Sequence[Row], path: Path) -> None:
         called = [row["name"] for row in of_kind(rows, "suggestion")]
         below = [f"impossible without {', '.join(gone)}"] if gone else []
         below += ["hollow: measured by other code than today's"] if older else []
+        below += machine_and_commit([whole])
         below += [f"not listed, but called for by the motion: {', '.join(called)}"] if called else []
         text(page, 130, 866, "   ·   ".join(below), size=10.5, color=WARNING if called else MUTED)
         save(page, path)

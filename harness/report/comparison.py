@@ -18,11 +18,11 @@ from matplotlib.lines import Line2D
 
 from harness.record.base import Replay
 from harness.report.frames import drawable_frames, shown_limit
+from harness.report.origin import made_by
 from harness.report.page import (
     count,
     header,
     headline,
-    made_by,
     new_page,
     paste,
     quantity,

@@ -41,6 +41,8 @@ commit.
 """
 FLOOR = 0.005
 """The least noise that is believed, of the logarithm: results are rounded, and repeat by chance."""
+CHANGED = "*"
+"""Behind a commit whose files were changed."""
 
 _INTERVAL = 2 * 1.96
 """Standard deviations that a 95 % interval spans."""
@@ -116,7 +118,7 @@ def _machine(stored: Stored) -> str:
 
 
 def _point(stored: Stored, benchmark: Benchmark) -> Point:
-    commit = stored.commit_info.id[:7] + ("*" if stored.commit_info.dirty else "")
+    commit = stored.commit_info.id[:7] + (CHANGED if stored.commit_info.dirty else "")
     ratio, least = benchmark.extra_info.ratio, benchmark.stats.min
     return Point(commit, ratio.median, ratio.low, ratio.high) if ratio else Point(commit, least, least, least)
 

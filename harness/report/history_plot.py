@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from harness.base.files import replacing
-from harness.report.history import FEWEST, GateHistory
+from harness.report.history import CHANGED, FEWEST, GateHistory
 from harness.report.style import DPI, INK, MUTED, RC, WARNING, WIDTH
 
 MOST = 12
@@ -42,6 +42,8 @@ def draw_history(found: Sequence[GateHistory], path: Path) -> int:
         title = f"{changed} of {count} gates changed" if changed else f"None of {count} gates changed"
         figure.text(0.04, 1 - 0.36 / height, title, fontsize=15, color=INK, weight="bold")
         said = "dots: stored results with their 95 % intervals, by commit; lines: their level, until it changed"
+        if any(CHANGED in point.commit for series in shown for point in series.points):
+            said += f"; {CHANGED}: with changes beyond the commit"
         figure.text(0.04, 1 - 0.62 / height, said, color=MUTED)
         machines = sorted({series.machine for series in shown})
         figure.text(0.04, 0.14 / height, "; ".join(machines), color=MUTED, fontsize=8)

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -71,20 +71,6 @@ def header(page: Figure, headline: str, facts: Sequence[str], *, letters: int = 
     """The title in the upper left corner, at most so many letters of it, and a line of facts below."""
     text(page, 40, 50, shorten(headline, letters), size=21, weight="bold")
     text(page, 41, 82, "   ·   ".join(facts), size=11.5, color=MUTED)
-
-
-def commits(known: Iterable[object]) -> list[str]:
-    """The commit that all of it was made by, in words, or how many there are; nothing where none is known."""
-    found = sorted({str(commit) for commit in known if commit})
-    return [f"commit {found[0]:.7}" if len(found) == 1 else f"{len(found)} commits"] if found else []
-
-
-def made_by(page: Figure, replays: Iterable[Replay], y: float) -> None:
-    """On which machine and by which code recordings were made, right-aligned at pixel y from the top."""
-    told = [replay.properties for replay in replays]
-    cpus = dict.fromkeys(str(one["cpu"]) for one in told if one.get("cpu"))
-    words = [*(shorten(cpu, 60) for cpu in list(cpus)[:2]), *commits(one.get("commit") for one in told)]
-    text(page, WIDTH - 36, y, "   ·   ".join(words), size=9, color=MUTED, ha="right")
 
 
 def strain_scale(page: Figure, limit: float, *, pins: bool) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,7 +80,8 @@ _ENDED = {
 class Judged:
     """One run: its case, its solver, what became of it and why; worst: the largest `beyond` of a step, or where
     `graded` is "distance" the largest distance from the reference, None where there is none;
-    reference: where the solver comes from, as rows have it; run_id: of the run."""
+    reference: where the solver comes from, as rows have it; run_id: of the run; cpu and commit: where it was
+    done, and by which code."""
 
     case: str
     solver: str
@@ -89,6 +91,8 @@ class Judged:
     reason: str
     reference: str = ""
     run_id: str = ""
+    cpu: str = ""
+    commit: str = ""
 
     @property
     def figure(self) -> str:
@@ -123,9 +127,16 @@ def read_cells(folder: Path) -> list[Judged]:
         case, solver = _case(run[0], firsts), _solver(run[0], firsts)
         outcome, worst, graded, reason = judged(run)
         run_id, reference = run[0]["run_id"], run[0]["reference"] or ""
-        cells[case, solver] = Judged(case, solver, outcome, worst, graded, reason, reference, run_id)
+        made = run[0]["cpu"] or "", run[0]["commit"] or ""
+        cells[case, solver] = Judged(case, solver, outcome, worst, graded, reason, reference, run_id, *made)
     order = [*SOLVERS, *OPTIONAL, *(first["solver"] for first in firsts)]
-    return sorted(cells.values(), key=lambda cell: (cell.case, order.index(cell.solver.split()[0]), cell.solver))
+    place = {solver: order.index(solver.split()[0]) for _, solver in cells}
+    return sorted(cells.values(), key=lambda cell: (_numbered(cell.case), place[cell.solver], cell.solver))
+
+
+def _numbered(name: str) -> list[int | str]:
+    """By which names are sorted that have numbers in them: 8 before 16."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
 
 
 def judged(run: Sequence[dict[str, Any]]) -> tuple[Outcome, float | None, str, str]:

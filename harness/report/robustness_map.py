@@ -16,6 +16,7 @@ from matplotlib.patches import Rectangle
 
 from harness.base import shelf
 from harness.base.errors import InputError
+from harness.report.origin import machine_and_commit
 from harness.report.robustness import (
     DIVERGED,
     FAILED,
@@ -64,7 +65,8 @@ def draw_map(cells: Sequence[Judged], path: Path, title: str, older: Collection[
     used = [outcome for outcome in OUTCOMES if any(cell.outcome == outcome for cell in cells)]
     ends = [_COLUMN * (x + 0.45) + _TURNED * len(solver) for x, solver in enumerate(solvers)]
     width = max(_LEFT + max([_COLUMN * len(solvers) + 0.3, *ends]), _NARROWEST)
-    head, foot = _fitted(title, width, _TITLE), _fitted(NOTE, width, _NOTE)
+    told = ", ".join(machine_and_commit([{"cpu": cell.cpu, "commit": cell.commit} for cell in cells]))
+    head, foot = _fitted(title, width, _TITLE), [*_fitted(NOTE, width, _NOTE), *_fitted(told, width, _NOTE)]
     if any(cell.run_id in older for cell in cells):
         foot += _fitted("Hollow marks: runs that other code than today's did.", width, _NOTE)
     across = max(1, int((width - 0.3) / _ACROSS))

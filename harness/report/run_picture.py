@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 from harness.record.base import Replay
 from harness.report.frames import drawable_frames, shown_limit
+from harness.report.origin import made_by
 from harness.report.page import (
     clock,
     count,
     header,
     headline,
-    made_by,
     new_page,
     paste,
     quantity,

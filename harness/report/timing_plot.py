@@ -17,7 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
 
 from harness.report.labels import LINE, End, direct_labels
-from harness.report.page import axes, commits, count, header, new_page, quantity, save, shorten, text, ticks
+from harness.report.origin import machine_and_commit
+from harness.report.page import axes, count, header, new_page, quantity, save, shorten, text, ticks
 from harness.report.style import DASH_DOTTED, DASHED, DOTTED, HEIGHT, INK, MUTED, PAGE, RC, WIDTH, Mark, marks
 from harness.report.timing_rows import HEADINGS, draw_rows
 from harness.report.timing_table import RunTimes, labels, runs
@@ -68,12 +69,11 @@ def draw_timing(table: pa.Table, path: Path, title: str, older: Collection[str] 
 
 def _facts(table: pa.Table) -> list[str]:
     """The machine and the code, and what the marks mean."""
-    cpus: list[str] = sorted(set[Any](table["cpu"].drop_null().to_pylist()))
     threads: list[int] = sorted(set[Any](table["threads"].drop_null().to_pylist()))
     facts = ["median and quartiles of all steps"]
     if threads:
         facts.append(f"{', '.join(map(str, threads))} thread{'s' if threads != [1] else ''}")
-    return [*facts, *(shorten(cpu, 60) for cpu in cpus[:2]), *commits(table["commit"].to_pylist())]
+    return [*facts, *machine_and_commit(table.select(["cpu", "commit"]).to_pylist())]
 
 
 def _scene(

@@ -21,7 +21,7 @@ from harness.report.speed.speed_table import speed_table
 from harness.report.style import OLDER, PAGE, marks
 from tests import accuracy_rows
 from tests import figure_results as made
-from tests.drawn_figures import composed
+from tests.drawn_figures import RESULTS, composed
 
 
 def test_what_other_code_measured_is_hollow_and_told(tmp_path: Path) -> None:
@@ -35,6 +35,14 @@ def test_what_other_code_measured_is_hollow_and_told(tmp_path: Path) -> None:
     _, (grid,) = composed("hard", swept, Asked(), older)
     assert {cell.column for cell in grid.cells if cell.older} == {"newton"}
     assert "other code" in grid.notes[0]
+
+
+@pytest.mark.parametrize("kind", ["timing", "hard", "ablation", "prices", "speed", "convergence", "winners"])
+def test_and_what_code_that_is_in_no_commit_did(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    monkeypatch.setitem(made.HERE, "commit", f"{'0' * 40}-dirty")
+    monkeypatch.setitem(accuracy_rows.MACHINE, "commit", f"{'0' * 40}-dirty")
+    figure, _ = composed(kind, RESULTS[kind][1](tmp_path), Asked())
+    assert "commit 0000000-dirty" in "\n".join(text.get_text() for text in texts(figure))
 
 
 @pytest.mark.parametrize("kind", ["convergence", "times", "work", "growth", "profiles", "liu2013"])

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
+from PIL import Image
 
 from harness.base import rows as base_rows
 from harness.report import opengl
-from harness.report.figures import canvas, kinds
-from harness.report.figures.asked import Asked
-from harness.report.figures.entry import chosen
 from harness.report.figures.faults import faults
 from tests import figure_results as made
+from tests.drawn_figures import ALIKE, FOLDER, MESHES, composed_meshes, sheet, similarity
+
+LOOKS = FOLDER / "meshes.png"
 
 
 @pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
@@ -48,7 +47,17 @@ def test_a_sheet_has_each_scene_once_of_one_shape_and_by_one_scale(tmp_path: Pat
     assert "numba, 36 vertices" in pictures[1].facts
 
 
-def composed_meshes(kind: str, folder: Path) -> tuple[Figure, list[Any]]:
-    found = kinds.kind(kind)
-    panels = found.draw(chosen(found.panels(folder, lambda _: ()), ()))
-    return canvas.compose(panels, found.title, Asked(width=60.0)), panels
+@pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
+def test_the_sheet_of_meshes_looks_as_it_did(tmp_path: Path) -> None:
+    folder = made.recorded(tmp_path / "results")
+    now = sheet([composed_meshes(kind, folder, 85.0)[0] for kind in MESHES], (1020, 360))
+    now.save(tmp_path / "meshes.png")
+    told = f"look at {tmp_path / 'meshes.png'} beside {LOOKS}, and where it is better, put it there"
+    assert coarse(now, Image.open(LOOKS)) > ALIKE, told
+    turned = Image.fromarray(np.asarray(now)[:, ::-1])
+    assert coarse(now, turned) < 0.5
+
+
+def coarse(one: Image.Image, other: Image.Image) -> float:
+    """How alike they are in parts of 3 pixels: other drawing libraries round the edges of triangles otherwise."""
+    return similarity(one.reduce(3), other.reduce(3))

@@ -15,7 +15,7 @@ from harness.base import shelf
 from harness.base.errors import InputError, Mistake
 from harness.base.rows import read as read_rows
 from harness.report.accuracy.measured import Curve, Measurements, Problem, Values, WorkPoint
-from harness.report.page import commits
+from harness.report.origin import commits, processors
 
 ROUND_OFF = 100 * float(np.finfo(np.float64).eps)
 """An energy this share of its terms' magnitude below g* is a lower minimum and not round-off: sums of up to 1e5
@@ -188,10 +188,9 @@ def _labels(rows: Sequence[_Row]) -> _Label:
 
 
 def _machine(rows: Sequence[_Row]) -> tuple[str, ...]:
-    cpus, threads = (sorted({row[key] for row in rows if row[key] is not None}) for key in ("cpu", "threads"))
+    threads = sorted({row["threads"] for row in rows if row["threads"] is not None})
     count = [f"{', '.join(map(str, threads))} thread{'s' if threads != [1] else ''}"] if threads else []
-    made = commits(row["commit"] for row in rows)
-    return (*cpus[:2], *count, *made)
+    return (*processors(row["cpu"] for row in rows), *count, *commits(row["commit"] for row in rows))
 
 
 def _number(value: Any) -> float:

@@ -23,7 +23,6 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.patches import Patch
 from matplotlib.text import Text
-from matplotlib.ticker import MaxNLocator
 
 from harness.report.figures.asked import Asked
 from harness.report.figures.direct import label_directly
@@ -36,6 +35,12 @@ from harness.report.style import INK, MUTED, STRAIN_MAP
 INCH = 25.4
 _PANEL, _PICTURE = 62.0, 36.0
 """Millimetres that a panel and that a picture wants for its width, at a type of 8 points."""
+_TALL = 48.0 / INCH
+"""A frame wider than 85 mm becomes flatter: as high as 0.3 of its width and this [inches]."""
+_FIVE = 55.0
+"""Millimetres in which a colour bar has five numbers, at a type of 8 points."""
+_BAR = 18.0
+"""Points of a colour bar, and around it."""
 _PAD = 3.0
 """Points between strips, and around."""
 
@@ -75,10 +80,10 @@ def compose(panels: Sequence[Panel], title: str, asked: Asked) -> Figure:
         subjects = list(dict.fromkeys(panel.subject for panel in panels))
         for ax, panel in zip(axes, panels, strict=True):
             _draw(ax, panel, asked, columns, several=len(subjects) > 1)
-        _strain_scale(figure, axes, panels, asked)
+        below = _strain_scale(figure, axes, panels, asked)
         direct = label_directly(axes, panels, asked)
         whole = ": ".join([title, subjects[0]] if len(subjects) == 1 and subjects[0] else [title])
-        _strips(figure, panels, whole, sum(heights), asked, legend=not direct)
+        _strips(figure, panels, whole, sum(heights) + below, asked, legend=not direct)
         with warnings.catch_warnings():
             _settle(axes, panels, asked)
         return figure
@@ -111,7 +116,7 @@ def _height(panel: Panel, width: float, asked: Asked) -> float:
         return width / panel.aspect + line * (1 + len(panel.facts))
     if panel.y.kind == "names":
         return line * (1.25 * len(panel.y.names) + 4.0)
-    return 0.86 * width * panel.aspect + 3.0 * line
+    return min(0.86 * width, 0.3 * width + _TALL) * panel.aspect + 3.0 * line
 
 
 def _draw(ax: Axes, panel: Panel, asked: Asked, columns: int, *, several: bool) -> None:
@@ -136,21 +141,22 @@ def wrapped(words: str, room: float, size: float) -> list[str]:
     return textwrap.wrap(words, max(12, int(room / (0.58 * size))), break_long_words=True) or [""]
 
 
-def _strain_scale(figure: Figure, axes: Sequence[Axes], panels: Sequence[Panel], asked: Asked) -> None:
-    """One scale of strain for all pictures, which share their limit."""
+def _strain_scale(figure: Figure, axes: Sequence[Axes], panels: Sequence[Panel], asked: Asked) -> float:
+    """One scale of strain for all pictures, which share their limit; how high it is [inches]."""
     pictures = [panel for panel in panels if isinstance(panel, Picture)]
     if not pictures:
-        return
+        return 0.0
     limit = pictures[0].limit
     bar = figure.colorbar(
         ScalarMappable(Normalize(-limit, limit), STRAIN_MAP), ax=list(axes), location="bottom", shrink=0.8, aspect=45,
-        pad=0.02, ticks=MaxNLocator(4, symmetric=True),
+        pad=0.02, ticks=np.linspace(-limit, limit, 5 if asked.width * 8.0 / asked.size > _FIVE else 3).tolist(),
     )  # fmt: skip
     bar.outline.set_visible(False)
     bar.ax.xaxis.set_major_formatter(ticks(lambda e: f"{100 * e:+.3g} %".replace("-", "−") if e else "at rest"))
     bar.ax.tick_params(length=2.0, width=0.5, labelsize=asked.small)
-    words = wrapped("strain of the most strained spring at each vertex", asked.width / INCH * 58.0, asked.small)
+    words = wrapped("strain of a vertex's most strained spring", asked.width / INCH * 58.0, asked.small)
     bar.set_label("\n".join(words), fontsize=asked.small)
+    return (1.45 * asked.small * (len(words) + 1.0) + _BAR) / 72.0
 
 
 def _strips(figure: Figure, panels: Sequence[Panel], title: str, height: float, asked: Asked, *, legend: bool) -> None:

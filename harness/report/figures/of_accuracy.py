@@ -28,7 +28,7 @@ from harness.report.accuracy.times import STEPS, TARGETS, left_out
 from harness.report.accuracy.work_plot import front
 from harness.report.figures.entry import Entry, ready
 from harness.report.figures.panel import Band, Plot, Scale, Series
-from harness.report.figures.scales import power, superscript
+from harness.report.figures.scales import power
 from harness.report.page import count, quantity
 from harness.report.style import MUTED, OLDER, Mark, looks
 
@@ -232,7 +232,7 @@ def growth(folder: Path) -> list[Entry]:
         here = [one for one in found if (one.scene, one.first_guess) == (scene, guess)]
         series = [
             Series(
-                one.label + (f"  n{superscript(f'{one.exponent:.2f}')}" if np.isfinite(one.exponent) else ""),
+                one.label + (f" n^{one.exponent:.2f}" if np.isfinite(one.exponent) else ""),
                 *(marked[one.label], np.array(one.vertices, float), np.array(one.seconds)),
                 older=np.array(one.older),
             )

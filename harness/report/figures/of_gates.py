@@ -9,7 +9,7 @@ import numpy as np
 
 from harness.report.figures.entry import Entry, ready
 from harness.report.figures.panel import Plot, Scale, Series
-from harness.report.history import FEWEST, GateHistory, history, stored_files
+from harness.report.history import CHANGED, FEWEST, GateHistory, history, stored_files
 from harness.report.style import INK, MUTED, Mark
 
 WANTED = f"{FEWEST} stored results of a gate, by `pytest tests/bench --benchmark-only` at as many commits"
@@ -24,6 +24,7 @@ def _panel(gate: GateHistory) -> Plot:
     x = np.arange(len(gate.points), dtype=float)
     y, low, high = (np.array([getattr(point, name) for point in gate.points]) for name in ("value", "low", "high"))
     changed = [f"{100 * (ratio - 1):+.1f} % at {gate.points[at].commit}" for at, ratio in gate.changes]
+    dirty = [f"{CHANGED}: with changes beyond the commit."] if any(CHANGED in p.commit for p in gate.points) else []
     words, unit = ("times its yardstick", "plain") if gate.ratio else ("least time", "time")
     return Plot(
         *((gate.gate,), ("history",), gate.gate, ""),
@@ -33,7 +34,7 @@ def _panel(gate: GateHistory) -> Plot:
             Series("results, with their 95 % intervals", Mark(MUTED, "o"), x, y, low, high, joined=False),
             *_levels(gate, x),
         ],
-        notes=[f"Changed by {', '.join(changed)}." if changed else "No change beyond noise."],
+        notes=[f"Changed by {', '.join(changed)}." if changed else "No change beyond noise.", *dirty],
         machine=gate.machine,
     )
 

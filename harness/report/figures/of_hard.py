@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from harness.report.figures.entry import Entry, ready
-from harness.report.figures.of_runs import Older, measured_on, sweep_rows
+from harness.report.figures.of_runs import Older, sweep_rows
 from harness.report.figures.panel import Cell, Grid, Panel, Plot, Scale, Series
+from harness.report.origin import NEEDED, measured_on
 from harness.report.robustness import OUTCOMES, RIGHT, Judged, read_cells, scores
 from harness.report.style import OLDER, Mark, marks
 
@@ -21,7 +22,7 @@ def hard(folder: Path, older: Older) -> list[Entry]:
     """Shares of the cases that each solver gets right, and of those it survives; then a map for each family."""
     table = sweep_rows(folder)
     cells, other = read_cells(folder), older(table)
-    told = measured_on(table.select(["cpu", "threads", "commit", "code"]).to_pylist())
+    told = measured_on(table.select(NEEDED).to_pylist())
     panels: list[Panel] = [_shares(cells, other, told)]
     for family in dict.fromkeys(cell.case.partition("-")[0] for cell in cells):
         mine = [cell for cell in cells if cell.case.partition("-")[0] == family]

@@ -15,9 +15,10 @@ from harness.base.errors import InputError, Mistake
 from harness.record.base import Replay
 from harness.report.comparison import distance_words, reference
 from harness.report.figures.entry import Entry
-from harness.report.figures.of_runs import measured_on, sweep_rows
+from harness.report.figures.of_runs import sweep_rows
 from harness.report.figures.panel import Picture, Renderer
 from harness.report.frames import drawable_frames, shown_limit
+from harness.report.origin import NEEDED, measured_on
 from harness.report.page import clock, count, quantity
 from harness.report.render import (
     Studio,
@@ -87,7 +88,7 @@ def _recorded(folder: Path) -> list[_Recorded]:
     table = sweep_rows(folder)
     found = runs(table)
     names, looks = labels(found), marks(run.solver for run in found)
-    told = {row["run_id"]: row for row in table.select(["run_id", "cpu", "threads", "commit", "code"]).to_pylist()}
+    told = {row["run_id"]: row for row in table.select(["run_id", *NEEDED]).to_pylist()}
     there = [
         _Recorded(one, names[one.run_id], path, looks[one.solver], measured_on([told[one.run_id]]))
         for one in sorted(found, key=lambda run: -(run.vertices or 0))

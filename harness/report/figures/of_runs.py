@@ -14,6 +14,7 @@ from harness.base.errors import InputError, Mistake
 from harness.report import ablation
 from harness.report.figures.entry import Entry, ready
 from harness.report.figures.panel import Band, Line, Plot, Scale, Series
+from harness.report.origin import NEEDED, measured_on
 from harness.report.speed import figures as speed_figures
 from harness.report.speed.pictures import PICTURES
 from harness.report.style import OLDER, Mark, looks, numbered
@@ -38,25 +39,13 @@ def sweep_rows(folder: Path) -> pa.Table:
     return table
 
 
-def measured_on(table: Sequence[Any]) -> str:
-    """Processor, threads and code of rows, in words."""
-    words: list[str] = []
-    for key, how in (("cpu", "{}"), ("threads", "{} thread(s)"), ("commit", "commit {:.7}"), ("code", "code {}")):
-        values = sorted({row[key] for row in table if row.get(key) is not None})
-        if values and len(values) <= 2:
-            words += [how.format(", ".join(map(str, values)) if key != "commit" else str(values[0]))]
-        elif values:
-            words += [f"{len(values)} {key}s"]
-    return ", ".join(words).replace("1 thread(s)", "1 thread").replace("thread(s)", "threads")
-
-
 def timing(folder: Path, older: Older) -> list[Entry]:
     """Times of a step and of preparing, of each scene."""
     table = sweep_rows(folder)
     found, other = runs(table), older(table)
     names = labels(found)
     marked = looks((names[run.run_id], run.solver) for run in found)
-    told = measured_on(table.select(["cpu", "threads", "commit", "code"]).to_pylist())
+    told = measured_on(table.select(NEEDED).to_pylist())
     plots: list[Plot] = []
     for scene in dict.fromkeys(run.scene for run in found):
         here = [run for run in found if run.scene == scene]
@@ -124,7 +113,7 @@ def speed(folder: Path) -> list[Entry]:
     if table is None or speed_figures.MACHINE not in table["solver"].unique().to_pylist():
         raise InputError(Mistake("holds no speed report; wanted the rows of `springbench speed CONFIG`", folder))
     found = [one for one in speed_figures.figures(table) if one.status == "ok"]
-    told = measured_on(table.select(["cpu", "threads", "commit", "code"]).to_pylist())
+    told = measured_on(table.select(NEEDED).to_pylist())
     marked = looks((one.label, one.solver) for one in found)
     plots: list[Plot] = []
     for scene in dict.fromkeys(one.scene for one in found):

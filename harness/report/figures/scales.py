@@ -30,7 +30,7 @@ def in_points(ax: Axes) -> tuple[float, float]:
     return ax.bbox.width / figure.dpi * 72.0, ax.bbox.height / figure.dpi * 72.0
 
 
-def superscript(words: str) -> str:
+def _superscript(words: str) -> str:
     """A number as an exponent, of letters of the full size: mathematics would set it in 0.7 of it."""
     return words.translate(_SUPERSCRIPTS)
 
@@ -42,7 +42,7 @@ def power(value: float) -> str:
     exponent = int(np.floor(np.log10(value) + 1e-9))
     mantissa = value / 10.0**exponent
     front = "" if abs(mantissa - 1.0) < 1e-6 else f"{mantissa:g}·"
-    return f"{front}10{superscript(str(exponent))}"
+    return f"{front}10{_superscript(str(exponent))}"
 
 
 def _percent(value: float) -> str:

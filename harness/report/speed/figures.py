@@ -42,7 +42,8 @@ class Figures(NamedTuple):
     bytes and flops; passes: the part of the time that two passes over the entries of L alone take, both from where
     they lie, which a program that uses entries twice while they are in the cache exceeds; faster: than the yardstick a
     step; careful_faster: than a careful program; solves_faster: than cholespy a global step; apart: from float64's
-    converged positions, in the scene's size; code: by which it was measured.
+    converged positions, in the scene's size; code, commit, cpu, cores: by which it was
+    measured, and where.
     """
 
     scene: str
@@ -73,6 +74,9 @@ class Figures(NamedTuple):
     load: float | None = None
     solver: str = ""
     code: str = ""
+    cpu: str = ""
+    cores: int | None = None
+    commit: str = ""
 
     @property
     def older(self) -> bool:
@@ -161,6 +165,9 @@ def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], l
         *(first["status"], first["reason"], first["choice"]),
         solver=first["solver"],
         code=first["code"] or "",
+        cpu=first["cpu"] or "",
+        cores=first["cores"],
+        commit=first["commit"] or "",
     )
     if first["status"] != "ok":
         return known

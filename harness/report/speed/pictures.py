@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from harness.base import machine
+from harness.report.origin import machine_and_commit
 from harness.report.speed.figures import STEP, Figures
 from harness.report.speed.size_plot import Series, draw_by_size
 from harness.report.style import OLDER
@@ -34,9 +34,10 @@ PICTURES = (
 def draw(found: Sequence[Figures], folder: Path) -> None:
     """Draw all pictures of each scene to `folder`, WIDTH x HEIGHT pixels, PNG."""
     folder.mkdir(parents=True, exist_ok=True)
-    here = machine.describe()
+    cores = sorted({f.cores for f in found if f.cores})
     loads = [f.load for f in found if f.load is not None]
-    facts = ["median over the rounds, candidates in turns", f"{here.cores} cores", here.cpu]
+    facts = ["median over the rounds, candidates in turns", *(f"{count} cores" for count in cores)]
+    facts += machine_and_commit([{"cpu": f.cpu, "commit": f.commit} for f in found])
     if loads:
         facts.append(f"load {min(loads):.1f} to {max(loads):.1f}")
     facts += [OLDER] if any(f.older for f in found) else []

@@ -1,7 +1,7 @@
 // One run: what it was, what became of it, its picture and recording, and the command that does it again.
 "use strict";
 Object.assign(springbench, (() => {
-  const { element, put, number, percent, fixed, step, day, glyph, state, copy, title, picture, recording, command, rowOf, references, sweepOf } = springbench;
+  const { element, put, number, percent, fixed, step, day, commit, glyph, state, copy, title, picture, recording, command, rowOf, references, sweepOf } = springbench;
 
   const pair = ([name, value]) => [element("dt", {}, name), element("dd", {}, value ?? "–")];
   const list = pairs => element("dl", {}, ...pairs.filter(([, value]) => value !== null && value !== undefined && value !== "").flatMap(pair));
@@ -73,7 +73,7 @@ Object.assign(springbench, (() => {
       element("h3", {}, "Do it again"), code(command(row), "Command that repeats the run"),
       source && element("h3", {}, "Method"), method(source),
       element("h3", {}, "Made by"), list([
-        ["code", element("span", {}, element("code", {}, (row.commit || "unknown").slice(0, 12)), ` (sources ${row.code})`)], ["machine", `${row.cpu || "unknown"} (${(row.machine || "").slice(0, 6)})`],
+        ["code", element("span", {}, element("code", {}, commit(row.commit)), ` (sources ${row.code})`)], ["machine", `${row.cpu || "unknown"} (${(row.machine || "").slice(0, 6)})`],
         ["on", (row.started || "").replace("T", " ").slice(0, 16)], ["timed", row.timing], ["own code", row.own],
       ]),
       element("p", {}, element("a", { href: `${sweep.up}rows/${encodeURIComponent(row.unit)}.parquet` }, "Its rows (Parquet)"), " · ",

@@ -98,7 +98,7 @@ Object.assign(springbench, (() => {
         element("div", {}, element("h3", {}, "Do it again"), springbench.commandBox(command, "Command that repeats the measurement"),
           springbench.method(chart.references?.[item.label]),
           own && element("h3", {}, `Recording of ${item.label}'s solve`), own && springbench.replayBox(item.recording, own, sweep.replays?.[item.recording] && `site/data/${encodeURIComponent(sweep.slug)}/${sweep.replays[item.recording]}.js`, `${item.label}: ${item.what}`),
-          element("p.muted", {}, `Made by code ${(made.commit || "unknown").slice(0, 12)} on ${made.cpu || "an unknown machine"}${sweep.made.length > 1 ? `, and by ${sweep.made.length - 1} more (see the overview)` : ""}.`)),
+          element("p.muted", {}, `Made by code ${springbench.commit(made.commit)} on ${made.cpu || "an unknown machine"}${sweep.made.length > 1 ? `, and by ${sweep.made.length - 1} more (see the overview)` : ""}.`)),
         item.picture && element("figure", {}, element("a", { href: sweep.up + item.picture.path }, element("img", { src: sweep.up + item.picture.path, alt: `The step's mesh, by ${item.picture.of}` })),
           element("figcaption", {}, `Not this point: the mesh where ${item.picture.of} came nearest the minimum of this step.`))));
     await scrubber(scrub, sweep, item, k);
