@@ -72,7 +72,10 @@ WANTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     ),
     "mesh": ("a subclass of harness.scenes.mesh.generator.Generator", _is_model(Generator, "generate")),
     "report": ("a function of rows and a folder", callable),
-    "integrator": ("an object of solvers.integrators.Integrator", lambda made: isinstance(made, integrators.Any)),
+    "integrator": (
+        "an object of solvers.integrators.Integrator",
+        lambda made: isinstance(made, integrators.AnyIntegrator),
+    ),
 }
 """What own code may be: in words, and by a test."""
 

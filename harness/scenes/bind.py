@@ -51,7 +51,7 @@ class Scene:
     filters: tuple[VelocityFilter, ...]
     pin_targets: Positions
     velocity: tuple[float, float, float]
-    integrator: integrators.Any = IMPLICIT_EULER
+    integrator: integrators.AnyIntegrator = IMPLICIT_EULER
     moving: tuple[tuple[NDArray[np.int64], Motion], ...] = ()
     start: Rest = AT_REST
     apart: tuple[Apart, ...] = ()
@@ -161,7 +161,7 @@ def _single(spec: SceneSpec, parts: list[Contribution]) -> None:
                 raise InputError(Mistake(problem, key=f"effects[{i}]"))
 
 
-def _ends(parts: list[Contribution], method: integrators.Any, name: str) -> None:
+def _ends(parts: list[Contribution], method: integrators.AnyIntegrator, name: str) -> None:
     """Raise InputError where an effect asks for unknowns at the step's end, and the integrator has others."""
     there = [n for n, known in integrators.INTEGRATORS.items() if getattr(known, "when", 0.0) == 1.0 and n != "own"]
     for i, part in enumerate(parts):

@@ -13,7 +13,7 @@ __all__ = [
     "IMPLICIT_EULER",
     "INTEGRATORS",
     "OWN",
-    "Any",
+    "AnyIntegrator",
     "End",
     "GeneralisedAlpha",
     "Integrator",
@@ -34,9 +34,9 @@ step's start is needed; embedded: the order of the method that the error is told
 one by one.
 """
 
-Any = Integrator | Staged
+AnyIntegrator = Integrator | Staged
 
-INTEGRATORS: dict[str, Any] = {
+INTEGRATORS: dict[str, AnyIntegrator] = {
     "implicit-euler": IMPLICIT_EULER,
     "bdf2": BDF2,
     "midpoint": MIDPOINT,
@@ -57,11 +57,11 @@ EVERY = Table("springbench.integrators", INTEGRATORS)
 """All that a config can name."""
 
 
-def splits(method: Any) -> bool:
+def splits(method: AnyIntegrator) -> bool:
     """Whether filters of the velocity act before a step; an integrator that takes forces where they act has none."""
     return isinstance(method, Integrator) and method.splits
 
 
-def find(name: str) -> Any:
+def find(name: str) -> AnyIntegrator:
     """The integrator of a name, which may be somebody's own."""
     return INTEGRATORS[name] if name in INTEGRATORS else load(EVERY[name])

@@ -48,7 +48,7 @@ COLUMNS = (
         "price_bound", _REAL, "", "the least that it can be: the effect's own numbers are read once, by a dot product"
     ),
     Column("bytes", _INT, "B", "memory of the bound scene and the prepared solver, as Python's allocators see it"),
-    Column("nnz_system", _INT, "", "stored entries of the system matrix Q"),
+    *as_in_runs("nnz_system"),
     Column("nnz_factor", _INT, "", "stored entries of the triangular factor L: of the Hessian's where one is made"),
     Column("largest", _REAL, "", "largest displacement of a vertex in any frame, in mean rest lengths"),
     Column("rms", _REAL, "", "root mean square of the displacements over vertices and frames, in mean rest lengths"),

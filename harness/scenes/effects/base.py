@@ -87,7 +87,7 @@ class Contribution:
     continuous: tuple[Callable[[], Contribution], ...] = field(default=())
     """Makes what does the same by forces and energies alone: for integrators that take forces at their unknowns."""
 
-    def by(self, method: integrators.Any) -> Contribution:
+    def by(self, method: integrators.AnyIntegrator) -> Contribution:
         """What an integrator takes of it."""
         return self.continuous[0]() if self.continuous and not splits(method) else self
 
