@@ -15,7 +15,7 @@ from harness.config.load import load_any
 from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.asked import held
 from harness.experiments.asked.goals import Met
-from harness.experiments.asked.peers import PEERS
+from harness.experiments.asked.libraries import LIBRARIES
 from solvers.registry import EVERY
 
 SPRING = """
@@ -39,14 +39,14 @@ def config(folder: Path, goals: str) -> Path:
 
 
 def test_the_shipped_goals_are_sound_and_name_their_schema() -> None:
-    goals = load_goals(CONFIGS / "goals.yaml", list(PEERS), list(EVERY)).goals
+    goals = load_goals(CONFIGS / "goals.yaml", list(LIBRARIES), list(EVERY)).goals
     assert [(one.scene, one.size) for one in goals][:4] == [
         ("chain", 9),
         ("net", 9),
         ("hanging-cloth", 9),
         ("hanging-cloth", 17),
     ]
-    controlled = load_goals(CONFIGS / "controlled.yaml", list(PEERS), list(EVERY)).goals
+    controlled = load_goals(CONFIGS / "controlled.yaml", list(LIBRARIES), list(EVERY)).goals
     assert len({one.scene for one in controlled}) == 11
     assert len(controlled) == 3 * 11
     assert all(one.goal.graded for one in controlled)
@@ -59,7 +59,7 @@ def test_the_shipped_goals_are_sound_and_name_their_schema() -> None:
     ("goal", "said"),
     [
         ("scene: sprung, error: 1e-3, peer: scipy-rk45", "came 'sprung'; wanted one of spring"),
-        ("scene: spring, error: 1e-3, peer: cvode", "came 'cvode'; wanted one of"),
+        ("scene: spring, error: 1e-3, peer: lsode", "came 'lsode'; wanted one of"),
         ("scene: spring, error: 1e-3", "wants either a `peer`, or `integrator` and `solver`"),
         ("scene: spring, error: 1e-3, integrator: midpoint", "wants either a `peer`, or `integrator` and `solver`"),
         ("scene: spring, error: 2, peer: scipy-rk45", "goals[0].error"),
@@ -68,7 +68,7 @@ def test_the_shipped_goals_are_sound_and_name_their_schema() -> None:
 )
 def test_what_cannot_be_a_goal_is_refused(tmp_path: Path, goal: str, said: str) -> None:
     with pytest.raises(InputError) as refused:
-        load_goals(config(tmp_path, f"[{{{goal}, horizon: 0.2, wanted: 0.5}}]"), list(PEERS), list(EVERY))
+        load_goals(config(tmp_path, f"[{{{goal}, horizon: 0.2, wanted: 0.5}}]"), list(LIBRARIES), list(EVERY))
     assert said in str(refused.value)
 
 
@@ -116,7 +116,7 @@ def test_what_takes_too_long_is_a_bound_of_the_goal(tmp_path: Path, monkeypatch:
 
 
 def test_a_graded_error_is_near_the_one_asked_or_it_is_said_why_not() -> None:
-    (one, *_) = load_goals(CONFIGS / "controlled.yaml", list(PEERS), list(EVERY)).goals
+    (one, *_) = load_goals(CONFIGS / "controlled.yaml", list(LIBRARIES), list(EVERY)).goals
     times = {"seconds": 1.0, "other_seconds": 1.0}
     cases = {(2.1, ""): False, (2.0, ""): True, (0.3, ""): False, (0.3, "unstable"): True}
     for (part, note), holds in cases.items():

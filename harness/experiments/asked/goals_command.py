@@ -25,11 +25,11 @@ def goals(
     from harness.experiments.accuracy.accuracy_rows import SCHEMA
     from harness.experiments.accuracy.units import references
     from harness.experiments.asked.goals import Met, met
-    from harness.experiments.asked.peers import PEERS
+    from harness.experiments.asked.libraries import LIBRARIES
     from harness.experiments.provenance import provenance
     from solvers.registry import EVERY
 
-    asked = load_goals(config, list(PEERS), list(EVERY))
+    asked = load_goals(config, list(LIBRARIES), list(EVERY))
     folder = claimed(results / asked.name, config)
     table = Table("", "asked", "error", "way", "against", "times its cost", "wanted", "")
     found = list[Met]()

@@ -1,0 +1,116 @@
+"""Integrators of other libraries, each at a tolerance: SciPy's, and CVODE of SUNDIALS where it is installed.
+
+Radau, BDF and CVODE's BDF know which entries of the Jacobian are zero; CVODE's Adams solves by GMRES without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.sparse import block_array, csr_array, eye_array, kron
+
+from harness.base.errors import RunFailed
+from harness.reference.motion import State
+from harness.scenes.bind import Scene
+from solvers.problem import LaggedEnergy, Start
+
+_STEPS = 10**8
+"""CVODE may take: the clock ends it."""
+
+
+class Motion(NamedTuple):
+    """What is integrated: the field F of y' = F(t, y), the scene that it is of, up to a time [s]; the relative
+    tolerance of y, and the absolute one [m, m/s]."""
+
+    field: Callable[[float, State], State]
+    start: State
+    scene: Scene
+    until: float
+    relative: float
+    absolute: float
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """An integrator of somebody else's. order: about that of its error; end: where a motion ends, which raises
+    RunFailed; compiled: whether forces are; module: what it needs, and extra: what installs that, empty for what is
+    always there."""
+
+    order: int
+    end: Callable[[Motion], State]
+    compiled: bool = True
+    module: str = ""
+    extra: str = ""
+
+    @property
+    def missing(self) -> str:
+        """Which command installs it, if it is not there."""
+        if not self.module or find_spec(self.module):
+            return ""
+        return f"is not installed; `.venv/bin/pip install -e '.[{self.extra}]'` in the checkout installs it"
+
+
+def _scipy(method: str) -> Callable[[Motion], State]:
+    def end(motion: Motion) -> State:
+        solve: Any = solve_ivp  # its stubs say little of what it answers
+        more: dict[str, Any] = {"jac_sparsity": pattern(motion.scene)} if method in ("Radau", "BDF") else {}
+        more |= {"rtol": motion.relative, "atol": motion.absolute}
+        solved = solve(motion.field, (0.0, motion.until), motion.start, method, **more)
+        if not solved.success:
+            raise RunFailed(str(solved.message))
+        return solved.y[:, -1]
+
+    return end
+
+
+def _cvode(method: str) -> Callable[[Motion], State]:
+    def end(motion: Motion) -> State:
+        def rate(t: float, y: State, out: State) -> None:
+            out[:] = motion.field(t, y)
+
+        linear: dict[str, Any] = {"linsolver": "gmres"}
+        if method == "BDF":
+            linear = {"linsolver": "sparse", "sparsity": pattern(motion.scene)}
+        made: Any = import_module("sksundae.cvode").CVODE(
+            rate, method=method, rtol=motion.relative, atol=motion.absolute, max_num_steps=_STEPS, **linear
+        )
+        solved = made.solve(np.array([0.0, motion.until]), motion.start)
+        if not solved.success:
+            raise RunFailed(str(solved.message))
+        return solved.y[-1]
+
+    return end
+
+
+_SUNDIALS: dict[str, Any] = {"module": "sksundae", "extra": "sundials"}
+LIBRARIES = {
+    "scipy-dop853": Library(8, _scipy("DOP853")),
+    "scipy-dop853-numpy": Library(8, _scipy("DOP853"), compiled=False),
+    "scipy-rk45": Library(5, _scipy("RK45")),
+    "scipy-lsoda": Library(5, _scipy("LSODA")),
+    "scipy-bdf": Library(3, _scipy("BDF")),
+    "scipy-radau": Library(5, _scipy("Radau")),
+    "cvode-adams": Library(5, _cvode("Adams"), **_SUNDIALS),
+    "cvode-bdf": Library(3, _cvode("BDF"), **_SUNDIALS),
+}
+"""By the names of their rows."""
+
+
+def pattern(scene: Scene) -> csr_array:
+    """Which entries of F's Jacobian may differ from zero, (6 f, 6 f): 1 where they may."""
+    system, p = scene.system, scene.mesh.rest
+    begun = Start(p, np.zeros_like(p), 0.0, p, system.rate, 0.0)
+    n = 3 * system.vertices
+    begins = (energy.begin_step(begun) if isinstance(energy, LaggedEnergy) else energy for energy in system.energies)
+    all_of_them = sum((abs(energy.hessian(p)) for energy in begins), csr_array((n, n)))
+    whole = kron(eye_array(system.vertices), np.ones((1, 3)))  # a vertex couples with all of its coordinates
+    vertices = csr_array(csr_array(whole @ all_of_them @ whole.T)[system.free])[:, system.free]
+    coupled = csr_array(kron(vertices + eye_array(len(system.free)), np.ones((3, 3))))
+    coupled.data[:] = 1.0
+    return csr_array(block_array([[None, eye_array(coupled.shape[0])], [coupled, coupled]]))
