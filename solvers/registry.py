@@ -18,6 +18,7 @@ SOLVERS = {
     "lbfgs": "solvers.methods.lbfgs:Lbfgs",
     "newton": "solvers.methods.newton:Newton",
     "newton-cg": "solvers.methods.newton_cg:NewtonCG",
+    "pncg": "solvers.methods.pncg:NonlinearCG",
     "hybrid": "solvers.methods.hybrid:Hybrid",
     "xpbd": "solvers.methods.xpbd:Xpbd",
     "xpbd-small-steps": "solvers.methods.xpbd:XpbdSmallSteps",

@@ -127,7 +127,11 @@ class Metric:
 
     def residual(self, gradient: Positions) -> float:
         """|Q^-1 g|_Q [J^(1/2)] over the unpinned vertices, of a gradient g (n, 3)."""
-        e, pins = self.solve(gradient), self.system.pins
+        return self.norm(self.solve(gradient), gradient)
+
+    def norm(self, e: Positions, gradient: Positions) -> float:
+        """The same of e = Q^-1 g, which is overwritten."""
+        pins = self.system.pins
         if pins.exact.all():  # then |Q^-1 g|_Q is what g does along it
             return max(dot(e, gradient), 0.0) ** 0.5  # in this order, which keeps NaN
         e[pins.vertices] = 0.0

@@ -96,6 +96,13 @@ class Scaled:
         x[vertices] = np.einsum("vij,vj->vi", root, x[vertices])
 
 
+def preconditioned(metric: Metric, step: StepObjective, p: Positions) -> tuple[Hessian, Preconditioner]:
+    """The Hessian at p (n, 3), and what preconditions it there: Q^-1, or (S Q S)^-1 where something is touched."""
+    hessian = step.hessian(p)
+    beyond = step.touched or any(len(blocks.vertices) for blocks in hessian.pairs)
+    return hessian, Scaled(metric, *hessian.beyond()) if beyond else metric.solve
+
+
 class Method:
     """The iteration for one system. compiled: its conjugate gradients in one kernel, None where that cannot be."""
 
@@ -108,7 +115,7 @@ class Method:
         """The points after `start`."""
         loose = _TOUCHED if step.touched else _LOOSE
         point, eta = self._settling.start(step, start) if self._settling and step.touched else start, loose
-        hessian, solve = self._at(step, point)
+        hessian, solve = preconditioned(self._metric, step, point.positions)
         descent = solve(point.gradient)
         while not point.stalled:
             found = None
@@ -118,7 +125,7 @@ class Method:
             if found is None:
                 yield point._replace(stalled=True)
                 return
-            hessian, solve = self._at(step, found)
+            hessian, solve = preconditioned(self._metric, step, found.positions)
             before, descent = dot(point.gradient, descent), solve(found.gradient)
             # The safeguard of Eisenstat and Walker: eta falls no faster than its own square.
             following = 0.9 * dot(found.gradient, descent) / before
@@ -132,16 +139,10 @@ class Method:
             return search(step, at, direction)
 
         def following(point: Point) -> Positions:
-            hessian, solve = self._at(step, point)
+            hessian, solve = preconditioned(self._metric, step, point.positions)
             return self._direction(step, hessian, solve, point, solve(point.gradient), eta)
 
         return self._settling.search(step, at, direction, following)
-
-    def _at(self, step: StepObjective, at: Point) -> tuple[Hessian, Preconditioner]:
-        """The Hessian at a point, and what preconditions it there."""
-        hessian = step.hessian(at.positions)
-        beyond = step.touched or any(len(blocks.vertices) for blocks in hessian.pairs)
-        return hessian, Scaled(self._metric, *hessian.beyond()) if beyond else self._metric.solve
 
     def certifies(self, step: StepObjective, at: Point) -> bool:
         """It has no factor to tell by."""

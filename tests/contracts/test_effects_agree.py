@@ -32,7 +32,7 @@ NOISE = np.random.default_rng(0)
 def takes(solver: str, scene: str) -> bool:
     if "contact" in scene:
         return solver in CONTACT
-    return solver in TAKE_ALL or (solver in {*PROJECTIVE, "vbd"} and "gas" not in scene)
+    return solver in {*TAKE_ALL, "pncg"} or (solver in {*PROJECTIVE, "vbd"} and "gas" not in scene)
 
 
 @cache

@@ -32,7 +32,7 @@ from solvers.registry import SOLVERS, load
 from tests.scenes import scene
 from tests.self_contacts import Two
 
-TAKE = ("newton", "newton-cg", "lbfgs", "hybrid")
+TAKE = ("newton", "newton-cg", "pncg", "lbfgs", "hybrid")
 THICKNESS = 0.01
 APART = SelfContact(thickness=THICKNESS)
 

@@ -17,7 +17,7 @@ from solvers.registry import SOLVERS, load
 CASES = {
     path.stem: path for path in sorted((Path(__file__).resolve().parents[2] / "configs/hard-touch").glob("*.yaml"))
 }
-SOLVE = ("newton", "newton-cg", "lbfgs", "hybrid")
+SOLVE = ("newton", "newton-cg", "pncg", "lbfgs", "hybrid")
 QUICK = {"edges-parallel", "vertex-on-face", "needles"}
 FEW = {"lbfgs": 4}
 """Frames, where iterations are many."""

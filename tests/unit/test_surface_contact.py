@@ -110,7 +110,7 @@ def test_nothing_passes_through_any_obstacle(name):
     assert touched > 20
 
 
-@pytest.mark.parametrize("name", ["newton", "newton-cg", "lbfgs", "hybrid"])
+@pytest.mark.parametrize("name", ["newton", "newton-cg", "pncg", "lbfgs", "hybrid"])
 @pytest.mark.parametrize("sideways", [0.0, 6.0])
 def test_an_obstacle_that_moves_pushes_the_sheet_and_never_passes_it(name, sideways):
     keys = (Key(time=0.0), Key(time=0.1, offset=(0.0, 0.3, 0.0)), Key(time=0.3, offset=(0.2, 0.3, 0.0), turn=120.0))
