@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from harness.base import rows
 from harness.cli import app
+from harness.experiments.gates.live import summary
 from harness.experiments.gates.sequential import Rule
 from harness.experiments.gates.study import OTHERS, SCHEMA, Start, read, replay, replay_other
 from tests.scenes import CLOTH_FILE
@@ -77,6 +78,23 @@ def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypa
     done = CliRunner().invoke(app, ["gate-study", "replay", str(samples), "--replays", "20"])
     assert done.exit_code == 0, done.output
     assert "asv continuous" in done.output
+
+
+@pytest.mark.long
+def test_real_gates_are_held_and_counted_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "cloth.yaml").write_text(CLOTH_FILE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("harness.experiments.gates.revisions.root", lambda folder: folder)
+    given = ["gate-study", "live", "held.parquet", "cloth.yaml", "--solver", "sparse", "--budget", "20", "--limit", "2"]
+    assert CliRunner().invoke(app, [*given, "--gates", "2"]).exit_code == 0
+    done = CliRunner().invoke(app, [*given, "--gates", "1", "--planted", "4"])
+    assert done.exit_code == 0, done.output
+    (same, slower) = summary(tmp_path / "held.parquet")
+    # A machine that is too busy lets a gate say that it cannot tell, and nothing else.
+    assert same[3:7] == ("0%", "100%", "2", "0")
+    assert int(same[7]) + int(same[8]) == 2
+    assert slower[3:6] == ("400%", "100%", "1")
+    assert slower[7] == "0"
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,19 @@
-"""`springbench gate-study`: record turns, and replay the gates' rule over what was recorded."""
+"""`springbench gate-study`: record turns, replay the gates' rule over what was recorded, and hold real gates."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from harness.base.console import out, say
 from harness.base.errors import InputError
+
+if TYPE_CHECKING:
+    from harness.experiments.gates.against import Request
 
 study = typer.Typer(help="How often gates are wrong, and what they find.", no_args_is_help=True)
 
@@ -17,28 +21,67 @@ CASES = ((1.0, 1.03), (1.1, 1.03), (1.05, 1.03), (1.02, 1.01))
 """Slowdowns, the first of none, and the limits of the gates that are to see them."""
 
 
-@study.command()
-def record(
-    samples: Annotated[Path, typer.Argument(help="Where to store the turns (.parquet).")],
-    config: Annotated[Path, typer.Argument(help="A scene or a sweep, whose runs take turns with themselves.")],
-    condition: Annotated[str, typer.Option(help="What is to run beside it: nothing, busy, bursty.")] = "nothing",
-    seconds: Annotated[float, typer.Option(help="For each run.")] = 1800.0,
-    starts: Annotated[int, typer.Option(help="Pairs of processes for each run.")] = 10,
-    size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
-    solver: Annotated[list[str] | None, typer.Option(help="For a scene: solvers; repeatable.")] = None,
-    planted: Annotated[float, typer.Option(help="Extra work of one of the two, as a part of its iterations.")] = 0.0,
-) -> None:
-    """Let two processes of this checkout take turns, and store every time."""
+Config = Annotated[Path, typer.Argument(help="A scene or a sweep, whose runs take turns with themselves.")]
+Condition = Annotated[str, typer.Option(help="What is to run beside it: nothing, busy, bursty.")]
+Sizes = Annotated[list[int] | None, typer.Option("--size", help="For a scene: mesh sizes; repeatable.")]
+Solvers = Annotated[list[str] | None, typer.Option("--solver", help="For a scene: solvers; repeatable.")]
+Planted = Annotated[float, typer.Option(help="Extra work of one of the two, as a part of its iterations.")]
+
+
+def _asked(config: Path, sizes: list[int] | None, solvers: list[str] | None) -> tuple[Path, Sequence[Request]]:
+    """The checkout, and a request for each of the config's runs. Raises InputError."""
     from harness.experiments.gates import revisions
     from harness.experiments.gates.against import requests_of_config
     from harness.experiments.gates.pair import Side
-    from harness.experiments.gates.study import record as record_turns
 
     checkout = revisions.root(Path.cwd())
     sides = Side("the one", checkout), Side("the other", checkout)
-    requests = requests_of_config(sides, config, {"solvers": solver or [], "sizes": size or []})
+    return checkout, requests_of_config(sides, config, {"solvers": solvers or [], "sizes": sizes or []})
+
+
+@study.command()
+def record(
+    samples: Annotated[Path, typer.Argument(help="Where to store the turns (.parquet).")],
+    config: Config,
+    condition: Condition = "nothing",
+    seconds: Annotated[float, typer.Option(help="For each run.")] = 1800.0,
+    starts: Annotated[int, typer.Option(help="Pairs of processes for each run.")] = 10,
+    sizes: Sizes = None,
+    solvers: Solvers = None,
+    planted: Planted = 0.0,
+) -> None:
+    """Let two processes of this checkout take turns, and store every time."""
+    from harness.experiments.gates.study import record as record_turns
+
+    checkout, requests = _asked(config, sizes, solvers)
     record_turns(samples, checkout, requests, condition, seconds=seconds, starts=starts, planted=planted)
     say(f"turns are in {samples}")
+
+
+@study.command()
+def live(
+    found: Annotated[Path, typer.Argument(help="Where the answers are stored (.parquet); those there are kept.")],
+    config: Config,
+    gates: Annotated[int, typer.Option(help="How many gates are held of each run.")] = 100,
+    condition: Condition = "nothing",
+    limit: Annotated[float, typer.Option(help="The ratio of times from which on something counts as slower.")] = 1.03,
+    budget: Annotated[float, typer.Option(help="Seconds of a gate.")] = 120.0,
+    sizes: Sizes = None,
+    solvers: Solvers = None,
+    planted: Planted = 0.0,
+) -> None:
+    """Hold real gates, in processes started anew for each, and print how many failed, held and could not tell."""
+    from rich.table import Table
+
+    from harness.experiments.gates.against import Options
+    from harness.experiments.gates.live import hold, summary
+
+    checkout, requests = _asked(config, sizes, solvers)
+    hold(found, checkout, requests, condition, Options(budget, limit), gates=gates, planted=planted, say=say)
+    table = Table("gate", "beside it", "load", "planted", "limit", "gates", "fails", "holds", "cannot tell", "median s")
+    for row in summary(found):
+        table.add_row(*row)
+    out().print(table)
 
 
 @study.command()
