@@ -18,7 +18,11 @@ LIST = ROOT / "slow.txt"
 KINDS = (
     *("float16", "float32", "eigen", "cholmod"),  # kernels of their own, and programs in C++
     *("bench/test_exact.py", "unit/test_speed.py", "unit/test_second_opinion_"),
-    *("unit/test_vbd_elements.py", "refuse_by_name[vbd-"),  # a kernel for each set of effects
+    *(
+        "unit/test_vbd_elements.py",
+        "refuse_by_name[vbd-",
+        "unit/test_effect_gas.py::test_a_balloon_of_a_thousand",
+    ),  # a kernel for each set of effects
     *("stability/test_hard_answers.py", "stability/test_properties", "contracts/test_backends_agree.py"),
 )
 """Parts of their names."""

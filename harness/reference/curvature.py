@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from harness.reference.oracle import symmetric_lu
+from solvers.energies.coupled import Coupled
 from solvers.linear.block import BlockCholesky
 from solvers.matrices import diagonal
 from solvers.problem import Positions, StepProblem
@@ -39,6 +40,32 @@ SHIFTS = (0.0, *(10.0**k for k in range(-17, 2)))
 
 
 Solve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+class Hessian(NamedTuple):
+    """H = S + V V' [N/m] without the exactly pinned vertices. sparse: S (3 f, 3 f); columns: V (3 f, r), none where all
+    energies are sparse (see `solvers.energies.coupled`)."""
+
+    sparse: csr_array
+    columns: NDArray[np.float64]
+
+    def times(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """H x, (3 f,)."""
+        return self.sparse @ x + self.columns @ (self.columns.T @ x)
+
+    def bend(self, x: NDArray[np.float64]) -> float:
+        """x' H x."""
+        along = self.columns.T @ x
+        return float(x @ (self.sparse @ x) + along @ along)
+
+    def sums(self, x: NDArray[np.float64]) -> float:
+        """|x|' |H| |x|, at most."""
+        along = np.abs(self.columns).T @ np.abs(x)
+        return float(np.abs(x) @ (abs(self.sparse) @ np.abs(x)) + along @ along)
+
+    def toarray(self) -> NDArray[np.float64]:
+        """All entries."""
+        return self.sparse.toarray() + self.columns @ self.columns.T
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,16 +101,16 @@ def curvature(problem: StepProblem, p: Positions) -> Curvature:
     if not len(free):
         return Curvature(np.inf, 0.0, direction, np.copy)
     H = free_hessian(problem, p)
-    if not np.isfinite(H.data).all():
+    if not (np.isfinite(H.sparse.data).all() and np.isfinite(H.columns).all()):
         return Curvature(np.nan, np.inf, direction, np.copy)
     x, solve = _softest(H)
-    smallest, rng = float(x @ (H @ x)), np.random.default_rng(0)
+    smallest, rng = H.bend(x), np.random.default_rng(0)
 
     def change(q: Positions) -> float:
-        return float(x @ (free_hessian(problem, q) @ x)) - smallest
+        return free_hessian(problem, q).bend(x) - smallest
 
     moved = max(abs(change(p * (1.0 + EPS * rng.integers(-1, 2, p.shape)))) for _ in range(ROUNDINGS))
-    sums = EPS * float(np.abs(x) @ (abs(H) @ np.abs(x)))
+    sums = EPS * H.sums(x)
     direction[free] = x.reshape(-1, 3)
     here = Curvature(smallest, 4.0 * (sums + moved), direction, solve)
     lost = -np.sign(smallest) * change(across(problem, p, here))
@@ -101,53 +128,80 @@ def across(problem: StepProblem, p: Positions, at: Curvature, *, most: float = S
     return q
 
 
-def free_hessian(problem: StepProblem, p: Positions) -> csr_array:
-    """The objective's Hessian at p [N/m], without the exactly pinned vertices, (3 f, 3 f)."""
+def free_hessian(problem: StepProblem, p: Positions) -> Hessian:
+    """The objective's Hessian at p."""
     system = problem.system
     _, vertices, weight = system.penalty
     held = system.inertia + np.bincount(vertices, weight, minlength=system.vertices)
-    total = diagonal(np.repeat(held, 3))
+    total, columns = diagonal(np.repeat(held, 3)), [np.empty((*p.shape, 0))]
     for energy in problem.energies:
-        total = csr_array(total + energy.hessian(p))
+        if isinstance(energy, Coupled):
+            total = csr_array(total + energy.sparse_hessian(p))
+            columns.append(energy.columns(p))
+        else:
+            total = csr_array(total + energy.hessian(p))
     free = (3 * system.free[:, None] + np.arange(3)).ravel()
-    return csr_array(total[free][:, free])
+    V = np.concatenate(columns, axis=2).reshape(p.size, -1)
+    return Hessian(csr_array(total[free][:, free]), V[free])
 
 
-def _softest(H: csr_array) -> tuple[NDArray[np.float64], Solve]:
+def _softest(H: Hessian) -> tuple[NDArray[np.float64], Solve]:
     """The eigenvector of the smallest eigenvalue of a symmetric matrix, of length 1, and the product with the inverse
     of the matrix, shifted as little as makes it positive definite."""
-    size = H.indptr.size - 1
-    scale = float(abs(H).sum(axis=1).max())
+    size = H.sparse.indptr.size - 1
+    rows = abs(H.sparse).sum(axis=1) + np.abs(H.columns) @ np.abs(H.columns).sum(axis=0)
+    scale = float(rows.max())
     start = np.random.default_rng(0).normal(size=size)  # the same eigenvector each time
     for shift in SHIFTS:
-        solve = definite(csr_array(H + diagonal(np.full(size, shift * scale))))
+        solve = definite(H._replace(sparse=csr_array(H.sparse + diagonal(np.full(size, shift * scale)))))
         if solve is not None:
-            given: Any = {"shape": H.shape, "matvec": solve, "dtype": np.dtype(np.float64)}
+            given: Any = {"shape": H.sparse.shape, "dtype": np.dtype(np.float64)}
             settings: Any = {
                 "k": 1,
                 "sigma": -shift * scale,
-                "OPinv": LinearOperator(**given),
+                "OPinv": LinearOperator(matvec=solve, **given),
                 "v0": start,
                 "tol": 1e-8,
             }
-            _, vectors = cast(tuple[Any, NDArray[np.float64]], eigsh(H, **settings))
+            A = LinearOperator(matvec=H.times, **given) if H.columns.size else H.sparse
+            _, vectors = cast(tuple[Any, NDArray[np.float64]], eigsh(A, **settings))
             return vectors[:, 0], solve
     raise ValueError("a Hessian that no multiple of the identity makes positive definite is not symmetric")
 
 
-def definite(H: csr_array) -> Solve | None:
+def definite(H: Hessian) -> Solve | None:
     """The product with the inverse of a symmetric matrix of 3 x 3 blocks; None where it is not positive definite in
-    floating point: some pivot of its factor is not positive."""
-    if H.indptr.size > LARGE:
-        blocks = bsr_array(H, blocksize=(3, 3))
+    floating point: some pivot of its factor is not positive.
+
+    Of S + V V' the number of negative eigenvalues is that of S less that of I + V'S^-1 V (Sylvester's law of inertia).
+    """
+    S, V = H
+    if S.indptr.size > LARGE:
+        blocks = bsr_array(S, blocksize=(3, 3))
         blocks.sort_indices()
         cholesky = BlockCholesky(csr_array((np.ones(len(blocks.indices)), blocks.indices, blocks.indptr)))
         if not cholesky.factorise(np.array(blocks.data, np.float64)):
             return None
-        return lambda x: cholesky.solve(x.reshape(-1, 3)).ravel()
-    try:
-        factor = symmetric_lu(H)
-    except RuntimeError:  # a pivot is zero
+        inner: Solve = lambda x: cholesky.solve(x.reshape(-1, 3)).ravel()  # noqa: E731
+        negative = 0
+    else:
+        try:
+            factor = symmetric_lu(S)
+        except RuntimeError:  # a pivot is zero
+            return None
+        pivots = factor.U.diagonal()
+        if not np.array_equal(factor.perm_r, factor.perm_c):  # a pivot was not to be had on the diagonal
+            return None
+        inner, negative = factor.solve, int(np.count_nonzero(~(pivots > 0.0)))
+    if not V.size:
+        return inner if negative == 0 else None
+    W = np.stack([inner(np.ascontiguousarray(column)) for column in V.T], axis=1)
+    C = np.eye(V.shape[1]) + V.T @ W
+    if not np.isfinite(C).all() or negative != np.count_nonzero(np.linalg.eigvalsh(0.5 * (C + C.T)) < 0.0):
         return None
-    symmetric = np.array_equal(factor.perm_r, factor.perm_c)  # else a pivot was not to be had on the diagonal
-    return factor.solve if symmetric and (factor.U.diagonal() > 0.0).all() else None
+
+    def solve(b: NDArray[np.float64]) -> NDArray[np.float64]:
+        x = inner(b)
+        return x - W @ np.linalg.solve(C, V.T @ x)
+
+    return solve

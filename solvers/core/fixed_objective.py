@@ -7,7 +7,7 @@ what does not change in a run is added up once.
 from __future__ import annotations
 
 from functools import cached_property, reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,21 @@ from scipy.sparse import csr_array
 
 from solvers import matrices
 from solvers.core.pattern import Matrix
+from solvers.energies.elements import Elements, Law
 from solvers.energies.springs import Springs
 from solvers.kernels import objective
 from solvers.kernels.forms import Form
 from solvers.problem import Energy, LaggedEnergy, ProjectiveEnergy, System
+
+
+class Stated(NamedTuple):
+    """What a step knows of an energy that states a law: which of the system's it is, whether it is projective, its law,
+    and its elements."""
+
+    number: int
+    projective: bool
+    law: Law
+    elements: Elements
 
 
 class Objective:

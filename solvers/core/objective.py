@@ -9,17 +9,19 @@ once (`solvers.core.pattern`); what does not change in a run or in a step is add
 from __future__ import annotations
 
 from functools import cached_property, reduce
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from solvers.core import low_rank
 from solvers.core.bounds import Bounded, PairBlocks, is_bounded, reach
-from solvers.core.fixed_objective import Objective
+from solvers.core.fixed_objective import Objective, Stated
 from solvers.core.pattern import Matrix
-from solvers.energies.elements import Elements, Joined, Law, add_blocks
+from solvers.energies.elements import Joined, add_blocks
 from solvers.kernels import forms, hessian, objective
+from solvers.linear.block import BlockCholesky
 from solvers.problem import Energy, Positions, StepProblem
 
 _ROUND_OFF = 4.0 * np.finfo(np.float64).eps
@@ -27,16 +29,6 @@ _ROUND_OFF = 4.0 * np.finfo(np.float64).eps
 
 _NEAR = 1e-10
 """Of that size, the change from which on its values tell less than its slopes do."""
-
-
-class Stated(NamedTuple):
-    """What a step knows of an energy that states a law: which of the system's it is, whether it is projective, its law,
-    and its elements."""
-
-    number: int
-    projective: bool
-    law: Law
-    elements: Elements
 
 
 class StepObjective:
@@ -170,7 +162,8 @@ class Hessian:
     def __init__(self, step: StepObjective, p: Positions) -> None:
         self._step, self._p = step, p
         self._terms, self._free = step.whole.terms, step.whole.system.free
-        parts = [csr_array(energy.hessian(p)) for energy in step.own if energy not in step.bounded]
+        parts = [low_rank.sparse_part(energy, p) for energy in step.own if energy not in step.bounded]
+        self._columns = low_rank.columns(step.own, p) if step.own else None
         self._others = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
         self._curvature = step.curvature(p)
         self.pairs: list[PairBlocks] = [energy.blocks(p) for energy in step.bounded]
@@ -203,8 +196,7 @@ class Hessian:
 
         keep: of the negative lateral part of springs; shift: added to the diagonal [N/m]; tension (m,): of springs [N].
         """
-        matrix = self._assembled(keep, shift, tension)
-        return matrix.factor.factorise(matrix.values)
+        return self._factor.factorise(self._assembled(keep, shift, tension).values)
 
     def solve_anew(
         self,
@@ -214,8 +206,8 @@ class Hessian:
         tension: NDArray[np.float64] | None = None,
     ) -> Positions | None:
         """Both at once, sooner than one after the other; None if it is not positive definite."""
-        matrix, out = self._assembled(keep, shift, tension), np.zeros_like(b)
-        x = matrix.factor.solve_anew(matrix.values, b[self._free])
+        out = np.zeros_like(b)
+        x = self._factor.solve_anew(self._assembled(keep, shift, tension).values, b[self._free])
         if x is None:
             return None
         out[self._free] = x
@@ -244,8 +236,13 @@ class Hessian:
     def solve(self, b: Positions) -> Positions:
         """Its inverse, as it was factorised last, times b (n, 3); zero at vertices that are not free."""
         out = np.zeros_like(b)
-        out[self._free] = self._placed[0].factor.solve(b[self._free])
+        out[self._free] = self._factor.solve(b[self._free])
         return out
+
+    @cached_property
+    def _factor(self) -> BlockCholesky | low_rank.Woodbury:
+        matrix = self._placed[0]
+        return matrix.factor if self._columns is None else low_rank.Woodbury(matrix, self._columns[self._free])
 
     @cached_property
     def _tension(self) -> NDArray[np.float64]:
@@ -290,6 +287,8 @@ class Hessian:
         hessian.multiply(*self.compiled, x, product)
         if self._others is not None:
             product += (self._others @ x.ravel()).reshape(-1, 3)
+        if self._columns is not None:
+            product += self._columns @ np.einsum("nik,ni->k", self._columns, x)
         for pairs in self.pairs:
             pairs.add_product(x, product)
         out[self._free] = product[self._free]

@@ -1,6 +1,7 @@
 """A fixed amount of gas at constant temperature in a closed surface: p V = p0 V0.
 
     E(x) = -p0 V0 ln(V/V0),   V = sum over triangles of a.(b x c)/6,   grad E = -(p0 V0/V) grad V
+    Hess E = p/V grad V grad V' - p Hess V,   p = p0 V0/V
 
 Without springs that hold it together the gas would expand for ever. A surface turned inside out has no such energy: it
 is infinite there, so that a line search turns back. The energy is not projective.
@@ -16,9 +17,6 @@ from numpy.typing import NDArray
 
 from solvers.matrices import without_zeros
 from solvers.problem import Positions
-
-LARGEST_DENSE = 1_000
-"""Vertices up to which the Hessian has its dense part: 9 million entries, 100 MB."""
 
 _INSIDE_OUT = 1e-3
 """Where the volume is not positive, the gradient is taken as if it were this fraction of that at rest."""
@@ -87,18 +85,18 @@ class Gas:
         out += pressure * (areas + off / volume * slope)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
-        """The Hessian [N/m], shape (3n, 3n): p/V grad V grad V' - p grad^2 V.
+        """The Hessian [N/m], shape (3n, 3n), all of whose entries differ from zero: see `sparse_hessian`."""
+        column = self.columns(p).ravel()
+        return without_zeros(scipy.sparse.csr_array(self.sparse_hessian(p) + np.outer(column, column)))
 
-        The first part is dense and positive semidefinite. Meshes of more than LARGEST_DENSE vertices get the second,
-        sparse and indefinite one alone: enough for a quasi-Newton method, not to tell a minimum from a saddle.
-        """
+    def sparse_hessian(self, p: Positions) -> scipy.sparse.csr_array:
+        """-p Hess V [N/m], shape (3n, 3n), sparse and indefinite."""
+        return without_zeros(scipy.sparse.csr_array(-self._pressure_at(p)[0] * self._volume_hessian(p)))
+
+    def columns(self, p: Positions) -> NDArray[np.float64]:
+        """(p/V)^(1/2) grad V [(N/m)^(1/2)], shape (n, 3, 1): its square is the rest of the Hessian."""
         pressure, volume = self._pressure_at(p)
-        n = len(p)
-        H = scipy.sparse.csr_array(-pressure * self._volume_hessian(p))
-        if n <= LARGEST_DENSE:
-            g = self._volume_gradient(p).ravel()
-            H = scipy.sparse.csr_array(H + scipy.sparse.csr_array(pressure / volume * np.outer(g, g)))
-        return without_zeros(H)
+        return (np.sqrt(pressure / volume) * self._volume_gradient(p))[:, :, None]
 
     def _volume_hessian(self, p: Positions) -> scipy.sparse.csr_array:
         n = len(p)

@@ -35,7 +35,7 @@ _TABLE = (
     ("springs-hessian", f"{_E}/springs.py", "1.0, 1.0 - ratio)", "1.0, 1.0 + ratio)", _SPRINGS),
     ("gas-value", f"{_E}/gas.py", "return -self.pressure *", "return -2.0 * self.pressure *", _GAS),
     ("gas-gradient", f"{_E}/gas.py", "corner, area / 6.0)", "corner, area / 3.0)", _GAS),
-    ("gas-hessian", f"{_E}/gas.py", "csr_array(pressure / volume *", "csr_array(2.0 * pressure / volume *", _SLOPES),
+    ("gas-hessian", f"{_E}/gas.py", "(np.sqrt(pressure / volume) *", "(np.sqrt(2.0 * pressure / volume) *", _SLOPES),
     ("dashpots-origin", f"{_E}/dashpots.py", "self._along(start.origin)", "self._along(start.expected)", _DAMPING),
     (
         "dashpots-rate",

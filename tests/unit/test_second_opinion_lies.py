@@ -96,7 +96,7 @@ LIES: dict[str, Lie] = {
     "gas of twice the volume": Lie([SPRINGS, GAS], "gas", bound(Gas, scaled(volume=2.0)), mesh=BALL, size=2),
     "gas that pulls": Lie([SPRINGS, GAS], "gas (gradient)", scales(Gas, "add_gradient", -1.0), mesh=BALL, size=2),
     "gas's Hessian without its sign": Lie(
-        [SPRINGS, GAS], "gas (Hessian)", scales(Gas, "hessian", -1.0), mesh=BALL, size=2
+        [SPRINGS, GAS], "gas (Hessian)", scales(Gas, "sparse_hessian", -1.0), mesh=BALL, size=2
     ),
     "attachments ten times as stiff": Lie([SPRINGS, TIED], "attachments", bound(Attachments, scaled(weight=10.0))),
     "attachments where the points were": Lie(
