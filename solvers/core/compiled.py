@@ -34,6 +34,9 @@ from solvers.memory import aligned
 from solvers.problem import Positions, ResidualOf, StepProblem
 from solvers.round_off import EPS
 
+Ints = NDArray[np.int64]
+Reals = NDArray[np.float64]
+
 _LOST = 1e-3
 """Of the median rest length, what positions may lose by the bound, which is some 20 times what they do lose. Sheets of
 256 vertices a side and 1e5 N/m keep a hundredfold distance from it; scenes whose stiffnesses lie 1e12 apart do not."""
@@ -73,6 +76,22 @@ def _reach(base: PreparedLocalGlobal, springs: Springs) -> float:
     """The largest coordinate [m] of which a solve for positions loses at most _LOST of the median rest length."""
     lengths = springs.rest_length[springs.rest_length > 0.0]
     return _LOST * float(np.median(lengths)) / (2.0 * EPS * base.spread) if len(lengths) else np.inf
+
+
+def _plan(order: Order, first: Ints, held: Reals, measure: Reals, loose: Reals) -> step.Plan:
+    """The plan over a factor's spans, with the bundles (groups + 1,) that each begins with."""
+    spans = np.ascontiguousarray(np.column_stack([order.spans[:, :2], first[:-1], first[1:], order.spans[:, 2:]]))
+    factor = order.squares, order.panels, order.places, order.chunks, order.top
+    return step.Plan(*factor, spans, order.of_group, order.visits, order.visits_of, held, measure, loose, order.shift)
+
+
+def _rows(base: PreparedLocalGlobal, row: Ints, right: Ints, corrects: bool) -> step_ends.Rows:
+    """What is constant of the vertices' right-hand side; corrections have none of Q's coupling to exact pins."""
+    s, pins = base.system, base.system.pins
+    coupling = csr_array((0, 0)).tocoo() if corrects else base.coupling.tocoo()
+    ends = s.free[coupling.coords[0]], np.flatnonzero(pins.exact)[coupling.coords[1]]
+    held = np.array(pins.weight), np.array(pins.vertices), np.array(coupling.data, np.float64)
+    return step_ends.Rows(row, right, s.inertia, *held, *ends)
 
 
 class Work(NamedTuple):
@@ -131,38 +150,14 @@ class PreparedCompiled(Iterative):
         held[row[soft]] += weight
         measure[row[s.free]] -= 0.5 * base.coupling.sum(axis=1)
         loose[row[s.unpinned]] = 1.0
-        coupling = csr_array((0, 0)).tocoo() if corrects else base.coupling.tocoo()
         return cls(
             base,
             parts,
-            step.Plan(
-                order.squares,
-                order.panels,
-                order.places,
-                order.chunks,
-                order.top,
-                np.ascontiguousarray(np.column_stack([order.spans[:, :2], first[:-1], first[1:], order.spans[:, 2:]])),
-                order.of_group,
-                order.visits,
-                order.visits_of,
-                held,
-                form.in_lanes(measure),
-                loose,
-                order.shift,
-            ),
+            _plan(order, first, held, form.in_lanes(measure), loose),
             bundles,
             parts.edges(row, len(held)),
             form,
-            step_ends.Rows(
-                row,
-                bundles.in_right(len(held))[row],
-                inertia,
-                np.array(pins.weight),
-                np.array(pins.vertices),
-                np.array(coupling.data, np.float64),
-                s.free[coupling.coords[0]],
-                np.flatnonzero(pins.exact)[coupling.coords[1]],
-            ),
+            _rows(base, row, bundles.in_right(len(held))[row], corrects),
             nobody + 1,
             corrects,
             np.inf if corrects else _reach(base, parts.springs),

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,6 +109,15 @@ def solved(solver: str, scored: Scored, iterations: int) -> Work:
     return lambda: prepared.solve(scored.problem, StopRule(iterations)).positions
 
 
+_GOAL: Any = {
+    "tolerance": None,
+    "guards": ("test_an_accuracy_takes_as_many_iterations_as_stored",),
+    "budget": 600.0,  # some of the programs take seconds, and the ratios lie far from their limits:
+    "error": 0.05,  # nine turns that agree decide
+}
+"""What gates of goals have in common."""
+
+
 def step_gates(
     name: str, step: Callable[[], Scored], error: float, iterations: int | None = None, **limits: float
 ) -> Iterator[Gate]:
@@ -134,10 +144,7 @@ def step_gates(
             yardstick=lambda backend=backend: yardstick(backend),
             limit=limit,
             why=f"a goal: the hybrid to {error:g} beside {iterations or 'as good'} iterations of {backend}",
-            tolerance=None,
-            guards=("test_an_accuracy_takes_as_many_iterations_as_stored",),
-            budget=600.0,  # some of the programs take seconds, and the ratios lie far from their limits:
-            error=0.05,  # nine turns that agree decide
+            **_GOAL,
         )
 
 
@@ -192,10 +199,7 @@ def trajectory_gates(name: str, error: float, best: Way, **limits: float) -> Ite
             yardstick=lambda backend=backend: yardstick(backend),
             limit=limit,
             why=f"a goal: a total error of {error:g} in so much of the time of implicit Euler with {backend}",
-            tolerance=None,
-            guards=("test_an_accuracy_takes_as_many_iterations_as_stored",),
-            budget=600.0,  # some of the programs take seconds, and the ratios lie far from their limits:
-            error=0.05,  # nine turns that agree decide
+            **_GOAL,
         )
 
 
