@@ -45,7 +45,11 @@ COLUMNS = (
     Column("price_low", _REAL, "", "lower end of its 95 % interval"),
     Column("price_high", _REAL, "", "upper end of its 95 % interval"),
     Column(
-        "price_bound", _REAL, "", "the least that it can be: the effect's own numbers are read once, by a dot product"
+        "price_bound",
+        _REAL,
+        "",
+        "the least that it can be: the effect's own numbers are read once, by a dot product, or multiplied once, at "
+        "the rate of a product of matrices, whichever takes longer",
     ),
     Column("bytes", _INT, "B", "memory of the bound scene and the prepared solver, as Python's allocators see it"),
     *as_in_runs("nnz_system"),

@@ -4,13 +4,16 @@
 
 The plain scene has springs, gravity, drag by velocity filters, and pins. Both scenes go step by step in turns, each to
 the tolerance that is asked for, so that a drift of the machine meets both alike. Rounds end once the price is known to
-CLOSE, or after as many as are allowed. No iteration reads the effect's own numbers sooner than a dot product does: that
-is the bound beside each price.
+CLOSE, or after as many as are allowed; a round ends after ENOUGH, so that the slowest solvers take minutes as well.
+
+No iteration reads the effect's own numbers sooner than a dot product does, nor multiplies and adds them up sooner than
+a product of matrices does: the longer one is the bound beside each price. Of an element that couples k vertices 12 k
+flops count, those of A p and of A'f for three coordinates, and none of what happens in between.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from time import perf_counter, thread_time
 from typing import Any, NamedTuple
@@ -34,12 +37,16 @@ CLOSE, LEAST = 0.03, 3
 """Of a price, the width of its interval at which rounds end; and rounds that an interval needs."""
 WARM = 2
 """Steps before those that count."""
+ENOUGH = 2.0
+"""Seconds of CPU time, of both scenes' counted steps, after which a round has no more steps."""
 _READS = 20
+_SIDE = 256
+"""Of matrices whose product tells how many flops a second there are at the most."""
 
 
 class Price(NamedTuple):
     """Of an effect: the ratio, and seconds of CPU time an iteration with the effect; bound: the least
-    ratio that reading the effect's numbers once allows; refused: why there is none of these, in words."""
+    ratio that the effect's own bytes and flops allow; refused: why there is none of these, in words."""
 
     effect: str
     price: Interval = Interval(np.nan, np.nan, np.nan)
@@ -109,31 +116,49 @@ def price(scene: SceneSpec, size: int, effect: str, solver: Solver, stop: Stop, 
         for k in range(WARM + frames):
             for run in runs[:: 1 if len(pairs) % 2 else -1]:
                 run.step(counts=k >= WARM)
+            if sum(run.seconds for run in runs) > ENOUGH:
+                break
         pairs.append((runs[0].each, runs[1].each))
         found = ratio(*np.array(pairs).T)
         if len(pairs) >= LEAST and found.high - found.low <= CLOSE * found.middle:
             break
     each, plain = np.array(pairs).min(axis=0)
-    return Price(effect, found, float(each), 1.0 + _reading(made[0]) / plain, len(pairs))
+    return Price(effect, found, float(each), 1.0 + _least(made[0]) / plain, len(pairs))
 
 
-def _reading(scene: Scene) -> float:
-    """The least time [s] in which the numbers of all energies that are not springs are read, once each."""
+def _least(scene: Scene) -> float:
+    """The least time [s] that the arithmetic of all energies that are not springs takes, once each."""
     n = scene.system.vertices
-    size = sum(_bytes(energy, n) for energy in scene.system.energies if not isinstance(energy, Springs))
-    x, best = np.ones(size // 8), np.inf
-    for _ in range(_READS if size else 0):
+    work = [_work(energy, n) for energy in scene.system.energies if not isinstance(energy, Springs)]
+    size, flops = sum(one.bytes for one in work), sum(one.flops for one in work)
+    if not size:
+        return 0.0
+    x, A = np.ones(size // 8), np.ones((_SIDE, _SIDE))
+    return max(_fastest(lambda: x.dot(x)), flops / (2.0 * _SIDE**3) * _fastest(lambda: A @ A))
+
+
+def _fastest(work: Callable[[], object]) -> float:
+    """The least of some times [s] that it takes."""
+    best = np.inf
+    for _ in range(_READS):
         began = perf_counter()
-        x.dot(x)
+        work()
         best = min(best, perf_counter() - began)
-    return best if size else 0.0
+    return best
 
 
-def _bytes(energy: Any, n: int) -> int:
-    """What an energy's own numbers take: its elements, or its entries of Q; 0 of what is known in steps alone."""
+class _Work(NamedTuple):
+    """What an energy reads of its own, and the flops of what is linear in it."""
+
+    bytes: int = 0
+    flops: int = 0
+
+
+def _work(energy: Any, n: int) -> _Work:
+    """Of its elements, or of its entries of Q; none of what is known in steps alone."""
     if hasattr(energy, "elements"):
-        return sum(x.nbytes for x in energy.elements)
+        return _Work(sum(x.nbytes for x in energy.elements), 12 * energy.elements.vertices.size)
     if isinstance(energy, ProjectiveEnergy):
         share = csr_array(energy.stiffness_matrix(n))
-        return share.data.nbytes + share.indices.nbytes
-    return 0
+        return _Work(share.data.nbytes + share.indices.nbytes, 6 * share.nnz)
+    return _Work()
