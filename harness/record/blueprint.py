@@ -18,9 +18,6 @@ _LEGEND = 0.55
 _LISTED = 1.6
 """The height of a plot with a legend over that of one without: five names have their place at 800 pixels."""
 
-FORCES = {"external": 0xF0E442FF, "contact": 0x56B4E9FF}
-"""The colours of arrows."""
-
 COLOURS = (0xE69F00FF, 0x56B4E9FF, 0x009E73FF, 0xCC79A7FF, 0xF0E442FF, 0xD55E00FF, 0x0072B2FF, 0x999999FF)
 """Of the lines of a plot: the palette of Okabe and Ito, told apart by the colour-blind; clear on black first."""
 
@@ -45,7 +42,7 @@ def scale_name(strain_range: float) -> str:
 def scene_view(root: str, name: str, box: Box, *, springs_visible: bool) -> rrb.Spatial3DView:
     """The mesh under `root`/scene; its springs and the forces on it are there to be switched on."""
     shown: dict[Any, rrb.EntityBehavior] = {f"{root}/scene/springs": rrb.EntityBehavior(visible=springs_visible)}
-    shown |= {f"{root}/scene/forces/{force}": rrb.EntityBehavior(visible=False) for force in FORCES}
+    shown[f"{root}/scene/forces"] = rrb.EntityBehavior(visible=False)
     return rrb.Spatial3DView(
         origin=f"{root}/scene",
         name=name,
@@ -59,9 +56,9 @@ def scene_view(root: str, name: str, box: Box, *, springs_visible: bool) -> rrb.
 def plot(name: str, contents: Sequence[str], *, last: int, legend: bool = True) -> rrb.TimeSeriesView:
     """One plot of everything under the given paths, to the `last` frame, and with room for the legend beyond."""
     corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend)
-    beyond = math.ceil(last * (1 + _LEGEND if legend else 1.0)) + 1
+    beyond = math.ceil(last * (1 + _LEGEND)) + 1
     ends = (rrb.TimeRangeBoundary.absolute(seq=at) for at in (0, beyond))
-    axis = rrb.TimeAxis(view_range=rrb.TimeRange(*ends))
+    axis = rrb.TimeAxis(view_range=rrb.TimeRange(*ends)) if legend else None
     return rrb.TimeSeriesView(origin="/", contents=list(contents), name=name, plot_legend=corner, axis_x=axis)
 
 

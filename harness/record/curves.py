@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -15,7 +16,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 _WIDTH, _HEIGHT = 150.0, 100.0
-_PALE, _RULE = 0xFFFFFFFF, (70, 73, 80)
+_PALE, _RULE = 0xFFFFFFFF, 0x464950FF
 _LINE = 7.0
 """The height of a word, by which those at the ends of curves are kept apart."""
 _LOWER = 4.5
@@ -25,6 +26,7 @@ _DEEPEST = 18
 """Decades below the largest value that are drawn."""
 
 Colours = NDArray[np.uint32]
+Points = NDArray[np.float64]
 
 
 def colours(numbers: Iterable[int]) -> Colours:
@@ -41,18 +43,31 @@ def draw(stream: rr.RecordingStream, entity: str, curves: Mapping[str, Sequence[
     top = math.ceil(math.log10(known.max()) + 1e-9)
     bottom = max(min(math.floor(math.log10(known.min())), top - 1), top - _DEEPEST)
     last = max(len(values) for values in found.values())
-    _axes(stream, entity, bottom, top, last)
-    strips, ends = list[NDArray[np.float64]](), list[tuple[float, float]]()
+    rules, places, words = _axes(bottom, top, last)
+    strips, ends = list[Points](), list[tuple[float, float]]()
     for values in found.values():
         fine = np.isfinite(values) & (values >= 10.0**bottom)
         x = _across(1 + np.flatnonzero(fine), last)
         y = _HEIGHT * (top - np.log10(values[fine])) / (top - bottom)
         strips.append(np.column_stack([x, y]))
         ends.append((float(x[-1]), float(y[-1])) if len(x) else (0.0, _HEIGHT))
-    drawn = rr.LineStrips2D(strips, colors=colours, radii=rr.Radius.ui_points(1.25))
-    stream.log(f"{entity}/curves", drawn, static=True)
+    # All lines are one entity and all words another: each entity costs some 3 kB.
+    radii: Any = [rr.Radius.ui_points(0.5)] * len(rules) + [rr.Radius.ui_points(1.25)] * len(strips)
+    lines = rr.LineStrips2D([*rules, *strips], colors=_painted(len(rules), _RULE, colours), radii=radii)
+    stream.log(f"{entity}/lines", lines, static=True)
     beside = np.column_stack([np.full(len(ends), _WIDTH + 14.0), _apart([y for _, y in ends])])
-    _words(stream, f"{entity}/names", beside, list(found), colours)
+    points = rr.Points2D(
+        np.concatenate([places, beside]) - (0.0, _LOWER),
+        labels=[*words, *found],
+        show_labels=True,
+        colors=_painted(len(words), _PALE, colours),
+        radii=rr.Radius.ui_points(0.1),
+    )
+    stream.log(f"{entity}/words", points, static=True)
+
+
+def _painted(count: int, colour: int, others: Colours) -> Colours:
+    return np.concatenate([np.full(count, colour, np.uint32), others])
 
 
 def view(origin: str, name: str) -> rrb.Spatial2DView:
@@ -61,26 +76,17 @@ def view(origin: str, name: str) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(origin=origin, name=name, background=(28, 30, 34), visual_bounds=bounds)
 
 
-def _axes(stream: rr.RecordingStream, entity: str, bottom: int, top: int, last: int) -> None:
+def _axes(bottom: int, top: int, last: int) -> tuple[list[Points], Points, list[str]]:
+    """Rules, and the places of the words beside them."""
     step = -(-(top - bottom) // 6)
     decades = np.arange(top, bottom - 1, -step)
     rows = _HEIGHT * (top - decades) / (top - bottom)
     every = _round(last)
     numbers = np.arange(0, last + 1, every) if every < last else np.array([1, last])
     columns = _across(np.maximum(numbers, 1), last)
-    rules = [[(0.0, y), (_WIDTH, y)] for y in rows] + [[(x, 0.0), (x, _HEIGHT)] for x in columns]
-    stream.log(f"{entity}/rules", rr.LineStrips2D(rules, colors=_RULE, radii=rr.Radius.ui_points(0.5)), static=True)
-    places = [(-9.0, y) for y in rows] + [(x, _HEIGHT + 9.0) for x in columns]
-    words = [f"1e{decade}" for decade in decades] + [str(max(1, number)) for number in numbers]
-    _words(stream, f"{entity}/numbers", np.array(places), words, colours([_PALE] * len(words)))
-
-
-def _words(
-    stream: rr.RecordingStream, entity: str, at: NDArray[np.float64], words: list[str], colours: Colours
-) -> None:
-    dots = rr.Radius.ui_points(0.1)
-    points = rr.Points2D(at - (0.0, _LOWER), labels=words, show_labels=True, colors=colours, radii=dots)
-    stream.log(entity, points, static=True)
+    rules = [np.array([(0.0, y), (_WIDTH, y)]) for y in rows] + [np.array([(x, 0.0), (x, _HEIGHT)]) for x in columns]
+    places = np.array([(-9.0, y) for y in rows] + [(x, _HEIGHT + 9.0) for x in columns])
+    return rules, places, [f"1e{decade}" for decade in decades] + [str(max(1, number)) for number in numbers]
 
 
 def _across(iterations: NDArray[np.int64], last: int) -> NDArray[np.float64]:

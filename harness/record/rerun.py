@@ -9,7 +9,7 @@ end has been found.
 Entities: `/scene/mesh` (positions, exact to float32), `/scene/pins`, `/scene/springs`, `/scene/obstacles/*`;
 `/scene/forces/*`, arrows that are hidden at first; `/scene/scale`, of strain; `/energy/*`, `/residual`, `/iterations`,
 `/strain/largest`, `/milliseconds/*` by `frame` and `time`, `/energy_change/*` as a share of its largest;
-`/convergence/residual`, `log10_residual` and `objective` by `iteration`, a value for each of the frames that
+`/convergence/residual` and `objective` by `iteration`, a value for each of the frames that
 `/convergence` names, and drawn in `/curves/*`; `/network` (springs, rest lengths, pins), `/run` (Markdown) and the
 recording's properties. Where frames are the iterates of a solve, everything is by `iteration`, and `/solve/*` tells
 how it converges.
@@ -28,22 +28,20 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from harness.record import blueprint, curves
+from harness.record.arrows import Arrows
 from harness.record.base import LAYOUT, Frame, RecordingInfo
 from harness.record.camera import Box
 from harness.record.obstacles import Obstacles, declared
 from harness.record.partial import PartialFile
 from harness.record.shading import PIN_COLOUR, Shading
 
-FLUSH = 5
-"""Frames between flushes: what a kill may cost, against a fixed cost of about 0.4 ms and 1.5 kB a flush."""
+FLUSH = 20
+"""Frames between flushes at most: what a kill may cost. A piece of an entity costs some 1.5 kB, and .5 kB of index."""
+_FULL = 100_000
+"""Vertices that wait for a flush at most, in all of its frames."""
 
-SCALARS = 25
-"""Frames between batches of scalars, which cost about 1.2 kB each per entity."""
-
-ARROWS = 200
-"""Of a force, at most."""
-_LONGEST = 0.15
-"""The longest arrow of the first frame that has any, in the mesh's size."""
+_DRAWN = ("/milliseconds/", "/strain/largest", "/residual/log10")
+"""The scalars that the layout draws: others need no look of their own."""
 
 _STRIPS: Any = rr.components.LineStrip3DBatch([]).as_arrow_array().type
 
@@ -69,7 +67,6 @@ class RerunRecorder:
         self._springs_shown = False
         self._curves: dict[int, tuple[Sequence[float], Sequence[float]]] = {}  # residual and objective, by frame
         self._energies: dict[str, dict[int, float]] = {}
-        self._arrow: dict[str, float] = {}  # metres a newton
         self._file = PartialFile(path, blueprint.application(info), info.run_id, info.title)
         self._stream = self._file.stream
 
@@ -95,7 +92,7 @@ class RerunRecorder:
         self._obstacles.at(frame.time)
         self._log_pins(p)
         self._log_springs(p, strain)
-        self._log_forces(frame, p)
+        self._arrows.at(frame.index, p, frame.forces, self._at)
         self._add(frame.index, {f"/energy/{name}": value for name, value in frame.energies.items()})
         for name, value in frame.energies.items():
             self._energies.setdefault(name, {})[frame.index] = value
@@ -104,11 +101,11 @@ class RerunRecorder:
         crossed = {} if frame.intersections is None else {"/intersections": frame.intersections}
         self._add(frame.index, crossed | {"/residual": frame.residual, "/residual/log10": _log10(frame.residual)})
         self._frames += 1
-        if self._frames % SCALARS == 0:
-            self._send_scalars()
-        if self._frames % FLUSH == 0 or self._frames == 1:
+        if len(self._held) >= FLUSH or len(self._held) * len(p) >= _FULL or self._frames == 1:
             self._box.add(p)
             self._send_mesh()
+            if self._frames > 1:
+                self._send_scalars()
             self._file.flush()
 
     def convergence(self, frame: int, residuals: Sequence[float], objective: Sequence[float]) -> None:
@@ -133,6 +130,7 @@ class RerunRecorder:
         self._send_scalars()
         self._send_convergence()
         self._send_changes()
+        self._arrows.close(self._at)
         self._log_scale()
         return self._file.finish(blueprint.blueprint(self._info, self._box, max(self._clock, default=0)))
 
@@ -143,6 +141,7 @@ class RerunRecorder:
     def _begin(self) -> None:
         self._log_once()
         self._obstacles = Obstacles(self._stream, self._info.obstacles, self._info.mesh.rest)
+        self._arrows = Arrows(self._stream, self._info.mesh.size)
 
     def _log_once(self) -> None:
         info, mesh = self._info, self._info.mesh
@@ -176,13 +175,9 @@ class RerunRecorder:
             columns = rr.Mesh3D.columns(vertex_positions=p, vertex_normals=normals, vertex_colors=colours)
         else:
             columns = rr.Points3D.columns(positions=p, colors=colours)
-        numbers = np.array(frames)
-        index = [
-            rr.TimeColumn("frame", sequence=numbers),
-            self._seconds(numbers),
-            rr.TimeColumn("iteration", sequence=numbers if self._info.iterates else np.zeros_like(numbers)),
-        ]
-        self._stream.send_columns("/scene/mesh", index, columns.partition([len(positions[0])] * len(frames)))
+        self._stream.send_columns(
+            "/scene/mesh", self._at(np.array(frames)), columns.partition([len(positions[0])] * len(frames))
+        )
         self._held.clear()
 
     def _log_pins(self, p: NDArray[np.float32]) -> None:
@@ -204,20 +199,6 @@ class RerunRecorder:
             self._stream.log("/scene/springs", rr.Clear(recursive=False))
         self._springs_shown = due
 
-    def _log_forces(self, frame: Frame, p: NDArray[np.float32]) -> None:
-        """Arrows from where forces act, of a length that stays in proportion; of many vertices, those of some."""
-        for name, force in frame.forces.items():
-            acting = np.flatnonzero(np.abs(force).max(axis=1) > 0.0)
-            acting = acting[:: -(-len(acting) // ARROWS) or 1]
-            if len(acting) and name not in self._arrow:
-                longest = float(np.linalg.norm(force[acting], axis=1).max())
-                self._arrow[name] = _LONGEST * self._info.mesh.size / longest
-            if name in self._arrow:
-                vectors = (self._arrow[name] * force[acting]).astype(np.float32)
-                thin, colour = rr.Radius.ui_points(1.25), blueprint.FORCES[name]
-                arrows = rr.Arrows3D(origins=p[acting], vectors=vectors, colors=colour, radii=thin)
-                self._stream.log(f"/scene/forces/{name}", arrows)
-
     def _log_scale(self) -> None:
         strip, numbers = self._box.scale(self._info.strain_range)
         self._stream.log("/scene/scale", strip, static=True)
@@ -232,12 +213,11 @@ class RerunRecorder:
         for k, frame in enumerate(frames):
             for which, values in enumerate(self._curves[frame]):
                 table[which, : len(values), k] = values
-        with np.errstate(divide="ignore", invalid="ignore"):
-            logarithms = np.where(table[0] > 0, np.log10(table[0]), np.nan)
         names, times = [f"frame {frame}" for frame in frames], [self._clock[frame] for frame in frames]
         colours = curves.colours(blueprint.COLOURS[k % len(blueprint.COLOURS)] for k in range(len(frames)))
         self._stream.log("/convergence", rr.AnyValues(frames=frames, times=times), static=True)
-        for name, values in {"residual": table[0], "log10_residual": logarithms, "objective": table[1]}.items():
+        self._file.flush()  # before the values: who reads a file that was cut knows whose they are
+        for name, values in {"residual": table[0], "objective": table[1]}.items():
             self._stream.log(f"/convergence/{name}", rr.SeriesLines(names=names, colors=colours), static=True)
             columns = rr.Scalars.columns(scalars=values.ravel()).partition([len(frames)] * longest)
             index = rr.TimeColumn("iteration", sequence=range(1, longest + 1))
@@ -265,7 +245,8 @@ class RerunRecorder:
     def _send_scalars(self) -> None:
         for entity, rows in self._scalars.items():
             if rows:
-                self._style(entity, entity.rsplit("/", 1)[-1])
+                if entity.startswith(_DRAWN):
+                    self._style(entity, entity.rsplit("/", 1)[-1])
                 frames, values = zip(*rows, strict=True)
                 index = self._times(np.array(frames))
                 self._stream.send_columns(entity, index, rr.Scalars.columns(scalars=np.array(values, float)))
@@ -275,6 +256,15 @@ class RerunRecorder:
         if self._info.iterates:
             return rr.TimeColumn("frame", sequence=frames), rr.TimeColumn("iteration", sequence=frames)
         return rr.TimeColumn("frame", sequence=frames), self._seconds(frames)
+
+    def _at(self, frames: NDArray[np.int64]) -> Iterable[rr.TimeColumn]:
+        """The times of what is in the scene, which stands still on the timeline of the iterations of a run."""
+        iterations = frames if self._info.iterates else np.zeros_like(frames)
+        return (
+            rr.TimeColumn("frame", sequence=frames),
+            self._seconds(frames),
+            rr.TimeColumn("iteration", sequence=iterations),
+        )
 
     def _seconds(self, frames: NDArray[np.int64]) -> rr.TimeColumn:
         return rr.TimeColumn("time", duration=np.array([self._clock[frame] for frame in frames.tolist()]))

@@ -26,5 +26,5 @@ def test_each_curve_and_its_name_have_its_colour(count: int) -> None:
     logged = Logged()
     drawn = {f"frame {k}": [1.0, 0.1 / (k + 1)] for k in range(count)}
     curves.draw(cast(rr.RecordingStream, logged), "/curves", drawn, curves.colours(given))
-    for entity in ("/curves/curves", "/curves/names"):
-        assert logged.held[entity].colors.as_arrow_array().to_pylist() == given
+    for entity in ("/curves/lines", "/curves/words"):
+        assert logged.held[entity].colors.as_arrow_array().to_pylist()[-count:] == given

@@ -1,0 +1,71 @@
+"""Forces in a recording: arrows from where they act, hidden until somebody asks for them.
+
+Entities: `/scene/forces/<name>`. An arrow's length is in proportion to its force, by one scale a recording: the longest
+of all that were seen. It is known at the end, so they wait for that, or until HELD frames wait.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from solvers.problem import Positions
+
+MOST = 200
+"""Of a force, at most."""
+COLOURS = {"external": 0xF0E442FF, "contact": 0x56B4E9FF}
+"""By the forces' names."""
+HELD = 2000
+"""Frames that wait; later ones have the scale of these."""
+_LONGEST = 0.15
+"""The longest arrow, in the mesh's size."""
+
+Points = NDArray[np.float32]
+Times = Callable[[NDArray[np.int64]], Iterable[rr.TimeColumn]]
+
+
+class Arrows:
+    """The forces on a mesh of a size [m], in an open recording."""
+
+    def __init__(self, stream: rr.RecordingStream, size: float) -> None:
+        self._stream, self._size = stream, size
+        self._held: dict[str, list[tuple[int, Points, Points]]] = {}
+        self._scale: dict[str, float] = {}  # metres a newton
+
+    def at(self, frame: int, p: Points, forces: Mapping[str, Positions], times: Times) -> None:
+        """Keep the forces (n, 3) [N] of a frame at positions p (n, 3) [m]; of many vertices, those of some. times: the
+        index of frames by their numbers."""
+        for name, force in forces.items():
+            acting = np.flatnonzero(np.abs(force).max(axis=1, initial=0.0) > 0.0)
+            acting = acting[:: -(-len(acting) // MOST) or 1]
+            held = self._held.setdefault(name, [])
+            if len(acting) or held or name in self._scale:
+                held.append((frame, p[acting], force[acting].astype(np.float32)))
+            if len(held) >= HELD:
+                self._send(name, times)
+
+    def close(self, times: Times) -> None:
+        """Send what waits."""
+        for name in [*self._held]:
+            self._send(name, times)
+
+    def _send(self, name: str, times: Times) -> None:
+        held = self._held.pop(name)
+        if not held:
+            return
+        frames, origins, forces = zip(*held, strict=True)
+        f = np.concatenate(forces)
+        entity = f"/scene/forces/{name}"
+        if name not in self._scale:
+            with np.errstate(over="ignore", invalid="ignore"):
+                lengths = np.linalg.norm(f, axis=1)
+            longest = float(lengths[np.isfinite(lengths)].max(initial=0.0))
+            self._scale[name] = _LONGEST * self._size / longest if longest else 0.0
+            look = rr.Arrows3D.from_fields(colors=COLOURS[name], radii=rr.Radius.ui_points(1.25))
+            self._stream.log(entity, look, static=True)
+        columns = rr.Arrows3D.columns(origins=np.concatenate(origins), vectors=self._scale[name] * f)
+        counts = [len(of_frame) for of_frame in origins]
+        self._stream.send_columns(entity, times(np.array(frames)), columns.partition(counts))
