@@ -4,6 +4,7 @@
     problem-SCENE-SIZE-INTEGRATOR-FRAME.npz   a frozen problem
     minima-PROBLEM.npz                        the minima known of it
     trajectory-SCENE-SIZE-TIMES.npz           positions and velocities at some times; SCENE without its time step
+    converged-SCENE-SIZE-TIMES.npz            the same of a scene with contact, as far as it converged
 
 Files have a partial name until they are complete, and hold arrays only.
 """
@@ -22,6 +23,7 @@ from harness.base.files import replacing
 from harness.reference.frozen import Arrays, Frozen, agree, bind, freeze, moment_frames, reference_run, thaw
 from harness.reference.minimiser import MINIMUM, Minimum, Reference, find_minima, polish
 from harness.reference.motion import Field, Unintegrable
+from harness.reference.self_converged import SelfConverged, converge, touches
 from harness.reference.trajectory import Told, Trajectory, integrate
 from harness.scenes.bind import Scene
 from harness.scenes.spec import IntegratorName, SceneSpec
@@ -95,10 +97,13 @@ class Store:
         """The trajectory at ascending times [s], by which relative errors down to `error` can be measured; told: how
         far it is, where it has to be made.
 
-        It is the same for every time step of the scene. Raises InputError, Unintegrable, Unpredictable.
+        It is the same for every time step of the scene; with contact it is self-converged, from steps of about the
+        scene's own. Raises InputError, Unintegrable, Unpredictable.
         """
-        scene, witness = _moving(spec, size)
         name = f"{spec.stepped(1.0).digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
+        if touches(bind(spec, size).system):
+            return self._converged(self.folder / f"converged-{name}.npz", spec, size, times, error)
+        scene, witness = _moving(spec, size)
         path = self.folder / f"trajectory-{name}.npz"
         stored: dict[str, Any] = dict(_read(path)) if path.exists() else {}
         if stored and agree(stored.pop("witness"), witness):
@@ -107,6 +112,21 @@ class Store:
             found = integrate(scene, times, told)
             arrays = {f.name: getattr(found, f.name) for f in fields(Trajectory)}
             _write(path, arrays | {"witness": witness})
+        found.require(error)
+        return found
+
+    def _converged(self, path: Path, spec: SceneSpec, size: int, times: Sequence[float], error: float) -> SelfConverged:
+        """As it is stored, if it was made for such an error, else anew. Its witness is its first step."""
+        witness = next(iter(reference_run(bind(spec, size), self.solver, 1, [1])[0].values())).positions
+        stored: dict[str, Any] = dict(_read(path)) if path.exists() else {}
+        known = bool(stored) and agree(stored.pop("witness"), witness)
+        if known and float(stored.pop("error")) <= error:
+            plain = {key: stored.pop(key).item() for key in ("step", "moved_last")}
+            found = SelfConverged(**stored, **plain)
+        else:
+            found = converge(lambda h, name: bind(spec.stepped(h), size, name), spec.time_step, times, error)
+            arrays = {f.name: np.asarray(getattr(found, f.name)) for f in fields(SelfConverged)}
+            _write(path, arrays | {"witness": witness, "error": np.asarray(error)})
         found.require(error)
         return found
 

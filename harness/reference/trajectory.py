@@ -46,6 +46,11 @@ class Trajectory:
     disagreement: NDArray[np.float64]
     growth: NDArray[np.float64]
 
+    @property
+    def truth(self) -> str:
+        """What kind of truth it is, in a word."""
+        return "integrated"
+
     def error(self, k: int, p: Positions) -> float:
         """How far p (n, 3) [m] is from the positions at times[k], relative to the displacement from the start."""
         return float(np.linalg.norm((p - self.positions[k])[self.free])) / float(self.moved[k])

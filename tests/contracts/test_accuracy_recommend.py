@@ -58,7 +58,8 @@ def asked(scene: Path, error: float, **more: Any) -> tuple[Recommendation, int]:
     """The answer, and how many simulations were measured for it."""
     display, results = Quiet(), scene.parent / "results"
     options: dict[str, Any] = {"size": None, "horizon": 0.2, "time_limit": 60.0} | more
-    found = recommend(scene, error, results=results, display=display, say=lambda line: None, **options)
+    options = {"say": lambda line: None} | options
+    found = recommend(scene, error, results=results, display=display, **options)
     return found, display.finished_units
 
 
@@ -160,8 +161,11 @@ def test_the_command_shows_what_it_predicts_and_what_it_measured(
 
 def test_a_scene_without_a_reference_is_refused_before_anything_is_measured(scene: Path) -> None:
     scene.write_text(SCENE.replace("{kind: gravity}", "{kind: contact, obstacles: [{kind: plane, point: [0, -9, 0]}]}"))
-    with pytest.raises(RunFailed, match="contact is stiff"):
-        asked(scene, 0.1)
+    said = list[str]()
+    with pytest.raises(RunFailed, match="nothing moves"):
+        asked(scene, 0.1, say=said.append)
+    assert said[0].startswith("chain: contact has")
+    assert sum("no certified reference" in line for line in said) == 1
     assert not measured(scene)
 
 

@@ -73,6 +73,7 @@ COLUMNS = (
     *as_in_runs("cpu_seconds"),
     Column("seconds_per_simulated", _REAL, "", "median over the rounds of wall seconds per simulated second"),
     Column("error", _REAL, "", "|p(T) - reference(T)| / |reference(T) - p(0)|, Frobenius norms, vertices not pinned"),
+    Column("truth", _TEXT, "", "what that reference is: integrated, or self-converged where there is contact"),
     Column("error_rms_m", _REAL, "m", "root mean square distance of a vertex from the reference at the horizon"),
     Column("iterations_done", _INT, "", "iterations done in all steps together"),
     *as_in_runs(

@@ -36,7 +36,8 @@ def recommend(
         display=display(err()),
         say=say,
     )
-    table = Table("", "error", "wall s per simulated s", "way")
+    integrated = found.checked.truth == "integrated"
+    table = Table("", "error" if integrated else f"error ({found.checked.truth})", "wall s per simulated s", "way")
     for name, way in (("predicted", found.best), ("measured", found.checked)):
         table.add_row(name, f"{way.error:.3g}", f"{way.cost:.4g}", str(way))
     out().print(table)
@@ -46,6 +47,7 @@ def recommend(
     folder = results / f"recommend-{scene.stem}" / "pictures"
     name = f"ways-{scene.stem}-{found.best.spec.case.size}-{error:g}-{horizon:g}".replace(".", "_")
     facts = [f"{horizon:g} s simulated", "time stepping and solver together"]
+    facts += [] if integrated else [f"by a {found.checked.truth} reference"]
     picture, *_ = draw_ways(folder / name, title, facts, points, error)
     say(f"the runners-up are in {picture}")
     if command := found.best.command(scene):

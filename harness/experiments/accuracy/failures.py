@@ -7,6 +7,7 @@ from typing import Any
 from harness.experiments.failure import failure
 from harness.reference.minimiser import Uncertified
 from harness.reference.motion import Unintegrable
+from harness.reference.self_converged import NotConverged
 from harness.reference.trajectory import Unpredictable
 
 
@@ -19,6 +20,7 @@ _STATUS: dict[type[Exception], str] = {
     Uncertified: "uncertified",
     Unintegrable: "uncertified",
     Unpredictable: "uncertified",
+    NotConverged: "uncertified",
 }
 
 

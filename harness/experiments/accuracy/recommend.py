@@ -31,6 +31,8 @@ from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.accuracy.studies import run_accuracy
 from harness.experiments.accuracy.units import references, trajectory_of
 from harness.experiments.accuracy.work import work_rows
+from harness.reference.frozen import bind
+from harness.reference.self_converged import told_once, touches
 from harness.reference.store import Store
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
@@ -63,11 +65,13 @@ def candidates() -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Recommended:
-    """A way to simulate the scene, its relative error, and its wall seconds per simulated second."""
+    """A way to simulate the scene, its relative error, its wall seconds per simulated second, and what kind of truth it
+    errs from."""
 
     spec: WorkSpec
     error: float
     cost: float
+    truth: str
 
     def __str__(self) -> str:
         u = self.spec
@@ -160,6 +164,8 @@ def _referenced(
     scene: SceneSpec, size: int, error: float, horizon: float, store: Store, say: Callable[[str], None]
 ) -> None:
     """Make the reference, or say at once why there is none. Raises RunFailed."""
+    if touches(bind(scene, size).system):
+        say(told_once(scene.path.stem))
     say(f"the reference first, the motion up to {horizon:g} s, which is made once")
     last = [monotonic()]
 
@@ -205,7 +211,7 @@ def _known(
         if path.stem != spec.label() or row["machine"] != here or row["horizon"] != horizon:
             continue  # the scene was another then, or the machine, or the question
         if row["status"] == "ok":
-            ways.append(Recommended(spec, row["error"], row["seconds_per_simulated"]))
+            ways.append(_recommended(spec, row))
         else:
             without.append(row)
     return sorted(ways, key=lambda way: way.cost), without
@@ -224,7 +230,11 @@ def _check(best: Recommended, store: Store) -> Recommended:
     row = work_rows(best.spec, trajectory_of(best.spec, store), lambda: None)[0]
     if row["status"] != "ok":
         raise RunFailed(f"the check of {best} ended otherwise than before: {row['status']}: {row['reason']}")
-    return Recommended(best.spec, row["error"], row["seconds_per_simulated"])
+    return _recommended(best.spec, row)
+
+
+def _recommended(spec: WorkSpec, row: dict[str, Any]) -> Recommended:
+    return Recommended(spec, row["error"], row["seconds_per_simulated"], row["truth"] or "integrated")
 
 
 def _nothing(ways: list[Recommended], without: list[dict[str, Any]], error: float, horizon: float) -> str:

@@ -19,6 +19,8 @@ from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.accuracy.units import CurveUnit, Home, StepsUnit, WorkUnit
 from harness.experiments.core import do_all, require_threads
 from harness.experiments.resume import Standing, standings, wanted
+from harness.reference.frozen import bind
+from harness.reference.self_converged import told_once, touches
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +54,9 @@ def run_accuracy(
     `harness.experiments.core.do_all`. Raises InputError, CannotWrite.
     """
     home = Home(accuracy.name, folder)
+    for name, case in {spec.case.scene_name: spec.case for spec in reversed(accuracy.work)}.items():
+        if touches(bind(case.scene, case.size).system):
+            say(told_once(name))
     require_threads({spec.how.threads for spec in (*accuracy.curves, *accuracy.work)})
     (folder / "accuracy").mkdir(parents=True, exist_ok=True)
     with holding.alone(folder):

@@ -74,7 +74,7 @@ def _simulated(spec: WorkSpec, trajectory: Trajectory, tick: Callable[[], None])
         row["iterations_done"] = iterations
         tick()
     away = (p - trajectory.positions[-1])[scene.system.free]
-    row["error"] = trajectory.error(-1, p)
+    row["error"], row["truth"] = trajectory.error(-1, p), trajectory.truth
     row["error_rms_m"] = float(np.sqrt(np.einsum("ij,ij->i", away, away).mean()))
     row |= {"seconds": seconds, "seconds_per_simulated": float(np.median(seconds)) / spec.horizon}
     trajectory.require(row["error"])

@@ -129,6 +129,7 @@ class WorkPoint:
     first_guess: str
     horizon: float
     error: float
+    truth: str
     error_rms: float
     seconds: float
     cpu: float

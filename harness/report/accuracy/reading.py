@@ -159,6 +159,7 @@ def _work(row: _Row, label: _Label) -> WorkPoint:
         label=label(row),
         horizon=_number(row["horizon"]),
         error=_number(row["error"]),
+        truth=row["truth"] or "",
         error_rms=_number(row["error_rms_m"]),
         seconds=_number(row["seconds_per_simulated"]),
         cpu=_number(row["cpu_seconds"]) / _number(row["horizon"]),

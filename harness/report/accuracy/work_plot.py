@@ -120,6 +120,8 @@ def _draw(stem: Path, mesh: str, works: list[WorkPoint], marked: dict[str, Mark]
     sizes = _sizes(works)
     across, down = limits([w.seconds for w in known], margin=1.6), limits([w.error for w in known], margin=1.6)
     facts = [f"{quantity(works[0].horizon)} s simulated", "time stepping and solver together", *machine]
+    if any(work.truth == "self-converged" for work in works):
+        facts.insert(1, "by a self-converged reference")
     with sheet(stem, f"Work and precision: {mesh}", facts) as page:
         across_page, down_page = min(ACROSS, len(integrators)), -(-len(integrators) // ACROSS)
         width = (RIGHT - LEFT - 62) / across_page - 20
