@@ -13,9 +13,10 @@ from harness.reference.frozen import bind
 from harness.scenes.bind import Scene
 from harness.scenes.spec import SceneSpec
 from harness.simulation.controlled import Follower, Implicit
+from harness.simulation.even_steps import ImplicitEven
 from harness.simulation.own_steps import Own, OwnEven
 from solvers.contact.touching import without_contact
-from solvers.integrators import INTEGRATORS, RungeKutta
+from solvers.integrators import INTEGRATORS, Integrator, RungeKutta, find
 from solvers.problem import NotPositiveDefinite, Unsupported
 from solvers.registry import EVERY, SOLVERS, about, load, minimises
 
@@ -83,11 +84,15 @@ class Way:
 
 def tried() -> list[tuple[str, SolverSpec]]:
     """Integrators and solvers by name: those with steps of their own, and those that minimise what the integrator
-    with an error states that has the highest order, and the highest of its stages."""
+    with an error states that has the highest order, and the highest of its stages; and, with steps of one length, what
+    the one states that has the highest order of those of one unknown that begin anew each step."""
     pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded}
     best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].starts))
     told = {name: about(load(target), name) for name, target in SOLVERS.items()}
-    found = [("own" if one.own_steps else best, SolverSpec(name, {})) for name, one in told.items() if one.to_error]
+    single = {name: one.order for name, one in INTEGRATORS.items() if isinstance(one, Integrator) and not one.history}
+    even = max((name for name in single if name != "own"), key=single.__getitem__)
+    tried = {name: ("own",) if one.own_steps else (best, even) for name, one in told.items() if one.to_error}
+    found = [(integrator, SolverSpec(name, {})) for name, several in tried.items() for integrator in several]
     return sorted(found, key=lambda pair: pair[0] != "own")
 
 
@@ -123,7 +128,8 @@ def _follower(asked: Asked, integrator: str, solver: SolverSpec, frames: int | N
     if integrator == "own":
         scene, even = asked.bound(asked.frame, integrator), about(load(EVERY[solver.name]), solver.name).even
         return OwnEven(scene, made, frames, lambda h: asked.bound(h, integrator)) if even else Own(scene, made, frames)
-    return Implicit(lambda h: asked.bound(h, integrator), made, asked.frame * frames, frames)
+    way = Implicit if isinstance(find(integrator), RungeKutta) else ImplicitEven
+    return way(lambda h: asked.bound(h, integrator), made, asked.frame * frames, frames)
 
 
 def _warm(asked: Asked, integrator: str, solver: SolverSpec) -> None:
