@@ -68,7 +68,7 @@ class Worker:
             done.clear()
             step = None
             for step in simulate(scene, prepared, stop, first_guess=run.first_guess, frames=frames):
-                done.append(step.iterations)
+                done.append(_iterations(step))
             assert step is not None
             if extra:
                 prepared.solve(step.problem, StopRule(max(1, round(extra * sum(done)))))
@@ -129,6 +129,11 @@ def _sweep(config: str, asked: dict[str, Any]) -> list[Any]:
     from harness.config.load import load_any
 
     return load_any(Path(config), **asked).runs()
+
+
+def _iterations(step: Any) -> int:
+    """Of a step; older revisions know those of its one unknown."""
+    return step.iterations if hasattr(step, "iterations") else step.solution.iterations
 
 
 def _title(run: Any) -> str:
