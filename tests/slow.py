@@ -21,7 +21,8 @@ KINDS = (
     *(
         "unit/test_vbd_elements.py",
         "refuse_by_name[vbd-",
-        "unit/test_effect_gas.py::test_a_balloon_of_a_thousand",
+        "test_a_balloon_of_a_thousand",
+        "test_gas_is_minimised_where_its_sparse",
     ),  # a kernel for each set of effects
     *("stability/test_hard_answers.py", "stability/test_properties", "contracts/test_backends_agree.py"),
 )
