@@ -15,7 +15,7 @@ from tests import accuracy_rows as made
 from tests import gate_results
 from tests.recordings import info, record
 
-HERE = {"cpu": "A processor", "threads": 1, "commit": "0" * 40, "code": "abc", "status": "ok"}
+HERE = {"machine": "abc", "cpu": "A processor", "threads": 1, "commit": "0" * 40, "code": "abc", "status": "ok"}
 SOLVERS = ("dense", "sparse", "numba", "newton", "hybrid", "xpbd")
 EFFECTS = ("springs", "gravity", "pins", "bending", "wind", "dashpots", "contact", "air-drag")
 

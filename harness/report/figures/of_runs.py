@@ -174,6 +174,8 @@ def effects(folder: Path) -> list[Entry]:
         error, whose = ablation.known_error(table)
         gone = [row["name"] for row in ablation.of_kind(table, "without") if row["status"] != "ok"]
         below = [f"Shaded: less than {whose}, so not called for."] if whose else []
+        dashed = [f"{_ERRORS[row['name']]}, {row['largest']:.2g}" for row in known]
+        below += [f"Dashed: {'; '.join(dashed)}."] if dashed else []
         below += [f"Impossible without {', '.join(gone)}."] if gone else []
         plots.append(
             Plot(
@@ -182,7 +184,7 @@ def effects(folder: Path) -> list[Entry]:
                 Scale("largest displacement without it [mean rest lengths]", "log", "power"),
                 series,
                 bands=[Band(0.0, error, "")] if np.isfinite(error) else [],
-                lines=[Line(max(row["largest"], 1e-6), _ERRORS[row["name"]]) for row in known],
+                lines=[Line(max(row["largest"], 1e-6), "") for row in known],
                 notes=[*below, *([OLDER] if other else [])],
                 machine=measured_on(table),
             )
