@@ -33,7 +33,7 @@ Error = Annotated[
 ]
 Horizon = Annotated[float | None, typer.Option(help="With --error: simulated seconds; all frames if left out.")]
 Check = Annotated[bool, typer.Option("--check", help="With --error: let the reference grade it.")]
-Peers = Annotated[bool, typer.Option("--peers", help="With --error: time SciPy's integrators beside it.")]
+Peers = Annotated[bool, typer.Option("--peers", help="With --error: time other libraries' integrators beside it.")]
 
 
 class Commands(TyperGroup):

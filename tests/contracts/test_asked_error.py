@@ -14,14 +14,10 @@ from harness.base import rows
 from harness.base.errors import RunFailed
 from harness.cli import app
 from harness.config.load import load_scene
-from harness.config.sweep import SolverSpec
 from harness.experiments.accuracy.accuracy_rows import SCHEMA
-from harness.experiments.asked import libraries
 from harness.experiments.asked import ways as module
 from harness.experiments.asked.halving import halved
 from harness.experiments.asked.libraries import LIBRARIES, pattern
-from harness.experiments.asked.libraries import Motion as Asking
-from harness.experiments.asked.peers import peers
 from harness.experiments.asked.search import foresee, search
 from harness.experiments.asked.ways import Asked, tried, ways
 from harness.reference.growth import growth
@@ -280,26 +276,6 @@ def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_pa
     assert row["accepted"] > 0
     assert (tmp_path / "chain" / row["recording"]).is_file()
     assert np.load(tmp_path / "p.npz")["positions"].shape == (6, 5, 3)
-
-
-@pytest.mark.parametrize("name", ["cvode-adams", "cvode-bdf"])
-def test_cvode_follows_the_motion_to_its_tolerance(name):
-    scene, truth = build(SWINGING, 5, "newmark"), integrate(build(SWINGING, 5, "own"), [END])
-    field = Field(scene)
-    ends = (LIBRARIES[name].end(Asking(field, field.start, scene, END, tol, tol)) for tol in (1e-5, 1e-8))
-    coarse, fine = (truth.error(0, field.motion(END, end)[0].copy()) for end in ends)
-    assert fine < 1e-5
-    assert fine < 0.1 * coarse
-
-
-def test_a_peer_that_is_not_installed_is_a_row_that_says_which_command_installs_it(monkeypatch):
-    monkeypatch.setattr(libraries, "find_spec", lambda name: None)
-    asked = Asked.of(load_scene(SCENES / "single-spring.yaml"), 2, 0.1)
-    seen = foresee(asked, 1e-2, lambda line: None)
-    answer = search(asked, 1e-2, seen, lambda line: None, [("own", SolverSpec("velocity-verlet", {}))])
-    (peer,) = peers(asked, 1e-2, answer, ["cvode-bdf"])
-    assert "pip install -e '.[sundials]'" in peer.reason
-    assert not LIBRARIES["scipy-radau"].missing
 
 
 @pytest.mark.long
