@@ -23,7 +23,7 @@ from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from harness.reference.oracle import symmetric_lu
-from solvers.energies.coupled import Coupled
+from solvers.core.coupled import Coupled
 from solvers.linear.block import BlockCholesky
 from solvers.matrices import diagonal
 from solvers.problem import Positions, StepProblem
@@ -44,7 +44,7 @@ Solve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 class Hessian(NamedTuple):
     """H = S + V V' [N/m] without the exactly pinned vertices. sparse: S (3 f, 3 f); columns: V (3 f, r), none where all
-    energies are sparse (see `solvers.energies.coupled`)."""
+    energies are sparse (see `solvers.core.coupled`)."""
 
     sparse: csr_array
     columns: NDArray[np.float64]

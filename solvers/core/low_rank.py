@@ -18,8 +18,8 @@ from scipy.linalg import eigh
 from scipy.sparse import bsr_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 
+from solvers.core.coupled import Coupled
 from solvers.core.pattern import Matrix
-from solvers.energies.coupled import Coupled
 from solvers.problem import Energy, Positions
 
 Solve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
