@@ -1,19 +1,23 @@
 # pyright: reportUnknownMemberType=false
 """Many workers and many runs, simulated: what a cluster's scheduler and its client bear.
 
-    python -m tests.many_workers [WORKERS] [RUNS] [FOLDER]        1,000 and 100,000 if left out
+    python -m tests.many_workers [WORKERS] [RUNS] [FOLDER] [--seconds S]        1,000 and 100,000 if left out
 
 Three processes: the client, which is the command as it is; Dask's scheduler; and all workers, as coroutines. A run's
 own process is left out, with what it measures: in its place stands `Dummy`, which writes rows as a run does. All else
-is the real code. Workers do not see the client's folder, so rows travel by the scheduler.
+is the real code. Workers do not see the client's folder, so rows travel by the scheduler; what each keeps on its own
+disk is kept in memory, for a thousand machines have as many disks. It ends after so many seconds where it is then, and
+goes on from there when it is given the same folder again.
 """
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import json
 import logging
-import sys
+import os
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import cache
@@ -79,7 +83,7 @@ def scheduler(pipe: Connection) -> None:
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
 
-    counted, read = [0, 0], TCP.read
+    counted, read = [0], TCP.read
 
     async def counting(self: TCP, deserializers: Any = None) -> Any:
         found = await read(self, deserializers)
@@ -92,10 +96,12 @@ def scheduler(pipe: Connection) -> None:
             await _ended(pipe)
 
     TCP.read = counting  # type: ignore[method-assign]
+    before = psutil.Process().io_counters()
     with suppress(Exception):  # workers that leave in the same second
         asyncio.run(serve())
-    sent = psutil.Process().io_counters()
-    pipe.send(_bears((counted[0], sent.read_chars + sent.write_chars)))
+    after = psutil.Process().io_counters()
+    bytes_moved = after.read_chars + after.write_chars - before.read_chars - before.write_chars
+    pipe.send(_bears((counted[0], bytes_moved)))
 
 
 def workers(pipe: Connection, address: str, count: int) -> None:
@@ -118,6 +124,8 @@ def workers(pipe: Connection, address: str, count: int) -> None:
         pipe.send(count)
         await _ended(pipe)
 
+    if Path("/dev/shm").is_dir():
+        tempfile.tempdir = "/dev/shm"
     with TemporaryDirectory() as home, suppress(Exception), dask.config.set(QUIET):
         asyncio.run(serve(home))
     pipe.send(_bears())
@@ -134,18 +142,25 @@ def _bears(messages: tuple[int, int] = (0, 0)) -> Bears:
     return Bears(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, process_time(), messages)
 
 
-class Counting(Quiet):
-    """Prints how far it is at each tenth."""
+class Over(Exception):
+    """The time is over."""
 
-    def __init__(self, runs: int) -> None:
+
+class Counting(Quiet):
+    """Prints how far it is at each tenth, and raises Over after so many seconds."""
+
+    def __init__(self, runs: int, seconds: float) -> None:
         super().__init__()
-        self._tenth, self._began = max(1, runs // 10), monotonic()
+        self._tenth, self._began, self._seconds = max(1, runs // 10), monotonic(), seconds
 
     def finished(self, outcome: str) -> None:
         super().finished(outcome)
+        took = monotonic() - self._began
         if not self.finished_units % self._tenth:
-            took, here = monotonic() - self._began, psutil.Process().memory_info().rss / 2**20
+            here = psutil.Process().memory_info().rss / 2**20
             print(f"{self.finished_units:,} runs after {took:.0f} s; client {here:.0f} MiB", flush=True)
+        if took > self._seconds:
+            raise Over
 
 
 def _part(folder: Path, part: int) -> list[RunSpec]:
@@ -158,36 +173,56 @@ def _part(folder: Path, part: int) -> list[RunSpec]:
     return load_any(folder / "sweep.yaml").runs()
 
 
-def simulate(count: int, runs: int, folder: Path) -> dict[str, Any]:
-    """Do so many dummy runs by so many workers; what each process bore, and how long each part took."""
+def simulate(count: int, runs: int, folder: Path, seconds: float) -> dict[str, Any]:
+    """Do dummy runs by so many workers, those of so many that are missing; what each process bore for how many, and
+    how many a second that allows: on this machine's cores, and where each process has a core of its own."""
     (folder / "scene.yaml").write_text(SCENE)
     began, context = monotonic(), get_context("spawn")
     found = [run for part in range(ceil(runs / MOST)) for run in _part(folder, part)][:runs]
     told: dict[str, Any] = {"workers": count, "runs": len(found), "expanded_seconds": monotonic() - began}
     (mine, theirs), (ours, others) = context.Pipe(), context.Pipe()
-    processes = [context.Process(target=scheduler, args=(theirs,))]
-    processes[0].start()
+    processes = {"scheduler": context.Process(target=scheduler, args=(theirs,))}
+    processes["scheduler"].start()
     address = mine.recv()
-    processes.append(context.Process(target=workers, args=(others, address, count)))
-    processes[1].start()
+    processes["workers"] = context.Process(target=workers, args=(others, address, count))
+    processes["workers"].start()
     ours.recv()
-    told["workers_seconds"], before = monotonic() - began - told["expanded_seconds"], process_time()
-    done, display = monotonic(), Counting(runs)
-    table = run_sweep("sweep", found, folder / "r", display, print, on=address)
-    told |= {"seconds": monotonic() - done, "rows": len(table), "client": _bears()._asdict()}
-    told["client"]["cpu"] -= before
-    told["runs_per_second"] = runs / told["seconds"]
-    for name, pipe, process in zip(("workers", "scheduler"), (ours, mine), processes[::-1], strict=True):
+    told["workers_seconds"] = monotonic() - began - told["expanded_seconds"]
+    pids = {"client": os.getpid()} | {name: process.pid or 0 for name, process in processes.items()}
+    before, done, display = {name: _cpu(pid) for name, pid in pids.items()}, monotonic(), Counting(runs, seconds)
+    told["ended"] = "all runs are done"
+    try:
+        told["rows"] = len(run_sweep("sweep", found, folder / "r", display, print, on=address))
+    except Over:
+        told["ended"] = f"after {seconds:g} s; the same command, with the same folder, does the rest"
+    took = {name: _cpu(pid) - before[name] for name, pid in pids.items()}
+    told |= {"done": display.finished_units, "seconds": monotonic() - done, "client_bore": _bears()._asdict()}
+    for name, pipe in (("workers", ours), ("scheduler", mine)):
         pipe.send(None)
         told[f"{name}_bore"] = pipe.recv()._asdict()
-        process.join(60.0)
-        process.kill()
-    return told
+        processes[name].join(60.0)
+        processes[name].kill()
+    each = {name: 1e3 * cpu / max(1, display.finished_units) for name, cpu in took.items()}
+    told |= {"runs_per_second": told["done"] / told["seconds"], "cpu_ms_per_run": each}
+    told["binds"] = max(each, key=lambda name: each[name])
+    here = max(sum(each.values()) / (os.cpu_count() or 1), max(each.values()))
+    return told | {"runs_per_second_idle": 1e3 / here, "runs_per_second_own_cores": 1e3 / max(each.values())}
+
+
+def _cpu(pid: int) -> float:
+    """Seconds of CPU that a process has taken."""
+    times = psutil.Process(pid).cpu_times()
+    return times.user + times.system
 
 
 if __name__ == "__main__":
-    numbers = [int(word) for word in sys.argv[1:3]] + [1000, 100_000][len(sys.argv[1:3]) :]
+    asked = argparse.ArgumentParser()
+    asked.add_argument("workers", type=int, nargs="?", default=1000)
+    asked.add_argument("runs", type=int, nargs="?", default=100_000)
+    asked.add_argument("folder", type=Path, nargs="?")
+    asked.add_argument("--seconds", type=float, default=3600.0)
+    given = asked.parse_args()
     with TemporaryDirectory() as temporary:
-        place = Path(sys.argv[3]) if len(sys.argv) > 3 else Path(temporary)
+        place = given.folder or Path(temporary)
         (place / "r").mkdir(parents=True, exist_ok=True)
-        print(json.dumps(simulate(numbers[0], numbers[1], place), indent=1))
+        print(json.dumps(simulate(given.workers, given.runs, place, given.seconds), indent=1))
