@@ -161,5 +161,6 @@ def _outcome(found: list[dict[str, Any]]) -> str:
 
 def failures(table: pa.Table) -> list[str]:
     """Scene, size, solver, status and reason of the runs that failed."""
-    failed = [row for row in table.to_pylist() if row["status"] != "ok"]
+    ended = table.select(["scene", "size", "solver", "status", "reason"]).to_pylist()
+    failed = [row for row in ended if row["status"] != "ok"]
     return [f"{r['scene']} {r['size']} {r['solver']}: {r['status']}: {r['reason']}" for r in failed]
