@@ -3,16 +3,26 @@
 A recording is a header of 12 bytes and messages, each a kind and a length of 8 bytes, then that many bytes of payload.
 The library aborts the process on some damaged files. So what this process has not written is first read in the child
 that `harness.base.child` keeps.
+
+Which files can be read is noted beside the user's other caches, for all processes: reading a recording in every way
+takes far longer than what a report wants of it. The note is of a file as it is: by its inode, size and times, of which
+the last change is the system's and cannot be set. It is not kept with the results, which may come from anybody.
 """
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
 
 from harness.base import child
 from harness.base.errors import InputError, Mistake
+from harness.base.files import users_cache
 
 _HEADER, _END = 12, 0
 
@@ -20,18 +30,61 @@ _SECONDS, _BYTES_PER_SECOND = 10.0, 1e7
 _MEMORY, _MEMORY_PER_BYTE = 2**30, 8
 """What a recording may take to read, for its bytes: it comes compressed."""
 
-_sound: set[tuple[int, ...]] = set()
+_NOTED = 2**21
+"""Bytes of notes from which on they begin anew."""
+
+_sound: set[bytes] = set()
 """The files that can be read, each in the state that it had then."""
 
-
-def trust(path: Path) -> None:
-    """Note that a recording can be read as it is now."""
-    _sound.add(_state(path))
+_read: dict[Path, int] = {}
+"""How many bytes of notes were read."""
 
 
-def _state(path: Path) -> tuple[int, ...]:
-    state = path.stat()
-    return state.st_dev, state.st_ino, state.st_mtime_ns, state.st_size
+def trust(path: Path, *, noted: bool = True) -> None:
+    """Note that a recording can be read as it is now, for this process alone or for others too."""
+    _sound.add(state := _state(path))
+    if noted:
+        with suppress(OSError):  # then it is found out again
+            notes = _notes()
+            notes.parent.mkdir(parents=True, exist_ok=True)
+            file = os.open(notes, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            try:
+                if os.fstat(file).st_size > _NOTED:
+                    os.truncate(file, 0)
+                os.write(file, state)
+            finally:
+                os.close(file)
+
+
+def _trusted(path: Path) -> bool:
+    state = _state(path)
+    if state not in _sound:
+        with suppress(OSError):
+            notes = _notes()
+            size, begin = notes.stat().st_size, _read.get(notes, 0)
+            if size != begin:
+                with notes.open("rb") as file:
+                    file.seek(begin if size > begin else 0)
+                    found = file.read()
+                _sound.update(found[k : k + len(state)] for k in range(0, len(found), len(state)))
+                _read[notes] = size
+    return state in _sound
+
+
+def _notes() -> Path:
+    return users_cache("recordings") / f"sound-{_library()}"
+
+
+@cache
+def _library() -> str:
+    """The version that reads recordings: another may not."""
+    return version("rerun-sdk")
+
+
+def _state(path: Path) -> bytes:
+    found = path.stat()
+    known = found.st_dev, found.st_ino, found.st_mtime_ns, found.st_ctime_ns, found.st_size
+    return sha256(repr(known).encode()).digest()[:16]
 
 
 def whole_messages(path: Path) -> tuple[bool, int]:
@@ -51,7 +104,7 @@ def whole_messages(path: Path) -> tuple[bool, int]:
 
 def require_sound(path: Path, read: Callable[[Path], None]) -> None:
     """Raise InputError for a recording that `read`, a function of a module, cannot read in a child within limits."""
-    if _state(path) in _sound:
+    if _trusted(path):
         return
     size = path.stat().st_size
     limits = child.Allowance(_SECONDS + size / _BYTES_PER_SECOND, _MEMORY + _MEMORY_PER_BYTE * size)

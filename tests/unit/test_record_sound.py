@@ -1,0 +1,79 @@
+"""A recording that was read in every way is known as one that can be read, by every process, until it changes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from harness.base.errors import InputError
+from harness.record import sound
+from harness.record.sound import require_sound, trust
+from tests.recordings import record
+
+
+def refuse(path: Path) -> None:
+    """A reader that can read nothing."""
+    raise ValueError("it is read")
+
+
+def another_process() -> None:
+    sound._sound.clear()
+    sound._read.clear()
+
+
+@pytest.fixture
+def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    path = record(tmp_path / "a.rrd")
+    another_process()
+    return path
+
+
+def test_what_one_process_wrote_or_read_is_not_read_in_every_way_by_another(recording: Path):
+    require_sound(recording, refuse)
+    other = recording.with_name("b.rrd")
+    other.write_bytes(recording.read_bytes())  # another file, of the same bytes
+    with pytest.raises(InputError, match="it is read"):
+        require_sound(other, refuse)
+    trust(other, noted=False)
+    require_sound(other, refuse)
+    another_process()
+    with pytest.raises(InputError, match="it is read"):
+        require_sound(other, refuse)
+
+
+def test_notes_that_come_meanwhile_are_seen(recording: Path):
+    other = recording.with_name("b.rrd")
+    other.write_bytes(recording.read_bytes())
+    require_sound(recording, refuse)
+    known = sound._sound.copy()
+    trust(other)  # by another process, as it were
+    sound._sound.clear()
+    sound._sound.update(known)
+    require_sound(other, refuse)
+
+
+def test_a_recording_that_was_cut_or_changed_since_is_read_again_whatever_its_times_say(recording: Path):
+    before, content = recording.stat(), recording.read_bytes()
+    for changed in (content[:-100], content[:-100] + bytes(100)):
+        recording.write_bytes(changed)
+        os.utime(recording, ns=(before.st_atime_ns, before.st_mtime_ns))
+        with pytest.raises(InputError, match="it is read"):
+            require_sound(recording, refuse)
+
+
+def test_notes_that_cannot_be_kept_are_no_failure(recording: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(recording))
+    trust(recording)
+    require_sound(recording, refuse)
+
+
+def test_notes_begin_anew_before_they_are_many(recording: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sound, "_NOTED", 64)
+    for _ in range(20):
+        trust(recording)
+    assert sound._notes().stat().st_size <= 64 + 16
+    another_process()
+    require_sound(recording, refuse)
