@@ -1,0 +1,126 @@
+"""What a sweep takes beside its timed passes, and what a second core saves; on an idle machine.
+
+    python -m tests.sweep_costs short [RUNS]        500 runs of five solvers, sizes 8 to 16, if left out
+    python -m tests.sweep_costs cores [CASES]       10 cases of configs/hard.yaml by five solvers, judged and drawn
+
+`short` prints what each run takes beside its timed passes, of the wall's time and of all processes' CPU. `cores` does a
+sweep by one worker and by two and prints
+
+    t = timed / wall            of one worker: the share that two may not do side by side
+    speed-up / (1 / (t + (1 - t) / 2))          .9 is wanted
+
+What is timed is what `harness.experiments.run` does while it has the machine for itself: preparing, the pass that warms
+up, and the timed rounds. Every sweep is done in a process of its own, once before to have its kernels compiled.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+from math import ceil
+from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import monotonic, process_time
+from typing import Any, NamedTuple
+
+from harness.config.load import load_any
+from harness.config.sweep import RunSpec
+from tests.displays import Quiet
+
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+SOLVERS = ("numba", "sparse", "hybrid", "xpbd", "lbfgs")
+SIZES = (8, 10, 12, 14, 16)
+SHORT = {"frames": 10, "rounds": 2, "record": False, "pictures": False}
+
+
+class Took(NamedTuple):
+    """Seconds of a sweep: by the wall, and of CPU in all its processes; and both of what is timed."""
+
+    wall: float
+    cpu: float
+    timed: float
+    timed_cpu: float
+
+
+def sweep(runs: list[RunSpec], folder: Path, workers: int | None) -> Took:
+    """Do runs in a process of its own. Raises RuntimeError where it fails."""
+    folder.mkdir(parents=True)
+    mine, theirs = (context := get_context("spawn")).Pipe()
+    process = context.Process(target=_sweep, args=(theirs, runs, folder, workers))
+    process.start()
+    theirs.close()
+    try:
+        return mine.recv()
+    except EOFError:
+        raise RuntimeError("the sweep failed") from None
+    finally:
+        process.join()
+
+
+def _sweep(answer: Any, runs: list[RunSpec], folder: Path, workers: int | None) -> None:
+    began = monotonic()
+    from harness.experiments import run as runs_of
+    from harness.experiments.sweep import run_sweep
+
+    timed, note = runs_of._timed, folder / "timed"
+
+    @contextmanager
+    def noting(*given: Any) -> Generator[dict[str, Any]]:
+        with timed(*given) as how:
+            since, used = monotonic(), process_time()
+            yield how
+            took = monotonic() - since, process_time() - used
+        with note.open("a") as file:  # a short line is written at once
+            file.write("{} {}\n".format(*took))
+
+    runs_of._timed = noting
+    run_sweep("costs", runs, folder, Quiet(), lambda said: None, at_once=workers)
+    wall = monotonic() - began
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    cpu = sum(one.ru_utime + one.ru_stime for one in used)
+    noted = [[float(word) for word in line.split()] for line in note.read_text().splitlines()]
+    answer.send(Took(wall, cpu, *map(sum, zip(*noted, strict=True))))
+
+
+def _asked(folder: Path, **asked: Any) -> list[RunSpec]:
+    path = folder / "costs.yaml"
+    path.write_text(json.dumps(asked))
+    return load_any(path).runs()
+
+
+def short(count: int, folder: Path) -> dict[str, float]:
+    """What so many short runs take beside their timed passes, a run in milliseconds."""
+    scene = {"scenes": [os.path.relpath(CONFIGS / "scenes" / "hanging-cloth.yaml", folder)]}
+    same = scene | {"sizes": list(SIZES), "solvers": list(SOLVERS)}
+    each = range(1, 1 + ceil(count / len(SIZES) / len(SOLVERS)))
+    sweep(_asked(folder, **same, options=SHORT | {"iterations": 1, "frames": 2}), folder / "first", None)
+    took = sweep(_asked(folder, **same, options=SHORT | {"iterations": list(each)})[:count], folder / "all", None)
+    told = took._asdict() | {"runs": count, "cores": len(os.sched_getaffinity(0))}
+    beside = {"wall_ms_beside": took.wall - took.timed, "cpu_ms_beside": took.cpu - took.timed_cpu}
+    return told | {name: 1e3 * seconds / count for name, seconds in beside.items()}
+
+
+def cores(cases: int, folder: Path) -> dict[str, float]:
+    """What two workers save of a sweep of hard cases, one worker's share of timed passes, and what that allows."""
+    hard = load_any(CONFIGS / "hard.yaml").runs()
+    scenes = list(dict.fromkeys(run.scene_name for run in hard))
+    kept = scenes[:: max(1, len(scenes) // cases)][:cases]
+    runs = [run for run in hard if run.scene_name in kept and run.solver.name in SOLVERS]
+    sweep(runs, folder / "first", None)
+    one, two = (sweep(runs, folder / f"by{workers}", workers) for workers in (1, 2))
+    t = one.timed / one.wall
+    allowed = 1.0 / (t + (1.0 - t) / 2.0)
+    told = {"runs": len(runs), "t": t, "wall_by_1": one.wall, "wall_by_2": two.wall, "speed_up": one.wall / two.wall}
+    return told | {"allowed": allowed, "share_of_allowed": one.wall / two.wall / allowed}
+
+
+if __name__ == "__main__":
+    what, number = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else None
+    with TemporaryDirectory() as temporary:
+        found = short(number or 500, Path(temporary)) if what == "short" else cores(number or 10, Path(temporary))
+    print(json.dumps(found, indent=1))
