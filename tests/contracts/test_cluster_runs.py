@@ -12,12 +12,11 @@ import pyarrow as pa
 import pytest
 from distributed import LocalCluster
 
-from harness.base import rows
 from harness.base.machine import node
 from harness.config.load import load_any
 from harness.experiments.sweep import run_sweep
 from tests.displays import Quiet
-from tests.own_solvers import own
+from tests.own_solvers import SCENE, SOURCE, own
 
 
 def done(sweep: Path, results: Path, address: str) -> pa.Table:
@@ -48,29 +47,51 @@ options: {frames: 4, rounds: 1, iterations: [5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 
 """
 
 
+MANY, EVERY = 200, 10.0
+"""Runs, and seconds between two kills."""
+
+TIMES = {"started", "seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted"}
+"""Columns that differ from run to run."""
+
+TELL = "import os; [open({told!r}, 'a').write(f'{{os.getpid()}} {{stop.iterations}}\\n')]"
+"""A solver that tells which process does which run: each has its own number of iterations."""
+
+
+def all_but_times(table: pa.Table) -> list[str]:
+    """The rows, in an order of their own."""
+    return sorted(map(repr, table.drop_columns(sorted(TIMES)).to_pylist()))
+
+
 @pytest.mark.long
-def test_workers_that_are_killed_lose_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    made = own(tmp_path, monkeypatch)
-    made.sweep.write_text(SWEEP)
-    quiet: Any = {"dashboard_address": None}
-    over = threading.Event()
-    with LocalCluster(n_workers=3, threads_per_worker=1, **quiet) as started:
+def test_workers_that_are_killed_lose_nothing_and_repeat_the_runs_at_hand_alone(tmp_path: Path):
+    told = tmp_path / "told"
+    (tmp_path / "counted.py").write_text(SOURCE.replace("pass  # while solving", TELL.format(told=str(told))))
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    sweep = tmp_path / "sweep.yaml"
+    options = f"frames: 2, rounds: 1, iterations: {list(range(1, MANY + 1))}, record: false, pictures: false"
+    sweep.write_text(f"scenes: [scene.yaml]\nsolvers: ['./counted.py:Mine']\noptions: {{{options}}}\n")
+    quiet: Any = {"dashboard_address": None, "silence_logs": 50, "local_directory": tmp_path}
+    over, killed = threading.Event(), list[int]()
+    with LocalCluster(n_workers=4, threads_per_worker=1, **quiet) as started:
         found: Any = started
 
         def kill() -> None:
-            while not over.wait(10.0):
+            while not over.wait(EVERY):
                 workers = [nanny.pid for nanny in found.workers.values() if nanny.pid]
-                if workers:
-                    os.kill(workers[0], signal.SIGKILL)
+                if len(found.scheduler.workers) == 4 and told.exists():  # else a slow machine would do nothing else
+                    killed.append(workers[len(killed) % len(workers)])
+                    os.kill(killed[-1], signal.SIGKILL)
 
         killer = threading.Thread(target=kill, daemon=True)
         killer.start()
-        killed = done(made.sweep, tmp_path / "r", found.scheduler_address)
+        disturbed = done(sweep, tmp_path / "r", found.scheduler_address)
         over.set()
         killer.join()
-        whole = done(made.sweep, tmp_path / "s", found.scheduler_address)
-    assert set(killed["status"].to_pylist()) == {"ok"}
-    for column in ("run_id", "phase", "frame", "digest", "iterations"):
-        assert sorted(map(str, killed[column].to_pylist())) == sorted(map(str, whole[column].to_pylist()))
-    assert len([*(tmp_path / "r" / "rows").glob("*.parquet")]) == 12
-    assert rows.read((tmp_path / "r" / "rows").glob("*.parquet")).num_rows == killed.num_rows
+        began = set(told.read_text().splitlines())
+        whole = done(sweep, tmp_path / "s", found.scheduler_address)
+    print(f"{len(killed)} workers were killed, and {len(began) - MANY} of {MANY} runs begun again")
+    assert killed
+    assert set(disturbed["status"].to_pylist()) == {"ok"}
+    assert len([*(tmp_path / "r" / "rows").glob("*.parquet")]) == MANY
+    assert all_but_times(disturbed) == all_but_times(whole)
+    assert len(began) - MANY <= len(killed)  # each worker has one run at hand
