@@ -6,6 +6,7 @@ from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -24,7 +25,6 @@ from harness.experiments.core import do_all, do_together, require_threads, worke
 from harness.experiments.plan import NEEDED, Files, of_other_code, plan
 from harness.experiments.provenance import common
 from harness.experiments.resume import wanted
-from harness.experiments.run import execute
 
 if TYPE_CHECKING:
     from harness.experiments.cluster import Cluster
@@ -72,6 +72,8 @@ class RunUnit:
 
     def do(self, tick: Tick) -> str:
         """See Unit."""
+        from harness.experiments.run import execute  # brings along all that simulates and records
+
         return _outcome(execute(self.run, self.files, tick, positions=self.positions, at_once=self.at_once))
 
     def lost(self, lost: Lost) -> str:
@@ -136,6 +138,8 @@ def run_sweep(
         )
         planned = plan(runs, folder, machines)
         todo = wanted(planned, "runs", say, again=again or positions is not None, changed=changed)
+        if todo and not away:
+            import_module("harness.experiments.run")  # here, for workers that are forks of this process
         many = min(at_once or workers_at_once(), max(1, len(todo)))
         units = [RunUnit(p.run, p.files, positions, many if p.run.timing == "shared" else 1) for p in todo]
         if away:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,14 +16,7 @@ from harness.base.machine_lock import beside
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.options import OPTIONS
 from harness.config.sweep import RunSpec
-from harness.record.compare import Look, side_by_side
-from harness.record.reader import read_replay
-from harness.report import opengl
-from harness.report.comparison import draw_comparison
 from harness.report.references import write_bibtex
-from harness.report.run_picture import draw_run
-from harness.report.style import shades
-from harness.report.timing_plot import draw_timing
 
 
 class Pictured(NamedTuple):
@@ -49,30 +44,40 @@ def draw_sweep(
     """
     write_bibtex(folder / "references.bib", table["reference"].to_pylist())
     drawn = [p for p in pictured if p.run.record and p.recording.exists()]
-    missing = opengl.problem() if any(p.run.pictures for p in drawn) else None
+    wanting = [p for p in drawn if p.run.pictures and _stale(p.picture, [p.recording])]
+    groups = [group for group in _groups(drawn, folder) if group.old_recording or group.old_picture]
+    if wanting or groups:
+        _draw_runs(wanting, groups, say, at_once)
+    if any(p.run.pictures for p in pictured):
+        from harness.report.timing_plot import draw_timing
+
+        draw_timing(table, folder / "pictures" / "timing.png", name, older)
+
+
+def _draw_runs(wanting: Sequence[Pictured], groups: Sequence[_Group], say: Callable[[str], None], at_once: int) -> None:
+    """Pictures of runs, and what compares those of groups."""
+    # Here, for processes that are forks of this one; a command with nothing to draw need not wait for all of it.
+    import_module("harness.report.run_picture")
+    from harness.record.compare import Look, side_by_side
+    from harness.record.reader import read_replay
+    from harness.report import opengl
+    from harness.report.comparison import draw_comparison
+    from harness.report.style import shades
+
+    missing = opengl.problem() if wanting or any(group.old_picture for group in groups) else None
     if missing:
         say(missing)
-    wanting = [p for p in drawn if p.run.pictures and _stale(p.picture, [p.recording])]
-    if wanting and not missing:
+    elif wanting:
         say(f"drawing the pictures of {len(wanting)} runs")
         for lost in _drawn(wanting, at_once):
             say(lost)
-    for label, group in _groups(drawn).items():
-        recordings = {_distinct(p, group): p.recording for p in group}
-        recording = folder / "recordings" / f"{label}-solvers.rrd"
-        picture = folder / "pictures" / f"{label}-solvers.png"
-        if _stale(recording, recordings.values()):
-            found = shades((_distinct(p, group), p.run.solver.name) for p in group)
-            side_by_side(
-                recording,
-                recordings,
-                label.replace("-", " "),
-                {name: Look(mark.color) for name, mark in found.items()},
-            )
-        if group[0].run.pictures and not missing and _stale(picture, recordings.values()):
-            draw_comparison({key: read_replay(path) for key, path in recordings.items()}, picture)
-    if any(p.run.pictures for p in pictured):
-        draw_timing(table, folder / "pictures" / "timing.png", name, older)
+    for group in groups:
+        if group.old_recording:
+            found = shades((name, p.run.solver.name) for name, p in group.runs.items())
+            looks = {name: Look(mark.color) for name, mark in found.items()}
+            side_by_side(group.recording, group.recordings, group.label.replace("-", " "), looks)
+        if group.old_picture and not missing:
+            draw_comparison({name: read_replay(path) for name, path in group.recordings.items()}, group.picture)
 
 
 def _drawn(wanting: Sequence[Pictured], at_once: int) -> Iterator[str]:
@@ -84,6 +89,9 @@ def _drawn(wanting: Sequence[Pictured], at_once: int) -> Iterator[str]:
 
 
 def _draw(p: Pictured, tick: Tick) -> None:
+    from harness.record.reader import read_replay
+    from harness.report.run_picture import draw_run
+
     camera = p.run.scene.camera
     with beside(tick):
         draw_run(read_replay(p.recording), p.picture, camera=(camera.azimuth, camera.elevation) if camera else None)
@@ -98,12 +106,46 @@ def _stale(made: Path, sources: Iterable[Path]) -> bool:
     return not made.exists() or any(made.stat().st_mtime_ns < source.stat().st_mtime_ns for source in sources)
 
 
-def _groups(drawn: list[Pictured]) -> dict[str, list[Pictured]]:
-    """Runs that differ in nothing but their solver or its settings, by scene and size."""
-    groups: dict[str, list[Pictured]] = {}
+@dataclass(frozen=True, slots=True)
+class _Group:
+    """Runs that differ in nothing but their solver or its settings, by what they differ in; and what compares them."""
+
+    label: str
+    runs: dict[str, Pictured]
+    recording: Path
+    picture: Path
+
+    @property
+    def recordings(self) -> dict[str, Path]:
+        """Of the runs."""
+        return {name: p.recording for name, p in self.runs.items()}
+
+    @property
+    def old_recording(self) -> bool:
+        """Whether the recording of all of them is to be made."""
+        return _stale(self.recording, self.recordings.values())
+
+    @property
+    def old_picture(self) -> bool:
+        """Whether their picture is to be drawn."""
+        return next(iter(self.runs.values())).run.pictures and _stale(self.picture, self.recordings.values())
+
+
+def _groups(drawn: list[Pictured], folder: Path) -> list[_Group]:
+    """Those of two runs and more, by scene and size."""
+    alike: dict[str, list[Pictured]] = {}
     for p in drawn:
-        groups.setdefault(f"{p.run.scene_name}-{p.run.size}", []).append(p)
-    return {label: group for label, group in groups.items() if len(group) > 1}
+        alike.setdefault(f"{p.run.scene_name}-{p.run.size}", []).append(p)
+    return [
+        _Group(
+            label,
+            {_distinct(p, some): p for p in some},
+            folder / "recordings" / f"{label}-solvers.rrd",
+            folder / "pictures" / f"{label}-solvers.png",
+        )
+        for label, some in alike.items()
+        if len(some) > 1
+    ]
 
 
 def _distinct(p: Pictured, group: list[Pictured]) -> str:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from harness.base.errors import SpringbenchError
 from harness.record.base import Replay
-from harness.record.reader import read_replay
 from harness.report.accuracy.measured import Curve, Measurements
 from harness.report.site import script
 from harness.report.site.folders import Folder
@@ -114,6 +113,8 @@ def _fresh(made: Path, *sources: Path) -> bool:
 
 def _read(recording: Path, frames: list[int] | None, say: Say) -> Replay | None:
     """A recording; None, and a remark, where it is damaged."""
+    from harness.record.reader import read_replay  # brings Rerun along, which a page of what is there already needs not
+
     try:
         return read_replay(recording, frames)
     except SpringbenchError as error:
