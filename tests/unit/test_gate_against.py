@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from harness.cli import app
+from harness.experiments.gates import revisions
 from harness.experiments.gates.against import Request, exit_code, started
 from harness.experiments.gates.pair import Side, changes, workers
 from harness.experiments.gates.sequential import Answer
@@ -113,6 +114,13 @@ def test_a_revision_whose_libraries_cannot_be_had_does_not_build(repository: Pat
     (repository / "pyproject.toml").write_text(project.format("0", '"no such thing !"'))
     commit(repository)
     (repository / "pyproject.toml").write_text(project.format("1", ""))
+    code, said = gate("--against", "HEAD", "-k", "adding")
+    assert code == 2
+    assert "does not build:" in said
+    # One that was killed while it was built is not taken for whole.
+    (tree,) = (path for path in revisions.cache().iterdir() if path.is_dir())
+    (tree / ".venv" / "bin").mkdir(parents=True)
+    (tree / ".venv" / "bin" / "python").touch()
     code, said = gate("--against", "HEAD", "-k", "adding")
     assert code == 2
     assert "does not build:" in said

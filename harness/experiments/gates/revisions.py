@@ -80,9 +80,10 @@ def _python(checkout: Path, tree: Path, name: str) -> Path:
     if _wanted(checkout) == _wanted(tree):
         return Path(sys.executable)
     own = tree / ".venv"
-    python = own / "bin" / "python"
-    if python.exists():
+    python, whole = own / "bin" / "python", own / "whole"
+    if whole.exists():  # what was killed on the way is built again
         return python
+    shutil.rmtree(own, ignore_errors=True)
     for command in (
         [sys.executable, "-m", "venv", str(own)],
         [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-e", str(tree)],
@@ -91,6 +92,7 @@ def _python(checkout: Path, tree: Path, name: str) -> Path:
         if told.returncode:
             shutil.rmtree(own, ignore_errors=True)
             raise InputError(f"{name}: does not build: {_last(told.stderr or told.stdout)}")
+    whole.touch()
     return python
 
 
