@@ -117,11 +117,12 @@ class KernelCache(_CACHE):
 
 
 def _told(value: Any) -> Any:
-    """What a kernel closes over: other kernels by their names and all that they depend on."""
+    """What a kernel closes over: other kernels by their names and all that they depend on, what they close over too."""
     function = getattr(value, "py_func", None)
     if function is None:
         return value
-    return function.__module__, function.__qualname__, sources.digest([function.__code__.co_filename])
+    cells = (_told(cell.cell_contents) for cell in function.__closure__ or ())
+    return function.__module__, function.__qualname__, sources.digest([function.__code__.co_filename]), *cells
 
 
 def _folder(home: Path, module: str, digest: str) -> Path:

@@ -10,13 +10,12 @@ block, in the end of one that majorises everything. What else acts on the vertic
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.compiling import inner
+from solvers.compiling import inner, inner_closure
 from solvers.kernels.springs import TINY_SQUARED
 from solvers.vectors.springs import LANES, RIGHT
 
@@ -197,12 +196,13 @@ def _rise(bundles, s, b, lane, i, p, x, d, held, load):
     return total
 
 
-def moving(felt: Any, risen: Any) -> Callable[..., None]:
+def moving(felt: Any, risen: Any) -> Any:
     """Moves the vertices of a bundle to lower energies, one after another: none is joined to another.
 
     felt(beside, i, p, gradient, block) adds what else row i feels, risen(beside, i, p, d) tells its rise by a step d.
     """
 
+    @inner_closure
     def move(bundles, s, beside, b, unknowns, p, right, majorant):
         for lane in range(LANES):
             i = bundles.own[LANES * b + lane] // 4

@@ -7,15 +7,13 @@ with the laws of one element that `solvers.energies.elements` has. Positions hav
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers import sources
 from solvers.compiling import inner_closure
-from solvers.energies.elements import Elements, Law
+from solvers.energies.elements import Elements, Law, One
 
 
 class Around(NamedTuple):
@@ -61,59 +59,10 @@ class Vertices(NamedTuple):
 
     @classmethod
     def of(cls, laws: list[Law]) -> Vertices:
-        """The functions of one law, and of those that follow; there is one at least."""
-        one = laws[0].one
-        value, gradients, curvature, rise = one.value, one.gradient, one.curvature, one.rise
-
-        @inner_closure
-        def own_total(around, p):
-            energy = 0.0
-            for e in range(len(around.rows)):
-                z0, z1, z2 = _seen(around, e, p)
-                energy += value(around.numbers, e, z0, z1, z2)
-            return energy
-
-        @inner_closure
-        def own_felt(around, i, p, gradient, block):
-            g0, g1, g2 = gradient
-            xx, xy, xz, yy, yz, zz = block
-            for entry in range(around.first[i], around.first[i + 1]):
-                e = around.element[entry]
-                c = around.coefficients[e, around.slot[entry]]
-                z0, z1, z2 = _seen(around, e, p)
-                f0, f1, f2 = gradients(around.numbers, e, z0, z1, z2)
-                h0, h1, h2, h3, h4, h5 = curvature(around.numbers, e, z0, z1, z2)
-                g0, g1, g2, c2 = g0 + c * f0, g1 + c * f1, g2 + c * f2, c * c
-                xx, xy, xz, yy, yz, zz = (
-                    xx + c2 * h0, xy + c2 * h1, xz + c2 * h2, yy + c2 * h3, yz + c2 * h4, zz + c2 * h5,
-                )  # fmt: skip
-            return (g0, g1, g2), (xx, xy, xz, yy, yz, zz)
-
-        @inner_closure
-        def own_risen(around, i, p, d):
-            energy = 0.0
-            for entry in range(around.first[i], around.first[i + 1]):
-                e = around.element[entry]
-                c = around.coefficients[e, around.slot[entry]]
-                z0, z1, z2 = _seen(around, e, p)
-                energy += rise(around.numbers, e, z0, z1, z2, c * d[0], c * d[1], c * d[2])
-            return energy
-
-        if len(laws) == 1:
-
-            @inner_closure
-            def last_total(around, p):
-                return own_total(around[0], p)
-
-            @inner_closure
-            def last_felt(around, i, p, gradient, block):
-                return own_felt(around[0], i, p, gradient, block)
-
-            @inner_closure
-            def last_risen(around, i, p, d):
-                return own_risen(around[0], i, p, d)
-
-            return cls(last_total, last_felt, last_risen)
+        """The functions of all laws together."""
+        if not laws:
+            return cls(_no_energy, _unchanged, _no_rise)
+        own_total, own_felt, own_risen = cls._of_one(laws[0].one)
         others_total, others_felt, others_risen = cls.of(laws[1:])
 
         @inner_closure
@@ -131,6 +80,62 @@ class Vertices(NamedTuple):
 
         return cls(total, felt, risen)
 
+    @classmethod
+    def _of_one(cls, one: One) -> Vertices:
+        """The functions of one law, which take its Around alone."""
+        value, gradients, curvature, rise = one.value, one.gradient, one.curvature, one.rise
+
+        @inner_closure
+        def total(around, p):
+            energy = 0.0
+            for e in range(len(around.rows)):
+                z0, z1, z2 = _seen(around, e, p)
+                energy += value(around.numbers, e, z0, z1, z2)
+            return energy
+
+        @inner_closure
+        def felt(around, i, p, gradient, block):
+            g0, g1, g2 = gradient
+            xx, xy, xz, yy, yz, zz = block
+            for entry in range(around.first[i], around.first[i + 1]):
+                e = around.element[entry]
+                c = around.coefficients[e, around.slot[entry]]
+                z0, z1, z2 = _seen(around, e, p)
+                f0, f1, f2 = gradients(around.numbers, e, z0, z1, z2)
+                h0, h1, h2, h3, h4, h5 = curvature(around.numbers, e, z0, z1, z2)
+                g0, g1, g2, c2 = g0 + c * f0, g1 + c * f1, g2 + c * f2, c * c
+                xx, xy, xz, yy, yz, zz = (
+                    xx + c2 * h0, xy + c2 * h1, xz + c2 * h2, yy + c2 * h3, yz + c2 * h4, zz + c2 * h5,
+                )  # fmt: skip
+            return (g0, g1, g2), (xx, xy, xz, yy, yz, zz)
+
+        @inner_closure
+        def risen(around, i, p, d):
+            energy = 0.0
+            for entry in range(around.first[i], around.first[i + 1]):
+                e = around.element[entry]
+                c = around.coefficients[e, around.slot[entry]]
+                z0, z1, z2 = _seen(around, e, p)
+                energy += rise(around.numbers, e, z0, z1, z2, c * d[0], c * d[1], c * d[2])
+            return energy
+
+        return cls(total, felt, risen)
+
+
+@inner_closure
+def _no_energy(around, p):
+    return 0.0
+
+
+@inner_closure
+def _unchanged(around, i, p, gradient, block):
+    return gradient, block
+
+
+@inner_closure
+def _no_rise(around, i, p, d):
+    return 0.0
+
 
 @inner_closure
 def _seen(around, e, p):
@@ -140,13 +145,3 @@ def _seen(around, e, p):
         i, c = 4 * around.rows[e, a], around.coefficients[e, a]
         z0, z1, z2 = z0 + c * p[i], z1 + c * p[i + 1], z2 + c * p[i + 2]
     return z0, z1, z2
-
-
-def named(laws: list[Law], function: Any) -> Any:
-    """A function that is to be a kernel made of these laws, under a name by all that they depend on, by which it is
-    kept: kernels tell closures that are made of different functions not apart."""
-    made = [part.py_func for law in laws for part in law.one]
-    told = [f"{one.__module__}.{one.__qualname__}" for one in made]
-    told.append(sources.digest(sorted({one.__code__.co_filename for one in made})))
-    function.__qualname__ = f"{function.__name__}_{hashlib.sha256(repr(told).encode()).hexdigest()[:16]}"
-    return function

@@ -53,7 +53,7 @@ def _risen(beside, i, p, d):
     return 0.0
 
 
-_move = inner(moving(_felt, _risen))
+_move = moving(_felt, _risen)
 
 
 @inner

@@ -13,7 +13,7 @@ from solvers.compiling import inner_closure, kernel
 from solvers.energies.elements import Law
 from solvers.kernels.accelerate_springs import descend as objective
 from solvers.kernels.half_spaces import moving, pressed
-from solvers.kernels.stencils import Vertices, named
+from solvers.kernels.stencils import Vertices
 from solvers.kernels.vbd import forces, over
 from solvers.vectors.springs import LANES
 from solvers.vectors.vbd import model, step
@@ -27,7 +27,7 @@ _D, _RISE = 3, 6
 def iterating(*laws: Law) -> Any:
     """The kernel `solvers.kernels.vbd.iterate` for elements of these laws."""
     total, felt, risen = Vertices.of(list(laws))
-    move = inner_closure(moving(felt, risen))
+    move = moving(felt, risen)
 
     @inner_closure
     def without_length(blocks, beside, right, b, p, work):
@@ -82,4 +82,4 @@ def iterating(*laws: Law) -> Any:
     def level(blocks, spaces, beside, p, right, out):
         return objective(blocks.bundles, blocks.shares, p, right, out) + pressed(spaces, p) + total(beside, p)
 
-    return kernel(named(list(laws), over(sweep, level)))
+    return kernel(over(sweep, level))
