@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -95,9 +94,10 @@ def _level(blocks, spaces, beside, p, right, out):
     return objective(blocks.bundles, blocks.shares, p, right, out) + pressed(spaces, p)
 
 
-def over(sweep: Any, level: Any) -> Callable[..., None]:
-    """The iteration over a sweep and the objective, for `kernel`."""
+def over(sweep: Any, level: Any) -> Any:
+    """The iteration over a sweep and the objective."""
 
+    @kernel
     def iterate(blocks, spaces, beside, right, radius, work, p, iterations):
         """That many sweeps over all vertices from p, which takes the result.
 
@@ -135,4 +135,4 @@ def over(sweep: Any, level: Any) -> Callable[..., None]:
     return iterate
 
 
-iterate = kernel(over(_sweep, _level))
+iterate = over(_sweep, _level)

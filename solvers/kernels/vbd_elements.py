@@ -9,7 +9,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from solvers.compiling import inner_closure, kernel
+from solvers.compiling import inner_closure
 from solvers.energies.elements import Law
 from solvers.kernels.accelerate_springs import descend as objective
 from solvers.kernels.half_spaces import moving, pressed
@@ -82,4 +82,4 @@ def iterating(*laws: Law) -> Any:
     def level(blocks, spaces, beside, p, right, out):
         return objective(blocks.bundles, blocks.shares, p, right, out) + pressed(spaces, p) + total(beside, p)
 
-    return kernel(over(sweep, level))
+    return over(sweep, level)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import os
 import shutil
 import subprocess
@@ -32,26 +31,6 @@ FACTOR = 2.0
 @inner
 def times(x):
     return 3.0 * x
-"""
-CLOSURES = """
-from solvers.compiling import inner, inner_closure, kernel
-@inner
-def double(x):
-    return 2.0 * x
-@inner
-def triple(x):
-    return 3.0 * x
-def made(part):
-    @inner_closure
-    def middle(x):
-        return part(x)
-    @inner_closure
-    def outer(x):
-        return middle(x)
-    @kernel
-    def closed(x):
-        return outer(x)
-    return closed
 """
 ASK = """
 from solvers.kernels.kernel_of_test import product
@@ -294,12 +273,3 @@ def test_the_process_that_compiles_a_kernel_finds_the_bits_of_those_that_load_it
         for _ in range(2)
     )
     assert compiling == loading
-
-
-def test_closures_of_other_functions_however_deep_are_other_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "closures_of_test.py").write_text(CLOSURES)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
-    monkeypatch.setattr(caching.config, "CACHE_DIR", str(tmp_path / "kept"))
-    module = importlib.import_module("closures_of_test")
-    assert [module.made(part)(1.0) for part in (module.double, module.triple, module.double)] == [2.0, 3.0, 2.0]

@@ -11,7 +11,7 @@ import pytest
 
 from solvers.compiling import kernel
 from solvers.core.vertex_elements import Beside
-from solvers.kernels.stencils import Vertices, named
+from solvers.kernels.stencils import Vertices
 from solvers.methods.newton import Newton
 from solvers.methods.vbd import VertexBlockDescent
 from solvers.problem import StopRule, Unsupported
@@ -45,7 +45,7 @@ def test_a_vertex_feels_what_the_oracle_says(effect):
             rises[i] = risen(around, i, p, (d[i, 0], d[i, 1], d[i, 2]))
 
     gradient, block, rises, value = (np.empty(shape) for shape in ((n, 3), (n, 6), n, 1))
-    kernel(named([energy.law], tell))(around, np.pad(p, ((0, 0), (0, 1))).ravel(), d, gradient, block, rises, value)
+    kernel(tell)(around, np.pad(p, ((0, 0), (0, 1))).ravel(), d, gradient, block, rises, value)
     wanted = np.zeros_like(p)
     energy.add_gradient(p, wanted)
     blocks = energy.hessian(p).toarray().reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
@@ -91,12 +91,6 @@ def test_vertices_of_one_element_have_different_colours():
     made = VertexBlockDescent().prepare(apart)
     bundle = {int(place) // 4: k // 8 for k, place in enumerate(made.blocks.bundles.own)}
     assert all(bundle[int(made.row[i])] != bundle[int(made.row[j])] for i, j in ((0, 35), (5, 30)))
-
-
-def test_kernels_of_different_laws_have_different_names():
-    energies: list[Any] = [energy for effect in (LIMITS, DASHPOTS) for energy in stepped(cloth(effect)).energies]
-    names = {named([energy.law], lambda: None).__qualname__ for energy in energies if hasattr(energy, "law")}
-    assert len(names) == 2
 
 
 def test_what_has_no_bound_on_its_curvature_is_refused_and_the_refusal_says_so():
