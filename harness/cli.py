@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -263,9 +264,10 @@ def main() -> None:
     """The console script."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for some in every installed package
     # Typer makes a parser of every command that it knows, a tenth of what it takes to list.
+    one = copy(app)
     asked = [c for c in app.registered_commands if c.callback and (c.name or c.callback.__name__) in sys.argv[1:2]]
-    app.registered_commands = asked or app.registered_commands
-    app()
+    one.registered_commands = asked or app.registered_commands
+    one()
 
 
 if __name__ == "__main__":
