@@ -105,7 +105,8 @@ def constants(folder: str) -> set[str]:
 
 def test_no_report_and_little_else_knows_a_solver_by_name():
     assert not constants("harness/report") & set(SOLVERS)
-    assert constants("harness") & set(SOLVERS) == DEFAULTS
+    # `sparse` is an option of a peer's, for its own linear solver.
+    assert constants("harness") & set(SOLVERS) - {"sparse"} == DEFAULTS
 
 
 def test_no_report_knows_an_effect_by_name():
