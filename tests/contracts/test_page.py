@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from harness.report.site import update
-from tests import accuracy_rows, site_results
+from tests import accuracy_rows, figure_results, site_results
 from tests.browser import chromium
 from tests.site_results import fails, run
 
@@ -21,6 +21,9 @@ VIEWS = {
     "two runs": f"compare?sel=made/{run(0)['run_id']},made/{run(1)['run_id']}",
     "plots": "plots?sweep=made",
     "convergence": "plots?sweep=study&plot=convergence",
+    **{plot: f"plots?sweep=accuracy&plot={plot}" for plot in ("times", "work", "profiles", "growth", "winners")},
+    **{plot: f"plots?sweep={sweep}&plot={plot}" for sweep, plot in (("cases", "hard"), ("machine", "speed"))},
+    **{plot: f"plots?sweep=effects&plot={plot}" for plot in ("ablation", "prices")},
 }
 
 FITS = "document.documentElement.scrollWidth <= innerWidth"
@@ -35,6 +38,10 @@ def results(folder: Path, count: int) -> Path:
         rows += list(accuracy_rows.curve("net", 6, "early", solver))
     rows.append(accuracy_rows.failure("net", 6, "early", "dense", "failed", "why"))
     accuracy_rows.write(folder / "study", rows)
+    figure_results.accuracy(folder / "accuracy")
+    figure_results.sweep(folder / "cases")
+    figure_results.speed(folder / "machine")
+    figure_results.ablation(folder / "effects")
     return update(folder)
 
 

@@ -12,6 +12,7 @@ from harness.report.accuracy.reading import read
 from harness.report.accuracy.winners import NOBODY, Cell, cells, family
 from harness.report.figures.of_winners import winners
 from harness.report.figures.panel import Grid
+from harness.report.site.winners import chart
 from tests import accuracy_rows as made
 from tests import figure_results
 
@@ -52,6 +53,18 @@ def test_the_cheapest_by_processor_time_within_the_error_wins(found):
         NOBODY,
     ]
     assert found[0.1].prices["implicit, order 2"].cpu == 0.8, "seconds a simulated second, the cheaper of the two"
+
+
+def test_the_page_has_a_point_for_each_error_that_somebody_reaches(tmp_path: Path):
+    told = chart(read(made.write(tmp_path, ROWS)))
+    points = {(error, item["label"]) for item in told["items"] for error in item["error"]}
+    order = ("implicit, order 1", "linearly implicit", "linearly implicit", "implicit, order 2")
+    assert points == {(10.0**-k, name) for k, name in enumerate(order, 1)}
+    assert {item["panel"] for item in told["items"]} == {"81 vertices"}
+    first = next(item for item in told["items"] if item["label"] == order[0])
+    assert (first["next"], first["ahead"]) == (["linearly implicit"], ["3 times as much"])
+    assert "numba" in first["setting"][0]
+    assert not chart(read(made.write(tmp_path / "one", ROWS[:1])))["items"], "one family alone wins nothing"
 
 
 def test_a_cell_tells_how_far_ahead_its_winner_is(found):

@@ -1,4 +1,5 @@
-"""The charts of an accuracy measurement for the page: convergence, times, work and precision, profiles, growth.
+"""The charts of an accuracy measurement for the page: convergence, times, work and precision, profiles, growth,
+winners.
 
 A chart is a list of items, each a line with its solver, what it was, and named columns of numbers; the page filters
 items by `filters`, puts them into a panel each `panel`, and draws the chosen columns.
@@ -18,6 +19,7 @@ from harness.report.accuracy.measured import Curve, Measurements, WorkPoint, by_
 from harness.report.accuracy.pictures import nearest, place
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
+from harness.report.site import winners
 from harness.report.site.marks import drawn
 from harness.report.site.runs import references
 from harness.report.site.script import numbers as _numbers
@@ -46,7 +48,8 @@ def charts(table: Measurements, folder: Path) -> dict[str, Item]:
     everyone = (*table.curves, *table.works)
     marks = {label: drawn(mark) for label, mark in looks((each.label, each.solver) for each in everyone).items()}
     shared = {"marks": marks, "references": references((each.label, each.reference) for each in everyone)}
-    return {name: chart | shared for name, chart in made.items() if chart["items"]}
+    made = {name: chart | shared for name, chart in made.items()} | {"winners": winners.chart(table)}
+    return {name: chart for name, chart in made.items() if chart["items"]}
 
 
 def axis(column: str, title: str, how: Mapping[str, Any] = LOG) -> Item:

@@ -43,7 +43,7 @@ springbench.chart = (() => {
       mode: points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
       line: { color: ink, dash: mark.dash, width: 1.7, shape: chart.shape === "hv" ? "hv" : undefined },
       // Marks stand apart: so many of a line at most, whatever the number of its points.
-      marker: { symbol: hollow.map(yes => mark.symbol + (yes ? "-open" : "")), color: ink, size: item.small ? 5 : 8, maxdisplayed: points ? 0 : chart.shape === "hv" ? 4 : 9, line: { width: hollow.map(yes => (yes ? 1.6 : 0)), color: ink } },
+      marker: { symbol: hollow.map(yes => mark.symbol + (yes ? "-open" : "")), color: ink, size: item.small ? 5 : item.large ? 13 : 8, maxdisplayed: points ? 0 : chart.shape === "hv" ? 4 : 9, line: { width: hollow.map(yes => (yes ? 1.6 : 0)), color: ink } },
     };
   }
 
