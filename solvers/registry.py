@@ -18,7 +18,6 @@ SOLVERS = {
     "lbfgs": "solvers.methods.lbfgs:Lbfgs",
     "newton": "solvers.methods.newton:Newton",
     "newton-cg": "solvers.methods.newton_cg:NewtonCG",
-    "pncg": "solvers.methods.pncg:NonlinearCG",
     "hybrid": "solvers.methods.hybrid:Hybrid",
     "xpbd": "solvers.methods.xpbd:Xpbd",
     "xpbd-small-steps": "solvers.methods.xpbd:XpbdSmallSteps",
@@ -34,6 +33,7 @@ SOLVERS = {
     "ros2": "solvers.methods.rosenbrock:Ros2",
     "ros3p": "solvers.methods.rosenbrock:Ros3P",
     "rodas": "solvers.methods.rosenbrock:Rodas",
+    "pncg": "solvers.methods.pncg:NonlinearCG",
 }
 
 OPTIONAL = {

@@ -61,7 +61,8 @@ STARS: tuple[Any, ...] = ((4, 1, 0), (6, 1, 0), (3, 1, 0), (8, 1, 0), (3, 1, 180
 CORNERS: tuple[Any, ...] = ((3, 0, 45), (3, 0, -45), (3, 0, 135), (3, 0, -135))
 """Triangles that point up and to the left, up and to the right, down and to the left, down and to the right."""
 HOURGLASS: Any = ((-1, 1), (1, 1), (-1, -1), (1, -1), (-1, 1))
-"""Two triangles that meet at their points."""
+BOWTIE: Any = ((-1, -1), (-1, 1), (1, -1), (1, 1), (-1, -1))
+"""Two triangles that meet at their points, one above the other and side by side."""
 _MARKERS: tuple[Any, ...] = (
     "s",
     "o",
@@ -81,6 +82,7 @@ _MARKERS: tuple[Any, ...] = (
     *STARS,
     *CORNERS,
     HOURGLASS,
+    BOWTIE,
 )
 
 # Okabe and Ito's palette, less its yellow and black, and five more: for families in the order of the registry.

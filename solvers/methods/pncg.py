@@ -37,7 +37,7 @@ class NonlinearCG:
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
     about: ClassVar[About] = About(
-        "nonlinear CG",
+        "accelerated local-global",
         Reference(
             "Shen, Xing and Cai, Runyuan and Bi, Mengxiao and Lv, Tangjie",
             2024,

@@ -52,14 +52,18 @@ TRIED = ["implicit-euler", "bdf2", "midpoint", "sdirk-4"]
 
 
 def candidates() -> list[dict[str, Any]]:
-    """What is measured where nothing was, of each family's first: steps solved to a tolerance, and steps of 50
-    iterations or substeps."""
-    first = {name: made for name, target in SOLVERS.items() if about(made := load(target), name).first}
-    implicit = [name for name, made in first.items() if minimises(made)]
-    fixed = [name for name, made in first.items() if not minimises(made) or about(made, name).family == LOCAL_GLOBAL]
+    """What is measured where nothing was: of each family's first, steps solved to a tolerance, and steps of 50
+    iterations or substeps; and all methods that take steps of their own to keep to an error."""
+    made = {name: load(target) for name, target in SOLVERS.items()}
+    told = {name: about(solver, name) for name, solver in made.items()}
+    own = [name for name, of in told.items() if of.own_steps and of.to_error]
+    first = {name: made[name] for name, of in told.items() if of.first}
+    implicit = [name for name, solver in first.items() if minimises(solver)]
+    fixed = [name for name, solver in first.items() if not minimises(solver) or told[name].family == LOCAL_GLOBAL]
     return [
         {"solver": implicit, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": TRIED},
         {"solver": fixed, "iterations": 50},
+        {"solver": own, "iterations": 1, "integrator": ["own"]},
     ]
 
 
