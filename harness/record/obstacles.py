@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # a scene without obstacles imports none of them
     from harness.scenes.effects.base import Effect
-    from harness.scenes.motion import Motion
+    from harness.scenes.motion import KeyedMotion
     from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
     from harness.scenes.shapes import AnySurface, Solid
 
@@ -43,7 +43,7 @@ class Obstacles:
 
     def __init__(self, stream: rr.RecordingStream, obstacles: Sequence[AnySurface], rest: Array) -> None:
         self._stream = stream
-        self._moving: list[tuple[str, Motion]] = []
+        self._moving: list[tuple[str, KeyedMotion]] = []
         for k, one in enumerate(obstacles):
             entity = f"/scene/obstacles/{k}-{one.kind}"
             stream.log(entity, _SHAPES[one.kind](one, rest), static=True)

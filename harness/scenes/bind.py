@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from harness.base.errors import InputError, Mistake
 from harness.scenes.effects.base import Contribution, Force, Pin, Steady, VelocityFilter
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.motion import Motion
+from harness.scenes.motion import KeyedMotion
 from harness.scenes.spec import SceneSpec
 from harness.scenes.start import Rest
 from solvers import integrators
@@ -52,7 +52,7 @@ class Scene:
     pin_targets: Positions
     velocity: tuple[float, float, float]
     integrator: integrators.AnyIntegrator = IMPLICIT_EULER
-    moving: tuple[tuple[NDArray[np.int64], Motion], ...] = ()
+    moving: tuple[tuple[NDArray[np.int64], KeyedMotion], ...] = ()
     start: Rest = AT_REST
     apart: tuple[Apart, ...] = ()
     alternate: Scene | None = None
@@ -198,7 +198,7 @@ def _require_determined(system: System) -> None:
         raise InputError(Mistake(str(error), key="mesh")) from error
 
 
-def _pins(parts: list[Contribution]) -> tuple[Pins, Positions, tuple[tuple[NDArray[np.int64], Motion], ...]]:
+def _pins(parts: list[Contribution]) -> tuple[Pins, Positions, tuple[tuple[NDArray[np.int64], KeyedMotion], ...]]:
     """All pins by vertex, their targets, and which move; a vertex may be named twice if both times mean the same."""
     pins: list[Pin] = [pin for part in parts for pin in part.pins]
     if not pins:

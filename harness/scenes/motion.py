@@ -31,7 +31,7 @@ class Key(Model):
     """Turn about the axis [degrees]; more than 360 is more than once around."""
 
 
-class Motion(Model):
+class KeyedMotion(Model):
     """A rigid motion along key frames."""
 
     keys: tuple[Key, ...] = Field(min_length=1, max_length=10_000)
@@ -44,7 +44,7 @@ class Motion(Model):
     """How the way leads from key to key: straight, or along cubics that stand still where it turns back."""
 
     @model_validator(mode="after")
-    def _in_order(self) -> Motion:
+    def _in_order(self) -> KeyedMotion:
         times = [key.time for key in self.keys]
         if any(b <= a for a, b in pairwise(times)):
             raise ValueError("the times of the keys should rise from key to key")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, model_validator
 
 from harness.base.model import Model, Vector
-from harness.scenes.motion import Motion
+from harness.scenes.motion import KeyedMotion
 from solvers.contact.energy import Obstacle
 
 Array = NDArray[np.float64]
@@ -18,7 +18,7 @@ Length = Annotated[PositiveFloat, Field(le=1e9)]
 
 
 class _Moving(Model):
-    motion: Motion | None = None
+    motion: KeyedMotion | None = None
     """Key frames that take the obstacle along; it is solid at every time, however fast."""
 
     def _obstacle(self, origin: Vector, axes: Array, low: Array, high: Array, radius: float) -> Obstacle:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from harness.scenes.motion import Motion
+from harness.scenes.motion import KeyedMotion
 from solvers.contact.energy import Obstacle
 from solvers.problem import Positions
 
@@ -24,13 +24,13 @@ _TURNS = 64
 """How often planes that turn are looked at in all."""
 
 
-def key_times(*motions: Motion | None) -> list[float]:
+def key_times(*motions: KeyedMotion | None) -> list[float]:
     """The start, and the times [s] at which any of these motions has a key."""
     return sorted({0.0, *(time for motion in motions if motion for time in motion.times)})
 
 
 def nearest(
-    obstacle: Obstacle, taken: Motion | None, targets: Positions, motion: Motion | None, limit: float
+    obstacle: Obstacle, taken: KeyedMotion | None, targets: Positions, motion: KeyedMotion | None, limit: float
 ) -> tuple[float, NDArray[np.float64]] | None:
     """The first time [s] at which points declared at `targets` (q, 3) [m] are nearer than `limit` [m] to an obstacle,
     and all their distances (q,) [m] then; None where they never are.
@@ -72,7 +72,7 @@ def gap(planes: Sequence[Obstacle], time: float) -> float:
     return float(found.x[3]) if found.x is not None else -np.inf
 
 
-def looks(motions: Sequence[Motion | None]) -> Iterator[float]:
+def looks(motions: Sequence[KeyedMotion | None]) -> Iterator[float]:
     """The times [s] at which to look at what these motions move: their keys, and between those where they turn."""
     times = key_times(*motions)
     straight = all(motion.straight for motion in motions if motion)

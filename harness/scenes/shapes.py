@@ -26,7 +26,7 @@ from harness.scenes.mesh.grid import Grid
 from harness.scenes.mesh.solids import Block
 from harness.scenes.mesh.surfaces import Balloon, Skirt
 from harness.scenes.mesh.topology import closed_by_points
-from harness.scenes.motion import Motion
+from harness.scenes.motion import KeyedMotion
 from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Solid(Model):
     """All coordinates of the mesh are multiplied by this,"""
     offset: Vector = (0.0, 0.0, 0.0)
     """then shifted by this [m]."""
-    motion: Motion | None = None
+    motion: KeyedMotion | None = None
     """Key frames that take the obstacle along."""
 
     @field_validator("mesh")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from harness.base.errors import InputError
 from harness.scenes.intersections import Crossing
 from harness.scenes.mesh.base import STRETCH, Mesh
-from harness.scenes.motion import Motion
+from harness.scenes.motion import KeyedMotion
 from solvers.contact.self_contact import PairContact
 from solvers.matrices import assemble
 from solvers.problem import Energy, Pins, Positions, ProjectiveEnergy, System
@@ -67,7 +67,7 @@ class Held(Protocol):
         ...
 
     @property
-    def motion(self) -> Motion | None:
+    def motion(self) -> KeyedMotion | None:
         """Takes the targets along."""
         ...
 

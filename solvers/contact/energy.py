@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from solvers.contact import planes as contact_planes
 from solvers.contact.law import LAW
 from solvers.contact.planes import HalfSpaces, Rounded
-from solvers.contact.touching import Rows
+from solvers.contact.touching import ContactRows
 from solvers.energies.elements import Elements, Law
 from solvers.problem import Positions, Start
 from solvers.round_off import EPS
@@ -201,7 +201,7 @@ class Contact:
         indptr = np.concatenate([[0], np.cumsum(held)])
         return scipy.sparse.csr_array(scipy.sparse.bsr_array((blocks[columns], columns, indptr), shape=(3 * n, 3 * n)))
 
-    def rows(self, p: Positions, trial: Positions, *, cautious: bool) -> Rows:
+    def rows(self, p: Positions, trial: Positions, *, cautious: bool) -> ContactRows:
         """The stiffnesses at p (n, 3) of what presses there or at the trial position, and of friction.
 
         Those of friction are exact, and majorise the energy where `cautious`.
@@ -213,7 +213,7 @@ class Contact:
         sticks = length <= self.slip
         along = np.divide(u, length[:, None], out=_across(normal), where=~sticks[:, None])
         both = sticks | cautious
-        return Rows(
+        return ContactRows(
             planes.vertices[np.concatenate([pressed, grips, grips[both]])],
             np.concatenate([planes.normal[pressed], np.cross(normal, along), along[both]]),
             np.concatenate([planes.stiffness[pressed], weight, weight[both]]),

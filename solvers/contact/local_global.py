@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array, csr_array
 
-from solvers.contact.touching import ContactEnergy, Rows, touching, without_contact
+from solvers.contact.touching import ContactEnergy, ContactRows, touching, without_contact
 from solvers.core.driver import Iterating, Iterative, largest
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
@@ -76,7 +76,7 @@ class Corrections:
 
     def around(
         self, contacts: list[ContactEnergy], p: Positions, gradient: Positions, plain: Positions, *, cautious: bool
-    ) -> tuple[Positions, Rows]:
+    ) -> tuple[Positions, ContactRows]:
         """The displacement from p, and the rows that were found for it; plain: Q^-1 gradient."""
         x, rows = -plain, None
         for _ in range(_PASSES):
@@ -88,19 +88,19 @@ class Corrections:
         assert rows is not None
         return x, rows
 
-    def displacement(self, rows: Rows, gradient: Positions, plain: Positions) -> Positions:
+    def displacement(self, rows: ContactRows, gradient: Positions, plain: Positions) -> Positions:
         """x of the model with these rows."""
         if not len(rows.vertices):
             return -plain
         return (self._woodbury if len(rows.vertices) <= _FEW else self._iterated)(rows, gradient, plain)
 
-    def _joined(self, parts: list[Rows]) -> Rows:
+    def _joined(self, parts: list[ContactRows]) -> ContactRows:
         """All rows of free vertices that resist."""
         vertices, direction, weight, gap = (np.concatenate(field) for field in zip(*parts, strict=True))
         kept = self._free[vertices] & (weight > 0.0)
-        return Rows(vertices[kept], direction[kept], weight[kept], gap[kept])
+        return ContactRows(vertices[kept], direction[kept], weight[kept], gap[kept])
 
-    def _woodbury(self, rows: Rows, gradient: Positions, plain: Positions) -> Positions:
+    def _woodbury(self, rows: ContactRows, gradient: Positions, plain: Positions) -> Positions:
         vertices, place = np.unique(rows.vertices, return_inverse=True)
         columns = self._inverse(vertices)
         K = columns[vertices][np.ix_(place, place)] * (rows.direction @ rows.direction.T)
@@ -123,7 +123,7 @@ class Corrections:
             self._columns.update(zip(some, self.plain(unit).T.copy(), strict=False))
         return np.array([self._columns[v] for v in vertices.tolist()]).T
 
-    def _iterated(self, rows: Rows, gradient: Positions, plain: Positions) -> Positions:
+    def _iterated(self, rows: ContactRows, gradient: Positions, plain: Positions) -> Positions:
         """Conjugate gradients; Q times a direction follows from the residuals that Q^-1 was asked for."""
         U = _columns(rows, len(plain))
         pulls = csr_array(U * rows.weight) @ U.T
@@ -165,7 +165,7 @@ class _Model(Iteration):
         return product <= self._enough
 
 
-def _columns(rows: Rows, n: int) -> csr_array:
+def _columns(rows: ContactRows, n: int) -> csr_array:
     """U (3n, r): the direction of each row, at its vertex."""
     places = (3 * rows.vertices[:, None] + np.arange(3)).ravel(), np.repeat(np.arange(len(rows.vertices)), 3)
     return csr_array(coo_array((rows.direction.ravel(), places), shape=(3 * n, len(rows.vertices))))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.contact.local_global import Corrections
-from solvers.contact.touching import ContactEnergy, Rows, touching
+from solvers.contact.touching import ContactEnergy, ContactRows, touching
 from solvers.core.acceleration import Accelerating, Engine, Interpreted, Scheme
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
@@ -49,7 +49,7 @@ class _Touching(Interpreted):
         corrections: Corrections,
     ) -> None:
         self._contacts, self._corrections = contacts, corrections
-        self._rows: Rows | None = None
+        self._rows: ContactRows | None = None
         self._begun = True
         super().__init__(base, scheme, step, guess)
 
@@ -76,7 +76,7 @@ class _Touching(Interpreted):
         return self._corrections.residual(self._plain)
 
 
-def _alike(one: Rows, other: Rows) -> bool:
+def _alike(one: ContactRows, other: ContactRows) -> bool:
     """Whether the rows of one point serve another as well: what begins to press belongs to one point alone."""
     if not np.array_equal(one.vertices, other.vertices) or one.gap.any() or other.gap.any():
         return False

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from solvers.problem import Energy, LaggedEnergy, Positions, StepProblem, System
 
 
-class Rows(NamedTuple):
+class ContactRows(NamedTuple):
     """Terms w/2 (direction.x_v + gap)^2 of the displacements x of vertices v (r,).
 
     direction: (r, 3), unit vectors; weight: w (r,) [N/m]; gap (r,) [m]: zero where the contact's force at p is part of
@@ -38,7 +38,7 @@ class ContactEnergy(LaggedEnergy, Protocol):
         """Whether nothing can be touched in the step that has begun."""
         ...
 
-    def rows(self, p: Positions, trial: Positions, *, cautious: bool) -> Rows:
+    def rows(self, p: Positions, trial: Positions, *, cautious: bool) -> ContactRows:
         """The rows that resist a displacement from p to `trial`, both (n, 3) [m]: contacts that press at p, and those
         that begin to press on the way.
 

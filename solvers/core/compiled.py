@@ -85,16 +85,16 @@ def _plan(order: Order, first: Ints, held: Reals, measure: Reals, loose: Reals) 
     return step.Plan(*factor, spans, order.of_group, order.visits, order.visits_of, held, measure, loose, order.shift)
 
 
-def _rows(base: PreparedLocalGlobal, row: Ints, right: Ints, corrects: bool) -> step_ends.Rows:
+def _rows(base: PreparedLocalGlobal, row: Ints, right: Ints, corrects: bool) -> step_ends.VertexRows:
     """What is constant of the vertices' right-hand side; corrections have none of Q's coupling to exact pins."""
     s, pins = base.system, base.system.pins
     coupling = csr_array((0, 0)).tocoo() if corrects else base.coupling.tocoo()
     ends = s.free[coupling.coords[0]], np.flatnonzero(pins.exact)[coupling.coords[1]]
     held = np.array(pins.weight), np.array(pins.vertices), np.array(coupling.data, np.float64)
-    return step_ends.Rows(row, right, s.inertia, *held, *ends)
+    return step_ends.VertexRows(row, right, s.inertia, *held, *ends)
 
 
-class Work(NamedTuple):
+class StepScratch(NamedTuple):
     """What the kernels write to: three vectors and scratch, the right-hand side, positions to be corrected or None."""
 
     vectors: tuple[NDArray[Any], ...]
@@ -120,7 +120,7 @@ class PreparedCompiled(Iterative):
     bundles: kernels.Bundles
     edges: Edges | None
     form: kernels.Bundles
-    rows: step_ends.Rows
+    rows: step_ends.VertexRows
     far: int
     corrects: bool
     reach: float
@@ -225,18 +225,18 @@ class PreparedCompiled(Iterative):
         return Team.of(int(self.plan.top[2]))
 
     @cached_property
-    def work(self) -> Work:
+    def work(self) -> StepScratch:
         """The memory of whole solves, one after the other."""
         return self.memory()
 
-    def memory(self) -> Work:
+    def memory(self) -> StepScratch:
         """Memory for one solve."""
         rows, dtype = len(self.plan.held), self.plan.squares.dtype
         arrays = vectors(dtype, rows)
         p = aligned(4 * rows) if self.corrects else None
         for x in arrays[:3] if p is None else [p]:
             x[4 * self.far] = FAR
-        return Work(arrays, self.bundles.right(self.plan.held), p)
+        return StepScratch(arrays, self.bundles.right(self.plan.held), p)
 
     def threads(self) -> int | None:
         """As many as are allowed and as there are groups of subtrees; None for one."""
@@ -267,7 +267,7 @@ class _Iterating(Iterating):
         (a, b, c, e), right, p = self._own
         fixed = made.plan, made.bundles, self._edges, made.form, (a, b, c, e), right, p
         step.iterate(*fixed, ONE, made.threads(), self._team)
-        self._own = Work((b, a, c, e), right, p)
+        self._own = StepScratch((b, a, c, e), right, p)
         step_ends.fetch(made.rows, b if p is None else p, self.positions)
         return True
 
@@ -277,7 +277,7 @@ class _Iterating(Iterating):
         return step.length(self._prepared.plan, self._prepared.form, a, b, p, e)
 
     @cached_property
-    def _own(self) -> Work:
+    def _own(self) -> StepScratch:
         work, (target, force, pins, guess) = self._prepared.memory(), self._arrays
         step_ends.state(self._prepared.rows, target, force, pins, work.right)
         step_ends.start(self._prepared.rows, work.vectors, work.p, guess, pins)

@@ -18,7 +18,7 @@ from solvers.kernels.edges import descend_edges
 from solvers.kernels.loop import compiled_over
 from solvers.kernels.springs import Bundles, squared_norm
 from solvers.kernels.step import Plan
-from solvers.kernels.step_ends import Rows, fetch, place, state
+from solvers.kernels.step_ends import VertexRows, fetch, place, state
 from solvers.linear.supernodal_solve import backwards, forwards
 
 NOISE = 4.0 * np.finfo(np.float64).eps
@@ -40,7 +40,7 @@ class Step(NamedTuple):
     bundles: Bundles
     form: Bundles
     shares: Shares
-    rows: Rows
+    rows: VertexRows
     right: NDArray[np.float64]
     x: NDArray[Any]
     e: NDArray[np.float64]

@@ -14,7 +14,7 @@ from solvers.vectors.intrinsics import ask_for
 from solvers.vectors.springs import LANES
 
 
-class Rows(NamedTuple):
+class VertexRows(NamedTuple):
     """Where vertices lie, and what is constant of their right-hand side.
 
     row (n,): of each vertex; right (n,): where its x is in the right-hand side; inertia: m/dt^2 (n,) [N/m]; weight: of

@@ -28,7 +28,7 @@ class Blocks(NamedTuple):
     majorant: NDArray[np.float64]
 
 
-class Work(NamedTuple):
+class SweepScratch(NamedTuple):
     """What a step's iterations write to, beside the positions: before and older, positions; out: scratch; near: scratch
     of the springs of one bundle; sums: scratch of nine numbers a vertex of one; omega (1,): Chebyshev's factor, 0 where
     a step begins; level (1,): the objective, nan where it is not known."""

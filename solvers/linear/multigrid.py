@@ -31,7 +31,7 @@ _LOWEST = 0.25
 """Smoothing damps the part of the spectrum of D^-1 A above this share of its largest eigenvalue."""
 
 
-class Rows(NamedTuple):
+class CompressedRows(NamedTuple):
     """A sparse matrix in compressed rows, entries in float32."""
 
     pointers: NDArray[np.int64]
@@ -39,7 +39,7 @@ class Rows(NamedTuple):
     values: NDArray[np.float32]
 
     @classmethod
-    def of(cls, matrix: csr_array) -> Rows:
+    def of(cls, matrix: csr_array) -> CompressedRows:
         """The same matrix, rounded."""
         return cls(
             np.asarray(matrix.indptr, np.int64), np.asarray(matrix.indices, np.int32), matrix.data.astype(np.float32)
@@ -50,9 +50,9 @@ class Rows(NamedTuple):
 class Level:
     """A level above the coarsest: its matrix, how it is smoothed, how it leads to the next, and its vectors (n, 4)."""
 
-    A: Rows
-    P: Rows
-    R: Rows
+    A: CompressedRows
+    P: CompressedRows
+    R: CompressedRows
     inverse_diagonal: NDArray[np.float32]
     weights: list[tuple[np.float32, np.float32]]
     b: NDArray[np.float32]
@@ -143,7 +143,12 @@ def _coarsen(A: csr_array) -> tuple[Level, csr_array]:
     coarse = csr_array(R @ csr_array(A @ P))
     vectors = [np.zeros((n, 4), np.float32) for _ in range(4)]
     level = Level(
-        Rows.of(A), Rows.of(P), Rows.of(R), (1.0 / diagonal).astype(np.float32), _chebyshev(largest), *vectors
+        CompressedRows.of(A),
+        CompressedRows.of(P),
+        CompressedRows.of(R),
+        (1.0 / diagonal).astype(np.float32),
+        _chebyshev(largest),
+        *vectors,
     )
     return level, coarse
 

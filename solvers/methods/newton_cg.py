@@ -62,7 +62,7 @@ class NewtonCG:
         metric = Metric(system)
         objective = Objective(system)
         choice = metric.choice + objective.interpreted
-        return PreparedDescent(objective, metric, Method(metric, objective), choice, metric.facts)
+        return PreparedDescent(objective, metric, TruncatedNewton(metric, objective), choice, metric.facts)
 
 
 Preconditioner = Callable[[Positions], Positions]
@@ -103,7 +103,7 @@ def preconditioned(metric: Metric, step: StepObjective, p: Positions) -> tuple[H
     return hessian, Scaled(metric, *hessian.beyond()) if beyond else metric.solve
 
 
-class Method:
+class TruncatedNewton:
     """The iteration for one system. compiled: its conjugate gradients in one kernel, None where that cannot be."""
 
     def __init__(self, metric: Metric, objective: Objective) -> None:
@@ -227,7 +227,7 @@ class _Compiled:
     def direction(
         self, hessian: Hessian, solve: Preconditioner, at: Point, descent: Positions, eta: float
     ) -> Positions:
-        """See `Method._direction`."""
+        """See `TruncatedNewton._direction`."""
         d = np.empty_like(descent)
         shrunk = solve.shrunk if isinstance(solve, Scaled) else None
         solving = self._factor, self._threads(), self._held, shrunk

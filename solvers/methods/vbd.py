@@ -184,7 +184,9 @@ class _Iterating(Iterating):
         p[-4] = _FAR
         entries = int(np.diff(blocks.bundles.start).max(initial=0))
         scratch = aligned(NUMBERS * LANES * entries), aligned(9 * LANES)
-        self._work = kernels.Work(p.copy(), p.copy(), np.zeros_like(p), *scratch, np.zeros(1), np.full(1, np.nan))
+        self._work = kernels.SweepScratch(
+            p.copy(), p.copy(), np.zeros_like(p), *scratch, np.zeros(1), np.full(1, np.nan)
+        )
         self._rows, self.positions = p, guess
 
     def advance(self) -> bool:

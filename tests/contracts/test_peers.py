@@ -9,7 +9,7 @@ import pytest
 from harness.config.load import load_scene
 from harness.config.sweep import SolverSpec
 from harness.experiments.asked import libraries
-from harness.experiments.asked.libraries import LIBRARIES, Motion
+from harness.experiments.asked.libraries import LIBRARIES, InitialValueProblem
 from harness.experiments.asked.peers import peers
 from harness.experiments.asked.search import foresee, search
 from harness.experiments.asked.ways import Asked
@@ -24,7 +24,7 @@ def test_cvode_follows_the_motion_to_its_tolerance(name):
     asked = Asked.of(load_scene(SPRING), 2, 0.5)
     scene, truth = asked.bound(asked.frame, "newmark"), integrate(asked.bound(asked.frame, "own"), [0.5])
     field = Field(scene)
-    ends = (LIBRARIES[name].end(Motion(field, field.start, scene, 0.5, tol, tol)) for tol in (1e-5, 1e-8))
+    ends = (LIBRARIES[name].end(InitialValueProblem(field, field.start, scene, 0.5, tol, tol)) for tol in (1e-5, 1e-8))
     coarse, fine = (truth.error(0, field.motion(0.5, end)[0].copy()) for end in ends)
     assert fine < 1e-5
     assert fine < 0.1 * coarse

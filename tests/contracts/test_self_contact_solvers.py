@@ -18,7 +18,7 @@ from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.self_contact import SelfContact
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.grid import Grid
-from harness.scenes.motion import Key, Motion
+from harness.scenes.motion import Key, KeyedMotion
 from harness.scenes.spec import SceneSpec
 from harness.scenes.start import Collapsed, Scaled
 from harness.simulation.observe import intersections
@@ -158,7 +158,7 @@ def test_a_mesh_through_itself_at_rest_is_refused():
 
 
 def test_exact_pins_that_move_are_refused():
-    moves = Motion(keys=(Key(time=0.0), Key(time=1.0, offset=(0.1, 0.0, 0.0))))
+    moves = KeyedMotion(keys=(Key(time=0.0), Key(time=1.0, offset=(0.1, 0.0, 0.0))))
     pins = Pins(at=("left",), motion=moves, weight="exact")
     with pytest.raises(InputError, match="exact pins that move"):
         scene(Grid(), Springs(stretch=100.0), pins, APART, size=4)

@@ -20,7 +20,7 @@ from harness.scenes.effects.strain_limits import StrainLimits
 from harness.scenes.effects.wind import Wind
 from harness.scenes.mesh.grid import Grid
 from harness.scenes.mesh.surfaces import Balloon
-from harness.scenes.motion import Key, Motion
+from harness.scenes.motion import Key, KeyedMotion
 from harness.simulation.step import prepare, simulate
 from solvers.matrices import assemble
 from solvers.methods.lbfgs import Lbfgs
@@ -29,7 +29,7 @@ from solvers.problem import ProjectiveEnergy, Solver, StopRule
 from tests.scenes import scene
 
 TINY, HUGE = 1e-9, 1e9
-LEAP = Motion(keys=(Key(time=0.0), Key(time=1e-6, offset=(0.3, 0.0, 0.0), turn=3e4)))
+LEAP = KeyedMotion(keys=(Key(time=0.0), Key(time=1e-6, offset=(0.3, 0.0, 0.0), turn=3e4)))
 
 EFFECTS: dict[str, Effect] = {
     "bending of 1e9 N m": Bending(stiffness=HUGE),

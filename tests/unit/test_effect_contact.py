@@ -14,7 +14,7 @@ from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.grid import Grid
-from harness.scenes.motion import Key, Motion
+from harness.scenes.motion import Key, KeyedMotion
 from solvers.problem import StopRule
 from tests.contacts import DT, OBSTACLES, THICKNESS, contact, depth, on_slope, sheet, steps
 from tests.effects import integrated
@@ -131,7 +131,7 @@ REFUSED = {
     "pin that moves inside": (
         [
             contact(OBSTACLES["plane"]),
-            net(motion=Motion(keys=(Key(time=0), Key(time=2, offset=(0, -3, 0))))),
+            net(motion=KeyedMotion(keys=(Key(time=0), Key(time=2, offset=(0, -3, 0))))),
         ],
         ["contact", "pins", " s", "plane"],
     ),

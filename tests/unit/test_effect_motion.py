@@ -18,7 +18,7 @@ from harness.scenes.effects.springs import Springs
 from harness.scenes.effects.wind import Wind
 from harness.scenes.mesh.chain import Chain
 from harness.scenes.mesh.grid import Grid
-from harness.scenes.motion import Key, Motion
+from harness.scenes.motion import Key, KeyedMotion
 from harness.simulation.step import prepare, simulate
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import StopRule
@@ -26,7 +26,7 @@ from tests.effects import at_rest, integrated
 from tests.scenes import scene
 
 POINTS = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 1.0]])
-LIFT = Motion(keys=(Key(time=1.0), Key(time=2.0, offset=(0.0, 3.0, 0.0)), Key(time=4.0, offset=(0.0, 1.0, 0.0))))
+LIFT = KeyedMotion(keys=(Key(time=1.0), Key(time=2.0, offset=(0.0, 3.0, 0.0)), Key(time=4.0, offset=(0.0, 1.0, 0.0))))
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 
 
@@ -50,13 +50,13 @@ def test_a_smooth_motion_goes_through_its_keys_and_never_beyond():
 
 
 def test_a_turn_is_about_its_axis():
-    motion = Motion(keys=(Key(time=0.0), Key(time=1.0, turn=180.0)), axis=(0.0, 0.0, 2.0), about=(1.0, 1.0, 5.0))
+    motion = KeyedMotion(keys=(Key(time=0.0), Key(time=1.0, turn=180.0)), axis=(0.0, 0.0, 2.0), about=(1.0, 1.0, 5.0))
     np.testing.assert_allclose(motion.moved(np.array([[3.0, 1.0, 0.0]]), 0.5), [[1.0, 3.0, 0.0]], atol=1e-15)
     np.testing.assert_allclose(motion.moved(np.array([[3.0, 1.0, 0.0]]), 1.0), [[-1.0, 1.0, 0.0]], atol=1e-15)
 
 
 def test_a_turn_of_many_rounds_keeps_distances():
-    motion = Motion(keys=(Key(time=0.0), Key(time=1.0, turn=3600.0)), axis=(1.0, 2.0, 3.0))
+    motion = KeyedMotion(keys=(Key(time=0.0), Key(time=1.0, turn=3600.0)), axis=(1.0, 2.0, 3.0))
     for t in (0.013, 0.4, 0.77):
         a, b = motion.moved(POINTS, t)
         assert np.linalg.norm(a - b) == pytest.approx(6**0.5, rel=1e-14)
@@ -76,10 +76,10 @@ def test_a_turn_of_many_rounds_keeps_distances():
 )
 def test_key_frames_that_mean_nothing_are_refused(data):
     with pytest.raises(ValidationError):
-        Motion.model_validate(data)
+        KeyedMotion.model_validate(data)
 
 
-SWING = Motion(keys=(Key(time=0.0), Key(time=0.3, offset=(0.2, 0.1, 0.0), turn=60.0)))
+SWING = KeyedMotion(keys=(Key(time=0.0), Key(time=0.3, offset=(0.2, 0.1, 0.0), turn=60.0)))
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -96,7 +96,7 @@ def test_pins_are_on_their_path_at_the_end_of_each_step(integrator, weight):
 
 def test_a_chain_pulled_at_both_ends_gets_there():
     """Both ends go 1 m along; what hangs between them follows and comes to rest a metre further, through drag."""
-    along = Motion(keys=(Key(time=0.0), Key(time=0.5, offset=(1.0, 0.0, 0.0))))
+    along = KeyedMotion(keys=(Key(time=0.0), Key(time=0.5, offset=(1.0, 0.0, 0.0))))
     pins = Pins(at=("ends",), weight="exact", motion=along)
     made = scene(Chain(), Springs(stretch=100.0), pins, EtherDrag(rate=10.0), size=6)
     *_, last = simulate(made, prepare(made, SparseLocalGlobal()), StopRule(50), first_guess="current", frames=90)
@@ -148,7 +148,7 @@ def test_attachments_pull_to_the_points_that_they_name():
 def test_an_attachment_pulls_a_free_mass_behind_its_point_as_the_equation_of_motion_says(integrator):
     """m x'' = -k (x - v t): x = v (t - sin(w t) / w)."""
     speed, w, seconds = 2.0, 5.0, 1.0
-    motion = Motion(keys=(Key(time=0.0), Key(time=10.0, offset=(10 * speed, 0.0, 0.0))))
+    motion = KeyedMotion(keys=(Key(time=0.0), Key(time=10.0, offset=(10 * speed, 0.0, 0.0))))
     wanted, errors = speed * (seconds - np.sin(w * seconds) / w), []
     for dt in (0.01, 0.005, 0.0025):
         ends = Attachments(at=("ends",), stiffness=2 * w**2, motion=motion)

@@ -13,7 +13,7 @@ from harness.cli import app
 from harness.report import opengl
 from harness.report.contact_sheet import abreast
 from harness.report.solids import solid
-from harness.scenes.motion import Key, Motion
+from harness.scenes.motion import Key, KeyedMotion
 from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
 
 needs_opengl = pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
@@ -52,7 +52,7 @@ def test_what_is_drawn_of_an_obstacle_is_its_surface(obstacle):
 
 
 def test_an_obstacle_is_drawn_where_it_has_moved_to():
-    moves = Motion(keys=(Key(time=0.0), Key(time=2.0, offset=(0.0, 4.0, 0.0))))
+    moves = KeyedMotion(keys=(Key(time=0.0), Key(time=2.0, offset=(0.0, 4.0, 0.0))))
     made = solid(Sphere(radius=1.0, motion=moves), 1.0, SEEN)
     assert made is not None
     assert np.asarray(made.points).mean(axis=0) == pytest.approx([0.0, 2.0, 0.0], abs=1e-5)  # single precision

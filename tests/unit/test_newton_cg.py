@@ -19,7 +19,7 @@ from solvers.core.objective import StepObjective
 from solvers.core.saddles import certified
 from solvers.methods.hybrid import Hybrid
 from solvers.methods.newton import Newton
-from solvers.methods.newton_cg import Method, NewtonCG
+from solvers.methods.newton_cg import NewtonCG, TruncatedNewton
 from solvers.problem import StopRule
 from tests.scenes import cloth, first_problem, random_problem, scene
 from tests.unit.test_objective import with_links
@@ -57,7 +57,7 @@ def test_the_compiled_loop_makes_the_iterates_of_the_one_that_takes_any_energy(s
     given = first_problem(cloth(size, weight))
     compiled, plain = (NewtonCG().prepare(given.system) for _ in range(2))
     assert isinstance(plain, PreparedDescent)
-    assert isinstance(plain.method, Method)
+    assert isinstance(plain.method, TruncatedNewton)
     plain.method.compiled = None
     for p, q in islice(zip(compiled.iterates(given), plain.iterates(given), strict=False), 6):
         # Sums in another order, which pins of 1e10 beside springs of 1e2 magnify.

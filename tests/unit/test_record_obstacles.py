@@ -12,12 +12,14 @@ import pytest
 
 from harness.record.reader import open_recording, read_replay
 from harness.report.solids import seen, solids
-from harness.scenes.motion import Key, Motion
+from harness.scenes.motion import Key, KeyedMotion
 from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
 from harness.scenes.shapes import from_json
 from tests.recordings import TIME_STEP, info, record
 
-RISES = Motion(keys=(Key(time=0.0), Key(time=10 * TIME_STEP, offset=(0.0, 2.0, 0.0), turn=90.0)), axis=(1.0, 2.0, 0.0))
+RISES = KeyedMotion(
+    keys=(Key(time=0.0), Key(time=10 * TIME_STEP, offset=(0.0, 2.0, 0.0), turn=90.0)), axis=(1.0, 2.0, 0.0)
+)
 OBSTACLES = (
     Sphere(center=(1.0, 2.0, 3.0), radius=0.5, motion=RISES),
     Capsule(ends=((0.0, 0.5, 0.0), (1.0, -1.0, 0.3)), radius=0.2),

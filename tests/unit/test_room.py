@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.scenes.motion import Key, Motion
+from harness.scenes.motion import Key, KeyedMotion
 from harness.scenes.obstacles import Plane, Sphere
 from harness.scenes.room import gap, key_times, looks, nearest
 
@@ -15,8 +15,8 @@ POINT = np.array([[0.0, 0.0, 0.0]])
 LIMIT = 0.01
 
 
-def moving(*keys: dict[str, Any], **more: Any) -> Motion:
-    return Motion.model_validate({"keys": list(keys), **more})
+def moving(*keys: dict[str, Any], **more: Any) -> KeyedMotion:
+    return KeyedMotion.model_validate({"keys": list(keys), **more})
 
 
 ACROSS = moving({"time": 0.0}, {"time": 1.0, "offset": (4.0, 0.0, 0.0)})
@@ -32,7 +32,7 @@ FAR = Sphere(center=(4.0, 0.0, 0.0), radius=0.05)
     [(BALL, ACROSS, 0.4725), (FAR, ROUND, 0.4952), (BALL, SMOOTH, 0.4725)],
     ids=["along a line", "along a circle", "along a cubic"],
 )
-def test_a_way_through_a_ball_is_found_where_it_begins(ball: Sphere, motion: Motion, when: float):
+def test_a_way_through_a_ball_is_found_where_it_begins(ball: Sphere, motion: KeyedMotion, when: float):
     found = nearest(ball.obstacle(), None, POINT, motion, LIMIT)
     assert found is not None
     assert found[0] == pytest.approx(when, abs=0.01)
@@ -48,13 +48,13 @@ def test_a_ball_that_comes_is_found_like_a_way_to_it():
 
 
 @pytest.mark.parametrize("motion", [None, ACROSS, ROUND, SMOOTH])
-def test_a_way_beside_a_ball_is_free(motion: Motion | None):
+def test_a_way_beside_a_ball_is_free(motion: KeyedMotion | None):
     beside = Sphere(center=(2.0, 5.0, 0.0), radius=0.1)
     assert nearest(beside.obstacle(), None, POINT, motion, LIMIT) is None
 
 
 @pytest.mark.parametrize("motion", [ACROSS, ROUND, SMOOTH])
-def test_no_point_is_faster_than_is_said(motion: Motion):
+def test_no_point_is_faster_than_is_said(motion: KeyedMotion):
     times = np.linspace(0.0, 1.0, 1001)
     way = np.array([motion.moved(POINT, t)[0] for t in times])
     fastest = np.linalg.norm(np.diff(way, axis=0), axis=1).max() / times[1]
@@ -77,4 +77,4 @@ def test_four_planes_may_leave_no_room_where_any_three_do():
 def test_planes_that_turn_are_looked_at_between_their_keys():
     assert list(looks([ACROSS])) == [0.0, 1.0]
     assert len(list(looks([ROUND]))) > 32
-    assert key_times(ACROSS, None, Motion(keys=(Key(time=0.5),))) == [0.0, 0.5, 1.0]
+    assert key_times(ACROSS, None, KeyedMotion(keys=(Key(time=0.5),))) == [0.0, 0.5, 1.0]

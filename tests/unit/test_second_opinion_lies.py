@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from harness.scenes import material
 from harness.scenes.bind import Scene
-from harness.scenes.motion import Motion
+from harness.scenes.motion import KeyedMotion
 from solvers.contact.energy import Contact
 from solvers.energies.attachments import Attachments
 from solvers.energies.bending import Bending
@@ -157,7 +157,7 @@ LIES: dict[str, Lie] = {
     "key frames that turn the other way": Lie(
         [SPRINGS, PINS],
         "targets of pins",
-        patched(Motion, "_at", lambda true: lambda self, time: true(self, time) * [1, 1, 1, -1]),
+        patched(KeyedMotion, "_at", lambda true: lambda self, time: true(self, time) * [1, 1, 1, -1]),
     ),
     "implicit Euler that goes too far": Lie(
         [SPRINGS], "inertial target", predicted("implicit-euler", target=1.0 + 1e-6)

@@ -14,14 +14,14 @@ from harness.scenes.effects.springs import Springs
 from harness.scenes.effects.surface_contact import SurfaceContact
 from harness.scenes.mesh.grid import Grid
 from harness.scenes.mesh.surfaces import Balloon
-from harness.scenes.motion import Key, Motion
+from harness.scenes.motion import Key, KeyedMotion
 from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
 from harness.scenes.shapes import Solid
 from harness.scenes.spec import SceneSpec
 from harness.simulation.opinion.second import second_opinion
 from solvers.contact.self_contact import ObstacleContact
 
-TURNS = Motion(keys=(Key(time=0.0), Key(time=0.1, offset=(0.01, 0.02, 0.0), turn=20.0)), axis=(0.1, 1.0, 0.2))
+TURNS = KeyedMotion(keys=(Key(time=0.0), Key(time=0.1, offset=(0.01, 0.02, 0.0), turn=20.0)), axis=(0.1, 1.0, 0.2))
 BALL = Solid(mesh=Balloon(radius=0.3), size=2, offset=(0.1, -0.5, 0.0))
 OBSTACLES: dict[str, tuple[Any, ...]] = {
     "mesh": (BALL,),

@@ -17,14 +17,14 @@ from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.body import Body
 from harness.scenes.mesh.grid import Grid
 from harness.scenes.mesh.surfaces import Balloon
-from harness.scenes.motion import Key, Motion
+from harness.scenes.motion import Key, KeyedMotion
 from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
 from harness.scenes.shapes import Solid, Triangles, from_json, shape
 from harness.simulation.observe import intersections
 from harness.simulation.step import State, prepare, problem, simulate, start
 from solvers.contact.self_contact import ObstacleContact
 from solvers.core.clearing import Blocked
-from solvers.integrators import Motion as Moving
+from solvers.integrators import Motion
 from solvers.methods.newton import Newton
 from solvers.problem import Positions, StopRule
 from solvers.registry import SOLVERS, load
@@ -114,11 +114,11 @@ def test_nothing_passes_through_any_obstacle(name):
 @pytest.mark.parametrize("sideways", [0.0, 6.0])
 def test_an_obstacle_that_moves_pushes_the_sheet_and_never_passes_it(name, sideways):
     keys = (Key(time=0.0), Key(time=0.1, offset=(0.0, 0.3, 0.0)), Key(time=0.3, offset=(0.2, 0.3, 0.0), turn=120.0))
-    speed = {"motion": Motion(keys=keys, axis=(0.0, 1.0, 0.3))}
+    speed = {"motion": KeyedMotion(keys=keys, axis=(0.0, 1.0, 0.3))}
     table = Plane(point=(0.0, -0.7, 0.0))
     made = draped(BALL.model_copy(update=speed), table, friction=0.3, size=6)
     begun = start(made).now
-    state = State(Moving(begun.positions, begun.velocity + np.array([sideways, 0.0, 0.0])), None, 0)
+    state = State(Motion(begun.positions, begun.velocity + np.array([sideways, 0.0, 0.0])), None, 0)
     prepared = prepare(made, load(SOLVERS[name])())
     highest = 0.0
     for step in simulate(made, prepared, RULE, first_guess="current", frames=12, state=state):
@@ -131,7 +131,7 @@ def test_an_obstacle_that_moves_pushes_the_sheet_and_never_passes_it(name, sidew
 
 
 def test_what_is_squeezed_between_obstacles_is_said():
-    down = Motion(keys=(Key(time=0.0), Key(time=1.0, offset=(0.0, -5.0, 0.0))))
+    down = KeyedMotion(keys=(Key(time=0.0), Key(time=1.0, offset=(0.0, -5.0, 0.0))))
     press = Plane(point=(0.0, 0.05, 0.0), normal=(0.0, -1.0, 0.0), motion=down)
     made = draped(Plane(point=(0, -0.05, 0)), press, size=4)
     with pytest.raises(Blocked, match="obstacles leave no room"):
@@ -223,7 +223,7 @@ def test_sheets_that_collide_with_friction_keep_their_momentum():
     p, v = made.mesh.rest, np.zeros_like(made.mesh.rest)
     upper = np.arange(len(p)) >= len(p) // 2
     v[upper] = (1.0, -2.0, 0.0)
-    state, mass = State(Moving(p, v), None, 0), made.system.mass
+    state, mass = State(Motion(p, v), None, 0), made.system.mass
     before, after = mass @ v, v
     for step in simulate(
         made, prepare(made, Newton()), StopRule(100, 1e-11), first_guess="motion", frames=8, state=state

@@ -11,7 +11,7 @@ import pytest
 from harness.report.accuracy.reading import read
 from harness.report.accuracy.winners import NOBODY, Cell, cells, family
 from harness.report.figures.of_winners import winners
-from harness.report.figures.panel import Grid
+from harness.report.figures.panel import CellMap
 from harness.report.site.winners import chart
 from tests import accuracy_rows as made
 from tests import figure_results
@@ -83,7 +83,9 @@ def test_an_integrator_from_outside_is_a_family_by_its_name(tmp_path):
 
 
 def test_each_number_of_vertices_is_a_grid_of_errors_by_stiffness(tmp_path):
-    panels = [panel for entry in winners(figure_results.winners(tmp_path)) if isinstance(panel := entry.make(), Grid)]
+    panels = [
+        panel for entry in winners(figure_results.winners(tmp_path)) if isinstance(panel := entry.make(), CellMap)
+    ]
     assert [panel.title for panel in panels] == ["81 vertices", "289 vertices", "1\u2009089 vertices"]
     assert {len({cell.column for cell in panel.cells}) for panel in panels} == {5}
     assert {len({cell.row for cell in panel.cells}) for panel in panels} == {8}

@@ -24,7 +24,7 @@ _STEPS = 10**8
 """CVODE may take: the clock ends it."""
 
 
-class Motion(NamedTuple):
+class InitialValueProblem(NamedTuple):
     """What is integrated: the field F of y' = F(t, y), the scene that it is of, up to a time [s]; the relative
     tolerance of y, and the absolute one [m, m/s]."""
 
@@ -43,7 +43,7 @@ class Library:
     always there."""
 
     order: int
-    end: Callable[[Motion], State]
+    end: Callable[[InitialValueProblem], State]
     compiled: bool = True
     module: str = ""
     extra: str = ""
@@ -56,8 +56,8 @@ class Library:
         return f"is not installed; `.venv/bin/pip install -e '.[{self.extra}]'` in the checkout installs it"
 
 
-def _scipy(method: str) -> Callable[[Motion], State]:
-    def end(motion: Motion) -> State:
+def _scipy(method: str) -> Callable[[InitialValueProblem], State]:
+    def end(motion: InitialValueProblem) -> State:
         solve: Any = solve_ivp  # its stubs say little of what it answers
         more: dict[str, Any] = {"jac_sparsity": pattern(motion.scene)} if method in ("Radau", "BDF") else {}
         more |= {"rtol": motion.relative, "atol": motion.absolute}
@@ -69,8 +69,8 @@ def _scipy(method: str) -> Callable[[Motion], State]:
     return end
 
 
-def _cvode(method: str) -> Callable[[Motion], State]:
-    def end(motion: Motion) -> State:
+def _cvode(method: str) -> Callable[[InitialValueProblem], State]:
+    def end(motion: InitialValueProblem) -> State:
         def rate(t: float, y: State, out: State) -> None:
             out[:] = motion.field(t, y)
 

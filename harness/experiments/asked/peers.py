@@ -12,7 +12,7 @@ from math import inf
 from time import perf_counter, thread_time
 
 from harness.base.errors import RunFailed
-from harness.experiments.asked.libraries import LIBRARIES, Motion
+from harness.experiments.asked.libraries import LIBRARIES, InitialValueProblem
 from harness.experiments.asked.search import AIM, Answer
 from harness.experiments.asked.ways import Asked
 from harness.reference.motion import Field, State
@@ -86,7 +86,9 @@ class _Beside:
         field = self.fields[library.compiled]
         began, cpu = perf_counter(), thread_time()
         limited = _limited(field, cpu + MOST)
-        motion = Motion(limited, field.start, self.scene, self.asked.horizon, max(tolerance / size, 1e-13), tolerance)
+        motion = InitialValueProblem(
+            limited, field.start, self.scene, self.asked.horizon, max(tolerance / size, 1e-13), tolerance
+        )
         try:
             end = library.end(motion)
         except TooSlow:

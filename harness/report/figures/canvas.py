@@ -27,7 +27,7 @@ from matplotlib.text import Text
 from harness.report.figures.asked import Asked
 from harness.report.figures.direct import label_directly
 from harness.report.figures.drawing import draw_grid, draw_picture, draw_plot, handle, names, write_cells
-from harness.report.figures.panel import Grid, Panel, Picture, Plot, Series
+from harness.report.figures.panel import CellMap, Panel, Picture, Plot, Series
 from harness.report.figures.scales import thin
 from harness.report.page import ticks
 from harness.report.style import INK, MUTED, STRAIN_MAP
@@ -109,7 +109,7 @@ def _heights(panels: Sequence[Panel], columns: int, asked: Asked) -> list[float]
 
 def _height(panel: Panel, width: float, asked: Asked) -> float:
     line = 1.45 * asked.small / 72.0
-    if isinstance(panel, Grid):
+    if isinstance(panel, CellMap):
         rows, columns = names(panel)
         return line * len(rows) + 0.62 * asked.small / 72.0 * max(map(len, columns)) + 2.0 * line
     if isinstance(panel, Picture):
@@ -212,7 +212,7 @@ def _height_of(figure: Figure, artist: Artist) -> float:
 
 
 def _entries(panels: Sequence[Panel]) -> list[Any]:
-    grids = [panel for panel in panels if isinstance(panel, Grid)]
+    grids = [panel for panel in panels if isinstance(panel, CellMap)]
     if grids:
         used = {cell.outcome for grid in grids for cell in grid.cells}
         return [Patch(color=color, label=words) for words, color in grids[0].outcomes if words in used]
@@ -244,7 +244,7 @@ def _settle(axes: Sequence[Axes], panels: Sequence[Panel], asked: Asked) -> None
     for ax, panel in zip(axes, panels, strict=True):
         if isinstance(panel, Plot):
             thin(ax)
-        elif isinstance(panel, Grid):
+        elif isinstance(panel, CellMap):
             write_cells(ax, panel, asked)
     figure.draw_without_rendering()
     for ax in axes:

@@ -14,7 +14,7 @@ from matplotlib.patches import Rectangle
 
 from harness.report.accuracy.sheet import size as enlarged
 from harness.report.figures.asked import Asked
-from harness.report.figures.panel import Grid, Picture, Plot, Series, Values
+from harness.report.figures.panel import CellMap, Picture, Plot, Series, Values
 from harness.report.figures.scales import in_points, set_scales
 from harness.report.style import INK, MUTED, RULE, Mark
 
@@ -91,7 +91,7 @@ def handle(series: Series) -> Line2D:
     return Line2D([], [], linestyle=line, linewidth=_LINE, label=series.label, **mark(look))
 
 
-def draw_grid(ax: Axes, panel: Grid, asked: Asked) -> None:
+def draw_grid(ax: Axes, panel: CellMap, asked: Asked) -> None:
     """Cells with their figures where these fit; rows named at the left, columns above."""
     rows, columns = names(panel)
     ax.set_xlim(0, len(columns))
@@ -108,7 +108,7 @@ def draw_grid(ax: Axes, panel: Grid, asked: Asked) -> None:
     ax.tick_params(length=0, pad=2, labeltop=True, labelbottom=False, labelcolor=INK)
 
 
-def write_cells(ax: Axes, panel: Grid, asked: Asked) -> None:
+def write_cells(ax: Axes, panel: CellMap, asked: Asked) -> None:
     """The figures of all cells, where the longest fits. To be called once the frame has its size."""
     rows, columns = names(panel)
     longest = max((len(cell.figure) for cell in panel.cells), default=0)
@@ -119,7 +119,7 @@ def write_cells(ax: Axes, panel: Grid, asked: Asked) -> None:
             ax.text(*at, cell.figure, ha="center", va="center", fontsize=asked.small, color=ink_on(cell.color))
 
 
-def names(panel: Grid) -> tuple[list[str], list[str]]:
+def names(panel: CellMap) -> tuple[list[str], list[str]]:
     """The names of rows and of columns, in their order."""
     return list(dict.fromkeys(c.row for c in panel.cells)), list(dict.fromkeys(c.column for c in panel.cells))
 

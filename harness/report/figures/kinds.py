@@ -12,7 +12,7 @@ from harness.base.errors import InputError, Mistake, RunFailed, SpringbenchError
 from harness.config.sweep import EVERY_REPORT
 from harness.report.figures import of_accuracy, of_gates, of_hard, of_meshes, of_runs, of_winners
 from harness.report.figures.entry import Entry, ready
-from harness.report.figures.panel import Grid, Panel, Picture
+from harness.report.figures.panel import CellMap, Panel, Picture
 from solvers.plugins import load
 
 
@@ -40,8 +40,11 @@ def _sheet(entries: Sequence[Entry]) -> list[Panel]:
 def _maps(entries: Sequence[Entry]) -> list[Panel]:
     """Families of hard cases as one map, below whatever else was chosen."""
     panels = [entry.make() for entry in entries]
-    grids = [panel for panel in panels if isinstance(panel, Grid)]
-    return [*(panel for panel in panels if not isinstance(panel, Grid)), *([of_hard.together(grids)] if grids else [])]
+    grids = [panel for panel in panels if isinstance(panel, CellMap)]
+    return [
+        *(panel for panel in panels if not isinstance(panel, CellMap)),
+        *([of_hard.together(grids)] if grids else []),
+    ]
 
 
 def _rows_alone(panels: Callable[[Path], list[Entry]]) -> Callable[[Path, of_runs.Older], list[Entry]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from harness.report.figures.entry import Entry, ready
 from harness.report.figures.of_runs import Older, sweep_rows
-from harness.report.figures.panel import Cell, Grid, Panel, Plot, Scale, Series
+from harness.report.figures.panel import Cell, CellMap, Panel, Plot, Scale, Series
 from harness.report.origin import NEEDED, measured_on
 from harness.report.robustness import OUTCOMES, RIGHT, Judged, read_cells, scores
 from harness.report.style import OLDER, Mark, marks
@@ -29,7 +29,7 @@ def hard(folder: Path, older: Older) -> list[Entry]:
         drawn = [_cell(cell, older=cell.run_id in other) for cell in mine]
         notes = [_DOTTED] if any(cell.older for cell in drawn) else []
         outcomes = [(outcome.words, outcome.color) for outcome in OUTCOMES]
-        panels.append(Grid(("map",), (family,), "", family, drawn, outcomes, notes, told))
+        panels.append(CellMap(("map",), (family,), "", family, drawn, outcomes, notes, told))
     return ready(panels)
 
 
@@ -38,7 +38,7 @@ def _cell(cell: Judged, *, older: bool) -> Cell:
     return Cell(row, cell.solver, cell.outcome.words, cell.outcome.color, cell.figure, older)
 
 
-def together(grids: Sequence[Grid]) -> Grid:
+def together(grids: Sequence[CellMap]) -> CellMap:
     """One map of several families, whose rows then name their family."""
     if len(grids) == 1:
         return grids[0]

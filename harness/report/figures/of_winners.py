@@ -7,7 +7,7 @@ from pathlib import Path
 from harness.report.accuracy.reading import read
 from harness.report.accuracy.winners import NOBODY, cells, families
 from harness.report.figures.entry import Entry, ready
-from harness.report.figures.panel import Cell, Grid
+from harness.report.figures.panel import Cell, CellMap
 from harness.report.page import count, quantity
 
 _NOTE = (
@@ -25,11 +25,11 @@ def winners(folder: Path) -> list[Entry]:
     looks = families(found)
     colors = {name: look.color for name, look in looks.items()} | {NOBODY: _NONE}
     dotted = any(work.code != table.newest for cell in found for work in cell.prices.values())
-    panels: list[Grid] = []
+    panels: list[CellMap] = []
     for vertices in dict.fromkeys(cell.vertices for cell in found):
         mine = [cell for cell in found if cell.vertices == vertices]
         panels.append(
-            Grid(
+            CellMap(
                 *(("winners",), (str(vertices),), "", f"{count(vertices)} vertices"),
                 [
                     Cell(

@@ -107,7 +107,7 @@ class Cell(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grid:
+class CellMap:
     """Coloured cells, rows by columns; outcomes: their meanings with colours, in the order of the legend."""
 
     of: tuple[str, ...]
@@ -161,7 +161,7 @@ class Renderer:
         raise NotImplementedError
 
 
-Panel = Plot | Grid | Picture
+Panel = Plot | CellMap | Picture
 
 
 def _points(panel: str, series: Series) -> list[Row]:

@@ -18,7 +18,7 @@ from harness.report.figures import scripts
 from harness.report.figures.asked import Asked
 from harness.report.figures.canvas import INCH, RC
 from harness.report.figures.drawing import DOTS
-from harness.report.figures.panel import Grid, Panel, Picture, Plot, Row
+from harness.report.figures.panel import CellMap, Panel, Picture, Plot, Row
 
 
 def write(figure: Figure, panels: Sequence[Panel], stem: Path, title: str, asked: Asked) -> list[Path]:
@@ -81,8 +81,8 @@ def script(figure: Figure, panels: Sequence[Panel], name: str, asked: Asked) -> 
         plots = [panel for panel in panels if isinstance(panel, Plot)]
         looks = {s.label: (s.look.color, s.look.marker, s.look.dash) for panel in plots for s in panel.series}
         return head + scripts.PLOT.format(looks=_told(looks), panels=_told(dict(map(_stated, plots))), **shared)
-    if kind is Grid:
-        grids = [panel for panel in panels if isinstance(panel, Grid)]
+    if kind is CellMap:
+        grids = [panel for panel in panels if isinstance(panel, CellMap)]
         outcomes = dict(grids[0].outcomes)
         return head + scripts.GRID.format(outcomes=_told(outcomes), **shared)
     pictures = [panel for panel in panels if isinstance(panel, Picture)]

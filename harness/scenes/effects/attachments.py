@@ -11,7 +11,7 @@ from harness.base.errors import InputError
 from harness.base.model import Vector
 from harness.scenes.effects.base import Contribution
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.motion import Motion
+from harness.scenes.motion import KeyedMotion
 from harness.scenes.selection import Selection
 from solvers.energies.attachments import Attachments as Energy
 from solvers.problem import Positions
@@ -27,7 +27,7 @@ class Attachments(Selection):
     """The stiffness of all the springs together [N/m], shared equally, so that it means the same at every mesh size."""
     to: tuple[Vector, ...] | None = None
     """The points [m]: one for all of the vertices, or one for each in their order; left out, their rest positions."""
-    motion: Motion | None = None
+    motion: KeyedMotion | None = None
     """Key frames that take the points along, all together."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.motion import Motion
+from harness.scenes.motion import KeyedMotion
 from solvers import integrators
 from solvers.energies.springs import Springs
 from solvers.integrators import splits
@@ -57,7 +57,7 @@ class Pin:
     vertices: NDArray[np.int64]
     targets: Positions
     weight: float
-    motion: Motion | None = None
+    motion: KeyedMotion | None = None
 
 
 class Check(Protocol):

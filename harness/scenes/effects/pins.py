@@ -9,7 +9,7 @@ from pydantic import Field, PositiveFloat
 
 from harness.scenes.effects.base import Contribution, Pin
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.motion import Motion
+from harness.scenes.motion import KeyedMotion
 from harness.scenes.selection import Selection
 
 
@@ -21,7 +21,7 @@ class Pins(Selection):
     kind: Literal["pins"] = "pins"
     weight: PositiveFloat | Literal["exact"] = Field(default=1e10)
     """The penalty's weight w [N/m], or `exact`: the vertices are no unknowns any more."""
-    motion: Motion | None = None
+    motion: KeyedMotion | None = None
     """Key frames that take the pinned vertices along, all together."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
