@@ -70,7 +70,7 @@ def stepped(made: Scene, integrator: str = "implicit-euler") -> StepProblem:
     """A step of the scene from positions that are a little stretched and disturbed, and from velocities."""
     rng, rest = np.random.default_rng(0), made.mesh.rest
     now, before = (
-        integrators.KeyedMotion(stretch * rest + 0.01 * rng.normal(size=rest.shape), 0.3 * rng.normal(size=rest.shape))
+        integrators.Motion(stretch * rest + 0.01 * rng.normal(size=rest.shape), 0.3 * rng.normal(size=rest.shape))
         for stretch in (1.05, 1.04)
     )
     return problem(integrated(made, integrator), State(now, before, 3), "current")
@@ -85,9 +85,7 @@ def integrated(made: Scene, name: str) -> Scene:
 def at_rest(made: Scene, solver: Solver | None = None, *, iterations: int = 200, tolerance: float = 1e-9) -> Positions:
     """Where a scene comes to rest, (n, 3) [m]: one step so long that inertia (M/dt^2) and damping weigh nothing."""
     long = replace(made, system=replace(made.system, time_step=1e3))
-    stated = problem(
-        long, State(integrators.KeyedMotion(made.mesh.rest, np.zeros_like(made.mesh.rest)), None, 0), "current"
-    )
+    stated = problem(long, State(integrators.Motion(made.mesh.rest, np.zeros_like(made.mesh.rest)), None, 0), "current")
     solution = (solver or Newton()).prepare(long.system).solve(stated, StopRule(iterations, tolerance))
     assert solution.stopped != "iterations", "the static solve has not converged"
     return solution.positions
