@@ -10,6 +10,8 @@ import typer
 from harness.base.console import say
 from harness.base.errors import InputError
 
+_SOLVER, _TOLERANCE = "hybrid", "1e-4"
+
 
 def gallery(
     scenes: Annotated[list[Path], typer.Argument(help="Scenes (YAML), in the order of the sheet.")],
@@ -24,15 +26,21 @@ def gallery(
     for path in scenes:
         tiles.append(_tile(path))
         say(f"[{len(tiles)}/{len(scenes)}] {tiles[-1].name}")
-    draw_sheet(tiles, output)
+    draw_sheet(tiles, output, [f"at the last frame, by {_SOLVER} to {_TOLERANCE}", *_strains(tiles)])
     say(f"the sheet is {output}")
+
+
+def _strains(tiles: list[Any]) -> list[str]:
+    """What colours mean, where they mean the same in all tiles."""
+    ranges = {tile.replay.strain_range for tile in tiles}
+    return [f"strain: blue −{100 * ranges.pop():g} %, orange as much stretched"] if len(ranges) == 1 else []
 
 
 def _tile(path: Path) -> Any:
     """A scene's tile."""
     import numpy as np
 
-    from harness.base.machine import pinned_threads
+    from harness.base import machine
     from harness.config.load import load_any
     from harness.record.base import Replay
     from harness.record.obstacles import declared, listed
@@ -43,12 +51,12 @@ def _tile(path: Path) -> Any:
     from solvers.problem import StopRule
     from solvers.registry import SOLVERS, load
 
-    run = load_any(path, solvers=["hybrid"]).runs()[0]
+    run = load_any(path, solvers=[_SOLVER]).runs()[0]
     scene = build(run.scene, run.size)
-    solver = load(SOLVERS["hybrid"])()
+    solver = load(SOLVERS[_SOLVER])()
     p = scene.mesh.rest
-    with pinned_threads(1):
-        settings = Settings(StopRule(200, 1e-4), run.first_guess, run.frames, 1)
+    with machine.pinned_threads(1):
+        settings = Settings(StopRule(200, float(_TOLERANCE)), run.first_guess, run.frames, 1)
         for step in steps(scene, prepare(scene, solver), settings):
             p = step.positions
     replay = Replay(
@@ -63,7 +71,11 @@ def _tile(path: Path) -> Any:
         pinned=scene.system.pins.vertices,
         strain_range=run.strain_range,
         scalars={},
-        properties=declared(listed(run.scene.effects)),
+        properties={
+            **declared(listed(run.scene.effects)),
+            "cpu": machine.describe().cpu,
+            "commit": machine.commit(),
+        },
     )
     kinds = dict.fromkeys(effect.kind for effect in run.scene.effects)
     camera = run.scene.camera

@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs say nothing of most keywords, and PyVista is known in part.
-"""A sheet of scenes: each in a tile with its name, its effects and its time, all type of one size."""
+"""A sheet of scenes: each in a tile with its name and its effects, all type of one size; at the foot what drew them."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from harness.record.base import Replay
+from harness.report.origin import machine_and_commit
 from harness.report.page import save
 from harness.report.render import Studio, area_vectors, frame_all, natural_angles
 from harness.report.solids import seen
@@ -28,16 +29,17 @@ _LINES = 70
 """Pixels for each vertex from which on the mesh's lines are drawn: the mesh is to be seen, if only as a texture."""
 _BOB, _HEAVY = 0.03, 20.0
 """Vertices so many times heavier than most are drawn as balls, of this radius in the scene's size."""
-_MARGIN, _GAP, _TILE, _CAPTION = 28, 20, 290, 78
-"""Pixels: around the sheet, between tiles, a tile's height, the type below it."""
+_MARGIN, _GAP, _TILE, _CAPTION, _FOOT = 28, 20, 290, 78, 24
+"""Pixels: around the sheet, between tiles, a tile's height, the type below it, the type at the sheet's foot."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tile:
     """A scene at one moment.
 
-    replay: of the frame to be drawn alone; mass: of its vertices (n,) [kg]; name and effects: in words; angles: azimuth
-    and elevation [degrees], chosen by the mesh's shape where None.
+    replay: of the frame to be drawn alone, its properties with the processor (`cpu`) and the `commit`; mass: of its
+    vertices (n,) [kg]; name and effects: in words; angles: azimuth and elevation [degrees], chosen by the mesh's shape
+    where None.
     """
 
     replay: Replay
@@ -47,12 +49,15 @@ class Tile:
     angles: tuple[float, float] | None
 
 
-def draw_sheet(tiles: Sequence[Tile], path: Path) -> None:
-    """Draw the tiles row by row, PNG. Raises RunFailed where the system cannot draw."""
+def draw_sheet(tiles: Sequence[Tile], path: Path, facts: Sequence[str] = ()) -> None:
+    """Draw the tiles row by row, PNG, with facts, processor and commit at the foot.
+
+    Raises RunFailed where the system cannot draw.
+    """
     columns = abreast(len(tiles))
     width = (WIDTH - 2 * _MARGIN - (columns - 1) * _GAP) // columns
     step = _TILE + _CAPTION
-    height = 2 * _MARGIN + -(-len(tiles) // columns) * step - _GAP // 2
+    height = 2 * _MARGIN + -(-len(tiles) // columns) * step + _FOOT - _GAP // 2
     with matplotlib.rc_context(RC), Studio(width, _TILE, mesh_lines=_LINES) as studio:
         page = Figure(figsize=(WIDTH / DPI, height / DPI), dpi=DPI, facecolor=PAGE)
         FigureCanvasAgg(page)
@@ -62,6 +67,8 @@ def draw_sheet(tiles: Sequence[Tile], path: Path) -> None:
             page.figimage(_drawn(studio, tile, width / _TILE), xo=left, yo=height - top - _TILE, origin="upper")
             for words, below, size, color in ((tile.name, 20, 15.0, INK), *_lines(tile.effects, width)):
                 page.text(left / WIDTH, 1 - (top + _TILE + below) / height, words, size=size, color=color)
+        said = "   ·   ".join((*facts, *machine_and_commit([tile.replay.properties for tile in tiles])))
+        page.text(_MARGIN / WIDTH, _MARGIN / height, said, size=10.0, color=MUTED)
         save(page, path)
 
 

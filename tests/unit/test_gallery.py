@@ -6,12 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 from typer.testing import CliRunner
 
+from harness.base import machine
 from harness.cli import app
-from harness.report import opengl
+from harness.report import contact_sheet, opengl
 from harness.report.contact_sheet import abreast
+from harness.report.origin import machine_and_commit
 from harness.report.solids import solid
 from harness.scenes.motion import Key, KeyedMotion
 from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
@@ -19,6 +22,7 @@ from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
 needs_opengl = pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
 SEEN = np.random.default_rng(0).normal(size=(20, 3))
 
+FACTS = ("at the last frame, by hybrid to 1e-4", "strain: blue −10 %, orange as much stretched")
 SCENE = """
 mesh: {kind: chain, length: 1}
 mass: 1
@@ -63,7 +67,14 @@ def test_the_level_ground_is_not_drawn():
 
 
 @needs_opengl
-def test_the_sheet_has_a_tile_for_each_scene(tmp_path: Path):
+def test_the_sheet_has_a_tile_for_each_scene_and_says_what_drew_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    said: list[list[str]] = []
+
+    def save(page: Figure, path: Path) -> None:
+        said.append([text.get_text() for text in page.texts])
+        page.savefig(path)
+
+    monkeypatch.setattr(contact_sheet, "save", save)
     paths = [tmp_path / f"scene-{k}.yaml" for k in range(7)]
     for path in paths:
         path.write_text(SCENE)
@@ -78,6 +89,9 @@ def test_the_sheet_has_a_tile_for_each_scene(tmp_path: Path):
     assert sizes[0][0] == sizes[1][0] == 1600
     assert sizes[1][1] > sizes[0][1] + 300  # another row
     assert blank == [False, True]  # the last of which is one tile short
+    here = {"cpu": machine.describe().cpu, "commit": machine.commit()}
+    for page in said:
+        assert page[-1] == "   ·   ".join([*FACTS, *machine_and_commit([here])])
 
 
 def test_a_sheet_leaves_as_few_places_blank_as_it_can():
