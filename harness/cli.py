@@ -184,6 +184,7 @@ def list_runs(config: Config, results: Results = Path("results")) -> None:
     """Check a config, and show what would run and what is there already."""
     from rich.table import Table
 
+    from harness.base.machine import describe
     from harness.config.load import load_any
     from harness.experiments.plan import plan
 
@@ -203,6 +204,10 @@ def list_runs(config: Config, results: Results = Path("results")) -> None:
             state,
         )
         table.add_row(*map(str, cells))
+    table.caption_justify, table.caption = (
+        "left",
+        f"states are those on this machine, {describe().id:.6}; settings hold on any",
+    )
     out().print(table)
 
 

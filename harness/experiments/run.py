@@ -22,6 +22,7 @@ from harness.base.files import replacing
 from harness.base.machine_lock import alone, beside, own_cores
 from harness.base.worker import Tick
 from harness.config.sweep import RunSpec
+from harness.experiments.ability import of_this_machine
 from harness.experiments.code import TO_ERROR, code, parts, solver_class
 from harness.experiments.failure import failure
 from harness.experiments.plan import Files
@@ -53,7 +54,8 @@ def execute(
     (frames, n, 3) [m], float64; at_once: how many runs may be timed at once. Returns the rows. Raises InputError, and
     CannotWrite without rows.
     """
-    shared, threads = common(run) | {"code": code(parts(run)), "at_once": at_once}, machine.threads(run.threads)
+    shared = common(run) | {"code": code(parts(run)), "at_once": at_once} | of_this_machine(tick)
+    threads = machine.threads(run.threads)
     with machine.pinned_threads(threads.number):
         try:
             found = _passes(run, files, tick, positions)

@@ -55,13 +55,14 @@ def commands(found: Sequence[RunTimes], config: Path, results: Path, recordings:
 
 
 def _fastest(fine: Iterable[RunTimes], names: dict[str, str]) -> Iterator[str]:
-    """For each scene, at the largest of the sizes that most solvers did: how much longer the others took."""
-    by_place: dict[str, dict[int, list[RunTimes]]] = defaultdict(lambda: defaultdict(list))
+    """For each scene, at the largest of the sizes that most solvers did on one machine: how much longer the others
+    took there."""
+    by_place: dict[str, dict[tuple[int, str, str], list[RunTimes]]] = defaultdict(lambda: defaultdict(list))
     for run in fine:
         if run.least:
-            by_place[run.scene][run.size].append(run)
+            by_place[run.scene][run.size, run.machine or "", run.node or ""].append(run)
     for scene, sizes in by_place.items():
-        size, there = max(sizes.items(), key=lambda item: (len(item[1]), item[0]))
+        (size, *_), there = max(sizes.items(), key=lambda item: (len(item[1]), item[0]))
         first, *others = sorted(there, key=lambda run: run.least or 0.0)
         if others:
             slower = [f"{names[r.run_id]} {quantity((r.least or 0.0) / (first.least or 1.0))} times" for r in others]

@@ -224,6 +224,7 @@ def percent(share: float | None) -> str:
 def summary(cells: Sequence[Judged]) -> Table:
     """A row for each solver: how many cases ended how, the shares of those it did not refuse, the worst residual."""
     table = Table("solver", *(outcome.words for outcome in OUTCOMES), "right", "finite", "worst")
+    table.caption, table.caption_justify = "none of these are times: they may be compared across machines", "left"
     for score in scores(cells):
         worst = "" if score.worst.worst is None else f"{score.worst.worst:.1e}"
         table.add_row(score.solver, *map(str, score.counts), percent(score.right), percent(score.finite), worst)

@@ -15,13 +15,15 @@ from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
+from harness.report.machines import foot
+from harness.report.machines import names as machine_names
 from harness.report.page import quantity
 from harness.report.references import cited
 from harness.report.sql import answer
 
 
 class RunTimes(NamedTuple):
-    """One run: what it was, and its times [ms]; None where the rows do not say.
+    """One run: what it was and where, and its times [ms]; None where the rows do not say.
 
     cold and warm: of preparing; step: median, its quartiles and the least of all steps; local, global_:
     medians of one such step; iterations: median of a step; stopped: what ended a step's iterations, the least welcome;
@@ -34,6 +36,8 @@ class RunTimes(NamedTuple):
     scene: str
     size: int
     solver: str
+    machine: str | None
+    node: str | None
     vertices: int | None
     springs: int | None
     status: str
@@ -58,7 +62,8 @@ class RunTimes(NamedTuple):
 
 
 _SUMMARY = """
-select run_id, any_value(scene), any_value("size"), any_value(solver), any_value(vertices), any_value(springs),
+select run_id, any_value(scene), any_value("size"), any_value(solver), any_value(machine), any_value(node),
+    any_value(vertices), any_value(springs),
     coalesce(any_value(status) filter (status <> 'ok'), 'ok'), any_value(reason) filter (status <> 'ok'),
     any_value(to_json({'integrator': integrator, 'dt': time_step, 'guess': first_guess, 'iterations': max_iterations,
                        'tolerance': tolerance, 'threads': threads, 'asked': asked})),
@@ -92,8 +97,11 @@ def _stated(run: RunTimes) -> dict[str, Any]:
 
 
 def labels(found: Sequence[RunTimes]) -> dict[str, str]:
-    """By run id, the solver's name and those of its settings in which the solver's runs of the scene differ."""
+    """By run id, the solver's name and those of its settings in which the solver's runs of the scene differ; and the
+    machine where there are several, so that no line in a plot and no row stands for two."""
     settings = {run.run_id: _stated(run) | json.loads(run.parameters or "{}") for run in found}
+    places = machine_names((run.machine, run.node) for run in found)
+    on = {run.run_id: places.get((run.machine, run.node), "unknown") for run in found if len(places) > 1}
     values: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     for run in found:
         for key, value in settings[run.run_id].items():
@@ -106,6 +114,7 @@ def labels(found: Sequence[RunTimes]) -> dict[str, str]:
                 for key, value in settings[run.run_id].items()
                 if len(values[run.scene, run.solver, key]) > 1
             ]
+            + ([f"machine {on[run.run_id]}"] if on else [])
         )
         for run in found
     }
@@ -182,7 +191,7 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
         n for how, n in zip(*(table[c].to_pylist() for c in ("timing", "at_once")), strict=True) if how == "shared"
     ]
     marks[SHARED.format(max(shared, default=0))] = bool(shared)
-    out.caption = "\n".join([*(words for words, there in marks.items() if there), *_methods(table)]) or None
+    out.caption = "\n".join([*(words for words, there in marks.items() if there), *_methods(table), *foot(table)])
     longest = max(map(len, [*names.values(), *scenes]), default=0)
     # Lines longer than a narrow terminal keep their numbers; Rich would cut them to ellipses.
     most = Measurement.get(wide := Console(width=1000), wide.options, out).maximum

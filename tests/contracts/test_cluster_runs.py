@@ -14,6 +14,7 @@ from distributed import LocalCluster
 
 from harness.base.machine import node
 from harness.config.load import load_any
+from harness.experiments.ability import NAMES as MACHINE
 from harness.experiments.sweep import run_sweep
 from tests.displays import Quiet
 from tests.own_solvers import SCENE, SOURCE, own
@@ -50,7 +51,7 @@ options: {frames: 4, rounds: 1, iterations: [5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 
 MANY, EVERY = 200, 10.0
 """Runs, and seconds between two kills."""
 
-TIMES = {"started", "seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted"}
+TIMES = {"started", "seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted", *MACHINE}
 """Columns that differ from run to run."""
 
 TELL = "import os; [open({told!r}, 'a').write(f'{{os.getpid()}} {{stop.iterations}}\\n')]"

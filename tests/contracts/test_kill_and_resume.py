@@ -19,13 +19,14 @@ from matplotlib.image import imread
 
 from harness.base import rows
 from harness.cli import main
+from harness.experiments.ability import NAMES as MACHINE
 from harness.record.reader import read_replay
 from harness.report import opengl
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES = 8
 TIMES = ("seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted", "adds_up")
-WRITTEN_BY = (*TIMES, "started", "commit", "code")
+WRITTEN_BY = (*TIMES, *MACHINE, "started", "commit", "code")
 """Columns that tell how long a run took, and when and by which state of the code it was done."""
 
 CLOTH = f"""

@@ -35,7 +35,8 @@ def two(tmp_path: Path) -> Path:
 
 
 def test_all_runs_are_there_once_with_their_recordings_and_again_changes_nothing(two: Path):
-    assert merged(two, "a", "b") == Merged(5, 1, [], [])
+    found = merged(two, "a", "b")
+    assert found == Merged(5, 1, [], [], found.machines)
     units = shelf.units(two / "all" / "sweep" / "rows")
     assert sorted(set(map(str, rows.read(units)["run_id"].to_pylist()))) == [f"{k:012x}" for k in range(5)]
     for part in ("recordings", "pictures"):
@@ -50,7 +51,7 @@ def test_a_run_that_was_done_twice_keeps_both_rows_and_the_newer_its_name(two: P
     rewritten(unit, started="2027-01-01T00:00:00+00:00", seconds=9.0)
     for order in (("a", "b"), ("b", "a")):
         found = merge([two / name for name in order], two / f"all-{order[0]}", lambda line: None)
-        assert found == Merged(6, 0, [], [])
+        assert found == Merged(6, 0, [], [], found.machines)
         there = [u for u in shelf.units(two / f"all-{order[0]}" / "sweep" / "rows") if unit.stem in u.stem]
         assert [rows.read([u])["seconds"][0].as_py() for u in there] == [9.0, 0.003]
         assert there[0].stem == unit.stem

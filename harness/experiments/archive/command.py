@@ -40,6 +40,8 @@ def merge(
         say(f"conflict, on one machine and by one code: {line} positions differ")
     for line in [line for line in found.others if line not in found.conflicts]:
         say(f"differs between machines or codes: {line}")
+    for line in found.machines:
+        say(line)
     raise typer.Exit(1 if found.conflicts else 0)
 
 

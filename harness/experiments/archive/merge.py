@@ -26,6 +26,7 @@ from harness.base.claim import claimed
 from harness.base.errors import InputError, Mistake
 from harness.base.files import replacing
 from harness.experiments.archive.compact import TABLES
+from harness.report.machines import KNOWN, foot
 from harness.report.stored import ASKED
 
 _ANY = pa.schema([])
@@ -35,12 +36,14 @@ _STARTED = pa.schema([columns.SCHEMA.field("started")])
 @dataclass(frozen=True, slots=True)
 class Merged:
     """What a merge did: units written and those that were there; conflicts: in words, runs of one machine and one code
-    that end at other positions; others: the same between machines or codes, which may differ in the last bits."""
+    that end at other positions; others: the same between machines or codes, which may differ in the last bits;
+    machines: which there are in all, and what may be compared across them."""
 
     written: int
     known: int
     conflicts: list[str]
     others: list[str]
+    machines: list[str]
 
 
 def sweeps(results: Path) -> list[Path]:
@@ -173,8 +176,9 @@ def _claim(source: Path, home: Path) -> None:
         claimed(home, config)
 
 
-def _conflicts(folders: Sequence[Path]) -> tuple[list[str], list[str]]:
-    """Runs that were asked the same and ended a step at other positions: of one machine and code, and of several."""
+def _conflicts(folders: Sequence[Path]) -> tuple[list[str], list[str], list[str]]:
+    """Runs that were asked the same and ended a step at other positions: of one machine and code, and of several; and
+    the machines that there are."""
     units = [unit for folder in folders for unit in shelf.units(folder)]
     asked = ", ".join(f'"{name}"' for name in ASKED)
     with union.connected() as connection:
@@ -192,4 +196,5 @@ def _conflicts(folders: Sequence[Path]) -> tuple[list[str], list[str]]:
                 for scene, size, solver, given, first in found
             ]
 
-        return differing("run_id, code"), differing("0")
+        where = connection.sql(f"SELECT {', '.join(KNOWN)} FROM rows GROUP BY ALL").to_arrow_table()
+        return differing("run_id, code"), differing("0"), foot(where)

@@ -30,7 +30,9 @@ Object.assign(springbench, (() => {
   const commit = text => (text || "unknown").slice(0, 10) + (/dirty/.test(text) ? "-dirty" : "");
   function madeBy(some, most = 2) {
     const told = [...new Set(some.map(one => `${one.cpu || "unknown processor"} (machine ${(one.machine || "unknown").slice(0, 6)}), code ${commit(one.commit)}`))];
-    return `made on ${told.slice(0, most).join("; on ")}${told.length > most ? `; and by ${told.length - most} more` : ""}`;
+    const machines = new Set(some.map(one => one.machine)).size;
+    const compare = machines > 1 ? ` · ${machines} machines: compare times within one, ratios of such times across them` : "";
+    return `made on ${told.slice(0, most).join("; on ")}${told.length > most ? `; and by ${told.length - most} more` : ""}${compare}`;
   }
 
   // A solver's colour as it stands out from the page: lighter on dark, darker on light where it is pale.

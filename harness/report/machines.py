@@ -1,0 +1,59 @@
+"""On which machines rows were made, and which of their numbers may be compared across machines: the foot of tables.
+
+A machine is told by the id of its kind, and where several of one kind were at work by the computer's own after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import pyarrow as pa
+
+from harness.report.sql import answer
+
+COMPARE = (
+    "compare times within one machine; across machines compare ratios of such times, iterations, residuals and errors"
+)
+"""What holds for all rows."""
+
+_SHOWN = 8
+"""So many machines have a line of their own."""
+
+COLUMNS = ("cpu", "cores", "machine_bandwidth", "machine_flops", "machine_step")
+"""The columns that tell of a machine."""
+
+KNOWN = ("machine", "node", *COLUMNS)
+"""All that the foot of a table is made of."""
+
+Place = tuple[str | None, str | None]
+"""The ids of a machine's kind and of the computer."""
+
+
+def names(places: Iterable[Place]) -> dict[Place, str]:
+    """Machines in few letters; none for rows that do not say."""
+    known = sorted({(machine, node) for machine, node in places if machine}, key=str)
+    kinds = [machine for machine, _ in known]
+    return {
+        (machine, node): f"{machine:.6}{f'-{node:.4}' if node and kinds.count(machine) > 1 else ''}"
+        for machine, node in known
+    }
+
+
+def foot(table: pa.Table) -> list[str]:
+    """Lines for the foot of a table that is made of rows: their machines, and which numbers may be compared."""
+    able = ", ".join(f'any_value("{name}")' for name in COLUMNS)
+    found = answer(f"select machine, node, {able} from rows_of where machine is not null group by all", table)
+    known = names((machine, node) for machine, node, *_ in found)
+    told = sorted(f"machine {known[machine, node]}: {_able(*about)}" for machine, node, *about in found)
+    more = [f"and {len(told) - _SHOWN} more machines"] if len(told) > _SHOWN else []
+    return [*told[:_SHOWN], *more, COMPARE]
+
+
+def _able(cpu: str | None, cores: int | None, bandwidth: float | None, flops: float | None, step: float | None) -> str:
+    """What a machine is, and what it can do."""
+    words = [cpu or "unknown processor", f"{cores} core{'s' if cores != 1 else ''}" if cores else ""]
+    if bandwidth and flops and step:
+        words += [
+            f"by one thread {bandwidth / 1e9:.3g} GB/s, {flops / 1e9:.3g} GFLOP/s, a fixed step {1e3 * step:.3g} ms"
+        ]
+    return ", ".join(filter(None, words))
