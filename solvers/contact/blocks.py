@@ -20,6 +20,10 @@ class Blocks(NamedTuple):
     vertices: NDArray[np.int64]
     values: Array
 
+    def of(self, values: Array) -> Blocks:
+        """The same pairs with other values."""
+        return self._replace(values=values)
+
     def add_product(self, x: Positions, out: Positions) -> None:
         """Add their product with x (n, 3) to `out`."""
         multiply(self.vertices, self.values, x, out)

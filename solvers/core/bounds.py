@@ -26,6 +26,15 @@ class PairBlocks(Protocol):
         """Of each pair, (a, k)."""
         ...
 
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Of each pair, (a, 3k, 3k)."""
+        ...
+
+    def of(self, values: NDArray[np.float64]) -> PairBlocks:
+        """The same pairs with other values."""
+        ...
+
     def add_product(self, x: Positions, out: Positions) -> None:
         """Add their product with x (n, 3) to `out`."""
         ...

@@ -17,6 +17,7 @@ from scipy.sparse import csr_array
 
 from solvers.core import low_rank
 from solvers.core.bounds import Bounded, PairBlocks, is_bounded, reach
+from solvers.core.eigenvalues import Filtered, Filtering
 from solvers.core.fixed_objective import Objective, Stated
 from solvers.core.pattern import Matrix
 from solvers.energies.elements import Joined, add_blocks
@@ -198,6 +199,18 @@ class Hessian:
         """
         return self._factor.factorise(self._assembled(keep, shift, tension).values)
 
+    def filtered(self, by: Filtering) -> Filtered:
+        """The same with its elements filtered by their eigenvalues; constant forms have none below zero."""
+        keep, tension = by.springs(self._terms.edges, self._tension)
+        stated = zip(self._step.stated, self._curvature, strict=True)
+        curvature = [c if one.law.constant else by.packed(one.elements.vertices, c) for one, c in stated]
+        pairs = [by.pairs(blocks) for blocks in self.pairs]
+        return Filtered(keep, tension, curvature, pairs, by.looked, by.changed)
+
+    def factorise_filtered(self, filtered: Filtered, shift: NDArray[np.float64] | float = 0.0) -> bool:
+        """Whether what was filtered, and `shift` added to its diagonal [N/m], is positive definite; see `factorise`."""
+        return self._factor.factorise(self._assembled(filtered.keep, shift, filtered.tension, filtered).values)
+
     def solve_anew(
         self,
         b: Positions,
@@ -214,19 +227,24 @@ class Hessian:
         return out
 
     def _assembled(
-        self, keep: float, shift: NDArray[np.float64] | float, tension: NDArray[np.float64] | None
+        self,
+        keep: float,
+        shift: NDArray[np.float64] | float,
+        tension: NDArray[np.float64] | None,
+        filtered: Filtered | None = None,
     ) -> Matrix:
         matrix, places, entries = self._placed
         step, tension = self._step, self._tension if tension is None else tension
         constant = step.constant(matrix, self._p)
         hessian.assemble(self._terms, matrix.places, constant, self._p, tension, keep, matrix.values)
-        for one, curvature in zip(step.stated, self._curvature, strict=True):
+        elements, pairs = (filtered.curvature, filtered.pairs) if filtered else (self._curvature, self.pairs)
+        for one, curvature in zip(step.stated, elements, strict=True):
             if not one.law.constant:
                 at = matrix.of_elements(one.number, one.elements.vertices)
                 add_blocks(one.elements, at, curvature, matrix.values)
-        for k, blocks in enumerate(self.pairs):
+        for k, blocks in enumerate(pairs):
             if len(blocks.vertices):
-                bent = blocks if keep == 1.0 else step.bounded[k].blocks(self._p, keep)
+                bent = blocks if filtered or keep == 1.0 else step.bounded[k].blocks(self._p, keep)
                 bent.add(matrix.of_elements(-1 - k, blocks.vertices), matrix.values)
         values = matrix.values.reshape(-1)
         values[places] += entries

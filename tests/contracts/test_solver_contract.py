@@ -14,6 +14,7 @@ from solvers.linear.factors import SparseLU
 from solvers.matrices import assemble, energy_norm
 from solvers.methods.local_global import DenseLocalGlobal, PreparedLocalGlobal, SparseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.methods.newton import Newton
 from solvers.problem import Positions, StepProblem, StopRule
 from solvers.registry import SOLVERS, load
 from tests.scenes import cloth, first_problem, frozen, random_problem
@@ -24,6 +25,10 @@ FORCED = {
     "numba, supernodal": CompiledLocalGlobal("supernodal"),
     "numba, supernodal in float32": CompiledLocalGlobal("supernodal", "float32"),
     "numba, supernodal in float16": CompiledLocalGlobal("supernodal", "float16"),
+    "newton, clamp": Newton("clamp"),
+    "newton, absolute": Newton("absolute"),
+    "newton, trust-region": Newton("trust-region"),
+    "newton, progressive": Newton("progressive"),
 }
 CHOICES = {name: load(target)() for name, target in SOLVERS.items()} | FORCED
 LOCAL_GLOBAL = {

@@ -1,0 +1,180 @@
+"""What Newton's method does about indefinite Hessians: each rule on elements whose eigenvalues are known, and where it
+ends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from solvers.core.definite import RULES, Clamped, Indefinite, Progressive, Trusted
+from solvers.core.descent import Metric, Point
+from solvers.core.eigenvalues import Filtering
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
+from solvers.energies.springs import Springs
+from solvers.methods.newton import Newton
+from solvers.problem import Pins, StepProblem, StopRule, Unsupported
+from tests.effects import SCENES, stepped
+from tests.scenes import cloth, first_problem
+from tests.self_contacts import touching
+
+OTHERS = [name for name in get_args(Indefinite) if name != "graded"]
+others = pytest.mark.parametrize("rule", OTHERS)
+
+FILTERS = {"clamp": lambda x: np.maximum(x, 0.0), "absolute": np.abs}
+filters = pytest.mark.parametrize("name", FILTERS)
+
+FIRST, SECOND = 0.4, 0.1
+"""Lengths of two springs of length 1 at rest."""
+
+
+def compressed() -> StepProblem:
+    """Two springs of 1 N/m along x, each from a vertex that is held to one that is free, k dt^2/m = 1/10."""
+    given = first_problem(cloth(2, "exact"))
+    edges = np.array([[0, 1], [2, 3]])
+    springs = Springs(edges, np.ones(2), np.ones(2), np.tile([1.0, 0.0, 0.0], (2, 1)))
+    p = np.zeros((4, 3))
+    p[:, 0] = [0.0, FIRST, 5.0, 5.0 + SECOND]
+    pins = Pins(np.array([0, 2]), np.full(2, np.inf))
+    system = replace(given.system, mass=np.full(4, 10.0), time_step=1.0, energies=(springs,), pins=pins)
+    return replace(
+        given, system=system, target=p, force=np.zeros_like(p), current=p, first_guess=p, pin_targets=p[[0, 2]]
+    )
+
+
+def lateral(length: float) -> float:
+    return 1.0 - 1.0 / length
+
+
+def begun(given: StepProblem) -> tuple[StepObjective, Point, np.ndarray]:
+    step = StepObjective(Objective(given.system), given)
+    p = step.placed(given.first_guess)
+    return step, Point(p, step.gradient(p)), np.repeat(Metric(given.system).diagonal, 3)
+
+
+def curvatures(hessian) -> list[float]:
+    """What was factorised last, across each spring [N/m]."""
+    across = np.zeros((4, 3))
+    across[[1, 3], 1] = 1.0
+    return [float(1.0 / x) for x in hessian.solve(across)[[1, 3], 1]]
+
+
+@filters
+def test_a_spring_keeps_its_stiffness_and_its_lateral_part_is_filtered(name):
+    step, at, diagonal = begun(compressed())
+    hessian = step.hessian(at.positions)
+    assert RULES[name]().factorised(hessian, at, diagonal) == 1
+    wanted = [10.0 + FILTERS[name](lateral(length)) for length in (FIRST, SECOND)]
+    np.testing.assert_allclose(curvatures(hessian), wanted, rtol=1e-12)
+    along = np.zeros((4, 3))
+    along[[1, 3], 0] = 1.0
+    np.testing.assert_allclose(hessian.solve(along)[[1, 3], 0], 1.0 / 11.0, rtol=1e-12)
+
+
+@filters
+def test_a_block_is_filtered_in_its_own_axes(name):
+    axes = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    known = np.array([[3.0, -2.0, 0.5], [1.0, 2.0, 3.0]])
+    whole = np.einsum("ij,mj,kj->mik", axes, known, axes)
+    packed = whole[:, *np.triu_indices(3)]
+    by = Filtering(absolute=name == "absolute")
+    out = by.packed(np.array([[0], [1]]), packed)
+    wanted = np.einsum("ij,mj,kj->mik", axes, FILTERS[name](known), axes)
+    np.testing.assert_allclose(out[0], wanted[0][np.triu_indices(3)], atol=1e-14)
+    np.testing.assert_array_equal(out[1], packed[1])
+    assert (by.looked, by.changed) == (2, 1)
+
+
+@filters
+def test_pairs_of_surfaces_are_filtered_so_too(name):
+    energy, p, _ = touching()
+    exact = energy.blocks(p)
+    size = np.linalg.eigvalsh(exact.values)
+    assert size.min() < -1e-3 * size.max()
+    found = Filtering(absolute=name == "absolute").pairs(exact)
+    wanted = np.sort(FILTERS[name](size), axis=1)
+    np.testing.assert_allclose(np.linalg.eigvalsh(found.values), wanted, atol=1e-12 * size.max())
+
+
+def test_the_trust_region_takes_absolute_values_until_the_model_is_right():
+    """Absolute values first; clamped after a step that the quadratic model foretold within 1 %, and only then."""
+    given = compressed()
+    step, at, _ = begun(given)
+    hessian, rule = step.hessian(at.positions), Trusted()
+    assert rule.absolute
+    for by, absolute in ((1e-6, False), (0.5, True), (1e-6, False)):
+        q = at.positions.copy()
+        q[3, 1] += by
+        along = replace(given, force=np.where(q > at.positions, 1.0, 0.0))
+        stated = StepObjective(Objective(given.system), along)
+        here = Point(at.positions, stated.gradient(at.positions))
+        rule.took(stated, hessian, here, Point(q, here.gradient))
+        assert rule.absolute is absolute
+
+
+def test_progressive_projection_leaves_a_definite_hessian_as_it_is():
+    step, at, diagonal = begun(compressed())
+    rule = Progressive()
+    hessian = step.hessian(at.positions)
+    assert rule.factorised(hessian, at, diagonal) == 0
+    assert (rule.looked, rule.changed) == (0, 0)
+    np.testing.assert_allclose(curvatures(hessian), [10.0 + lateral(x) for x in (FIRST, SECOND)], rtol=1e-12)
+
+
+def test_progressive_projection_takes_the_elements_where_the_gradient_is_largest():
+    """Without the inertia that holds it, the shorter spring makes the Hessian indefinite; its force is the larger one,
+    so that the other one keeps its negative lateral part."""
+    given = compressed()
+    system = replace(given.system, mass=np.full(4, 2.0))
+    step, at, diagonal = begun(replace(given, system=system))
+    hessian, rule = step.hessian(at.positions), Progressive()
+    force = at.gradient.copy()
+    force[1] *= 0.1
+    assert rule.factorised(hessian, at._replace(gradient=force), diagonal) == 1
+    np.testing.assert_allclose(curvatures(hessian), [2.0 + lateral(FIRST), 2.0], rtol=1e-12)
+    assert (rule.looked, rule.changed) == (1, 1)
+    everywhere = Clamped()
+    everywhere.factorised(hessian, at, diagonal)
+    assert everywhere.changed == 2
+
+
+@others
+@pytest.mark.parametrize("name", ["springs", "all that are projective", "contact"])
+def test_all_rules_descend_to_the_same_certified_minimum(rule, name):
+    given = first_problem(cloth(8, "exact", stretch=1e4)) if name == "springs" else stepped(SCENES[name]())
+    wanted = Newton().prepare(given.system).solve(given, StopRule(300, 1e-11))
+    prepared = Newton(rule).prepare(given.system)
+    found = prepared.solve(given, StopRule(300, 1e-11))
+    assert found.stopped in ("tolerance", "floor", "stalled")
+    size = np.ptp(wanted.positions, axis=0).max()
+    np.testing.assert_allclose(found.positions, wanted.positions, atol=1e-9 * size)
+    _, at, _ = begun(replace(given, first_guess=found.positions))
+    assert prepared.method.certifies(StepObjective(Objective(given.system), given), at)
+
+
+@others
+def test_all_rules_leave_a_saddle(rule):
+    """Both springs pressed along their lines, in balance, and unstable across them."""
+    given = compressed()
+    system = replace(given.system, mass=np.full(4, 0.1))
+    _, at, _ = begun(replace(given, system=system))
+    given = replace(given, system=system, force=at.gradient)
+    start = StepObjective(Objective(system), given)
+    assert not start.gradient(at.positions).any()
+    found = Newton(rule).prepare(system).solve(given, StopRule(300, 1e-10))
+    p, free = found.positions, system.free
+    assert given.value(p) < given.value(at.positions)
+    (springs,) = system.energies
+    hessian = springs.hessian(p).toarray()
+    inner = (3 * free[:, None] + np.arange(3)).ravel()
+    assert np.linalg.eigvalsh(hessian[np.ix_(inner, inner)] + 0.1 * np.eye(6)).min() > 0.0
+
+
+@others
+def test_energies_without_elements_are_refused_by_name(rule):
+    made = SCENES["gas"]()
+    with pytest.raises(Unsupported, match=f"newton, indefinite: {rule}: .*none of Gas; take indefinite: graded"):
+        Newton(rule).prepare(made.system)
