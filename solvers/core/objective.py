@@ -158,7 +158,7 @@ class StepObjective:
 
 
 class Hessian:
-    """The Hessian [N/m] at a point, over the coordinates of free vertices."""
+    """The Hessian [N/m] at a point, over the coordinates of free vertices. curvature: see `StepObjective.curvature`."""
 
     def __init__(self, step: StepObjective, p: Positions) -> None:
         self._step, self._p = step, p
@@ -166,7 +166,7 @@ class Hessian:
         parts = [low_rank.sparse_part(energy, p) for energy in step.own if energy not in step.bounded]
         self._columns = low_rank.columns(step.own, p) if step.own else None
         self._others = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
-        self._curvature = step.curvature(p)
+        self.curvature = step.curvature(p)
         self.pairs: list[PairBlocks] = [energy.blocks(p) for energy in step.bounded]
 
     @cached_property
@@ -202,7 +202,7 @@ class Hessian:
     def filtered(self, by: Filtering) -> Filtered:
         """The same with its elements filtered by their eigenvalues; constant forms have none below zero."""
         keep, tension = by.springs(self._terms.edges, self._tension)
-        stated = zip(self._step.stated, self._curvature, strict=True)
+        stated = zip(self._step.stated, self.curvature, strict=True)
         curvature = [c if one.law.constant else by.packed(one.elements.vertices, c) for one, c in stated]
         pairs = [by.pairs(blocks) for blocks in self.pairs]
         return Filtered(keep, tension, curvature, pairs, by.looked, by.changed)
@@ -237,7 +237,7 @@ class Hessian:
         step, tension = self._step, self._tension if tension is None else tension
         constant = step.constant(matrix, self._p)
         hessian.assemble(self._terms, matrix.places, constant, self._p, tension, keep, matrix.values)
-        elements, pairs = (filtered.curvature, filtered.pairs) if filtered else (self._curvature, self.pairs)
+        elements, pairs = (filtered.curvature, filtered.pairs) if filtered else (self.curvature, self.pairs)
         for one, curvature in zip(step.stated, elements, strict=True):
             if not one.law.constant:
                 at = matrix.of_elements(one.number, one.elements.vertices)
@@ -276,28 +276,8 @@ class Hessian:
     def compiled(self) -> tuple[Any, ...]:
         """What `solvers.kernels.hessian.multiply` needs of it: all but the energies that state nothing."""
         step = self._step
-        curvature = np.concatenate(self._curvature) if self._curvature else None
+        curvature = np.concatenate(self.curvature) if self.curvature else None
         return self._terms, self._linear, step.whole.form, step.joined, curvature
-
-    def beyond(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """What elements that are in no Q add to the blocks of vertices: which (c,), and the blocks (c, 3, 3) [N/m]."""
-        n = len(self._p)
-        blocks, acted = np.zeros((n, 3, 3)), np.zeros(n, np.bool_)
-        for one, curvature in zip(self._step.stated, self._curvature, strict=True):
-            if not one.projective:
-                k = one.elements.vertices.shape[1]
-                places = np.full((len(curvature), k * k), -1)
-                places[:, :: k + 1] = one.elements.vertices
-                add_blocks(one.elements, places, curvature, blocks)
-                acted[one.elements.vertices] = True
-        for pairs in self.pairs:
-            k = pairs.vertices.shape[1]
-            places = np.full((len(pairs.vertices), k * k), -1)
-            places[:, :: k + 1] = pairs.vertices
-            pairs.add(places, blocks)
-            acted[pairs.vertices] = True
-        acted &= blocks.any(axis=(1, 2))
-        return np.flatnonzero(acted), blocks[acted]
 
     def multiply(self, x: Positions) -> Positions:
         """The exact Hessian times x (n, 3), which is zero at vertices that are not free; so is the product."""

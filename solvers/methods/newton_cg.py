@@ -23,6 +23,7 @@ from solvers.about import About, Reference
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import Hessian, StepObjective
+from solvers.energies.elements import add_blocks
 from solvers.kernels import conjugate
 from solvers.linear.inverse import Inverse
 from solvers.linear.krylov import CURVED, Iteration
@@ -100,7 +101,27 @@ def preconditioned(metric: Metric, step: StepObjective, p: Positions) -> tuple[H
     """The Hessian at p (n, 3), and what preconditions it there: Q^-1, or (S Q S)^-1 where something is touched."""
     hessian = step.hessian(p)
     beyond = step.touched or any(len(blocks.vertices) for blocks in hessian.pairs)
-    return hessian, Scaled(metric, *hessian.beyond()) if beyond else metric.solve
+    return hessian, Scaled(metric, *_beyond(step, hessian, len(p))) if beyond else metric.solve
+
+
+def _beyond(step: StepObjective, hessian: Hessian, n: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """What elements that are in no Q add to the blocks of n vertices: which (c,), and the blocks (c, 3, 3) [N/m]."""
+    blocks, acted = np.zeros((n, 3, 3)), np.zeros(n, np.bool_)
+    for one, curvature in zip(step.stated, hessian.curvature, strict=True):
+        if not one.projective:
+            k = one.elements.vertices.shape[1]
+            places = np.full((len(curvature), k * k), -1)
+            places[:, :: k + 1] = one.elements.vertices
+            add_blocks(one.elements, places, curvature, blocks)
+            acted[one.elements.vertices] = True
+    for pairs in hessian.pairs:
+        k = pairs.vertices.shape[1]
+        places = np.full((len(pairs.vertices), k * k), -1)
+        places[:, :: k + 1] = pairs.vertices
+        pairs.add(places, blocks)
+        acted[pairs.vertices] = True
+    acted &= blocks.any(axis=(1, 2))
+    return np.flatnonzero(acted), blocks[acted]
 
 
 class TruncatedNewton:
