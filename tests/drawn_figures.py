@@ -38,7 +38,7 @@ RESULTS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "timing": ("step", made.sweep),
     "hard": ("map", made.sweep),
     "ablation": ("", made.ablation),
-    "prices": ("numba", made.ablation),
+    "prices": ("", made.ablation),
     "speed": ("step", made.speed),
     "history": ("", made.gates),
 }

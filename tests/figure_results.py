@@ -106,6 +106,8 @@ def ablation(folder: Path) -> Path:
         for k, name in enumerate(EFFECTS):
             price = {"price": 1.0 + 0.2 * k, "price_low": 1.0 + 0.18 * k, "price_high": 1.0 + 0.25 * k}
             rows.append(whole | price | {"kind": "price", "name": name, "solver": solver})
+    refused = {"kind": "price", "solver": "dense", "status": "unsupported"}
+    rows += [whole | refused | {"name": name} for name in EFFECTS[3:]]
     write(folder / "ablation" / "cloth.parquet", rows, ABLATION)
     return folder
 

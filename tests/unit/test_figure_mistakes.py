@@ -31,6 +31,11 @@ BAD = {
         "--panels: came 'gap:tine'; wanted parts of",
         "geometry-flat:step",
     ),
+    "curves and a map": (
+        ["hard", "--panels", "shares,map:geometry"],
+        "--panels: came shares:right, map:geometry, of which some are curves and some are maps",
+        "draw the others as a figure of their own",
+    ),
     "nothing of that kind": (["convergence"], "holds no accuracy rows; run `springbench accuracy CONFIG`", ""),
     "no ablation": (["ablation"], "wanted the rows of `springbench ablate SCENE`", ""),
     "no speed": (["speed"], "wanted the rows of `springbench speed CONFIG`", ""),

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
+from matplotlib.transforms import ScaledTranslation
 
 from harness.report.accuracy.sheet import size as enlarged
 from harness.report.figures.asked import Asked
@@ -20,6 +21,8 @@ from harness.report.style import INK, MUTED, RULE, Mark
 
 _LINE, _MARKER, _FEW = 1.1, 3.6, 12
 """Width of curves and size of marks [points]; up to so many points, each has a mark."""
+_INSET = 2.2
+"""Points from a cell's corner to the dot in it."""
 DOTS = 300
 """Dots an inch of what cannot be vectors."""
 
@@ -92,17 +95,19 @@ def handle(series: Series) -> Line2D:
 
 
 def draw_grid(ax: Axes, panel: CellMap, asked: Asked) -> None:
-    """Cells with their figures where these fit; rows named at the left, columns above."""
+    """Cells, those of other code with a dot in the corner; rows named at the left, columns above."""
     rows, columns = names(panel)
     ax.set_xlim(0, len(columns))
     ax.set_ylim(len(rows), 0)
     for spine in ax.spines.values():
         spine.set_visible(False)
+    mixed = not all(cell.older for cell in panel.cells)
+    corner = ax.transData + ScaledTranslation(_INSET / 72.0, -_INSET / 72.0, ax.figure.dpi_scale_trans)
     for cell in panel.cells:
         x, y = columns.index(cell.column), rows.index(cell.row)
         ax.add_patch(Rectangle((x + 0.04, y + 0.06), 0.92, 0.88, facecolor=cell.color, linewidth=0))
-        if cell.older:
-            ax.plot(x + 0.12, y + 0.5, "o", mfc="white", mec=INK, ms=2.6, mew=0.7, zorder=4)
+        if cell.older and mixed:
+            ax.plot(x + 0.04, y + 0.06, "o", mfc="white", mec=INK, ms=2.6, mew=0.7, zorder=4, transform=corner)
     ax.set_yticks(np.arange(len(rows)) + 0.5, rows, fontsize=asked.small)
     ax.set_xticks(np.arange(len(columns)) + 0.5, columns, fontsize=asked.small, rotation=90)
     ax.tick_params(length=0, pad=2, labeltop=True, labelbottom=False, labelcolor=INK)

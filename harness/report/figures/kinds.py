@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from harness.base.errors import InputError, Mistake, RunFailed, SpringbenchError, did_you_mean
 from harness.config.sweep import EVERY_REPORT
-from harness.report.figures import of_accuracy, of_gates, of_hard, of_meshes, of_runs, of_winners
+from harness.report.figures import of_accuracy, of_effects, of_gates, of_hard, of_meshes, of_runs, of_winners
 from harness.report.figures.entry import Entry, ready
 from harness.report.figures.panel import CellMap, Panel, Picture
 from solvers.plugins import load
@@ -38,13 +38,11 @@ def _sheet(entries: Sequence[Entry]) -> list[Panel]:
 
 
 def _maps(entries: Sequence[Entry]) -> list[Panel]:
-    """Families of hard cases as one map, below whatever else was chosen."""
+    """Families of hard cases as one map."""
     panels = [entry.make() for entry in entries]
     grids = [panel for panel in panels if isinstance(panel, CellMap)]
-    return [
-        *(panel for panel in panels if not isinstance(panel, CellMap)),
-        *([of_hard.together(grids)] if grids else []),
-    ]
+    rest = [panel for panel in panels if not isinstance(panel, CellMap)]
+    return [*rest, *([of_hard.together(grids)] if grids else [])]
 
 
 def _rows_alone(panels: Callable[[Path], list[Entry]]) -> Callable[[Path, of_runs.Older], list[Entry]]:
@@ -67,9 +65,12 @@ KINDS: dict[str, Kind] = {
     "liu2013": Kind("Liu et al. 2013, reproduced", f"{_ACCURACY}, of liu2013.yaml", _rows_alone(of_accuracy.paper)),
     "timing": Kind("Time a step", _SWEEP, of_runs.timing, (("step",), ("prepare",))),
     "hard": Kind("Hard cases", f"{_SWEEP} with `judge: true`", of_hard.hard, (("shares",),), _maps),
-    "ablation": Kind("What effects cost", "rows of `springbench ablate SCENE`", _rows_alone(of_runs.effects)),
+    "ablation": Kind("What effects cost", "rows of `springbench ablate SCENE`", _rows_alone(of_effects.effects)),
     "prices": Kind(
-        "The price of effects", "rows of `springbench ablate SCENE --all-solvers`", _rows_alone(of_runs.prices)
+        "The price of effects",
+        "rows of `springbench ablate SCENE --all-solvers`",
+        _rows_alone(of_effects.prices),
+        (("map",),),
     ),
     "speed": Kind("Speed", "rows of `springbench speed CONFIG`", _rows_alone(of_runs.speed), (("step",), ("global",))),
     "run": Kind("The mesh at the end", f"{_SWEEP} with recordings", _rows_alone(of_meshes.run), draw=_meshes),

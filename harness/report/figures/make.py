@@ -31,13 +31,17 @@ def make(name: str, kind: Kind, results: Path, older: Older, folder: Path, asked
     """Write the figure of a kind to files in `folder`, of the results in another one.
 
     older: see `Kind.panels`. Raises InputError where the results hold nothing of the kind, where no panel has the names
-    that were asked for, and where the type does not fit into the width.
+    that were asked for, where curves and maps were, and where the type does not fit into the width.
     """
     entries = kind.panels(results, older)
     if not entries:
         raise InputError(Mistake(f"holds nothing to draw as {name}; wanted {kind.wanted}", results))
     picked = entry.chosen(entries, asked.selectors or kind.usual)
     panels = kind.draw(picked)
+    if len({type(panel) for panel in panels}) > 1:
+        parts = ", ".join(":".join(one.parts) for one in picked)
+        why = f"came {parts}, of which some are curves and some are maps; wanted one of both: their data differ"
+        raise InputError(Mistake(f"{why}; draw the others as a figure of their own", key="--panels"))
     figure = compose(panels, kind.title, asked)
     wrong = faults(figure)
     if wrong:

@@ -10,12 +10,10 @@ import numpy as np
 
 from harness.report.figures.entry import Entry, ready
 from harness.report.figures.of_runs import Older, sweep_rows
-from harness.report.figures.panel import Cell, CellMap, Panel, Plot, Scale, Series
+from harness.report.figures.panel import Cell, CellMap, Panel, Plot, Scale, Series, dotted
 from harness.report.origin import NEEDED, measured_on
 from harness.report.robustness import OUTCOMES, RIGHT, Judged, read_cells, scores
 from harness.report.style import OLDER, Mark, marks
-
-_DOTTED = "Dot: measured by other code than today's."
 
 
 def hard(folder: Path, older: Older) -> list[Entry]:
@@ -27,9 +25,8 @@ def hard(folder: Path, older: Older) -> list[Entry]:
     for family in dict.fromkeys(cell.case.partition("-")[0] for cell in cells):
         mine = [cell for cell in cells if cell.case.partition("-")[0] == family]
         drawn = [_cell(cell, older=cell.run_id in other) for cell in mine]
-        notes = [_DOTTED] if any(cell.older for cell in drawn) else []
         outcomes = [(outcome.words, outcome.color) for outcome in OUTCOMES]
-        panels.append(CellMap(("map",), (family,), "", family, drawn, outcomes, notes, told))
+        panels.append(CellMap(("map",), (family,), "", family, drawn, outcomes, dotted(drawn), told))
     return ready(panels)
 
 
@@ -43,8 +40,8 @@ def together(grids: Sequence[CellMap]) -> CellMap:
     if len(grids) == 1:
         return grids[0]
     cells = [cell._replace(row=f"{grid.title}: {cell.row}") for grid in grids for cell in grid.cells]
-    notes = list(dict.fromkeys(note for grid in grids for note in grid.notes))
-    return replace(grids[0], name=tuple(grid.name[0] for grid in grids), title="", cells=cells, notes=notes)
+    names = tuple(grid.name[0] for grid in grids)
+    return replace(grids[0], name=names, title="", cells=cells, notes=dotted(cells))
 
 
 def _shares(cells: Sequence[Judged], other: Collection[str], told: str) -> Plot:

@@ -1,23 +1,21 @@
-"""The panels of sweeps, of speed reports and of ablations: times against size, and what effects cost and change."""
+"""The panels of sweeps and of speed reports: times against size."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from harness.base import machine, rows, shelf
+from harness.base import rows, shelf
 from harness.base.errors import InputError, Mistake
-from harness.report import ablation
 from harness.report.figures.entry import Entry, ready
-from harness.report.figures.panel import Band, Line, Plot, Scale, Series
+from harness.report.figures.panel import Plot, Scale, Series
 from harness.report.origin import NEEDED, measured_on
 from harness.report.speed import figures as speed_figures
 from harness.report.speed.pictures import PICTURES
-from harness.report.style import OLDER, Mark, looks, numbered
+from harness.report.style import OLDER, Mark, looks
 from harness.report.timing_table import RunTimes, labels, runs
 
 Older = Callable[[pa.Table], Collection[str]]
@@ -25,7 +23,6 @@ Older = Callable[[pa.Table], Collection[str]]
 
 _VERTICES = Scale("vertices", "sizes", "plain")
 _NEEDED = ("run_id", "scene", "size", "solver", "phase", "status")
-_ERRORS = {"solver": "error of the solver", "time-step": "error of the time step"}
 
 
 def sweep_rows(folder: Path) -> pa.Table:
@@ -148,77 +145,3 @@ def _lines(
         x, y = (values, np.full(len(n), float(k))) if lone else (n, values)
         series.append(Series(label, marked[label], x, y, older=older, joined=not lone))
     return series, (_VALUE, Scale("", "names", names=tuple(each))) if lone else (_VERTICES, _VALUE)
-
-
-def _ablations(folder: Path, kind: str) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """The rows of each ablation that holds rows of a kind, by the name of its file. Raises InputError without any."""
-    found = [(path.stem, ablation.read(path)) for path in shelf.units(folder / "ablation")]
-    found = [(stem, table) for stem, table in found if ablation.of_kind(table, kind)]
-    if not found:
-        command = "springbench ablate SCENE" + (" --all-solvers" if kind == "price" else "")
-        raise InputError(Mistake(f"holds nothing of that kind; wanted the rows of `{command}`", folder))
-    yield from found
-
-
-def effects(folder: Path) -> list[Entry]:
-    """What each effect of a scene costs, and what leaving it out changes."""
-    plots: list[Plot] = []
-    for stem, table in _ablations(folder, "without"):
-        (whole,) = ablation.of_kind(table, "whole")
-        points = [row for row in ablation.of_kind(table, "without") if row["status"] == "ok"]
-        if whole["status"] != "ok" or not points:
-            continue
-        other = whole["code"] not in (None, machine.code_hash())
-        series = [_effect(k, row, whole["seconds"], older=other) for k, row in enumerate(points)]
-        known = [row for row in ablation.of_kind(table, "error") if row["status"] == "ok"]
-        error, whose = ablation.known_error(table)
-        gone = [row["name"] for row in ablation.of_kind(table, "without") if row["status"] != "ok"]
-        below = [f"Shaded: less than {whose}, so not called for."] if whose else []
-        dashed = [f"{_ERRORS[row['name']]}, {row['largest']:.2g}" for row in known]
-        below += [f"Dashed: {'; '.join(dashed)}."] if dashed else []
-        below += [f"Impossible without {', '.join(gone)}."] if gone else []
-        plots.append(
-            Plot(
-                *((whole["scene"], str(whole["size"])), (stem,), f"{whole['scene']}, {whole['vertices']} vertices", ""),
-                Scale("cost [% of a step, with the 95 % interval]", "linear", "percent"),
-                Scale("largest displacement without it [mean rest lengths]", "log", "power"),
-                series,
-                bands=[Band(0.0, error, "")] if np.isfinite(error) else [],
-                lines=[Line(max(row["largest"], 1e-6), "") for row in known],
-                notes=[*below, *([OLDER] if other else [])],
-                machine=measured_on(table),
-            )
-        )
-    return ready(plots)
-
-
-def _effect(k: int, row: Any, whole: float, *, older: bool) -> Series:
-    x, low, high = (np.array([row[key] / whole]) for key in ("cost", "cost_low", "cost_high"))
-    y = np.array([max(row["largest"], 1e-6)])
-    return Series(row["name"], numbered(k), x, y, low, high, True, np.array([older]), joined=False, named=True)
-
-
-def prices(folder: Path) -> list[Entry]:
-    """What each effect adds to an iteration of each solver."""
-    tables = [table for _, table in _ablations(folder, "price")]
-    found = [row for table in tables for row in ablation.of_kind(table, "price") if row["status"] == "ok"]
-    marked = looks((row["solver"], row["solver"]) for row in found)
-    plots: list[Plot] = []
-    for scene in dict.fromkeys((row["scene"], row["size"]) for row in found):
-        here = [row for row in found if (row["scene"], row["size"]) == scene]
-        for solver in dict.fromkeys(row["solver"] for row in here):
-            mine = sorted((row for row in here if row["solver"] == solver), key=lambda row: -row["price"])
-            older = np.array([row["code"] not in (None, machine.code_hash()) for row in mine])
-            x, low, high = (np.array([r[key] for r in mine], float) for key in ("price", "price_low", "price_high"))
-            y, names = np.arange(len(mine), dtype=float), tuple(row["name"] for row in mine)
-            series = [Series(solver, marked[solver], x, y, low, high, True, older, joined=False)]
-            plots.append(
-                Plot(
-                    *((scene[0], str(scene[1])), (solver,), f"{scene[0]}, size {scene[1]}", solver),
-                    *(Scale("an iteration with the effect over one without", "log", "plain"),),
-                    *(Scale("", "names", names=names), series),
-                    notes=[OLDER] if older.any() else [],
-                    machine=measured_on(mine),
-                )
-            )
-    return ready(plots)

@@ -106,6 +106,13 @@ class Cell(NamedTuple):
     older: bool = False
 
 
+def dotted(cells: Sequence[Cell]) -> list[str]:
+    """What the dots in cells mean; there are none where other code measured all of them."""
+    if cells and all(cell.older for cell in cells):
+        return ["Measured by other code than today's."]
+    return ["Dot: measured by other code than today's."] if any(cell.older for cell in cells) else []
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CellMap:
     """Coloured cells, rows by columns; outcomes: their meanings with colours, in the order of the legend."""

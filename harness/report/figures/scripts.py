@@ -71,7 +71,7 @@ for ax, panel in zip(axes.flat, panels):
         at = across.index(row["column"]), down.index(row["row"])
         ax.add_patch(plt.Rectangle((at[0] + 0.04, at[1] + 0.06), 0.92, 0.88, color=row["color"]))
         if row["older"] == "True":
-            ax.plot(at[0] + 0.12, at[1] + 0.5, "o", color="black", markerfacecolor="white", markersize=2.6)
+            ax.plot(at[0] + 0.12, at[1] + 0.24, "o", color="black", markerfacecolor="white", markersize=2.6)
     ax.set(xlim=(0, len(across)), ylim=(len(down), 0))
     ax.set_xticks([k + 0.5 for k in range(len(across))], across, rotation=90)
     ax.set_yticks([k + 0.5 for k in range(len(down))], down)

@@ -1,0 +1,142 @@
+"""The panels of ablations: what effects cost and change, and what each adds to an iteration of every solver."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from harness.base import machine, shelf
+from harness.base.errors import InputError, Mistake
+from harness.report import ablation
+from harness.report.ablation import Row
+from harness.report.figures.entry import Entry, ready
+from harness.report.figures.panel import Band, Cell, CellMap, Line, Panel, Plot, Scale, Series, dotted
+from harness.report.origin import measured_on
+from harness.report.style import OLDER, Mark, looks, numbered
+
+_ERRORS = {"solver": "error of the solver", "time-step": "error of the time step"}
+
+_NOTHING = ("cannot be told from 1", "#efece6")
+_CLASSES = (
+    (1.0, "below 1", "#a8d5b9"),
+    (1.1, "to 1.1", "#dfeaf3"),
+    (1.5, "1.1 to 1.5", "#aacbe4"),
+    (2.0, "1.5 to 2", "#64a2d6"),
+    (3.0, "2 to 3", "#2f78b5"),
+    (np.inf, "above 3", "#0f3f70"),
+)
+"""Up to which price, in words, in which colour."""
+_REFUSED = "#bcb8b0"
+_READ = (
+    "CPU time of an iteration with the effect over one without, the median over rounds; of those whose interval of "
+    "95 % holds 1 nothing can be told."
+)
+_ALL = "all"
+"""The price of all effects together, as the rows name it."""
+
+
+def _ablations(folder: Path, kind: str) -> Iterator[tuple[str, Sequence[Row]]]:
+    """The rows of each ablation that holds rows of a kind, by the name of its file. Raises InputError without any."""
+    found = [(path.stem, ablation.read(path)) for path in shelf.units(folder / "ablation")]
+    found = [(stem, table) for stem, table in found if ablation.of_kind(table, kind)]
+    if not found:
+        command = "springbench ablate SCENE" + (" --all-solvers" if kind == "price" else "")
+        raise InputError(Mistake(f"holds nothing of that kind; wanted the rows of `{command}`", folder))
+    yield from found
+
+
+def effects(folder: Path) -> list[Entry]:
+    """What each effect of a scene costs, and what leaving it out changes."""
+    plots: list[Plot] = []
+    for stem, table in _ablations(folder, "without"):
+        (whole,) = ablation.of_kind(table, "whole")
+        points = [row for row in ablation.of_kind(table, "without") if row["status"] == "ok"]
+        if whole["status"] != "ok" or not points:
+            continue
+        other = _other(whole)
+        series = [_effect(k, row, whole["seconds"], older=other) for k, row in enumerate(points)]
+        known = [row for row in ablation.of_kind(table, "error") if row["status"] == "ok"]
+        error, whose = ablation.known_error(table)
+        gone = [row["name"] for row in ablation.of_kind(table, "without") if row["status"] != "ok"]
+        below = [f"Shaded: less than {whose}, so not called for."] if whose else []
+        dashed = [f"{_ERRORS[row['name']]}, {row['largest']:.2g}" for row in known]
+        below += [f"Dashed: {'; '.join(dashed)}."] if dashed else []
+        below += [f"Impossible without {', '.join(gone)}."] if gone else []
+        plots.append(
+            Plot(
+                *((whole["scene"], str(whole["size"])), (stem,), f"{whole['scene']}, {whole['vertices']} vertices", ""),
+                Scale("cost [% of a step, with the 95 % interval]", "linear", "percent"),
+                Scale("largest displacement without it [mean rest lengths]", "log", "power"),
+                series,
+                bands=[Band(0.0, error, "")] if np.isfinite(error) else [],
+                lines=[Line(max(row["largest"], 1e-6), "") for row in known],
+                notes=[*below, *([OLDER] if other else [])],
+                machine=measured_on(table),
+            )
+        )
+    return ready(plots)
+
+
+def _effect(k: int, row: Row, whole: float, *, older: bool) -> Series:
+    x, low, high = (np.array([row[key] / whole]) for key in ("cost", "cost_low", "cost_high"))
+    y = np.array([max(row["largest"], 1e-6)])
+    return Series(row["name"], numbered(k), x, y, low, high, True, np.array([older]), joined=False, named=True)
+
+
+def prices(folder: Path) -> list[Entry]:
+    """What each effect adds to an iteration: a map of all solvers, and for each a panel with intervals."""
+    found = [row for _, table in _ablations(folder, "price") for row in ablation.of_kind(table, "price")]
+    marked = looks((row["solver"], row["solver"]) for row in found)
+    panels: list[Panel] = []
+    for scene in dict.fromkeys((row["scene"], row["size"]) for row in found):
+        here = [row for row in found if (row["scene"], row["size"]) == scene]
+        of, subject = (scene[0], str(scene[1])), f"{scene[0]}, size {scene[1]}"
+        panels.append(_map(of, subject, here))
+        for solver in dict.fromkeys(row["solver"] for row in here):
+            mine = [row for row in here if row["solver"] == solver and row["status"] == "ok"]
+            panels += [_intervals(of, subject, marked[solver], mine)] if mine else []
+    return ready(panels)
+
+
+def _other(row: Row) -> bool:
+    return row["code"] not in (None, machine.code_hash())
+
+
+def _map(of: tuple[str, ...], subject: str, here: Sequence[Row]) -> CellMap:
+    """Effects down, the dearest first and all of them together last; solvers across."""
+    known = [row for row in here if row["status"] == "ok"]
+    paid = {row["name"]: [r["price"] for r in known if r["name"] == row["name"]] for row in here}
+    order = sorted(paid, key=lambda name: (name == _ALL, -median(paid[name] or [0.0])))
+    cells = [_cell(row) for row in sorted(here, key=lambda row: order.index(row["name"]))]
+    refused = dict.fromkeys(row["status"] for row in here if row["status"] != "ok")
+    classes = [_NOTHING, *((words, color) for _, words, color in _CLASSES), *((words, _REFUSED) for words in refused)]
+    return CellMap(of, ("map",), subject, "", cells, classes, [_READ, *dotted(cells)], measured_on(here))
+
+
+def _cell(row: Row) -> Cell:
+    at = row["name"], row["solver"]
+    if row["status"] != "ok":
+        return Cell(*at, row["status"], _REFUSED, "–", _other(row))
+    price = row["price"]
+    class_ = next((words, color) for most, words, color in _CLASSES if price <= most)
+    told = _NOTHING if row["price_low"] <= 1.0 <= row["price_high"] else class_
+    return Cell(*at, *told, f"{price:.2f}" if price < 9.995 else f"{price:.0f}", _other(row))
+
+
+def _intervals(of: tuple[str, ...], subject: str, look: Mark, rows: Sequence[Row]) -> Plot:
+    """A solver's prices with their intervals, the dearest effect first."""
+    mine, solver = sorted(rows, key=lambda row: -row["price"]), rows[0]["solver"]
+    older = np.array([_other(row) for row in mine])
+    x, low, high = (np.array([row[key] for row in mine], float) for key in ("price", "price_low", "price_high"))
+    y, names = np.arange(len(mine), dtype=float), tuple(row["name"] for row in mine)
+    return Plot(
+        *(of, (solver,), subject, solver),
+        Scale("an iteration with the effect over one without", "log", "plain"),
+        Scale("", "names", names=names),
+        [Series(solver, look, x, y, low, high, True, older, joined=False)],
+        notes=[OLDER] if older.any() else [],
+        machine=measured_on(mine),
+    )

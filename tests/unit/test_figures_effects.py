@@ -1,0 +1,64 @@
+"""The map of what effects add to an iteration: all solvers on one page, and what cannot be told is not told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.experiments.ablation.ablation_rows import SCHEMA
+from harness.report.figures.asked import Asked
+from harness.report.figures.canvas import INCH, texts
+from harness.report.figures.faults import faults
+from solvers.registry import SOLVERS
+from tests import figure_results as made
+from tests.drawn_figures import composed
+
+PRICES = {"bending": (1.7, 1.6, 1.9), "wind": (1.05, 0.98, 1.1), "gas": (2.4, 2.3, 2.5), "all": (1.2, 1.1, 1.3)}
+"""Of each effect, with the interval."""
+
+
+def priced(folder: Path, solvers: list[str], refused: str, codes: dict[str, str]) -> Path:
+    """Each effect's price by each solver; one refuses bending; codes: of solvers of other code."""
+    rows: list[dict[str, Any]] = []
+    for solver in solvers:
+        same = made.HERE | {"scene": "cloth", "size": 33, "vertices": 1089, "kind": "price", "solver": solver}
+        for name, (price, low, high) in PRICES.items():
+            told: dict[str, Any] = {"name": name, "price": price, "price_low": low, "price_high": high}
+            if (solver, name) == (refused, "bending"):
+                told = {"name": name, "status": "unsupported"}
+            rows.append(same | told | {"code": codes.get(solver)})
+    made.write(folder / "ablation" / "cloth.parquet", rows, SCHEMA)
+    return folder
+
+
+def test_the_dearest_effect_stands_first_all_last_and_round_off_of_one_is_no_price(tmp_path: Path) -> None:
+    figure, (grid,) = composed("prices", priced(tmp_path, ["numba", "dense"], "dense", {"dense": "before"}), Asked())
+    told = {(cell.row, cell.column): (cell.outcome, cell.figure, cell.older) for cell in grid.cells}
+    assert list(dict.fromkeys(cell.row for cell in grid.cells)) == ["gas", "bending", "wind", "all"]
+    assert told["gas", "numba"] == ("2 to 3", "2.40", False)
+    assert told["wind", "numba"] == ("cannot be told from 1", "1.05", False)
+    assert told["bending", "dense"] == ("unsupported", "–", True)
+    said = " ".join(text.get_text() for text in texts(figure))
+    assert "Dot: measured by other code than today's." in said
+    assert sum(line.get_marker() == "o" for line in figure.axes[0].lines) == 4
+
+
+def test_where_all_is_of_other_code_words_say_so_and_no_dots(tmp_path: Path) -> None:
+    codes: dict[str, str] = {"numba": "before", "dense": "before"}
+    figure, _ = composed("prices", priced(tmp_path, list(codes), "", codes), Asked())
+    said = " ".join(text.get_text() for text in texts(figure))
+    assert "Dot" not in said
+    assert "Measured by other code than today's." in said
+    assert not figure.axes[0].lines
+
+
+@pytest.mark.parametrize("width", [85.0, 220.0])
+def test_all_solvers_fit_a_page(tmp_path: Path, width: float) -> None:
+    figure, (grid,) = composed("prices", priced(tmp_path, list(SOLVERS), "dense", {}), Asked(width=width))
+    across, up = figure.get_size_inches() * INCH
+    assert up < 1.2 * across
+    assert faults(figure) == []
+    assert {cell.column for cell in grid.cells} == set(SOLVERS)
+    assert len(figure.axes[0].texts) == (len(grid.cells) if width > 100 else 0), "figures, where they fit"
