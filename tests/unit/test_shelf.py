@@ -1,6 +1,7 @@
 """Rows at scale: many units are read at once, packed or not, and give the same rows as one by one."""
 
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from multiprocessing import get_context
@@ -131,21 +132,30 @@ def killed_at(call: int, sweep: Path) -> None:
 
     os.replace, Path.unlink, os.fsync = deadly(os.replace), deadly(Path.unlink), deadly(os.fsync)  # type: ignore[assignment]
     pq.ParquetWriter.write_table = deadly(pq.ParquetWriter.write_table)  # type: ignore[method-assign]
-    module._BATCH = 5
+    module._BATCH = 2
     compact(sweep, lambda line: None)
 
 
-@pytest.mark.parametrize("call", [0, 1, 2, 4, 9])
-def test_packing_that_is_killed_loses_and_doubles_nothing_and_goes_on(sweep: Path, call: int):
+def test_packing_that_is_killed_at_any_moment_loses_and_doubles_nothing_and_goes_on(sweep: Path, tmp_path: Path):
     units = shelf.units(sweep / "rows")
-    before = told(rows.read(units))
-    process = get_context("fork").Process(target=killed_at, args=(call, sweep))
-    process.start()
-    process.join()
-    assert process.exitcode == -signal.SIGKILL
-    assert shelf.units(sweep / "rows") == units
-    assert told(rows.read(units)) == before
-    compact(sweep, lambda line: None)
-    assert {path.name for path in sweep.iterdir()} == {"rows", "rows.parquet", ".lock"}
-    assert list((sweep / "rows").iterdir()) == []
-    assert told(rows.read(units)) == before
+    for unit in (*units[:2], *units[6:]):  # four are left, of three schemas
+        unit.unlink()
+    before, moments = told(rows.read(units[2:6])), 0
+    while True:
+        copy = tmp_path / str(moments) / "sweep"
+        shutil.copytree(sweep, copy)
+        process = get_context("fork").Process(target=killed_at, args=(moments, copy))
+        process.start()
+        process.join()
+        left = shelf.units(copy / "rows")
+        assert [unit.name for unit in left] == [unit.name for unit in units[2:6]]
+        assert told(rows.read(left)) == before
+        if process.exitcode == 0:  # it had done all before
+            break
+        assert process.exitcode == -signal.SIGKILL
+        compact(copy, lambda line: None)
+        assert {path.name for path in copy.iterdir()} == {"rows", "rows.parquet", ".lock"}
+        assert list((copy / "rows").iterdir()) == []
+        assert told(rows.read(left)) == before
+        moments += 1
+    assert moments == 2 + 3 + 1 + 4, "two batches, to sync, rename and sync, the partial file, and each unit"
