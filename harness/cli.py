@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from harness.base.commands import Again, Changed, Check, Commands, Error, Horizon, InThisProcess, Peers, Results, Rows
-from harness.base.console import err, out
+from harness.base.console import aligned, err, out
 from harness.base.console import say as _say
 from harness.base.errors import InputError, Mistake
 from harness.config.command_line import taking
@@ -182,33 +182,20 @@ app.add_typer(study, name="gate-study")
 @app.command("list")
 def list_runs(config: Config, results: Results = Path("results")) -> None:
     """Check a config, and show what would run and what is there already."""
-    from rich.table import Table
-
     from harness.base.machine import describe
     from harness.config.load import load_any
     from harness.experiments.plan import plan
 
     sweep = load_any(config, opens=False)
-    table = Table("run", "scene", "size", "solver", "iterations", "frames", "threads", "state")
+    lines = [("run", "scene", "size", "solver", "iterations", "frames", "threads", "state")]
     for p in plan(sweep.runs(), results / sweep.name):
         r, there = p.run, p.standing
         state = there.state + (" (by other code)" if there.older else "") + (" (damaged)" if there.damage else "")
-        cells = (
-            p.files.rows.stem[-12:],
-            r.scene_name,
-            r.size,
-            r.solver.name,
-            r.iterations,
-            r.frames,
-            r.threads,
-            state,
-        )
-        table.add_row(*map(str, cells))
-    table.caption_justify, table.caption = (
-        "left",
-        f"states are those on this machine, {describe().id:.6}; settings hold on any",
-    )
-    out().print(table)
+        what = r.scene_name, r.size, r.solver.name, r.iterations, r.frames, r.threads
+        lines.append((p.files.rows.stem[-12:], *map(str, what), state))
+    for line in aligned(lines):
+        print(line)
+    print(f"states are those on this machine, {describe().id:.6}; settings hold on any")
 
 
 @app.command()
@@ -219,6 +206,7 @@ def query(
     seconds: Annotated[float, typer.Option(help="Processor time that the answer may take.")] = 15.0,
 ) -> None:
     """Answer an SQL query over the rows of all sweeps."""
+    from harness.report.machines import COMPARE
     from harness.report.query import PRINTED, SHOWN, answer
 
     found = answer(sql, results, most=PRINTED if csv else SHOWN, seconds=seconds)
@@ -229,6 +217,7 @@ def query(
         found.write_csv(sys.stdout)
     else:
         out().print(found.table())
+        out().print(f"columns machine and node: {COMPARE}")
 
 
 @app.command()

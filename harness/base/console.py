@@ -6,6 +6,7 @@ Rich is loaded when something is written: no command has to wait for it before.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -35,6 +36,16 @@ def err() -> Console:
     from rich.console import Console
 
     return Console(stderr=True)
+
+
+def aligned(lines: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Lines of cells in columns, the first of them headings: plain, for tables of many thousand lines, of which Rich
+    lays out a thousand a second."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for number, line in enumerate(lines):
+        yield "  ".join(map(str.ljust, line, widths)).rstrip()
+        if number == 0:
+            yield "  ".join("─" * width for width in widths)
 
 
 def say(line: str) -> None:

@@ -68,7 +68,8 @@ def plan(runs: Iterable[RunSpec], folder: Path, machines: Sequence[str | None] =
     """Each run with its files and what is there already; machines: the ids of those on which it may have been done."""
     code_of = _codes()
     planned: list[PlannedRun] = []
-    placed = [(run, [Files.of(run, folder, on) for on in machines]) for run in runs]
+    here = machine.describe().id
+    placed = [(run, [Files.of(run, folder, on or here) for on in machines]) for run in runs]
     heads = _heads([files.rows for _, some in placed for files in some])
     for run, some in placed:
         files = next((files for files in some if files.rows in heads), some[0])

@@ -20,7 +20,6 @@ from rich.text import Text
 
 from harness.base import child, columns, rows, shelf, union
 from harness.base.errors import InputError, Mistake
-from harness.report.machines import COMPARE
 
 _TABLES: dict[str, pa.Schema] = {"rows": columns.SCHEMA, "accuracy": pa.schema([]), "ablation": pa.schema([])}
 """The tables by the names of their folders, with the columns that they have even where no row has them."""
@@ -52,7 +51,7 @@ class Answer:
 
     def table(self) -> Table:
         """The answer as a table to print; what cells hold is text and no markup."""
-        table = Table(caption=f"columns machine and node: {COMPARE}", caption_justify="left")
+        table = Table()
         for name in self.columns[:_COLUMNS]:
             table.add_column(Text(_shown(name)))
         for row in self.values:

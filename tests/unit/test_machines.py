@@ -100,7 +100,7 @@ def test_list_query_and_merge_say_it(tmp_path: Path):
         (tmp_path / name / "sweep" / "rows").mkdir(parents=True)
         rows.write(tmp_path / name / "sweep" / "rows" / f"{name}.parquet", told)
     question = "SELECT machine, median(seconds) FROM rows GROUP BY ALL"
-    assert COMPARE.split(";")[0] in command("query", question, "--results", tmp_path / "a")
+    assert COMPARE in command("query", question, "--results", tmp_path / "a")
     assert COMPARE not in command("query", question, "--results", tmp_path / "a", "--csv"), "it is read by programs"
     said = command("merge", tmp_path / "a", tmp_path / "b", "-o", tmp_path / "all")
     assert "machine 000000: " in said
