@@ -36,4 +36,5 @@ kernel: Any = kept(**_bare, no_cfunc_wrapper=True)
 inner: Any = kept(**inner_options)
 part: Any = kept(**_linked)  # an inner one that makes arrays
 inner_closure: Any = njit(**inner_options)  # has no name on disk; kept within what calls it
+inlined_closure: Any = njit(**inner_options, forceinline=True)  # for what takes more arrays than it has work
 inner_in_parallel: Any = kept(**_bare, **_alone, parallel=True)

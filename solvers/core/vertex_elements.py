@@ -66,7 +66,8 @@ class Beside:
             return self
         from solvers.kernels.stencils import Around  # for those who need it
 
-        return replace(self, around=tuple(Around.of(one, row, rows) for one in self._joined(self.energies)))
+        joined = zip(self._laws, self._joined(self.energies), strict=True)
+        return replace(self, around=tuple(Around.of(law, one, row, rows) for law, one in joined))
 
     def begun(self, problem: StepProblem) -> tuple[Around, ...] | None:
         """The elements by rows as they are in a step, None without any."""
@@ -74,8 +75,7 @@ class Beside:
             return self.around or None
         joined = self._joined([problem.energies[k] for k in self.numbers])
         return tuple(
-            around._replace(numbers=np.ascontiguousarray(one.numbers))
-            for around, one in zip(self.around, joined, strict=True)
+            around.with_numbers(law, one) for around, law, one in zip(self.around, self._laws, joined, strict=True)
         )
 
     @cached_property
@@ -83,9 +83,11 @@ class Beside:
         """`solvers.kernels.vbd.iterate` with these energies."""
         if not self.numbers:
             return plain.iterate
+        from solvers.kernels.stencils import Kind  # for those who need it
         from solvers.kernels.vbd_elements import iterating
 
-        return iterating(*self._laws)
+        widths = [one.vertices.shape[1] for one in self._joined(self.energies)]
+        return iterating(*(Kind(*kind) for kind in zip(self._laws, widths, strict=True)))
 
     @cached_property
     def _laws(self) -> list[Law]:

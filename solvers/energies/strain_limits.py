@@ -22,6 +22,16 @@ from solvers.energies.elements import Elements, Law, line
 from solvers.problem import Positions
 from solvers.round_off import EPS
 
+_SURE = 1.0 + 4.0 * EPS
+"""By so much a squared length is within squared limits for the length to be within the limits, rounded as they are."""
+
+
+@inner
+def _within(numbers, e, squared):
+    """Whether the limits say nothing for sure, known without a root."""
+    low, high = numbers[e, 1], numbers[e, 2]
+    return low * low * _SURE <= squared and squared * _SURE <= high * high
+
 
 @inner
 def _beyond(numbers, e, length):
@@ -38,12 +48,16 @@ def _direction(numbers, e, length, z0, z1, z2):
 
 @inner
 def _value(numbers, e, z0, z1, z2):
-    return 0.5 * numbers[e, 0] * _beyond(numbers, e, np.sqrt(z0 * z0 + z1 * z1 + z2 * z2)) ** 2
+    squared = z0 * z0 + z1 * z1 + z2 * z2
+    return 0.0 if _within(numbers, e, squared) else 0.5 * numbers[e, 0] * _beyond(numbers, e, np.sqrt(squared)) ** 2
 
 
 @inner
 def _gradient(numbers, e, z0, z1, z2):
-    length = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2)
+    squared = z0 * z0 + z1 * z1 + z2 * z2
+    if _within(numbers, e, squared):
+        return 0.0, 0.0, 0.0
+    length = np.sqrt(squared)
     force = numbers[e, 0] * _beyond(numbers, e, length)
     if force == 0.0:
         return 0.0, 0.0, 0.0
@@ -53,7 +67,10 @@ def _gradient(numbers, e, z0, z1, z2):
 
 @inner
 def _curvature(numbers, e, z0, z1, z2):
-    length, k = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2), numbers[e, 0]
+    squared, k = z0 * z0 + z1 * z1 + z2 * z2, numbers[e, 0]
+    if _within(numbers, e, squared):
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    length = np.sqrt(squared)
     beyond = _beyond(numbers, e, length)
     if beyond == 0.0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -64,7 +81,10 @@ def _curvature(numbers, e, z0, z1, z2):
 @inner
 def _rise(numbers, e, z0, z1, z2, s0, s1, s2):
     t0, t1, t2 = z0 + s0, z1 + s1, z2 + s2
-    before, after = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2), np.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+    before, after = z0 * z0 + z1 * z1 + z2 * z2, t0 * t0 + t1 * t1 + t2 * t2
+    if _within(numbers, e, before) and _within(numbers, e, after):
+        return 0.0
+    before, after = np.sqrt(before), np.sqrt(after)
     one, other = _beyond(numbers, e, before), _beyond(numbers, e, after)
     longer = other - one
     if one * other > 0.0:  # the same limit: the difference of the lengths, which keeps its digits

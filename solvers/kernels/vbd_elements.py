@@ -10,10 +10,9 @@ from functools import cache
 from typing import Any
 
 from solvers.compiling import inner_closure
-from solvers.energies.elements import Law
 from solvers.kernels.accelerate_springs import descend as objective
 from solvers.kernels.half_spaces import moving, pressed
-from solvers.kernels.stencils import Vertices
+from solvers.kernels.stencils import Kind, Vertices
 from solvers.kernels.vbd import forces, over
 from solvers.vectors.springs import LANES
 from solvers.vectors.vbd import model, step
@@ -24,9 +23,9 @@ _D, _RISE = 3, 6
 
 
 @cache
-def iterating(*laws: Law) -> Any:
-    """The kernel `solvers.kernels.vbd.iterate` for elements of these laws."""
-    total, felt, risen = Vertices.of(list(laws))
+def iterating(*kinds: Kind) -> Any:
+    """The kernel `solvers.kernels.vbd.iterate` for elements of these kinds."""
+    total, felt, risen = Vertices.of(list(kinds))
     move = moving(felt, risen)
 
     @inner_closure

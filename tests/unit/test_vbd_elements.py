@@ -11,7 +11,7 @@ import pytest
 
 from solvers.compiling import kernel
 from solvers.core.vertex_elements import Beside
-from solvers.kernels.stencils import Vertices
+from solvers.kernels.stencils import Kind, Vertices
 from solvers.methods.newton import Newton
 from solvers.methods.vbd import VertexBlockDescent
 from solvers.problem import StopRule, Unsupported
@@ -36,7 +36,7 @@ def test_a_vertex_feels_what_the_oracle_says(effect):
     beside = Beside.of(problem.system)
     around = beside.among(np.arange(n), n).begun(problem)
     energy: Any = problem.energies[beside.numbers[0]]
-    total, felt, risen = Vertices.of([energy.law])
+    total, felt, risen = Vertices.of([Kind(energy.law, 2)])
 
     def tell(around, p, d, gradient, block, rises, value):
         value[0] = total(around, p)
