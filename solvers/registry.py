@@ -34,6 +34,7 @@ SOLVERS = {
     "ros3p": "solvers.methods.rosenbrock:Ros3P",
     "rodas": "solvers.methods.rosenbrock:Rodas",
     "pncg": "solvers.methods.pncg:NonlinearCG",
+    "admm": "solvers.methods.admm:Admm",
 }
 
 OPTIONAL = {

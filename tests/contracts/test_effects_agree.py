@@ -23,6 +23,7 @@ SOLVED: dict[str, Solver] = {
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 TAKE_ALL = {"newton", "newton-cg", "hybrid", "lbfgs"}
 PROJECTIVE = {"sparse", "numba", "anderson", "chebyshev"}
+ALONG_EDGES = {"admm": {"bending", "strain limits", "air drag", "attachments"}}
 CONTACT = {*PROJECTIVE, *TAKE_ALL, "vbd"}
 """Who takes what; those not named take springs only."""
 STOP = StopRule(5000, 1e-11)
@@ -32,6 +33,8 @@ NOISE = np.random.default_rng(0)
 def takes(solver: str, scene: str) -> bool:
     if "contact" in scene:
         return solver in CONTACT
+    if solver in ALONG_EDGES:
+        return scene in ALONG_EDGES[solver]
     return solver in {*TAKE_ALL, "pncg"} or (solver in {*PROJECTIVE, "vbd"} and "gas" not in scene)
 
 
