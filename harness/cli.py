@@ -187,7 +187,7 @@ def list_runs(config: Config, results: Results = Path("results")) -> None:
     from harness.experiments.plan import plan
 
     sweep = load_any(config, opens=False)
-    lines = [("run", "scene", "size", "solver", "iterations", "frames", "threads", "state")]
+    lines: list[tuple[str, ...]] = [("run", "scene", "size", "solver", "iterations", "frames", "threads", "state")]
     for p in plan(sweep.runs(), results / sweep.name):
         r, there = p.run, p.standing
         state = there.state + (" (by other code)" if there.older else "") + (" (damaged)" if there.damage else "")
