@@ -1,4 +1,7 @@
-"""What a sweep's runs say, in sentences: who is fastest where all are equally accurate, and who is far from it."""
+"""What a sweep's runs say, in sentences: who is fastest where all are equally accurate, and who is far from it.
+
+Runs are compared by their least times, as at the end of a sweep: these depend least on what else the machine does.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ def _races(found: Sequence[Run]) -> Iterator[list[Run]]:
     """Of each scene the runs of its largest size of which there are several that ended well and were timed."""
     groups: dict[str, dict[Any, list[Run]]] = defaultdict(lambda: defaultdict(list))
     for run in found:
-        if run["status"] == "ok" and run["step"] is not None:
+        if run["status"] == "ok" and run["least"] is not None:
             groups[run["scene"]][run["size"] or 0, run["integrator"], run["time_step"]].append(run)
     for sizes in groups.values():
         several = [key for key, group in sizes.items() if len({run["label"] for run in group}) > 1]
@@ -35,20 +38,20 @@ def _race(group: Sequence[Run]) -> Iterator[dict[str, Any]]:
     known = [run for run in group if run["residual"] is not None]
     lowest = min((run["residual"] for run in known), default=None)
     equal = [run for run in known if lowest is not None and run["residual"] <= SAME * lowest] or list(group)
-    first, *others = sorted(equal, key=lambda run: run["step"])
-    words = f"{where}: fastest at equal accuracy is {first['label']}, {quantity(first['step'])} ms a step"
+    first, *others = sorted(equal, key=lambda run: run["least"])
+    words = f"{where}: fastest at equal accuracy is {first['label']}, {quantity(first['least'])} ms a step at the least"
     if others:
         words += "; " + ", ".join(f"{run['label']} takes {_times(run, first)}" for run in others[:4])
     yield {"words": f"{words}.", "runs": [first["run_id"], *(run["run_id"] for run in others[:3])]}
-    worse = [run for run in known if run not in equal and run["step"] < first["step"]]
-    for run in sorted(worse, key=lambda run: run["step"])[:2]:
+    worse = [run for run in known if run not in equal and run["least"] < first["least"]]
+    for run in sorted(worse, key=lambda run: run["least"])[:2]:
         far = factor(run["residual"] / lowest) if lowest else "many"
-        words = f"{where}: {run['label']} is faster, {quantity(run['step'])} ms, and ends {far} times further away."
+        words = f"{where}: {run['label']} is faster, {quantity(run['least'])} ms, and ends {far} times further away."
         yield {"words": words, "runs": [run["run_id"], first["run_id"]]}
 
 
 def _times(run: Run, first: Run) -> str:
-    return f"{factor(run['step'] / first['step'])} times as long"
+    return f"{factor(run['least'] / first['least'])} times as long"
 
 
 def _unconverged(found: Sequence[Run]) -> Iterator[dict[str, Any]]:
