@@ -1,0 +1,110 @@
+"""What Newton's method does about indefinite Hessians: iterations, elements looked at, and CPU time of each rule.
+
+    python -m tests.bench.hessians [SCENE ...]
+
+The scenes of `configs/hessians.yaml`, with its limits. Rules take turns, frame by frame, in one process. Elements that
+were looked at are told as a part of all elements in all iterations, which `clamp` looks at; CPU time as a multiple of
+that of the default, without what it takes to prepare. A rule that needs all iterations in some frame is marked by >.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from unittest.mock import patch
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from harness.base.machine import pinned_threads
+from harness.config.load import load_scene
+from harness.scenes.bind import build
+from harness.simulation.step import Step, prepare, simulate
+from solvers.core import definite
+from solvers.core.definite import Indefinite
+from solvers.core.eigenvalues import Filtered, Filtering
+from solvers.core.objective import Hessian
+from solvers.methods.newton import Newton
+from solvers.problem import StopRule
+
+SCENES = sorted((Path(__file__).parents[2] / "configs" / "hessians").glob("*.yaml"))
+STOP = StopRule(1000, 1e-6)
+RULES: tuple[Indefinite, ...] = tuple(definite.RULES)
+
+
+@dataclass
+class Tally:
+    """What a rule took of a scene. elements: all of them in all iterations; looked: those that were looked at."""
+
+    iterations: int = 0
+    seconds: float = 0.0
+    elements: int = 0
+    looked: int = 0
+    ended: bool = True
+
+    def told(self, against: Tally) -> str:
+        """The cell."""
+        looked = f" {100 * self.looked / self.elements:.0f} %" if self.looked else ""
+        return f"{'' if self.ended else '>'}{self.iterations}{looked} {self.seconds / against.seconds:.2f}"
+
+
+@contextmanager
+def counted() -> Iterator[list[int]]:
+    """How many elements each filtered Hessian looked at, from now on."""
+    looked: list[int] = []
+    filtered = Hessian.filtered
+
+    def counting(self: Hessian, by: Filtering) -> Filtered:
+        found = filtered(self, by)
+        looked.append(found.looked)
+        return found
+
+    with patch.object(Hessian, "filtered", counting):
+        yield looked
+
+
+def measured(path: Path) -> dict[Indefinite, Tally]:
+    """A scene by each rule."""
+    spec = load_scene(path)
+    made = build(spec, spec.default_size or 0)
+    edges = sum(len(getattr(energy, "edges", ())) for energy in made.system.energies)
+    tallies: dict[Indefinite, Tally] = {rule: Tally() for rule in RULES}
+    runs: dict[Indefinite, Iterator[Step]] = {
+        rule: simulate(made, prepare(made, Newton(rule)), STOP, first_guess="current", frames=spec.frames)
+        for rule in RULES
+    }
+    for _ in range(spec.frames):
+        for rule, run in runs.items():
+            tally = tallies[rule]
+            with counted() as looked:
+                began = time.process_time()
+                solution = next(run).solution
+                tally.seconds += time.process_time() - began
+            tally.looked += sum(looked)
+            tally.iterations += solution.iterations
+            tally.elements += solution.iterations * edges
+            tally.ended &= solution.stopped != "iterations"
+    return tallies
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("scenes", nargs="*", type=Path, default=SCENES, metavar="SCENE")
+    table = Table("scene", *RULES, box=SIMPLE_HEAD)
+    scenes = parser.parse_args().scenes
+    with pinned_threads(1):
+        measured(scenes[0])  # compiles
+        for path in scenes:
+            found = measured(path)
+            table.add_row(path.stem, *(tally.told(found["graded"]) for tally in found.values()))
+    Console(width=120).print(table)
+
+
+if __name__ == "__main__":
+    main()
