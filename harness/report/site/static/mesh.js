@@ -39,7 +39,9 @@ Object.assign(springbench, (() => {
         flat[3 * i + 1] = high / 2 - scale * (ct * z + st * deep);
         flat[3 * i + 2] = ct * deep - st * z;
       }
-      const of = (...ids) => (values ? `rgb(${ramp(ids.reduce((sum, i) => sum + values[i], 0) / ids.length)})` : getComputedStyle(canvas).color);
+      // Without values faces are grey between darker lines: else a mesh of triangles would be one dark patch.
+      const style = getComputedStyle(canvas), [line, edge, face] = ["--ink", "--muted", "--rule"].map(name => style.getPropertyValue(name));
+      const of = (...ids) => (values ? `rgb(${ramp(ids.reduce((sum, i) => sum + values[i], 0) / ids.length)})` : line);
       ink.lineWidth = ratio * (triangles.length ? 0.7 : 1.6);
       if (triangles.length) {
         const count = triangles.length / 3, order = Array.from({ length: count }, (_, k) => k);
@@ -47,7 +49,8 @@ Object.assign(springbench, (() => {
         order.sort((a, b) => depth[b] - depth[a]);
         for (const k of order) {
           const ids = [triangles[3 * k], triangles[3 * k + 1], triangles[3 * k + 2]];
-          ink.fillStyle = ink.strokeStyle = of(...ids);
+          ink.fillStyle = values ? of(...ids) : face;
+          ink.strokeStyle = values ? ink.fillStyle : edge;
           ink.beginPath();
           ids.forEach((i, j) => (j ? ink.lineTo(flat[3 * i], flat[3 * i + 1]) : ink.moveTo(flat[3 * i], flat[3 * i + 1])));
           ink.closePath();
