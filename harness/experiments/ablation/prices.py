@@ -4,7 +4,8 @@
 
 The plain scene has springs, gravity, drag by velocity filters, and pins. Both scenes go step by step in turns, each to
 the tolerance that is asked for, so that a drift of the machine meets both alike. Rounds end once the price is known to
-CLOSE, or after as many as are allowed; a round ends after ENOUGH, so that the slowest solvers take minutes as well.
+CLOSE, or after as many as are allowed. A round that has taken ENOUGH ends with the next step that counts, and then LEAST
+rounds will do, so that the slowest solvers take minutes as well.
 
 No iteration reads the effect's own numbers sooner than a dot product does, nor multiplies and adds them up sooner than
 a product of matrices does: the longer one is the bound beside each price. Of an element that couples k vertices 12 k
@@ -38,7 +39,7 @@ CLOSE, LEAST = 0.03, 3
 WARM = 2
 """Steps before those that count."""
 ENOUGH = 2.0
-"""Seconds of CPU time, of both scenes' counted steps, after which a round has no more steps."""
+"""Seconds of CPU time, of both scenes' steps, after which a round has no more steps but one that counts."""
 _READS = 20
 _SIDE = 256
 """Of matrices whose product tells how many flops a second there are at the most."""
@@ -58,18 +59,21 @@ class Price(NamedTuple):
 
 @dataclass(eq=False)
 class _Run:
-    """A scene on its way by one solver: seconds of its steps, and its iterations."""
+    """A scene on its way by one solver: seconds of the steps that count, and their iterations; spent: of all [s]."""
 
     steps: Iterator[Step]
     seconds: float = 0.0
     iterations: int = 0
+    spent: float = 0.0
 
     def step(self, *, counts: bool) -> None:
         """One step more."""
         began = thread_time()
         done = next(self.steps)
+        took = thread_time() - began
+        self.spent += took
         if counts:
-            self.seconds += thread_time() - began
+            self.seconds += took
             self.iterations += done.solution.iterations
 
     @property
@@ -113,14 +117,17 @@ def price(scene: SceneSpec, size: int, effect: str, solver: Solver, stop: Stop, 
             _Run(iter(simulate(one, prepared, stop, first_guess="current", frames=WARM + frames)))
             for one, prepared in zip(made, ready, strict=True)
         ]
+        enough = False
         for k in range(WARM + frames):
+            last = enough
             for run in runs[:: 1 if len(pairs) % 2 else -1]:
-                run.step(counts=k >= WARM)
-            if sum(run.seconds for run in runs) > ENOUGH:
+                run.step(counts=last or k >= WARM)
+            enough = sum(run.spent for run in runs) > ENOUGH
+            if last or (enough and k >= WARM):
                 break
         pairs.append((runs[0].each, runs[1].each))
         found = ratio(*np.array(pairs).T)
-        if len(pairs) >= LEAST and found.high - found.low <= CLOSE * found.middle:
+        if len(pairs) >= LEAST and (enough or found.high - found.low <= CLOSE * found.middle):
             break
     each, plain = np.array(pairs).min(axis=0)
     return Price(effect, found, float(each), 1.0 + _least(made[0]) / plain, len(pairs))
