@@ -22,20 +22,20 @@ class Around(NamedTuple):
     """Elements by the rows of their vertices, and each of them once.
 
     first (rows + 1,): the first entry of each row; element, own: of each entry, and the row's coefficient in it;
-    places, weights (entries, k - 1): where the other vertices' rows begin, and their coefficients; told (entries, q):
-    what phi reads, so that what a row needs lies together; block (rows, 6), pull (rows, 3): where phi'' is constant, of
-    each row its sum and the gradient that was felt last; rows, coefficients (m, k), numbers (m, q): of the elements.
+    places, weights (entries, k - 1): where the other vertices' rows begin, and their coefficients; block (rows, 6),
+    pull (rows, 3): where phi'' is constant, of each row its sum and the gradient that was felt last; rows, coefficients
+    (m, k), numbers (m, q): of the elements, with what phi reads. Indices are
+    unsigned: no code has to ask whether they count from the end.
     """
 
-    first: NDArray[np.int64]
-    element: NDArray[np.int64]
+    first: NDArray[np.uint32]
+    element: NDArray[np.uint32]
     own: NDArray[np.float64]
-    places: NDArray[np.int64]
+    places: NDArray[np.uint32]
     weights: NDArray[np.float64]
-    told: NDArray[np.float64]
     block: NDArray[np.float64]
     pull: NDArray[np.float64]
-    rows: NDArray[np.int64]
+    rows: NDArray[np.uint32]
     coefficients: NDArray[np.float64]
     numbers: NDArray[np.float64]
 
@@ -52,9 +52,10 @@ class Around(NamedTuple):
         element, slot = element[order], slot[order]
         others = (slot[:, None] + np.arange(1, width)) % width
         none, c = np.empty((0, 0)), elements.coefficients
-        first = np.concatenate([[0], np.cumsum(np.bincount(at[element, slot], minlength=rows))])
-        places, weights = 4 * at[element[:, None], others], c[element[:, None], others]
-        made = cls(first, element, c[element, slot], places, weights, none, none, none, at, c, none)
+        first = np.concatenate([[0], np.cumsum(np.bincount(at[element, slot], minlength=rows))]).astype(np.uint32)
+        places, weights = (4 * at[element[:, None], others]).astype(np.uint32), c[element[:, None], others]
+        own, element = c[element, slot], element.astype(np.uint32)
+        made = cls(first, element, own, places, weights, none, none, at.astype(np.uint32), c, none)
         return made.with_numbers(law, elements)
 
     def with_numbers(self, law: Law, elements: Elements) -> Around:
@@ -66,7 +67,7 @@ class Around(NamedTuple):
             law.curve(elements, np.zeros((int(elements.vertices.max(initial=-1)) + 1, 3)), curvature)
             _add_up(self.first, self.element, self.own, curvature, block)
         numbers = np.ascontiguousarray(elements.numbers)
-        return self._replace(told=numbers[self.element], block=block, pull=np.zeros((rows, 3)), numbers=numbers)
+        return self._replace(block=block, pull=np.zeros((rows, 3)), numbers=numbers)
 
 
 @kernel
@@ -150,8 +151,8 @@ class Vertices(NamedTuple):
             xx, xy, xz, yy, yz, zz = block
             for entry in range(around.first[i], around.first[i + 1]):
                 z0, z1, z2 = seen(around, entry, i, p)
-                f0, f1, f2 = gradients(around.told, entry, z0, z1, z2)
-                h0, h1, h2, h3, h4, h5 = curvature(around.told, entry, z0, z1, z2)
+                f0, f1, f2 = gradients(around.numbers, around.element[entry], z0, z1, z2)
+                h0, h1, h2, h3, h4, h5 = curvature(around.numbers, around.element[entry], z0, z1, z2)
                 c = around.own[entry]
                 g0, g1, g2, c2 = g0 + c * f0, g1 + c * f1, g2 + c * f2, c * c
                 xx, xy, xz, yy, yz, zz = (
@@ -165,7 +166,7 @@ class Vertices(NamedTuple):
             for entry in range(around.first[i], around.first[i + 1]):
                 z0, z1, z2 = seen(around, entry, i, p)
                 c = around.own[entry]
-                energy += rise(around.told, entry, z0, z1, z2, c * d[0], c * d[1], c * d[2])
+                energy += rise(around.numbers, around.element[entry], z0, z1, z2, c * d[0], c * d[1], c * d[2])
             return energy
 
         @inlined_closure
@@ -173,7 +174,7 @@ class Vertices(NamedTuple):
             g0 = g1 = g2 = 0.0
             for entry in range(around.first[i], around.first[i + 1]):
                 z0, z1, z2 = seen(around, entry, i, p)
-                f0, f1, f2 = gradients(around.told, entry, z0, z1, z2)
+                f0, f1, f2 = gradients(around.numbers, around.element[entry], z0, z1, z2)
                 c = around.own[entry]
                 g0, g1, g2 = g0 + c * f0, g1 + c * f1, g2 + c * f2
             around.pull[i, 0], around.pull[i, 1], around.pull[i, 2] = g0, g1, g2

@@ -4,8 +4,8 @@
 
 The plain scene has springs, gravity, drag by velocity filters, and pins. Both scenes go step by step in turns, each to
 the tolerance that is asked for, so that a drift of the machine meets both alike. Rounds end once the price is known to
-CLOSE, or after as many as are allowed. A round that has taken ENOUGH ends with the next step that counts, and then LEAST
-rounds will do, so that the slowest solvers take minutes as well.
+CLOSE, or after as many as are allowed. A round that has taken ENOUGH ends with the next step that counts, and then
+LEAST rounds will do, so that the slowest solvers take minutes as well.
 
 No iteration reads the effect's own numbers sooner than a dot product does, nor multiplies and adds them up sooner than
 a product of matrices does: the longer one is the bound beside each price. Of an element that couples k vertices 12 k
