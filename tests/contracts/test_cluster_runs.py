@@ -54,7 +54,13 @@ MANY, EVERY = 200, 10.0
 TIMES = {"started", "seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted", *MACHINE}
 """Columns that differ from run to run."""
 
-TELL = "import os; [open({told!r}, 'a').write(f'{{os.getpid()}} {{stop.iterations}}\\n')]"
+SOLVE = 0.03
+"""Seconds that a solve takes at least: six of them make a run, so that all last through several kills."""
+
+TELL = (
+    "import os, time; [open({told!r}, 'a').write(f'{{os.getpid()}} {{stop.iterations}}\\n')]; "
+    f"until = time.perf_counter() + {SOLVE}; any(time.perf_counter() > until for _ in iter(int, 1))"
+)
 """A solver that tells which process does which run: each has its own number of iterations."""
 
 
