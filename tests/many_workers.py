@@ -54,7 +54,8 @@ QUIET = {"distributed.worker.profile.enabled": False, "distributed.admin.system-
 
 
 class Bears(NamedTuple):
-    """What a process took: MiB at most, seconds of CPU, and messages that came, as (number, bytes)."""
+    """What a process took: MiB at most, seconds of CPU, and messages that came, and bytes that came
+    and went."""
 
     peak: float
     cpu: float
@@ -79,29 +80,39 @@ _code = cache(code)
 def scheduler(pipe: Connection) -> None:
     """Be the scheduler until the pipe ends, and count the messages that come."""
     from distributed import Scheduler
-    from distributed.comm.tcp import TCP
+    from distributed.comm import tcp
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
 
-    counted, read = [0], TCP.read
+    messages, moved = 0, 0
+    read, write, read_bytes = tcp.TCP.read, tcp.TCP.write, tcp.read_bytes_rw
 
-    async def counting(self: TCP, deserializers: Any = None) -> Any:
+    async def counting(self: tcp.TCP, deserializers: Any = None) -> Any:
+        nonlocal messages
         found = await read(self, deserializers)
-        counted[0] += len(found) if isinstance(found, tuple | list) else 1
+        messages += len(found) if isinstance(found, tuple | list) else 1
         return found
+
+    async def sending(self: tcp.TCP, *args: Any, **options: Any) -> int:
+        nonlocal moved
+        sent = await write(self, *args, **options)
+        moved += sent
+        return sent
+
+    async def receiving(stream: Any, n: int) -> Any:
+        nonlocal moved
+        moved += n
+        return await read_bytes(stream, n)
 
     async def serve() -> None:
         async with Scheduler(host="127.0.0.1", port=0, dashboard=False) as served:
             pipe.send(served.address)
             await _ended(pipe)
 
-    TCP.read = counting  # type: ignore[method-assign]
-    before = psutil.Process().io_counters()
+    tcp.TCP.read, tcp.TCP.write, tcp.read_bytes_rw = counting, sending, receiving  # type: ignore[method-assign]
     with suppress(Exception):  # workers that leave in the same second
         asyncio.run(serve())
-    after = psutil.Process().io_counters()
-    bytes_moved = after.read_chars + after.write_chars - before.read_chars - before.write_chars
-    pipe.send(_bears((counted[0], bytes_moved)))
+    pipe.send(_bears((messages, moved)))
 
 
 def workers(pipe: Connection, address: str, count: int) -> None:
