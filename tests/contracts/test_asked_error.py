@@ -152,6 +152,12 @@ def test_growth_tells_a_motion_that_can_be_known_from_one_that_cannot():
         foresee(cloth, wild.least / 10, lambda line: None)
 
 
+def test_an_error_below_round_off_is_refused_with_the_one_that_can_be_had():
+    pendulum = Asked.of(load_scene(SCENES / "single-spring.yaml"), 2, 1.0)
+    with pytest.raises(RunFailed, match=r"nobody can know the motion to 1e-14 there; it can be known to \de-1[0-2],"):
+        foresee(pendulum, 1e-14, lambda line: None)
+
+
 def test_the_pattern_of_the_jacobian_holds_all_that_differs_from_zero():
     scene = build(chain(Springs(stretch=40.0), Dashpots(stretch=1.0), Gravity(), HELD), 5, "newmark")
     field = Field(scene)
