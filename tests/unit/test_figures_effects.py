@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from harness.experiments.ablation.ablation_rows import SCHEMA
+from harness.report.ablation import read
 from harness.report.figures.asked import Asked
 from harness.report.figures.canvas import INCH, texts
 from harness.report.figures.faults import faults
@@ -62,3 +63,13 @@ def test_all_solvers_fit_a_page(tmp_path: Path, width: float) -> None:
     assert faults(figure) == []
     assert {cell.column for cell in grid.cells} == set(SOLVERS)
     assert len(figure.axes[0].texts) == (len(grid.cells) if width > 100 else 0), "figures, where they fit"
+
+
+def test_a_solver_of_two_settings_has_a_column_for_each(tmp_path: Path) -> None:
+    folder = priced(tmp_path, ["newton", "numba"], "", {})
+    table = read(folder / "ablation" / "cloth.parquet")
+    graded = [row | {"parameters": '{"indefinite": "graded"}', "price": 9.0} for row in table[:4]]
+    made.write(folder / "ablation" / "other.parquet", graded, SCHEMA)
+    figure, (grid,) = composed("prices", folder, Asked())
+    assert {cell.column for cell in grid.cells} == {"newton", "newton, indefinite graded", "numba"}
+    assert faults(figure) == []

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +31,8 @@ _CLASSES = (
     (np.inf, "above 3", "#0f3f70"),
 )
 """Up to which price, in words, in which colour."""
-_REFUSED = "#bcb8b0"
+_REFUSED, _BROKEN = "#bcb8b0", "#dd8f88"
+"""Colours of what a solver does not support, and of what ended in any other way without a price."""
 _READ = (
     "CPU time of an iteration with the effect over one without, the median over rounds; of those whose interval of "
     "95 % holds 1 nothing can be told."
@@ -88,17 +91,29 @@ def _effect(k: int, row: Row, whole: float, *, older: bool) -> Series:
 
 def prices(folder: Path) -> list[Entry]:
     """What each effect adds to an iteration: a map of all solvers, and for each a panel with intervals."""
-    found = [row for _, table in _ablations(folder, "price") for row in ablation.of_kind(table, "price")]
-    marked = looks((row["solver"], row["solver"]) for row in found)
+    found = _labelled([row for _, table in _ablations(folder, "price") for row in ablation.of_kind(table, "price")])
+    marked = looks((row["label"], row["solver"]) for row in found)
     panels: list[Panel] = []
     for scene in dict.fromkeys((row["scene"], row["size"]) for row in found):
         here = [row for row in found if (row["scene"], row["size"]) == scene]
         of, subject = (scene[0], str(scene[1])), f"{scene[0]}, size {scene[1]}"
         panels.append(_map(of, subject, here))
-        for solver in dict.fromkeys(row["solver"] for row in here):
-            mine = [row for row in here if row["solver"] == solver and row["status"] == "ok"]
-            panels += [_intervals(of, subject, marked[solver], mine)] if mine else []
+        for label in dict.fromkeys(row["label"] for row in here):
+            mine = [row for row in here if row["label"] == label and row["status"] == "ok"]
+            panels += [_intervals(of, subject, marked[label], mine)] if mine else []
     return ready(panels)
+
+
+def _labelled(rows: Sequence[Row]) -> list[Row]:
+    """Rows with their solver's name as a `label`, and with its parameters where it was measured with several."""
+    settings: dict[str, set[str]] = {row["solver"]: set() for row in rows}
+    for row in rows:
+        settings[row["solver"]].add(row["parameters"] or "{}")
+    labels: list[str] = []
+    for row in rows:
+        stated: dict[str, Any] = json.loads(row["parameters"] or "{}") if len(settings[row["solver"]]) > 1 else {}
+        labels.append(", ".join([row["solver"], *(f"{name} {value}" for name, value in stated.items())]))
+    return [{**row, "label": label} for row, label in zip(rows, labels, strict=True)]
 
 
 def _other(row: Row) -> bool:
@@ -112,31 +127,39 @@ def _map(of: tuple[str, ...], subject: str, here: Sequence[Row]) -> CellMap:
     order = sorted(paid, key=lambda name: (name == _ALL, -median(paid[name] or [0.0])))
     cells = [_cell(row) for row in sorted(here, key=lambda row: order.index(row["name"]))]
     refused = dict.fromkeys(row["status"] for row in here if row["status"] != "ok")
-    classes = [_NOTHING, *((words, color) for _, words, color in _CLASSES), *((words, _REFUSED) for words in refused)]
+    classes = [
+        _NOTHING,
+        *((words, color) for _, words, color in _CLASSES),
+        *((words, _unpriced(words)) for words in refused),
+    ]
     return CellMap(of, ("map",), subject, "", cells, classes, [_READ, *dotted(cells)], measured_on(here))
 
 
 def _cell(row: Row) -> Cell:
-    at = row["name"], row["solver"]
+    at = row["name"], row["label"]
     if row["status"] != "ok":
-        return Cell(*at, row["status"], _REFUSED, "–", _other(row))
+        return Cell(*at, row["status"], _unpriced(row["status"]), "–", _other(row))
     price = row["price"]
     class_ = next((words, color) for most, words, color in _CLASSES if price <= most)
     told = _NOTHING if row["price_low"] <= 1.0 <= row["price_high"] else class_
     return Cell(*at, *told, f"{price:.2f}" if price < 9.995 else f"{price:.0f}", _other(row))
 
 
+def _unpriced(status: str) -> str:
+    return _REFUSED if status == "unsupported" else _BROKEN
+
+
 def _intervals(of: tuple[str, ...], subject: str, look: Mark, rows: Sequence[Row]) -> Plot:
     """A solver's prices with their intervals, the dearest effect first."""
-    mine, solver = sorted(rows, key=lambda row: -row["price"]), rows[0]["solver"]
+    mine, label = sorted(rows, key=lambda row: -row["price"]), rows[0]["label"]
     older = np.array([_other(row) for row in mine])
     x, low, high = (np.array([row[key] for row in mine], float) for key in ("price", "price_low", "price_high"))
     y, names = np.arange(len(mine), dtype=float), tuple(row["name"] for row in mine)
     return Plot(
-        *(of, (solver,), subject, solver),
+        *(of, (label,), subject, label),
         Scale("an iteration with the effect over one without", "log", "plain"),
         Scale("", "names", names=names),
-        [Series(solver, look, x, y, low, high, True, older, joined=False)],
+        [Series(label, look, x, y, low, high, True, older, joined=False)],
         notes=[OLDER] if older.any() else [],
         machine=measured_on(mine),
     )
