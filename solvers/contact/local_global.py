@@ -44,6 +44,10 @@ class Idle(Prepared, Protocol):
         """See Iterative."""
         ...
 
+    def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
+        """See Iterative."""
+        ...
+
 
 def local_global(solver: Solver, system: System) -> PreparedContact:
     """A local-global method with contact; raises what the solver raises for the system without it."""
@@ -206,14 +210,16 @@ class PreparedContact(Iterative):
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """See Iterative; it takes no iteration where something is touched."""
-        return self.gauge(problem)(p) if touching(problem) else self.idle.residual_at(problem, p)
+        return self.gauge(problem)(p)
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Those of the method while nothing is touched; with contact an iteration has no parts that stand alone."""
         return {} if touching(problem) else self.idle.phases(problem)
 
     def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
-        """What tells the residual [J^(1/2)] at positions (n, 3)."""
+        """See Iterative."""
+        if not touching(problem):
+            return self.idle.gauge(problem)
         step = StepObjective(self.objective, problem)
         return lambda p: self.corrections.residual(self.corrections.plain(step.gradient(p)))
 

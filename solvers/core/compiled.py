@@ -25,7 +25,7 @@ from solvers.energies.springs import Springs
 from solvers.kernels import springs as kernels
 from solvers.kernels import step, step_ends
 from solvers.kernels.edges import Edges
-from solvers.kernels.loop import ONE, Limits
+from solvers.kernels.loop import ONE, Limits, at_most
 from solvers.kernels.plan import Order, of_inverse, of_supernodal, vectors
 from solvers.linear.inverse import Inverse
 from solvers.linear.supernodal import Supernodal
@@ -190,6 +190,11 @@ class PreparedCompiled(Iterative):
         """See Iterative."""
         return _Iterating(self if largest(problem) <= self.reach else self.corrected, problem, guess)
 
+    def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
+        """See Iterative; what the step's energies are is asked once."""
+        made = self if largest(problem) <= self.reach else self.corrected
+        return _Iterating(made, problem, problem.current).residual_from
+
     def scale(self, problem: StepProblem) -> float:
         """See Iterative."""
         return largest(problem) * self.base.trace**0.5
@@ -260,6 +265,11 @@ class _Iterating(Iterating):
         answer = step_ends.solve(*fixed, limits, made.threads(), made.team, self.positions)
         self._arrays[-1] = self.positions  # where the next ones go on
         return answer
+
+    def residual_from(self, p: Positions) -> float:
+        """|p - LG(p)|_Q of positions p (n, 3), by one iteration from there."""
+        self._arrays[-1] = p if p.flags.carray else np.array(p, np.float64, order="C")
+        return self.iterate(at_most(1))[1]
 
     def advance(self) -> bool:
         """See Iterating."""

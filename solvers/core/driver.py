@@ -130,6 +130,10 @@ class Iterative(ABC):
             return float("nan")
         return self.begin(problem, p).iterate(at_most(int(self.residual_of == "previous")))[1]
 
+    def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
+        """What tells `residual_at` of many positions of one step."""
+        return lambda p: self.residual_at(problem, p)
+
     def scale(self, problem: StepProblem) -> float:
         """The residual [J^(1/2)] that a mean displacement of the first guess's largest coordinate would cause: a small
         part of it is where round-off begins to be looked for, and 0 where it never is."""

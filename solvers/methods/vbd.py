@@ -20,9 +20,8 @@ again at w_1. With these restarts rho needs no tuning: too large a one is no wor
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,9 +39,12 @@ from solvers.kernels.loop import EACH, ITERATIONS, LAST, Limits
 from solvers.kernels.springs import Bundles
 from solvers.memory import aligned
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Positions, Prepared, StepProblem, System, Unsupported
+from solvers.problem import Positions, StepProblem, System, Unsupported
 from solvers.vectors.springs import LANES
 from solvers.vectors.vbd import NUMBERS
+
+if TYPE_CHECKING:
+    from solvers.contact.local_global import Idle
 
 _FAR = 1e100
 """Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
@@ -85,7 +87,7 @@ class VertexBlockDescent:
                 "neighbours its vertices are nor a bound of the second derivatives: a vertex's step needs both, to go "
                 "while its neighbours rest and to fall back on what cannot rise"
             )
-        measure = CompiledLocalGlobal().prepare(system)
+        measure = cast("Idle", CompiledLocalGlobal().prepare(system))
         coloured = colouring.of_vertices(np.concatenate([parts.whole.edges, beside.pairs()]), n)
         colour = np.empty(n, np.int64)
         colour[coloured.order] = np.repeat(np.arange(coloured.colours), np.diff(coloured.start))
@@ -130,7 +132,7 @@ class PreparedVertexBlockDescent(Iterative):
     row: NDArray[np.int64]
     held: NDArray[np.float64]
     trace: float
-    measure: Prepared
+    measure: Idle
     choice: str
 
     @property
@@ -144,16 +146,7 @@ class PreparedVertexBlockDescent(Iterative):
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """See Iterative; by an iteration of local-global, where nothing is touched."""
-        return self.gauge(problem, touching(problem))(p)
-
-    def gauge(self, problem: StepProblem, contacts: list[ContactEnergy]) -> Callable[[Positions], float]:
-        """What tells the residual [J^(1/2)] at positions (n, 3)."""
-        if contacts:
-            from solvers.contact.local_global import PreparedContact
-
-            assert isinstance(self.measure, PreparedContact)
-            return self.measure.gauge(problem)
-        return lambda p: self.measure.residual_at(problem, p)
+        return self.measure.gauge(problem)(p)
 
     def scale(self, problem: StepProblem) -> float:
         """See Iterative."""
@@ -176,7 +169,7 @@ class _Iterating(Iterating):
     def __init__(self, prepared: PreparedVertexBlockDescent, problem: StepProblem, guess: Positions) -> None:
         contacts, blocks = touching(problem), prepared.blocks
         self._beside = prepared.beside.begun(problem)
-        self._prepared, self._gauge = prepared, prepared.gauge(problem, contacts)
+        self._prepared, self._gauge = prepared, prepared.measure.gauge(problem)
         pull = vertex_terms.pull(replace(problem, force=prepared.parts.force(problem)))
         p, y = (prepared.in_rows(x) for x in (vertex_terms.placed(guess, problem), pull))
         self._right = blocks.bundles.right(prepared.held, y)

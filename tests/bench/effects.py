@@ -44,10 +44,9 @@ GATES = {
     "hybrid": (1.5, 2.5, 3.0, 1.3, 6.0),
     "newton-cg": (1.5, 2.5, 3.0, 1.3, 6.0),
     "lbfgs": (1.5, 2.5, 3.0, 1.3, 5.5),
-    "vbd": (2.0, 6.0, 4.0, 1.5, 30.0),
+    "vbd": (1.5, 4.0, 3.0, 1.5, 10.0),
 }
-"""What no price may reach, with room above what `results/README.md` has; those of vbd that it does not have, above what
-was measured before vbd took strain limits and dashpots."""
+"""What no price may reach, with room above what `results/README.md` has."""
 
 
 def main() -> None:
