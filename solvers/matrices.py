@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from solvers.problem import Energy, LaggedEnergy, NotPositiveDefinite, ProjectiveEnergy, Start, System
+from solvers.problem import Energy, NotPositiveDefinite, ProjectiveEnergy, Start, System, is_lagged
 
 Dense = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ def shares(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[sci
     nowhere = np.zeros((system.vertices, 3))
     start = Start(nowhere, nowhere, 0.0, nowhere, system.rate, 0.0)
     for energy in energies:
-        begun: Energy = energy.begin_step(start) if isinstance(energy, LaggedEnergy) else energy
+        begun: Energy = energy.begin_step(start) if is_lagged(energy) else energy
         if isinstance(begun, ProjectiveEnergy):
             yield begun.stiffness_matrix(system.vertices)
 

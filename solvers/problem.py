@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, Literal, Protocol, runtime_checkable
+from typing import ClassVar, Literal, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 import scipy
@@ -38,15 +38,12 @@ class Energy(Protocol):
 
     def value(self, p: Positions) -> float:
         """The energy [J] at p, shape (n, 3)."""
-        ...
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N], shape (n, 3), to `out`."""
-        ...
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """The Hessian [N/m], shape (3n, 3n), the coordinates of a vertex side by side."""
-        ...
 
 
 @runtime_checkable
@@ -55,11 +52,9 @@ class ProjectiveEnergy(Energy, Protocol):
 
     def stiffness_matrix(self, n: int) -> scipy.sparse.csr_array:
         """The energy's share A'KA [N/m] of the system matrix, shape (n, n)."""
-        ...
 
     def add_projection(self, p: Positions, out: Positions) -> None:
         """Add A'K d(p) [N], shape (n, 3), its share of the right-hand side, to `out`."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,14 +151,17 @@ class Start:
         return self.rate * (x - self.origin)
 
 
-@runtime_checkable
 class LaggedEnergy(Energy, Protocol):
     """An energy that depends on where the step starts: damping, friction, obstacles that move. Of that, the stiffness
     of a projective one may depend on the rate alone, for Q is made once."""
 
     def begin_step(self, start: Start) -> Energy:
         """The energy of this one step."""
-        ...
+
+
+def is_lagged(energy: Energy) -> TypeGuard[LaggedEnergy]:
+    """Whether it does; to ask the protocol itself takes a hundredth of a small step."""
+    return hasattr(energy, "begin_step")
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +185,7 @@ class StepProblem:
     @cached_property
     def energies(self) -> tuple[Energy, ...]:
         """The system's energies, as they are in this step, in their order."""
-        return tuple(e.begin_step(self.start) if isinstance(e, LaggedEnergy) else e for e in self.system.energies)
+        return tuple(e.begin_step(self.start) if is_lagged(e) else e for e in self.system.energies)
 
     def terms(self, p: Positions) -> dict[str, float]:
         """The terms [J] of the objective at p by name: inertia, force, pins, and energies by their class."""
@@ -261,28 +259,22 @@ class Prepared(Protocol):
     @property
     def choice(self) -> str:
         """What the solver chose by itself, and why, in words; empty where it had nothing to choose."""
-        ...
 
     @property
     def facts(self) -> dict[str, float]:
         """Exact counts of what was built, by name (for example `nnz_system`, `nnz_factor`)."""
-        ...
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """The iterates, one more each time it is asked; a yielded array may be reused (copy to keep)."""
-        ...
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """The same iterates on the fast path, up to where `stop` ends them."""
-        ...
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """|Q^-1 grad g|_Q [J^(1/2)] at p (n, 3) [m], which may take an iteration; nan where none is known."""
-        ...
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """The parts of an iteration by name, if any; each returns the array (or what else) that it has computed."""
-        ...
 
 
 class Solver(Protocol):
@@ -297,4 +289,3 @@ class Solver(Protocol):
 
     def prepare(self, system: System) -> Prepared:
         """Raises Unsupported, before any work, for what the method cannot do, and NotPositiveDefinite."""
-        ...

@@ -21,7 +21,7 @@ from harness.simulation.step import start
 from solvers.compiling import kernel
 from solvers.contact.touching import without_contact
 from solvers.energies.springs import TINY, Springs
-from solvers.problem import LaggedEnergy, Positions, Start
+from solvers.problem import Positions, Start, is_lagged
 
 Reals = NDArray[np.float64]
 State = Reals
@@ -82,7 +82,7 @@ class Field:
             rate = self._system.rate
             here = Start(p, v, t, p - v / rate, rate, t)
             for energy in self._others:
-                (energy.begin_step(here) if isinstance(energy, LaggedEnergy) else energy).add_gradient(p, push)
+                (energy.begin_step(here) if is_lagged(energy) else energy).add_gradient(p, push)
         for force in self._scene.forces:
             push -= force(p, v, t)
         out = np.empty_like(y).reshape(2, -1, 3)

@@ -19,7 +19,7 @@ from solvers.energies.elements import Elements, Law
 from solvers.energies.springs import Springs
 from solvers.kernels import objective
 from solvers.kernels.forms import Form
-from solvers.problem import Energy, LaggedEnergy, ProjectiveEnergy, System
+from solvers.problem import Energy, ProjectiveEnergy, System, is_lagged
 
 
 class Stated(NamedTuple):
@@ -62,7 +62,7 @@ class Objective:
             n = self.system.vertices
             shares = matrices.shares(self.system, quadratic.values())
             self.form = Form.of(reduce(lambda total, share: total + share, shares, csr_array((n, n))))
-        self.moving = [k for k, e in quadratic.items() if isinstance(e, LaggedEnergy) or e.d.any()]
+        self.moving = [k for k, e in quadratic.items() if is_lagged(e) or e.d.any()]
         rest = {k: e for k, e in others.items() if k not in quadratic}
         self.stated = [k for k, e in rest.items() if hasattr(e, "law")]
         self.own = [k for k in rest if k not in self.stated]

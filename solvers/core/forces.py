@@ -17,7 +17,7 @@ from solvers.kernels.forms import Form
 from solvers.kernels.loop import ITERATIONS, Limits
 from solvers.kernels.springs import Bundles
 from solvers.memory import aligned
-from solvers.problem import LaggedEnergy, Positions, System, Unsupported
+from solvers.problem import Positions, System, Unsupported, is_lagged
 
 _ABOVE = 1.02
 """Of the largest eigenvalue as it is found, which is from below: to one percent."""
@@ -26,7 +26,7 @@ _ABOVE = 1.02
 def frequency(system: System) -> float:
     """A bound of the largest angular frequency [rad/s] of springs and constant quadratic forms, all pins held."""
     free = np.flatnonzero(system.unpinned)
-    constant = [e for e in system.energies if isinstance(e, (Springs, Quadratic)) and not isinstance(e, LaggedEnergy)]
+    constant = [e for e in system.energies if isinstance(e, (Springs, Quadratic)) and not is_lagged(e)]
     if not len(free) or not constant:
         return 0.0
     n = system.vertices
@@ -67,7 +67,7 @@ class Parts:
         for energy in system.energies:
             if isinstance(energy, Viscous) and (np.diff(energy.A.indptr) == 1).all():
                 drag += energy.A.power(2).T @ energy.weight
-            elif isinstance(energy, Quadratic) and not isinstance(energy, LaggedEnergy):
+            elif isinstance(energy, Quadratic) and not is_lagged(energy):
                 L = csr_array(L + energy.stiffness_matrix(n))
                 energy.add_projection(load, load)
             elif not isinstance(energy, Springs):

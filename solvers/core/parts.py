@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 
 from solvers import matrices
 from solvers.energies.springs import Springs
-from solvers.problem import Energy, LaggedEnergy, Positions, Start, StepProblem, System
+from solvers.problem import Energy, Positions, Start, StepProblem, System, is_lagged
 
 if TYPE_CHECKING:
     from solvers.energies.dashpots import Dashpots
@@ -124,7 +124,7 @@ def split(system: System) -> Parts:
         whole,
         pairs,
         form.held,
-        tuple(form.begin_step if isinstance(form, LaggedEnergy) else _steady(form) for form in forms),
+        tuple(form.begin_step if is_lagged(form) else _steady(form) for form in forms),
         limits,
         dashpots,
         unknown,

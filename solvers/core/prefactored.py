@@ -17,13 +17,13 @@ from solvers.energies.springs import Springs
 from solvers.linear.factors import DenseCholesky, Factor
 from solvers.problem import (
     Energy,
-    LaggedEnergy,
     Positions,
     ProjectiveEnergy,
     ResidualOf,
     StepProblem,
     System,
     Unsupported,
+    is_lagged,
 )
 
 Project = Callable[[Positions, Positions, Positions], None]
@@ -188,7 +188,7 @@ def prepared(
     exact = system.pins.vertices[system.pins.exact]
     inner = rows if len(free) == system.vertices else csr_array(rows[:, free])
     factor, choice = factorise(inner) if len(free) else (DenseCholesky(np.eye(0)), "nothing to solve for")
-    lagged = any(isinstance(energy, LaggedEnergy) for energy in energies)
+    lagged = any(is_lagged(energy) for energy in energies)
     return PreparedLocalGlobal(
         system,
         _projection(energies),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from solvers import matrices
 from solvers.energies.elements import Elements, Law
 from solvers.kernels import vbd as plain
-from solvers.problem import LaggedEnergy, ProjectiveEnergy, StepProblem, System
+from solvers.problem import ProjectiveEnergy, StepProblem, System, is_lagged
 
 if TYPE_CHECKING:
     from solvers.kernels.stencils import Around
@@ -71,7 +71,7 @@ class Beside:
 
     def begun(self, problem: StepProblem) -> tuple[Around, ...] | None:
         """The elements by rows as they are in a step, None without any."""
-        if not any(isinstance(energy, LaggedEnergy) for energy in self.energies):
+        if not any(is_lagged(energy) for energy in self.energies):
             return self.around or None
         joined = self._joined([problem.energies[k] for k in self.numbers])
         return tuple(

@@ -30,13 +30,13 @@ from solvers.core.objective import StepObjective
 from solvers.energies.quadratic import Viscous
 from solvers.methods.rosenbrock_tables import RODAS, ROS2, ROS3P, Rosenbrock
 from solvers.problem import (
-    LaggedEnergy,
     NotPositiveDefinite,
     Positions,
     ResidualOf,
     StepProblem,
     System,
     Unsupported,
+    is_lagged,
 )
 
 _CAUTION, _FEWEST, _LARGEST = 0.9, 0.2, 6.0
@@ -72,7 +72,7 @@ class _Linear:
         for energy in system.energies:
             if isinstance(energy, Viscous) and (np.diff(energy.A.indptr) == 1).all():
                 drag += energy.A.power(2).T @ energy.weight
-            elif isinstance(energy, LaggedEnergy) or is_bounded(energy):
+            elif is_lagged(energy) or is_bounded(energy):
                 raise Unsupported(
                     f"{self.name}: needs the exact derivatives of all forces, and knows energies of the positions "
                     f"alone and drag on vertices; the scene has {type(energy).__name__} as well"

@@ -10,7 +10,16 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-KERNELS = {"kept", "kernel", "inner", "inner_closure", "inner_in_parallel", "part", "register_jitable"}
+KERNELS = {
+    "kept",
+    "kernel",
+    "inner",
+    "inner_closure",
+    "inlined_closure",
+    "inner_in_parallel",
+    "part",
+    "register_jitable",
+}
 """What a compiled function is decorated with: ours, and Numba's for what is compiled within its caller."""
 GENERATES = {"typingctx", "context"}
 """The first parameter of an intrinsic, and of the function that generates its code; Numba gives both."""

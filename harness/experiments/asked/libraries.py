@@ -18,7 +18,7 @@ from scipy.sparse import block_array, csr_array, eye_array, kron
 from harness.base.errors import RunFailed
 from harness.reference.motion import State
 from harness.scenes.bind import Scene
-from solvers.problem import LaggedEnergy, Start
+from solvers.problem import Start, is_lagged
 
 _STEPS = 10**8
 """CVODE may take: the clock ends it."""
@@ -107,7 +107,7 @@ def pattern(scene: Scene) -> csr_array:
     system, p = scene.system, scene.mesh.rest
     begun = Start(p, np.zeros_like(p), 0.0, p, system.rate, 0.0)
     n = 3 * system.vertices
-    begins = (energy.begin_step(begun) if isinstance(energy, LaggedEnergy) else energy for energy in system.energies)
+    begins = (energy.begin_step(begun) if is_lagged(energy) else energy for energy in system.energies)
     all_of_them = sum((abs(energy.hessian(p)) for energy in begins), csr_array((n, n)))
     whole = kron(eye_array(system.vertices), np.ones((1, 3)))  # a vertex couples with all of its coordinates
     vertices = csr_array(csr_array(whole @ all_of_them @ whole.T)[system.free])[:, system.free]

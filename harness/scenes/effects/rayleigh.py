@@ -19,7 +19,7 @@ from harness.scenes.mesh.base import Mesh
 from solvers.energies.dashpots import RayleighDashpots
 from solvers.energies.quadratic import Quadratic, RayleighDamping
 from solvers.energies.springs import Springs
-from solvers.problem import Energy, LaggedEnergy
+from solvers.problem import Energy, is_lagged
 
 
 class Rayleigh(Model):
@@ -45,7 +45,7 @@ class Rayleigh(Model):
     def _of(self, energies: Sequence[Energy]) -> tuple[Energy, ...]:
         b = self.stiffness
         springs = [energy for energy in energies if isinstance(energy, Springs)]
-        constant = [e for e in energies if isinstance(e, Quadratic) and not isinstance(e, LaggedEnergy)]
+        constant = [e for e in energies if isinstance(e, Quadratic) and not is_lagged(e)]
         return (
             *(RayleighDashpots(s.edges, b * s.stiffness, s.rest_direction, np.zeros(len(s.edges))) for s in springs),
             *(RayleighDamping.of(energy.A, b * energy.weight) for energy in constant),

@@ -16,7 +16,7 @@ from harness.scenes.effects.base import Contribution, Pin
 from harness.simulation.opinion import vertices
 from harness.simulation.opinion.declared import Array, Opinion
 from harness.simulation.opinion.derivatives import EPS, ROUNDINGS, Told, wide
-from solvers.problem import Energy, LaggedEnergy, ProjectiveEnergy, Start
+from solvers.problem import Energy, ProjectiveEnergy, Start, is_lagged
 
 _TINY = 1e-100
 
@@ -46,7 +46,7 @@ def resistance(energies: Sequence[Energy], n: int, time_step: float) -> Array:
     zero, total = np.zeros((n, 3)), np.zeros(n)
     start = Start(zero, zero, 0.0, zero, 1.0 / time_step, 0.0)
     for energy in energies:
-        begun = energy.begin_step(start) if isinstance(energy, LaggedEnergy) else energy
+        begun = energy.begin_step(start) if is_lagged(energy) else energy
         if isinstance(begun, ProjectiveEnergy):
             total += begun.stiffness_matrix(n).diagonal()
     return total
