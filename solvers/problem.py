@@ -38,12 +38,15 @@ class Energy(Protocol):
 
     def value(self, p: Positions) -> float:
         """The energy [J] at p, shape (n, 3)."""
+        ...
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N], shape (n, 3), to `out`."""
+        ...
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """The Hessian [N/m], shape (3n, 3n), the coordinates of a vertex side by side."""
+        ...
 
 
 @runtime_checkable
@@ -52,9 +55,11 @@ class ProjectiveEnergy(Energy, Protocol):
 
     def stiffness_matrix(self, n: int) -> scipy.sparse.csr_array:
         """The energy's share A'KA [N/m] of the system matrix, shape (n, n)."""
+        ...
 
     def add_projection(self, p: Positions, out: Positions) -> None:
         """Add A'K d(p) [N], shape (n, 3), its share of the right-hand side, to `out`."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +162,7 @@ class LaggedEnergy(Energy, Protocol):
 
     def begin_step(self, start: Start) -> Energy:
         """The energy of this one step."""
+        ...
 
 
 def is_lagged(energy: Energy) -> TypeGuard[LaggedEnergy]:
@@ -240,9 +246,7 @@ class Solution:
     """Where a solve ended. positions: (n, 3) [m]; iterations: how many were done; residual: |Q^-1 grad g|_Q [J^(1/2)]
     over the unpinned vertices, by which the rule judged (nan for a method that does not minimise), of the iterate that
     residual_of names; yardstick: the same at the current positions (nan without a tolerance); stopped: "iterations",
-    "tolerance", "floor", or "stalled" where nothing descends any more; velocity: (n, 3) [m/s] at the end, of a method
-    that keeps its own.
-    """
+    "tolerance", "floor", or "stalled" where nothing descends any more; velocity: (n, 3) [m/s], of a method's own."""
 
     positions: Positions
     iterations: int
@@ -259,33 +263,37 @@ class Prepared(Protocol):
     @property
     def choice(self) -> str:
         """What the solver chose by itself, and why, in words; empty where it had nothing to choose."""
+        ...
 
     @property
     def facts(self) -> dict[str, float]:
         """Exact counts of what was built, by name (for example `nnz_system`, `nnz_factor`)."""
+        ...
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """The iterates, one more each time it is asked; a yielded array may be reused (copy to keep)."""
+        ...
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """The same iterates on the fast path, up to where `stop` ends them."""
+        ...
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """|Q^-1 grad g|_Q [J^(1/2)] at p (n, 3) [m], which may take an iteration; nan where none is known."""
+        ...
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """The parts of an iteration by name, if any; each returns the array (or what else) that it has computed."""
+        ...
 
 
 class Solver(Protocol):
-    """A frozen dataclass of a method's parameters.
-
-    minimises: whether its iterates tend to a minimum of the step's objective; others are graded on their trajectories.
-    descends: whether the objective rises in no iteration, round-off apart.
-    """
+    """A frozen dataclass of a method's parameters. minimises: whether its iterates tend to a minimum of the step's
+    objective; others are graded on their trajectories. descends: whether it rises in no iteration, round-off apart."""
 
     minimises: ClassVar[bool]
     descends: ClassVar[bool]
 
     def prepare(self, system: System) -> Prepared:
         """Raises Unsupported, before any work, for what the method cannot do, and NotPositiveDefinite."""
+        ...
