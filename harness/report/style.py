@@ -63,6 +63,8 @@ CORNERS: tuple[Any, ...] = ((3, 0, 45), (3, 0, -45), (3, 0, 135), (3, 0, -135))
 HOURGLASS: Any = ((-1, 1), (1, 1), (-1, -1), (1, -1), (-1, 1))
 BOWTIE: Any = ((-1, -1), (-1, 1), (1, -1), (1, 1), (-1, -1))
 """Two triangles that meet at their points, one above the other and side by side."""
+LOZENGE: Any = ((-1, 0), (0, 0.5), (1, 0), (0, -0.5), (-1, 0))
+"""A diamond that lies on its side."""
 _MARKERS: tuple[Any, ...] = (
     "s",
     "o",
@@ -83,6 +85,7 @@ _MARKERS: tuple[Any, ...] = (
     *CORNERS,
     HOURGLASS,
     BOWTIE,
+    LOZENGE,
 )
 
 # Okabe and Ito's palette, less its yellow and black, and five more: for families in the order of the registry.

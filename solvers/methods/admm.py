@@ -46,7 +46,7 @@ class Admm:
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = False
     about: ClassVar[About] = About(
-        "ADMM",
+        "accelerated local-global",
         Reference(
             "Overby, Matthew and Brown, George E. and Li, Jie and Narain, Rahul",
             2017,
