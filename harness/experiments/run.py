@@ -37,6 +37,7 @@ from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
 from harness.simulation import times
 from harness.simulation.algebraic import stop_rule
+from harness.simulation.clock import measured_again
 from harness.simulation.measure import Measured, Settings, digest, measure
 from harness.simulation.observe import observe, require_numbers
 from harness.simulation.step import prepare
@@ -84,13 +85,19 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
     settings = _settings(run)
     with _timed(run, tick) as how:
-        told = times.rows(measured := measure(scene, _solver(run), settings, tick))
+        measured, told = _measured(scene, _solver(run), settings, tick)
     with beside(tick):
         by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
     require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=isinstance(run.tolerance, float))
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
     facts |= {"choice": measured.prepared.choice} | standing(run) | how
     return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
+
+
+@measured_again
+def _measured(scene: Scene, solver: Solver, settings: Settings, tick: Tick) -> tuple[Measured, list[dict[str, Any]]]:
+    measured = measure(scene, solver, settings, tick)
+    return measured, times.rows(measured)
 
 
 def _to_error(run: RunSpec, error: float, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:

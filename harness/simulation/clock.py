@@ -13,14 +13,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import wraps
 from time import CLOCK_MONOTONIC_RAW, clock_gettime, perf_counter, process_time, thread_time
-from typing import Any, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
 from solvers.problem import Prepared, StepProblem
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 SHARE, LEAST, CALL = 0.03, 1e-3, 5e-6
 """The share of a wall time, and the seconds, by which two clocks may differ; seconds that reading them may take each
@@ -30,6 +34,23 @@ COLD = 1.5
 
 ITERATION_SHARE = 0.15
 """The share of an iteration's time by which that of its phases may differ before their rows say so."""
+
+
+class ClocksDisagree(RunFailed):
+    """Two clocks tell of different times."""
+
+
+def measured_again(measure: Callable[P, T]) -> Callable[P, T]:
+    """The same, done once more where its clocks disagree; raises ClocksDisagree where they do so twice."""
+
+    @wraps(measure)
+    def twice(*arguments: P.args, **named: P.kwargs) -> T:
+        try:
+            return measure(*arguments, **named)
+        except ClocksDisagree:
+            return measure(*arguments, **named)
+
+    return twice
 
 
 @dataclass
@@ -68,10 +89,10 @@ class Watch:
         return max(SHARE * self.wall, LEAST, CALL * self.entered)
 
     def columns(self, what: str, seconds: Iterable[float]) -> dict[str, Any]:
-        """The columns of rows with these times of `what`, which were taken within. Raises RunFailed for a lie."""
+        """The columns of rows with these times of `what`, which were taken within. Raises ClocksDisagree."""
         told = sum(seconds)
         if not -self.tolerance <= self.wall - told <= self.tolerance + COLD * self.lost:  # so that NaN fails too
-            raise RunFailed(
+            raise ClocksDisagree(
                 f"the times of {what} add up to {told:.6g} s, where another clock saw {self.wall:.6g} s go by, "
                 f"{self.lost:.3g} s of them without computing: one of the two does not measure what it says"
             )

@@ -17,7 +17,7 @@ from harness.simulation.measure import ITERATION, Measured, Timing
 
 
 def rows(measured: Measured) -> list[dict[str, Any]]:
-    """The columns that tell of times, a row for each of them. Raises RunFailed where two clocks disagree."""
+    """The columns that tell of times, a row for each of them. Raises ClocksDisagree."""
     groups: dict[tuple[str, int | None], list[Timing]] = defaultdict(list)
     for timing in measured.timings:
         groups[timing.phase, measured.pass_of(timing)].append(timing)

@@ -24,7 +24,7 @@ from harness.base.errors import RunFailed
 from harness.experiments.accuracy.scales import round_off
 from harness.reference.curvature import Curvature, curvature
 from harness.reference.oracle import Oracle
-from harness.simulation.clock import Watch
+from harness.simulation.clock import Watch, measured_again
 from solvers.problem import Positions, Prepared, StepProblem
 
 STATIONARY, GAP = 1e-10, 1e-9
@@ -170,6 +170,7 @@ class _Grading:
         return any(np.min(s[half:]) < (1 - PROGRESS) * np.min(s[:half]) for s in (gaps, stationarity))
 
 
+@measured_again
 def _timed(
     prepared: Prepared, problem: StepProblem, count: int, expected: Positions
 ) -> tuple[NDArray[np.float64], bool]:

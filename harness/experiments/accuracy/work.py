@@ -23,7 +23,7 @@ from harness.reference.frozen import bind
 from harness.reference.trajectory import Trajectory
 from harness.scenes.bind import Scene
 from harness.simulation.algebraic import stop_rule
-from harness.simulation.clock import Clock, Watch
+from harness.simulation.clock import Clock, Watch, measured_again
 from harness.simulation.measure import Diverged
 from harness.simulation.step import prepare, simulate
 from solvers.problem import Positions, Prepared, Solver
@@ -81,6 +81,7 @@ def _simulated(spec: WorkSpec, trajectory: Trajectory, tick: Callable[[], None])
     return row
 
 
+@measured_again
 def _run(
     spec: WorkSpec, scene: Scene, prepared: Prepared, frames: int, *, limit: float | None = None
 ) -> tuple[Positions, int, Row]:

@@ -20,7 +20,7 @@ from harness.experiments.speed.rest import Rest, apart, precision
 from harness.experiments.speed.yardstick import Yardstick
 from harness.report.speed.counts import Counted, count
 from harness.scenes.bind import Scene
-from harness.simulation.clock import Watch, working
+from harness.simulation.clock import Watch, measured_again, working
 from solvers.problem import Positions, Prepared, StepProblem, StopRule
 from solvers.registry import EVERY, load
 
@@ -74,6 +74,7 @@ class SolverCandidate:
         self._positions: Positions | None = None
         self._work: dict[str, Counted] = {}
 
+    @measured_again
     def prepare(self) -> float:
         """See Candidate. Raises Unsupported, NotPositiveDefinite, MemoryError."""
         watch = Watch(numba.get_num_threads())
@@ -200,8 +201,9 @@ class Repeated:
     def __init__(self, call: Callable[[], object]) -> None:
         self._call, self.interrupted = call, False
 
+    @measured_again
     def __call__(self, number: int) -> float:
-        """Wall seconds of so many calls. Raises RunFailed where another clock saw other ones."""
+        """Wall seconds of so many calls. Raises ClocksDisagree."""
         watch = Watch(numba.get_num_threads())
         with watch:
             began = perf_counter()
