@@ -56,7 +56,7 @@ COLUMNS = (
     ),
     Column("accepted", _INT, "", "steps that kept to it"),
     Column("rejected", _INT, "", "steps that did not, and were done again"),
-    Column("factorisations", _INT, "", "factors made for steps of different lengths; 0 of explicit methods"),
+    Column("factorisations", _INT, "", "factors made: one a length of steps, or one a linearly implicit step tried"),
     Column("estimate_seconds", _REAL, "s", "wall time of all that was simulated to choose and to estimate"),
     Column(
         "phase",

@@ -33,6 +33,11 @@ class _Stepping(Protocol):
         """Of the forces, in a step."""
         ...
 
+    @property
+    def factorisations(self) -> int:
+        """In a step that is tried, 0 of explicit methods."""
+        ...
+
     def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, Sequence[float]]:
         """Positions [m] and velocities [m/s] at the frame's end, and steps accepted, rejected and the last one's length
         [s]; h: the first one's."""
@@ -98,7 +103,7 @@ class Own(Follower):
         accepted, rejected = (int(count) for count in told[:, :2].sum(axis=0))
         evaluations = (accepted + rejected) * ready.evaluations
         mean = scene.system.time_step * len(told) / accepted
-        counts = accepted, rejected, 0, evaluations
+        counts = accepted, rejected, (accepted + rejected) * ready.factorisations, evaluations
         return Path(np.array(seen), *counts, (mean, mean), reached[-1], shares(reached), thread_time() - cpu)
 
     def _prepared(self, setting: float) -> tuple[Scene, _Stepping, int]:

@@ -200,6 +200,7 @@ class PreparedExplicit(Iterative):
     fastest motion [1/s]."""
 
     residual_of: ClassVar[ResidualOf] = "none"
+    factorisations: ClassVar[int] = 0
 
     system: System
     method: Composition | Tableau

@@ -160,6 +160,8 @@ class PreparedRosenbrock(Iterative):
     they differ, else 0."""
 
     residual_of: ClassVar[ResidualOf] = "none"
+    factorisations: ClassVar[int] = 1
+    """Of a step that is tried."""
 
     system: System
     table: Rosenbrock

@@ -221,6 +221,7 @@ def test_a_rosenbrock_method_keeps_to_an_error_that_is_asked_for():
     scene = build(SWINGING, 5, "own")
     coarse, fine = (Own(scene, Rodas(), FRAMES).follow(tolerance) for tolerance in (1e-3, 1e-6))
     assert fine.accepted > coarse.accepted
+    assert [path.factorisations for path in (coarse, fine)] == [p.accepted + p.rejected for p in (coarse, fine)]
     assert truth.error(0, fine.positions[-1]) < 0.1 * truth.error(0, coarse.positions[-1])
 
 

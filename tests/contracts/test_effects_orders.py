@@ -103,7 +103,10 @@ def test_every_effect_states_it() -> None:
     assert {name for name, order in stated.items() if order == 1.0} == set(ROUGH)
 
 
-@pytest.mark.parametrize("integrator", MEASURED)
+@pytest.mark.parametrize(
+    "integrator",
+    [pytest.param(i, marks=[pytest.mark.long] * (i not in MEASURED)) for i in INTEGRATORS if i != "own"],
+)
 @pytest.mark.parametrize("effect", [pytest.param(e, marks=[pytest.mark.long] * (e == "gas")) for e in SMOOTH])
 def test_integrators_keep_their_order_up_to_it(effect, integrator):
     order, case = INTEGRATORS[integrator].order, SMOOTH[effect]

@@ -8,10 +8,13 @@ from typing import Any
 
 import pytest
 
+from harness.report.accuracy.findings import findings
 from harness.report.accuracy.reading import read
 from harness.report.accuracy.winners import NOBODY, Cell, cells, family
+from harness.report.figures.of_accuracy import work
 from harness.report.figures.of_winners import winners
-from harness.report.figures.panel import CellMap
+from harness.report.figures.panel import CellMap, Plot
+from harness.report.site.accuracy import charts
 from harness.report.site.winners import chart
 from tests import accuracy_rows as made
 from tests import figure_results
@@ -89,3 +92,18 @@ def test_each_number_of_vertices_is_a_grid_of_errors_by_stiffness(tmp_path):
     assert [panel.title for panel in panels] == ["81 vertices", "289 vertices", "1\u2009089 vertices"]
     assert {len({cell.column for cell in panel.cells}) for panel in panels} == {5}
     assert {len({cell.row for cell in panel.cells}) for panel in panels} == {8}
+
+
+@pytest.mark.parametrize("truth", ["integrated", "self-converged"])
+def test_errors_by_a_self_converged_motion_are_marked_wherever_they_are_shown(tmp_path, truth):
+    folder = made.write(tmp_path, [one | {"truth": truth} for one in ROWS])
+    table = read(folder)
+    panels = [panel for entry in (*work(folder), *winners(folder)) if isinstance(panel := entry.make(), Plot | CellMap)]
+    shown = [" ".join(panel.notes) for panel in panels]
+    on_page = charts(table, folder)
+    shown += [on_page[name]["note"] for name in ("work", "winners")]
+    shown += [" ".join(findings(table)["Work and precision"])]
+    assert {"by a self-converged reference, for there is contact: net 9." in text for text in shown} == {
+        truth == "self-converged"
+    }
+    assert len(shown) > 4

@@ -12,7 +12,7 @@ import numpy as np
 from harness.report.accuracy import work_plot
 from harness.report.accuracy.convergence import GUESSES, remarks
 from harness.report.accuracy.growth import TARGET, growths
-from harness.report.accuracy.measured import Curve, Measurements, Values, without_short
+from harness.report.accuracy.measured import Curve, Measurements, Values, by_self_converged, without_short
 from harness.report.accuracy.paper import FAR, FIGURE_2, ITERATIONS, Comparison, comparisons
 from harness.report.accuracy.profiles import least_ratios
 from harness.report.accuracy.times import STEPS, TARGETS, crossings, power, races, reach, seconds_to
@@ -152,6 +152,7 @@ def _works(table: Measurements) -> Iterator[str]:
     for mesh in dict.fromkeys(work.mesh for work in table.works):
         for sentence in work_plot.findings([work for work in table.works if work.mesh == mesh]):
             yield f"{mesh}: {sentence}."
+    yield from by_self_converged(table.works)
 
 
 def _growth(table: Measurements) -> Iterator[str]:

@@ -184,6 +184,12 @@ def by_other_code(measured: Iterable[Curve | WorkPoint], newest: str | None = No
     return [f"Measured by other code than {than}, in whole or in part: {', '.join(names)}."] if names else []
 
 
+def by_self_converged(works: Iterable[WorkPoint]) -> list[str]:
+    """A sentence about the meshes whose errors are told by a self-converged motion, if there are any."""
+    names = sorted({work.mesh for work in works if work.truth == "self-converged"})
+    return [f"Errors by a self-converged reference, for there is contact: {', '.join(names)}."] if names else []
+
+
 def step_words(dt: float) -> str:
     """A time step [s] in words: 1/30 s, or milliseconds where it is no whole part of a second."""
     whole = round(1 / dt)

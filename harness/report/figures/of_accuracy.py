@@ -17,6 +17,7 @@ from harness.report.accuracy.measured import (
     Values,
     WorkPoint,
     by_other_code,
+    by_self_converged,
     older,
     stop_words,
     without_short,
@@ -161,7 +162,10 @@ def work(folder: Path) -> list[Entry]:
                     Scale("wall time a simulated second", "log", "time"),
                     Scale("error of the positions, relative to the way from the start", "log", "percent"),
                     [_front(here), *_chains(mine, marked, tolerances)],
-                    notes=[*said, "Grey: the least error that a budget buys, by any integrator.", *_hollow(mine)],
+                    notes=[
+                        *(*said, "Grey: the least error that a budget buys, by any integrator."),
+                        *(*by_self_converged(mine), *_hollow(mine)),
+                    ],
                     machine=", ".join(table.machine),
                 )
             )

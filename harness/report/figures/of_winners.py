@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from harness.report.accuracy.measured import by_self_converged
 from harness.report.accuracy.reading import read
 from harness.report.accuracy.winners import NOBODY, cells, families
 from harness.report.figures.entry import Entry, ready
@@ -41,7 +42,7 @@ def winners(folder: Path) -> list[Entry]:
                     for cell in mine
                 ],
                 list(colors.items()),
-                notes=[_NOTE, *([_DOTTED] if dotted else [])],
+                notes=[_NOTE, *by_self_converged(table.works), *([_DOTTED] if dotted else [])],
                 machine=", ".join(table.machine),
             )
         )

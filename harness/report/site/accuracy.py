@@ -15,7 +15,15 @@ import numpy as np
 
 from harness.report.accuracy.convergence import GUESSES
 from harness.report.accuracy.growth import TARGET, growths
-from harness.report.accuracy.measured import Curve, Measurements, WorkPoint, by_other_code, step_words, stop_words
+from harness.report.accuracy.measured import (
+    Curve,
+    Measurements,
+    WorkPoint,
+    by_other_code,
+    by_self_converged,
+    step_words,
+    stop_words,
+)
 from harness.report.accuracy.pictures import nearest, place
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
@@ -165,7 +173,7 @@ def _work(table: Measurements) -> Item:
     return {
         "title": "Work and precision",
         "note": "Total error of the positions at the horizon against wall time; a line joins time steps, small marks "
-        "do a fixed number of iterations.",
+        f"do a fixed number of iterations. {' '.join(by_self_converged(table.works))}",
         "filters": ["scene"],
         "x": [axis("seconds", "wall seconds a simulated second")],
         "y": [axis("error", "relative error")],

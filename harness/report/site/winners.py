@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from harness.report.accuracy.measured import Measurements
+from harness.report.accuracy.measured import Measurements, by_self_converged
 from harness.report.accuracy.winners import CLOSE, Cell, cells, families
 from harness.report.page import count
 from harness.report.site.marks import drawn
@@ -27,7 +27,7 @@ def chart(table: Measurements) -> dict[str, Any]:
         of.setdefault((cell.vertices, cell.winner), []).append(cell)
     return {
         "title": "Map of winners",
-        "note": _NOTE,
+        "note": " ".join([_NOTE, *by_self_converged(table.works)]),
         "shape": "points",
         "filters": [],
         "x": [{"column": "number", "title": "stiffness number k dt²/m", "axis": _LOG}],
