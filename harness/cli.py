@@ -85,7 +85,7 @@ def run(
         from harness.experiments.asked.command import run_to_error
 
         others = {"solver": solver, "on": on, "workers": workers, **given.obj}
-        wanted: dict[str, Any] = {"sizes": size or (), "positions": positions, "others": others}
+        wanted: dict[str, Any] = {"sizes": size or (), "positions": positions, "again": again, "others": others}
         raise typer.Exit(0 if run_to_error(config, error, results, _say, **of_error, **wanted) else 1)
     if unfit := next((key for key, value in of_error.items() if value), None):
         raise InputError(Mistake("is of a run with --error; leave it out", key=f"--{unfit}"))

@@ -8,6 +8,7 @@ One table holds all kinds of rows, which `kind` tells apart:
     curve     an iterate of a solver on it: energy, errors, stationarity, and when it came
     work      a simulation of the horizon: its error, the wall time that it took, and the CPU time of its best round
     asked     a simulation to an error that was asked for (`springbench run SCENE --error`)
+    way       one of the ways that were tried for it, by its first setting
     peer      the same by another library's integrator (`--peers`), whose name is `solver`
     goal      the processor time of the cheapest way to an error, beside another's (`springbench goals`)
 
@@ -24,7 +25,7 @@ from harness.base.columns import OF_SOLVER, PROVENANCE, Column, as_in_runs, sche
 _TEXT, _INT, _REAL, _YES = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 
 COLUMNS = (
-    Column("kind", _TEXT, "", "problem, minimum, prepare, curve, work, asked, peer or goal"),
+    Column("kind", _TEXT, "", "problem, minimum, prepare, curve, work, asked, way, peer or goal"),
     Column("unit", _TEXT, "", "hash of all that determines the unit's result and timing"),
     *as_in_runs("sweep", "scene", "size", "vertices", "springs", "solver", "parameters", "integrator", "time_step"),
     *OF_SOLVER,
@@ -36,7 +37,7 @@ COLUMNS = (
         "ok, saddle, unsupported, diverged, no-progress, time-limit, failed, killed or uncertified (the reference)",
     ),
     *as_in_runs("reason"),
-    Column("problem", _TEXT, "", "digest of the frozen step; of work the digest of the reference trajectory"),
+    Column("problem", _TEXT, "", "digest of the frozen step, of the reference trajectory, or of what was asked"),
     Column("moment", _TEXT, "", "early, middle, violent, or frame-k"),
     Column("frame", _INT, "", "the step that was frozen, from 1"),
     Column("stiffness_ratio", _REAL, "", "k dt^2/m: median stiffness and mean mass of what is not pinned"),
@@ -79,6 +80,7 @@ COLUMNS = (
     *as_in_runs(
         "asked", "estimated", "local_tolerance_m", "accepted", "rejected", "factorisations", "estimate_seconds"
     ),
+    Column("promised", _REAL, "s", "of a way: processor time that it would take to the error asked, by its order"),
     Column("against", _TEXT, "", "of a goal: what was held against it, the best of its kind"),
     Column("against_error", _REAL, "", "its error, estimated as that of the goal"),
     Column("against_seconds", _REAL, "s", "its processor time, in the process of the goal's (`cpu_seconds`)"),

@@ -15,6 +15,7 @@ from harness.base.stated import stated
 from harness.config.load import load_scene
 from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.accuracy.units import references
+from harness.experiments.asked.known import Row, known, problem, promising, way_rows
 from harness.experiments.asked.peers import peers as peers_of
 from harness.experiments.asked.search import Answer, foresee, search
 from harness.experiments.asked.ways import Asked
@@ -22,6 +23,7 @@ from harness.experiments.provenance import provenance
 from harness.experiments.run import save_positions
 from harness.record.base import Frame, RecordingInfo
 from harness.record.rerun import RerunRecorder
+from harness.reference.growth import Growth
 from solvers.problem import Positions
 
 Say = Callable[[str], None]
@@ -40,20 +42,23 @@ def run_to_error(
     check: bool = False,
     peers: bool = False,
     positions: Path | None = None,
+    again: bool = False,
     others: Mapping[str, Any] | None = None,
 ) -> bool:
     """Simulate the scene in a file to a relative error at a horizon [s], and say what it took.
 
     sizes: of the mesh, one at most; check: whether the reference grades it; peers: whether theirs are timed as well;
-    positions: where to store those of the frames; others: options that were given besides, which are refused. Returns
-    whether what was checked holds. Raises InputError, RunFailed.
+    positions: where to store those of the frames; again: whether all ways are tried, also those that rows measured
+    before tell to be dear; others: options that were given besides, which are refused. Returns whether what was checked
+    holds. Raises InputError, RunFailed.
     """
     _require(error, horizon, {**(others or {}), "second --size": sizes[1:]})
     asked = Asked.of(load_scene(config), sizes[0] if sizes else None, horizon, say)
     folder = claimed(results / config.stem, config)
     with machine.pinned_threads(1):
         seen = foresee(asked, error, say)
-        answer = search(asked, error, seen, say)
+        before = known(folder / "accuracy", asked)
+        answer = _searched(asked, error, seen, [] if again else before, say)
     path, best = answer.best.path, answer.best
     each = path.seconds / asked.horizon
     say(f"asked {error:g}, estimated {best.estimated:.1g}, {1e3 * each:.3g} ms a simulated second")
@@ -69,11 +74,29 @@ def run_to_error(
     row = _row(config.stem, asked, error, answer) | {"error": measured, "recording": f"recordings/{recording.name}"}
     (folder / "accuracy").mkdir(exist_ok=True)
     found = [row, *(_beside(row, asked, error, answer, say) if peers else ())]
+    shared = {name: row[name] for name in (*_SHARED, "problem")} | provenance()
+    found += [shared | way for way in way_rows(answer, before, error)]
     rows.write(folder / "accuracy" / f"{label}.parquet", [one | {"unit": label} for one in found], SCHEMA)
     if positions:
         save_positions(positions, path.positions[1:])
     say(f"the row is in {folder / 'accuracy'}, the recording is {recording}")
     return not check or (measured is not None and measured <= error)
+
+
+def _searched(asked: Asked, error: float, seen: Growth, before: Sequence[Row], say: Say) -> Answer:
+    """The cheapest way, among those first that were not dear to an error about as large. Raises RunFailed."""
+    nearest, pairs = promising(before, error)
+    if not pairs:
+        return search(asked, error, seen, say)
+    names = ", ".join(
+        solver.name if integrator == "own" else f"{integrator} with {solver.name}" for integrator, solver in pairs
+    )
+    say(f"worth trying by rows measured before, for an error of {nearest:g}: {names}; --again tries all ways")
+    try:
+        return search(asked, error, seen, say, pairs)
+    except RunFailed as failed:
+        say(f"{failed}; so all ways are tried")
+        return search(asked, error, seen, say)
 
 
 def _checked(asked: Asked, error: float, p: Positions, results: Path, say: Say) -> float | None:
@@ -111,6 +134,7 @@ def _row(name: str, asked: Asked, error: float, answer: Answer) -> dict[str, Any
         "reason": answer.note,
         "sweep": name,
         "scene": name,
+        "problem": problem(asked),
         "size": asked.size,
         "vertices": path.positions.shape[1],
         "solver": best.way.solver,

@@ -58,7 +58,7 @@ class Kept:
             "rejected": path.rejected,
             "factorisations": path.factorisations,
             "estimate_seconds": self.answer.seconds,
-            "choice": "; ".join([f"{best.way} of {1 + len(self.answer.others)} ways", *self.said]),
+            "choice": "; ".join([f"{best.way} of {len(self.answer.tried)} ways", *self.said]),
         }
         seen = [self._seen(k, p) for k, p in enumerate(self.positions) if k]
         return [

@@ -65,12 +65,12 @@ class Found:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """best: what keeps to the error; others: the other ways at their first settings, which the tolerance [m] gave;
-    closer: by which errors were estimated; seconds: wall time of all that was done besides; note: why it is far more
-    exact than was asked."""
+    """best: what keeps to the error; tried: the ways at their first settings, which the tolerance [m] gave, and the
+    processor seconds that each promised, the cheapest first; closer: by which errors were estimated; seconds: wall time
+    of all that was done besides; note: why it is far more exact than was asked."""
 
     best: Found
-    others: tuple[Found, ...]
+    tried: tuple[tuple[Found, float], ...]
     tolerance: float
     closer: Found
     seconds: float
@@ -131,7 +131,8 @@ class _Search:
             self._say(f"  {one.way}: {one.path.seconds:.3g} s, an error of {one.estimated:.1e}")
         best, note = self._moved(graded[0], closer)
         besides = perf_counter() - began - best.path.seconds
-        return Answer(best, tuple(graded[1:]), tolerance, closer, besides, note)
+        promised = tuple((one, self._promise(one)) for one in graded)
+        return Answer(best, promised, tolerance, closer, besides, note)
 
     @staticmethod
     def _run(way: Way, setting: float, limit: float = inf) -> Found:
