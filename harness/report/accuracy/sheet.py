@@ -30,6 +30,9 @@ LEFT, TOP, RIGHT, BOTTOM = 40, 118, 1384, HEIGHT - 34
 
 _LINE, _NOTES, _LETTERS, _WIDE = 17, 5, 21, 220
 
+_END = 0.04
+"""Of an axis: a label so near to its end would stand out."""
+
 
 @contextmanager
 def sheet(stem: Path, title: str, facts: Sequence[str]) -> Generator[Figure]:
@@ -145,6 +148,15 @@ def log_axis(axis: Axis, low: float, high: float, *, unit: str = "power") -> Non
     axis.set_major_locator(LogLocator(subs=subs, numticks=7 if decades > 2.2 else 12))
     axis.set_major_formatter(_FORMATTERS[unit])
     axis.set_minor_locator(NullLocator())
+    if axis is axis.axes.xaxis:
+        _inward(axis.axes)
+
+
+def _inward(ax: Axes) -> None:
+    """Let the labels at the ends of the x axis end there, so that those of two panels side by side do not touch."""
+    for tick, at in zip(ax.xaxis.get_major_ticks(), ax.xaxis.get_majorticklocs(), strict=False):
+        x = ax.transAxes.inverted().transform(ax.transData.transform((at, ax.get_ylim()[1])))[0]
+        tick.label1.set_horizontalalignment("left" if x < _END else "right" if x > 1 - _END else "center")
 
 
 def iteration_axis(ax: Axes, last: float) -> None:
@@ -155,6 +167,7 @@ def iteration_axis(ax: Axes, last: float) -> None:
     ax.xaxis.set_major_locator(FixedLocator([0.0, *decades]))
     ax.xaxis.set_major_formatter(ticks(quantity))
     ax.xaxis.set_minor_locator(NullLocator())
+    _inward(ax)
 
 
 def limits(values: Iterable[float], *, least: float = 0.0, margin: float = 1.3) -> tuple[float, float]:

@@ -42,13 +42,13 @@ ERRORS = (0.1, 0.03, 0.01, 0.003, 0.001)
 
 
 def is_default(work: WorkPoint) -> bool:
-    """Whether this is the assignment's default: implicit Euler at 1/30 s with 50 iterations of local-global."""
+    """Whether this is what is done most often: implicit Euler at 1/30 s with 50 iterations of local-global."""
     same_method = work.family == LOCAL_GLOBAL and work.integrator == "implicit-euler"
     return same_method and work.tolerance is None and work.iterations == 50 and abs(30 * work.time_step - 1) < 1e-9
 
 
 def default(works: Iterable[WorkPoint]) -> WorkPoint | None:
-    """The assignment's default among these, by the fastest of its backends."""
+    """What is done most often, among these, by the fastest of its backends."""
     return min((w for w in works if is_default(w) and _known(w)), key=lambda w: w.seconds, default=None)
 
 
@@ -166,7 +166,7 @@ def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dic
     if base:
         ax.plot(base.seconds, base.error, "o", mfc="none", mec=INK, markersize=15, mew=1.6, zorder=6)
         ax.annotate(
-            "the assignment's default", (base.seconds, base.error), (2, 13), textcoords="offset points",
+            "the default", (base.seconds, base.error), (2, 13), textcoords="offset points",
             fontsize=9, ha="left", color=INK, bbox={"facecolor": PAGE, "alpha": 0.8, "edgecolor": "none", "pad": 0.8},
         )  # fmt: skip
 
