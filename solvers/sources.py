@@ -65,10 +65,16 @@ _FIRST: dict[str, Stamp] = {
 def digest(sources: Iterable[str | Path]) -> str:
     """SHA-256, in hexadecimal digits, of all that the sources depend on."""
     told = hashlib.sha256()
-    paths = {path for source in sources for path in reached(str(Path(source).resolve()))}
-    for name, path in sorted((_name(path), path) for path in paths):
+    for name, path in _reached_by(frozenset(os.path.abspath(source) for source in sources)):
         told.update(f"{name}\0".encode() + _content(path))
     return told.hexdigest()
+
+
+@cache
+def _reached_by(sources: frozenset[str]) -> list[tuple[str, str]]:
+    """All that sources at absolute paths depend on, by name: a sweep asks the same for each of its runs."""
+    paths = {path for source in sources for path in reached(str(Path(source).resolve()))}
+    return sorted((_name(path), path) for path in paths)
 
 
 @cache
@@ -90,7 +96,8 @@ def everything(package: str) -> str:
     return told.hexdigest()
 
 
-def of_class(made: type) -> set[Path]:
+@cache
+def of_class(made: type) -> frozenset[Path]:
     """The files that a class is written in, wherever they lie, and those of what it inherits, libraries apart."""
     own = {getattr(sys.modules.get(made.__module__), "__file__", None)}
     for base in made.__mro__:
@@ -99,7 +106,7 @@ def of_class(made: type) -> set[Path]:
         files = {code.co_filename for code in codes if code}
         files.add(getattr(sys.modules.get(base.__module__), "__file__", None))
         own |= {file for file in files if file and not _library(file)}
-    return {Path(file).resolve() for file in own if file and file.endswith(".py") and os.path.isfile(file)}
+    return frozenset(Path(file).resolve() for file in own if file and file.endswith(".py") and os.path.isfile(file))
 
 
 def known(path: str) -> bool:

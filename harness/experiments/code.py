@@ -46,10 +46,10 @@ def _file_of(name: str) -> Path:
     return Path(source_of(EVERY[name].partition(":")[0]) or _RUN)
 
 
-def files(part: Part) -> set[Path]:
+def files(part: Part) -> frozenset[Path]:
     """The files that a part is written in."""
     if isinstance(part, Path):
-        return {part}
+        return frozenset([part])
     if isinstance(part, Plugin):
-        return {Path(part.source)} if part.source.endswith(".py") else set()
+        return frozenset([Path(part.source)] if part.source.endswith(".py") else [])
     return sources.of_class(part)

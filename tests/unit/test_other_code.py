@@ -98,6 +98,7 @@ def test_the_code_of_a_run_covers_what_its_solver_compiles_in_another_language(
         made.solver.with_name(f"{name}.hpp").write_text("import what;\n")
         sources.reached.cache_clear()
         sources._imported.cache_clear()
+        sources._reached_by.cache_clear()
         assert (code(parts(made.run())) != before) == (name == made.solver.stem)
     (eigen,) = sources.of_class(load(OPTIONAL["eigen"]))
     assert {str(eigen.with_suffix(ending)) for ending in (".cpp", ".hpp")} <= sources.reached(str(eigen))
@@ -143,4 +144,5 @@ def test_the_file_of_a_class_is_known_however_its_module_was_loaded(tmp_path: Pa
     assert sources.of_class(module.Mine) == {path}
     monkeypatch.setitem(sys.modules, "by_hand", module)
     monkeypatch.setattr(sources, "_INSTALLED", {str(tmp_path)})  # as a package that brings a solver is
+    sources.of_class.cache_clear()
     assert sources.of_class(module.Mine) == {path}
