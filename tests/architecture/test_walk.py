@@ -21,6 +21,7 @@ GIVEN = {
     ("harness.base.document", "harness.scenes.spec"): "the same",
     ("harness.base.rows", "harness.experiments.sweep"): "paths, one after the other",
     ("harness.simulation.step", "harness.reference.grade"): "a solver whose residuals are graded",
+    ("harness.simulation.clock", "harness.experiments.run"): "what is measured once more where clocks do not agree",
     ("harness.simulation.observe", "harness.experiments.run"): "who is told of each step",
 }
 """The calls that lead up, each to what was given on the way down."""
