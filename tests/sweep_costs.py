@@ -3,8 +3,9 @@
     python -m tests.sweep_costs short [RUNS]        500 runs of five solvers, sizes 8 to 16, if left out
     python -m tests.sweep_costs cores [CASES]       10 cases of configs/hard.yaml by five solvers, judged and drawn
 
-`short` prints what each run takes beside its timed passes, of the wall's time and of all processes' CPU. `cores` does a
-sweep by one worker and by two and prints
+`short` prints what each run takes beside its timed passes, of the wall's time and of all processes' CPU, and the memory
+of the process that asks for them, when half of the runs have ended and when all have. `cores` does a sweep by one
+worker and by two and prints
 
     t = timed / wall            of one worker: the share that two may not do side by side
     speed-up / (1 / (t + (1 - t) / 2))          .9 is wanted
@@ -28,6 +29,8 @@ from tempfile import TemporaryDirectory
 from time import monotonic, process_time
 from typing import Any, NamedTuple
 
+import psutil
+
 from harness.config.load import load_any
 from harness.config.sweep import RunSpec
 from tests.displays import Quiet
@@ -39,12 +42,29 @@ SHORT = {"frames": 10, "rounds": 2, "record": False, "pictures": False}
 
 
 class Took(NamedTuple):
-    """Seconds of a sweep: by the wall, and of CPU in all its processes; and both of what is timed."""
+    """Seconds of a sweep: by the wall, and of CPU in all its processes; and both of what is timed.
+
+    mib_halfway, mib_last: the memory [MiB] of the process that asks, when half of the runs have ended, and all.
+    """
 
     wall: float
     cpu: float
+    mib_halfway: float
+    mib_last: float
     timed: float
     timed_cpu: float
+
+
+class Weighed(Quiet):
+    """Notes how much memory [MiB] this process has when a run ends."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mib: list[float] = []
+
+    def finished(self, outcome: str) -> None:
+        super().finished(outcome)
+        self.mib.append(psutil.Process().memory_info().rss / 2**20)
 
 
 def sweep(runs: list[RunSpec], folder: Path, workers: int | None) -> Took:
@@ -79,12 +99,14 @@ def _sweep(answer: Any, runs: list[RunSpec], folder: Path, workers: int | None) 
             file.write("{} {}\n".format(*took))
 
     runs_of._timed = noting
-    run_sweep("costs", runs, folder, Quiet(), lambda said: None, at_once=workers)
+    weighed = Weighed()
+    run_sweep("costs", runs, folder, weighed, lambda said: None, at_once=workers)
     wall = monotonic() - began
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     cpu = sum(one.ru_utime + one.ru_stime for one in used)
     noted = [[float(word) for word in line.split()] for line in note.read_text().splitlines()]
-    answer.send(Took(wall, cpu, *map(sum, zip(*noted, strict=True))))
+    mib = weighed.mib[len(runs) // 2], weighed.mib[-1]
+    answer.send(Took(wall, cpu, *mib, *map(sum, zip(*noted, strict=True))))
 
 
 def _asked(folder: Path, **asked: Any) -> list[RunSpec]:
