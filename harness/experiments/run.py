@@ -27,7 +27,6 @@ from harness.experiments.code import TO_ERROR, code, parts, solver_class
 from harness.experiments.failure import failure
 from harness.experiments.plan import Files
 from harness.experiments.provenance import asked, common, tolerance
-from harness.experiments.standing import standing
 from harness.record.base import Frame, RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
@@ -55,7 +54,9 @@ def execute(
     (frames, n, 3) [m], float64; at_once: how many runs may be timed at once. Returns the rows. Raises InputError, and
     CannotWrite without rows.
     """
-    shared = common(run) | {"code": code(parts(run)), "at_once": at_once} | of_this_machine(tick)
+    with beside(tick):
+        shared = common(run) | {"code": code(parts(run)), "at_once": at_once}
+    shared |= of_this_machine(tick)
     threads = machine.threads(run.threads)
     with machine.pinned_threads(threads.number):
         try:
@@ -73,7 +74,8 @@ def execute(
         for row in found:
             row["choice"] = "; ".join(filter(None, [row.get("choice"), threads.why]))
     result = [shared | row for row in found]
-    rows.write(files.rows, result)
+    with beside(tick):
+        rows.write(files.rows, result)
     return result
 
 
@@ -88,10 +90,19 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> l
         measured, told = _measured(scene, _solver(run), settings, tick)
     with beside(tick):
         by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
-    require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=isinstance(run.tolerance, float))
+        require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=isinstance(run.tolerance, float))
+        stands = _standing(run)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
-    facts |= {"choice": measured.prepared.choice} | standing(run) | how
+    facts |= {"choice": measured.prepared.choice} | stands | how
     return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
+
+
+def _standing(run: RunSpec) -> dict[str, str]:
+    if not run.judge:
+        return {"status": "ok"}
+    from harness.experiments.standing import standing  # for which those whom nobody judges need not wait
+
+    return standing(run)
 
 
 @measured_again

@@ -25,9 +25,7 @@ class _Formulas:
 
 
 def standing(run: RunSpec) -> dict[str, str]:
-    """The columns `status`, `second_opinion` and `reason` of a run that was done, as far as it has them."""
-    if not run.judge:
-        return {"status": "ok"}
+    """The columns `status`, `second_opinion` and `reason` of a run that was done and judged, as far as it has them."""
     if isinstance(run.integrator, Plugin):
         return {"status": "ok", "second_opinion": SINGLE}
     said = opinion(_Formulas((run.scene.digest, run.size, run.integrator), run))
