@@ -47,12 +47,17 @@ class _Member:
 
 
 def done_by(
-    members: int, ready: Callable[[], object], groups: Iterable[Hashable], start: Start
+    members: int,
+    ready: Callable[[], object],
+    groups: Iterable[Hashable],
+    start: Start,
+    meanwhile: Callable[[], object] | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """Do tasks by so many workers; yields (number, value or Lost) of each that is done, in that order.
 
     ready: called in each worker before anything else; groups: of the tasks, by number; start: see there, called when a
-    task's turn comes. Raises what a piece raises. Whoever stops asking ends the workers.
+    task's turn comes; meanwhile: done here once the workers have begun, and nothing is looked at as long as it takes.
+    Raises what a piece raises. Whoever stops asking ends the workers.
     """
     left = dict(enumerate(groups))
     with ExitStack() as cleanup:
@@ -81,7 +86,10 @@ def done_by(
                     outcome = lost
                 member.going = None
                 yield member.number, outcome
-            if len(pipes) == len(going):
+            if meanwhile:
+                meanwhile()
+                meanwhile = None
+            elif len(pipes) == len(going):
                 wait(pipes, _LOOK)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import stat
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
@@ -129,9 +129,10 @@ class Claims:
     def _changed(self, unit: Path) -> bool:
         return _state(unit) != self._units[unit]
 
-    def wait(self, units: Sequence[Path]) -> None:
-        """Until one of them was done by somebody else, or may be claimed."""
+    def wait(self, units: Sequence[Path], look: Callable[[], object] = int) -> None:
+        """Until one of them was done by somebody else, or may be claimed. look: called now and then."""
         while units and all(self.take(unit) == TAKEN for unit in units):
+            look()
             sleep(_LOOK)
 
     def close(self) -> None:

@@ -19,10 +19,23 @@ _REDRAW = 0.2
 """Seconds between two redraws."""
 
 _SILENT = 10.0
-"""Seconds after which a line is printed, though no run has ended."""
+"""Seconds after which a line is printed, though nothing has ended."""
 
 _KNOWN = 0.2
 """The share of the work from which on the time left is told: it is then four times what is known, at most."""
+
+
+class Remarks:
+    """Says how far something is that is no run, as often as lines come while no run ends."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say, self._said = say, monotonic()
+
+    def __call__(self, words: str) -> None:
+        """How far it is, in words."""
+        if monotonic() - self._said > _SILENT:
+            self._say(words)
+            self._said = monotonic()
 
 
 class Run(Protocol):

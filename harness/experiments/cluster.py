@@ -45,6 +45,9 @@ from solvers.plugins import Plugin, load
 CLOCKS = 60.0
 """Seconds by which a worker's clock may differ from the client's before that is said."""
 
+_QUEUED = 60
+"""So many times PATIENCE the first job of a batch system may be queued."""
+
 _TRIES = 4
 """How often a run is handed out whose worker is lost."""
 
@@ -110,11 +113,15 @@ def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Gen
             raise InputError(Mistake(f"{on}: {why}; start one with `dask scheduler`", key="--on")) from None
         # Its log would put tracebacks beside what the user is told of a scheduler that is gone.
         with silence_logging_cmgr(SILENCE), client, client.as_current():
-            try:
-                client.wait_for_workers(1, timeout=PATIENCE if address is on else 60 * PATIENCE)
-            except TimeoutError:
-                why = f"the scheduler has no worker; start some with `dask worker {on} --nthreads 1`"
-                raise InputError(Mistake(f"{on}: {why}", key="--on")) from None
+            for waits in range(0 if address is on else _QUEUED, -1, -1):
+                try:
+                    client.wait_for_workers(1, timeout=PATIENCE)
+                    break
+                except TimeoutError:
+                    if not waits:
+                        why = f"the scheduler has no worker; start some with `dask worker {on} --nthreads 1`"
+                        raise InputError(Mistake(f"{on}: {why}", key="--on")) from None
+                    say(f"{on}: no worker has come yet")
             yield Cluster(client, machines(client, runs, say))
 
 

@@ -18,7 +18,7 @@ from harness.base.asides import compiling_told
 from harness.base.crew import Task, done_by
 from harness.base.holding import TAKEN, Claims
 from harness.base.machine_lock import alone
-from harness.base.progress import Display, Run
+from harness.base.progress import Display, Remarks, Run
 from harness.base.workers import Limits, Lost, Tick
 from harness.scenes.effects.effect_names import EFFECTS
 from harness.scenes.mesh.mesh_names import MESHES
@@ -87,11 +87,18 @@ class Filed(Unit, Protocol):
 F = TypeVar("F", bound=Filed)
 
 
-def do_together(todo: Sequence[F], claims: Claims, do: Callable[[Sequence[F], Callable[[F], str]], None]) -> None:
+def do_together(
+    todo: Sequence[F],
+    claims: Claims,
+    do: Callable[[Sequence[F], Callable[[F], str]], None],
+    say: Callable[[str], None],
+) -> None:
     """Do those of some units that no other command does; what one leaves undone is done here in the end.
 
-    do: does units, asking of each, when its turn comes, why it is another's; empty where it is ours.
+    do: does units, asking of each, when its turn comes, why it is another's, empty where it is ours; say: prints a
+    remark.
     """
+    remarks = Remarks(say)
     while todo:
         left: list[F] = []
 
@@ -102,7 +109,8 @@ def do_together(todo: Sequence[F], claims: Claims, do: Callable[[Sequence[F], Ca
             return why
 
         do(todo, another)
-        claims.wait([unit.place for unit in left])
+        waits = f"waiting for other commands, which have {len(left)} of these at hand"
+        claims.wait([unit.place for unit in left], partial(remarks, waits))
         todo = left
 
 

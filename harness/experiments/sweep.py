@@ -140,14 +140,16 @@ def run_sweep(
         todo = wanted(planned, "runs", say, again=again or positions is not None, changed=changed)
         if todo and not away:
             import_module("harness.experiments.run")  # here, for workers that are forks of this process
+            if any(p.run.judge for p in todo):
+                import_module("harness.experiments.standing")
         many = min(at_once or workers_at_once(), max(1, len(todo)))
         units = [RunUnit(p.run, p.files, positions, many if p.run.timing == "shared" else 1) for p in todo]
         if away:
-            do_together(units, claims, partial(away.do_all, folder, display))
+            do_together(units, claims, partial(away.do_all, folder, display), say)
             planned = plan(runs, folder, machines)
         else:
             here = partial(do_all, display=display, isolated=isolated, at_once=many)
-            do_together(units, claims, lambda some, another: here(some, another=another))
+            do_together(units, claims, lambda some, another: here(some, another=another), say)
         from harness.report.sweep import Pictured, draw_sweep  # takes a second, in which runs can be done already
 
         table = rows.read((p.files.rows for p in planned), needed=NEEDED)

@@ -20,6 +20,19 @@ raise SystemExit(not window.SupportsOpenGL())
 """
 _SECONDS = 60
 
+_TRIES = list["subprocess.Popen[bytes]"]()
+"""The child that tries, if one has begun."""
+
+
+def begin() -> None:
+    """Begin to find out, beside whatever this process does until it asks."""
+    if _TRIES or problem.cache_info().currsize:
+        return
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+    nowhere = subprocess.DEVNULL
+    _TRIES.append(subprocess.Popen([sys.executable, "-c", _TRY], stdout=nowhere, stderr=nowhere))
+
 
 @cache
 def problem() -> str | None:
@@ -27,14 +40,15 @@ def problem() -> str | None:
 
     Without a display VTK is told to draw through EGL. The answer is found once a process.
     """
-    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+    begin()
+    child = _TRIES.pop()
     try:
-        child = subprocess.run([sys.executable, "-c", _TRY], capture_output=True, timeout=_SECONDS)
-        ended = f"exit code {child.returncode}"
+        ended = f"exit code {child.wait(_SECONDS)}"
     except subprocess.TimeoutExpired:
-        child, ended = None, f"no answer within {_SECONDS} s"
-    if child is not None and child.returncode == 0:
+        child.kill()
+        child.wait()
+        ended = f"no answer within {_SECONDS} s"
+    if child.returncode == 0:
         return None
     return (
         f"pictures need OpenGL, and a trial drawing failed ({ended}); on Debian and Ubuntu install it with "

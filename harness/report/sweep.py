@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from harness.base.crew import Task, done_by
 from harness.base.machine_lock import beside
+from harness.base.progress import Remarks
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.options import OPTIONS
 from harness.config.sweep import RunSpec
@@ -46,46 +47,69 @@ def draw_sweep(
     drawn = [p for p in pictured if p.run.record and p.recording.exists()]
     wanting = [p for p in drawn if p.run.pictures and _stale(p.picture, [p.recording])]
     groups = [group for group in _groups(drawn, folder) if group.old_recording or group.old_picture]
-    if wanting or groups:
-        _draw_runs(wanting, groups, say, at_once)
-    if any(p.run.pictures for p in pictured):
-        from harness.report.timing_plot import draw_timing
 
-        draw_timing(table, folder / "pictures" / "timing.png", name, older)
+    def times() -> None:
+        if any(p.run.pictures for p in pictured):
+            from harness.report.timing_plot import draw_timing
+
+            with beside(_silent):
+                draw_timing(table, folder / "pictures" / "timing.png", name, older)
+
+    missing = _loaded() if wanting or any(group.old_picture for group in groups) else None
+    if missing:
+        say(missing)
+    if wanting and not missing:
+        say(f"drawing the pictures of {len(wanting)} runs")
+        _draw_runs(wanting, say, at_once, times)
+    else:
+        times()
+    _draw_groups(groups, say, pictures=not missing)
 
 
-def _draw_runs(wanting: Sequence[Pictured], groups: Sequence[_Group], say: Callable[[str], None], at_once: int) -> None:
-    """Pictures of runs, and what compares those of groups."""
-    # Here, for processes that are forks of this one; a command with nothing to draw need not wait for all of it.
+def _loaded() -> str | None:
+    """What draws is loaded, here, for processes that are forks of this one; returns why it cannot draw, if so."""
+    from harness.report import opengl
+
+    opengl.begin()
     import_module("harness.report.run_picture")
+    return opengl.problem()
+
+
+def _draw_runs(
+    wanting: Sequence[Pictured], say: Callable[[str], None], at_once: int, meanwhile: Callable[[], None]
+) -> None:
+    """Pictures of runs, in processes; of those that are lost is said why they are."""
+    done, remarks = 0, Remarks(say)
+
+    def tick(said: str) -> None:
+        remarks(f"{done} of {len(wanting)} pictures are drawn")
+
+    tasks = [Task(partial(_draw, p), tick, Limits()) for p in wanting]
+    for number, outcome in done_by(at_once, int, [None] * len(tasks), lambda number: tasks[number], meanwhile):
+        done += 1
+        if isinstance(outcome, Lost):
+            say(f"{wanting[number].picture} is not drawn: its process {outcome}")
+
+
+def _draw_groups(groups: Sequence[_Group], say: Callable[[str], None], *, pictures: bool) -> None:
+    """What compares the runs of groups: recordings, and pictures where these can be drawn."""
+    if not groups:
+        return
     from harness.record.compare import Look, side_by_side
     from harness.record.reader import read_replay
-    from harness.report import opengl
     from harness.report.comparison import draw_comparison
     from harness.report.style import shades
 
-    missing = opengl.problem() if wanting or any(group.old_picture for group in groups) else None
-    if missing:
-        say(missing)
-    elif wanting:
-        say(f"drawing the pictures of {len(wanting)} runs")
-        for lost in _drawn(wanting, at_once):
-            say(lost)
-    for group in groups:
-        if group.old_recording:
-            found = shades((name, p.run.solver.name) for name, p in group.runs.items())
-            looks = {name: Look(mark.color) for name, mark in found.items()}
-            side_by_side(group.recording, group.recordings, group.label.replace("-", " "), looks)
-        if group.old_picture and not missing:
-            draw_comparison({name: read_replay(path) for name, path in group.recordings.items()}, group.picture)
-
-
-def _drawn(wanting: Sequence[Pictured], at_once: int) -> Iterator[str]:
-    """Draw pictures of runs, and say of those that are lost why they are."""
-    tasks = [Task(partial(_draw, p), _silent, Limits()) for p in wanting]
-    for number, outcome in done_by(at_once, int, [None] * len(tasks), lambda number: tasks[number]):
-        if isinstance(outcome, Lost):
-            yield f"{wanting[number].picture} is not drawn: its process {outcome}"
+    remarks = Remarks(say)
+    for number, group in enumerate(groups):
+        remarks(f"{number} of {len(groups)} comparisons of solvers are drawn")
+        with beside(_silent):
+            if group.old_recording:
+                found = shades((name, p.run.solver.name) for name, p in group.runs.items())
+                looks = {name: Look(mark.color) for name, mark in found.items()}
+                side_by_side(group.recording, group.recordings, group.label.replace("-", " "), looks)
+            if group.old_picture and pictures:
+                draw_comparison({name: read_replay(path) for name, path in group.recordings.items()}, group.picture)
 
 
 def _draw(p: Pictured, tick: Tick) -> None:
