@@ -124,3 +124,9 @@ def factor(value: float) -> str:
 def shorten(words: str, limit: int) -> str:
     """The words, or as many of their letters as fit into `limit` with an ellipsis."""
     return words if len(words) <= limit else words[: limit - 1].rstrip() + "…"
+
+
+def step_words(dt: float) -> str:
+    """A time step [s] in words: 1/30 s, or milliseconds where it is no whole part of a second."""
+    whole = round(1 / dt)
+    return f"1/{whole} s" if abs(whole * dt - 1) < 1e-9 else f"{1e3 * dt:.3g} ms"

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from harness.report.machines import foot
 from harness.report.machines import names as machine_names
-from harness.report.page import quantity
+from harness.report.page import quantity, step_words
 from harness.report.references import cited
 from harness.report.sql import answer
 
@@ -110,7 +110,7 @@ def labels(found: Sequence[RunTimes]) -> dict[str, str]:
         run.run_id: ", ".join(
             [run.solver]
             + [
-                f"{key} {value}"
+                f"{key} {step_words(value) if key == 'dt' else value}"
                 for key, value in settings[run.run_id].items()
                 if len(values[run.scene, run.solver, key]) > 1
             ]

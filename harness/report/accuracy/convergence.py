@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from harness.report.accuracy.measured import Curve, Measurements, Problem, Values, older, step_words
+from harness.report.accuracy.measured import Curve, Measurements, Problem, Values, older
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -29,7 +29,7 @@ from harness.report.accuracy.sheet import (
     panel,
     sheet,
 )
-from harness.report.page import count, quantity, text
+from harness.report.page import count, quantity, step_words, text
 from harness.report.style import INK, MUTED, OLDER, PAGE, WARNING, WIDTH, Mark, looks
 
 GUESSES: dict[str, str] = {

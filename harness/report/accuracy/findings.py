@@ -135,17 +135,13 @@ def _profiles(table: Measurements) -> Iterator[str]:
             wins = {label: int(np.sum(values <= 1.0)) for label, values in found.items()}
             count = len(next(iter(found.values())))
             first = sorted(wins, key=lambda label: -wins[label])[:3]
-            told = ", ".join(
-                f"{label} on {wins[label]} (at worst {_times_of(found[label])} the fastest)"
-                for label in first
-                if wins[label]
-            )
+            told = ", ".join(f"{label} on {wins[label]} ({_times_of(found[label])})" for label in first if wins[label])
             yield f"To {power(target)}, of {count} problems: fastest is {told}."
 
 
 def _times_of(values: Values) -> str:
     worst = float(np.max(values))
-    return f"{factor(worst)} times" if np.isfinite(worst) else "never reaching, against"
+    return f"at worst {factor(worst)} times the fastest" if np.isfinite(worst) else "and not there on all"
 
 
 def _works(table: Measurements) -> Iterator[str]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base import machine
+from harness.report.page import step_words
 
 Values = NDArray[np.float64]
 
@@ -188,12 +189,6 @@ def by_self_converged(works: Iterable[WorkPoint]) -> list[str]:
     """A sentence about the meshes whose errors are told by a self-converged motion, if there are any."""
     names = sorted({work.mesh for work in works if work.truth == "self-converged"})
     return [f"Errors by a self-converged reference, for there is contact: {', '.join(names)}."] if names else []
-
-
-def step_words(dt: float) -> str:
-    """A time step [s] in words: 1/30 s, or milliseconds where it is no whole part of a second."""
-    whole = round(1 / dt)
-    return f"1/{whole} s" if abs(whole * dt - 1) < 1e-9 else f"{1e3 * dt:.3g} ms"
 
 
 LONG = 500

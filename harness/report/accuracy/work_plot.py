@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from harness.report.accuracy.measured import Measurements, WorkPoint, older, step_words
+from harness.report.accuracy.measured import Measurements, WorkPoint, older
 from harness.report.accuracy.sheet import (
     LEFT,
     RIGHT,
@@ -29,7 +29,7 @@ from harness.report.accuracy.sheet import (
     size,
 )
 from harness.report.accuracy.times import duration, power
-from harness.report.page import quantity, text
+from harness.report.page import quantity, step_words, text
 from harness.report.style import INK, MUTED, OLDER, PAGE, Mark, looks
 from solvers.about import LOCAL_GLOBAL
 from solvers.integrators import INTEGRATORS

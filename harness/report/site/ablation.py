@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from harness.report.ablation import Row, of_kind, sentences
-from harness.report.references import cited
 from harness.report.site.accuracy import LOG, axis
 from harness.report.site.marks import drawn
+from harness.report.site.runs import references
 from harness.report.site.script import number
 from harness.report.style import looks
 
@@ -21,7 +21,9 @@ def charts(rows: Sequence[Row]) -> tuple[dict[str, dict[str, Any]], list[str]]:
     made = {"ablation": _effects(rows), "prices": _prices(rows)}
     by_whole = [_of(whole, rows) for whole in of_kind(rows, "whole") if whole["status"] == "ok"]
     words = [f"{some[0]['scene']}: {said}" for some in by_whole for said in sentences(some)]
-    return {name: chart for name, chart in made.items() if chart["items"]}, words
+    return {
+        name: chart | {"command": "springbench ablate CONFIG"} for name, chart in made.items() if chart["items"]
+    }, words
 
 
 def _of(whole: Row, rows: Sequence[Row]) -> list[Row]:
@@ -104,4 +106,4 @@ def _marks(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _references(rows: Sequence[Row]) -> dict[str, Any]:
-    return {row["solver"]: {"cited": cited(row["reference"]), "bibtex": ""} for row in rows if row["reference"]}
+    return references((row["solver"], row["reference"]) for row in rows)

@@ -21,12 +21,12 @@ from harness.report.accuracy.measured import (
     WorkPoint,
     by_other_code,
     by_self_converged,
-    step_words,
     stop_words,
 )
 from harness.report.accuracy.pictures import nearest, place
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
+from harness.report.page import step_words
 from harness.report.site import winners
 from harness.report.site.marks import drawn
 from harness.report.site.runs import references
@@ -36,6 +36,7 @@ from harness.report.style import looks
 Item = dict[str, Any]
 
 LOG = {"type": "log"}
+_COMMAND = "springbench accuracy CONFIG --again"
 _SHARES = {"range": [-0.02, 1.05], "tickformat": ".0%"}
 
 
@@ -57,7 +58,7 @@ def charts(table: Measurements, folder: Path) -> dict[str, Item]:
     marks = {label: drawn(mark) for label, mark in looks((each.label, each.solver) for each in everyone).items()}
     shared = {"marks": marks, "references": references((each.label, each.reference) for each in everyone)}
     made = {name: chart | shared for name, chart in made.items()} | {"winners": winners.chart(table)}
-    return {name: chart for name, chart in made.items() if chart["items"]}
+    return {name: chart | {"command": _COMMAND} for name, chart in made.items() if chart["items"]}
 
 
 def axis(column: str, title: str, how: Mapping[str, Any] = LOG) -> Item:

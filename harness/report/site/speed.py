@@ -6,10 +6,9 @@ from typing import Any
 
 import pyarrow as pa
 
-from harness.report.references import cited
 from harness.report.site.accuracy import LOG, axis
 from harness.report.site.marks import drawn
-from harness.report.site.runs import MACHINE
+from harness.report.site.runs import MACHINE, references
 from harness.report.site.script import number
 from harness.report.speed.figures import Figures, figures
 from harness.report.speed.speed_table import remarks
@@ -55,7 +54,8 @@ def chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
         "hover": [*hover, ["binds", "limit that binds"], ["reached", "share of that limit reached"]],
         "items": [_item(scene, label, some, newest) for (scene, label), some in lines.items()],
         "marks": {label: drawn(mark) for label, mark in marks.items()},
-        "references": {f.label: {"cited": cited(reference.get(f.solver)), "bibtex": ""} for f in timed},
+        "references": references((f.label, reference.get(f.solver)) for f in timed),
+        "command": "springbench speed CONFIG --again",
     }, remarks(found)
 
 

@@ -18,6 +18,7 @@ Object.assign(springbench, (() => {
       for (let c = 0; c < names.length; c++) row[names[c]] = read[c](k);
       row.key = `${sweep.slug}/${row.run_id}`;
       row.mark = table.marks[row.label];
+      row.cited = table.references[row.solver]?.cited;
       return row;
     });
     tables.set(sweep.slug, rows);
@@ -65,5 +66,5 @@ Object.assign(springbench, (() => {
   // A file of the results, as commands call it.
   const called = file => quoted(`${index.place === "." ? "" : `${index.place}/`}${decodeURI(file)}`);
 
-  return { called, rows, rowOf, sweepOf, references, picture, recording, title, command };
+  return { called, quoted, rows, rowOf, sweepOf, references, picture, recording, title, command };
 })());

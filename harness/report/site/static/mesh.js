@@ -92,10 +92,11 @@ Object.assign(springbench, (() => {
     box.onkeydown = event => { if (event.key === "Escape" && event.target.tagName !== "INPUT") close(); };
     const figures = springbench.definitions(chart.hover.map(([column, words]) => [words, Array.isArray(item[column]) ? item[column][k] : item[column]])
       .map(([words, value]) => [words, typeof value === "number" ? number(value) : value]));
-    const made = sweep.made[0] || {}, command = `springbench ${sweep.kinds.includes("accuracy") ? "accuracy" : "ablate"} ${sweep.config || "CONFIG.yaml"}`;
+    const made = sweep.made[0] || {}, command = chart.command.replace("CONFIG", springbench.quoted(sweep.config || "CONFIG.yaml"));
+    const settings = Object.entries(JSON.parse(item.parameters || "{}")).map(pair => pair.join(" ")).join(", ");
     const scrub = element("div"), own = item.recording && sweep.up + item.recording;
     put(box, shut, element("h2", {}, springbench.glyph(chart.marks[item.label]), ` ${item.label}`), element("p.label", {}, item.what),
-      item.parameters && item.parameters !== "{}" && element("p.muted", {}, item.parameters), scrub,
+      settings && element("p.muted", {}, settings), scrub,
       element("div.cols", {},
         element("div", {}, element("h3", {}, "At this point"), figures),
         element("div", {}, element("h3", {}, "Do it again"), springbench.commandBox(command, "Command that repeats the measurement"),

@@ -17,8 +17,8 @@
     { id: "sweep", width: "minmax(96px, 1fr)", spare: 5, title: "Results", show: row => row.sweep },
     { id: "scene", width: "minmax(120px, 2fr)", title: "Scene", show: row => row.scene },
     { id: "size", width: "58px", title: "Size", numeric: true, show: row => row.size || "–" },
-    { id: "solver", width: "minmax(150px, 2fr)", title: "Solver", meaning: "and the options in which its runs differ", show: row => element("span.who", {}, glyph(row.mark), row.solver, row.options && element("span.options", {}, row.options)) },
-    { id: "status", width: "minmax(104px, 1fr)", title: "Status", show: row => element("span", {}, state(row.status), row.by && " ", marked(row)) },
+    { id: "solver", width: "minmax(150px, 2fr)", title: "Solver", meaning: "and the options in which its runs differ", show: row => element("span.who", { title: row.cited }, glyph(row.mark), row.solver, row.options && element("span.options", {}, row.options)) },
+    { id: "status", width: "minmax(118px, 1fr)", title: "Status", show: row => element("span", {}, state(row.status), row.by && " ", marked(row)) },
     { id: "outcome", width: "minmax(116px, 1fr)", title: "Judged", show: row => (row.outcome ? state(row.outcome) : "–") },
     { id: "stopped", width: "92px", spare: 3, title: "Stopped by", meaning: "what ended the last step's iterations", show: row => words(row, "stopped") || "–" },
     { id: "iterations", width: "64px", spare: 6, title: "Iter.", meaning: "median iterations a step", numeric: true, show: row => number(row.iterations) },
@@ -26,8 +26,8 @@
     { id: "step", width: "86px", title: "ms a step", meaning: "the median over frames and rounds", numeric: true, show: row => element("span", {}, number(row.step), doubt(row)) },
     { id: "least", width: "82px", spare: 7, title: "Least ms", numeric: true, show: row => number(row.least) },
     { id: "warm", width: "92px", spare: 8, title: "Prepare ms", meaning: "warm", numeric: true, show: row => number(row.warm) },
-    { id: "largest_strain", width: "74px", spare: 1, title: "Strain", meaning: "the largest of all springs and frames", numeric: true, show: row => percent(row.largest_strain) },
-    { id: "strain_99", width: "68px", spare: 2, title: "99 %", meaning: "strain that 99 % of the springs stay below", numeric: true, show: row => percent(row.strain_99) },
+    { id: "largest_strain", width: "78px", spare: 1, title: "Strain", meaning: "the largest of all springs and frames", numeric: true, show: row => percent(row.largest_strain) },
+    { id: "strain_99", width: "78px", spare: 2, title: "99 %", meaning: "strain that 99 % of the springs stay below", numeric: true, show: row => percent(row.strain_99) },
   ];
   const FACETS = [["sweep", "Results"], ["scene", "Scene"], ["size", "Size"], ["solver", "Solver"], ["status", "Status"], ["outcome", "Judged"], ["stopped", "Stopped by"], ["by", "Code"]];
   const LIMITS = [["residual", "Residual at most"], ["step", "ms a step at most"], ["largest_strain", "Strain at most (%)"]];
@@ -59,10 +59,12 @@
   }
 
   function csv(rows) {
-    const names = Object.keys(rows[0] || {}).filter(name => !["mark", "key", "slug"].includes(name));
+    const names = Object.keys(rows[0] || {}).filter(name => !["mark", "key", "slug", "cited"].includes(name));
     const cell = v => (v === null || v === undefined ? "" : /[",\n]/.test(String(v)) ? `"${String(v).replaceAll('"', '""')}"` : String(v));
     return [names.join(","), ...rows.map(row => names.map(name => cell(row[name])).join(","))].join("\n") + "\n";
   }
+
+  const parquet = (slug, name) => element("a.quiet", { href: `site/data/${encodeURIComponent(slug)}/runs.parquet`, download: `${slug}-runs.parquet` }, name);
 
   springbench.views.runs = async (content, query, index) => {
     const all = await springbench.rows();
@@ -134,8 +136,8 @@
         const slugs = [...new Set(shown.map(row => row.slug))];
         downloads.replaceChildren(
           element("button.quiet", { type: "button", onclick: () => save("runs.csv", csv(shown), "text/csv") }, "CSV"),
-          ...slugs.slice(0, 3).map(slug => element("a.quiet", { href: `site/data/${encodeURIComponent(slug)}/runs.parquet`, download: `${slug}-runs.parquet` },
-            slugs.length > 1 ? `Parquet: ${springbench.sweepOf(slug).name}` : "Parquet")));
+          slugs.length > 1 ? element("details.menu", {}, element("summary.quiet", {}, "Parquet"), element("div", {}, ...slugs.map(slug => parquet(slug, springbench.sweepOf(slug).name))))
+            : element("span", {}, ...slugs.map(slug => parquet(slug, "Parquet"))));
       }
       selected = changes.selected = new Set((next.get("sel") || "").split(",").filter(Boolean));
       changes.opened = next.get("run") || "";
