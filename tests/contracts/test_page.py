@@ -21,7 +21,10 @@ VIEWS = {
     "two runs": f"compare?sel=made/{run(0)['run_id']},made/{run(1)['run_id']}",
     "plots": "plots?sweep=made",
     "convergence": "plots?sweep=study&plot=convergence",
-    **{plot: f"plots?sweep=accuracy&plot={plot}" for plot in ("times", "work", "profiles", "growth", "winners")},
+    **{
+        plot: f"plots?sweep=accuracy&plot={plot}"
+        for plot in ("times", "work", "profiles", "growth", "winners", "liu2013")
+    },
     **{plot: f"plots?sweep={sweep}&plot={plot}" for sweep, plot in (("cases", "hard"), ("machine", "speed"))},
     **{plot: f"plots?sweep=effects&plot={plot}" for plot in ("ablation", "prices")},
 }
@@ -154,6 +157,7 @@ def test_the_table_sorts_filters_and_says_so_in_the_url(tab: Tab, page: str):
     assert tab.view() == "#runs?sort=step"
     first = shown.locator(".body .tr").first
     assert "xpbd" in first.inner_text(), "the fastest of the smallest size"
+    assert "doi:" in first.locator(".who").get_attribute("title"), "where the solver comes from, on pointing at it"
     shown.get_by_label("Status").select_option("unsupported")
     assert tab.rows() == sum(fails(k) for k in range(COUNT))
     shown.get_by_label("Status").select_option("ok")

@@ -22,12 +22,13 @@ from harness.report.accuracy.measured import (
     by_other_code,
     by_self_converged,
     stop_words,
+    without_short,
 )
 from harness.report.accuracy.pictures import nearest, place
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
 from harness.report.page import step_words
-from harness.report.site import winners
+from harness.report.site import paper, winners
 from harness.report.site.marks import drawn
 from harness.report.site.runs import references
 from harness.report.site.script import numbers as _numbers
@@ -40,8 +41,9 @@ _COMMAND = "springbench accuracy CONFIG --again"
 _SHARES = {"range": [-0.02, 1.05], "tickformat": ".0%"}
 
 
-def charts(table: Measurements, folder: Path) -> dict[str, Item]:
+def charts(everything: Measurements, folder: Path) -> dict[str, Item]:
     """The charts that the rows have something for, by their ids; folder: of the sweep's results."""
+    table = without_short(everything)
     pictures: dict[str, Item] = {}
     for problem in table.problems:
         path, best = place(problem, Path("report/meshes")), nearest(table, problem, folder)
@@ -57,7 +59,8 @@ def charts(table: Measurements, folder: Path) -> dict[str, Item]:
     everyone = (*table.curves, *table.works)
     marks = {label: drawn(mark) for label, mark in looks((each.label, each.solver) for each in everyone).items()}
     shared = {"marks": marks, "references": references((each.label, each.reference) for each in everyone)}
-    made = {name: chart | shared for name, chart in made.items()} | {"winners": winners.chart(table)}
+    made = {name: chart | shared for name, chart in made.items()}
+    made |= {"winners": winners.chart(table), "liu2013": paper.chart(everything)}
     return {name: chart | {"command": _COMMAND} for name, chart in made.items() if chart["items"]}
 
 

@@ -148,7 +148,7 @@ def _accuracy(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
     from harness.report.site.accuracy import charts
 
     table = read(folder.path)
-    scripts, facts = charts(without_short(table), folder.path), dict[str, Any]()
+    scripts, facts = charts(table, folder.path), dict[str, Any]()
     if recorded:
         from harness.report.site.meshes import write_recordings, write_solves
 

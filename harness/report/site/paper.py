@@ -1,0 +1,48 @@
+"""The reproduction of figures 2 and 3 of Liu et al. 2013 as a chart of the page: our errors over the paper's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from harness.report.accuracy.measured import Measurements, by_other_code
+from harness.report.accuracy.paper import comparisons, own
+from harness.report.site.marks import drawn
+from harness.report.site.script import numbers
+from harness.report.style import DASHED, MUTED, Mark
+
+_MARKS = {"ours": Mark("#0072b2", "o"), "Liu et al. 2013": Mark(MUTED, "D", DASHED)}
+_LOG = {"type": "log"}
+_NOTE = "Relative error (g − g*)/(g0 − g*) after iterations of local-global: ours, and as the paper's figures show it."
+
+
+def chart(table: Measurements) -> dict[str, Any]:
+    """The chart, without items where no row belongs to the reproduction."""
+    found = comparisons(table)
+    items = [
+        {
+            "label": label,
+            "what": curve,
+            "curve": curve,
+            "parameters": "{}",
+            "iterations": [one.iterations for one in mine],
+            "error": numbers(getattr(one, side) for one in mine),
+            "ratio": numbers(one.ratio for one in mine),
+            "frames": [one.frames for one in mine],
+        }
+        for curve in dict.fromkeys(one.curve for one in found)
+        for mine in [[one for one in found if one.curve == curve]]
+        for label, side in zip(_MARKS, ("ours", "theirs"), strict=True)
+    ]
+    return {
+        "title": "The paper reproduced",
+        "note": " ".join([_NOTE, *by_other_code(own(table), table.newest)]),
+        "filters": ["curve"],
+        "x": [{"column": "iterations", "title": "iterations", "axis": _LOG}],
+        "y": [{"column": "error", "title": "relative error", "axis": _LOG}],
+        "hover": [
+            *(["iterations", "iterations"], ["error", "relative error"]),
+            *(["ratio", "ours over theirs"], ["frames", "our frames"]),
+        ],
+        "marks": {name: drawn(mark) for name, mark in _MARKS.items()},
+        "items": items,
+    }
