@@ -199,6 +199,19 @@ def test_the_others_damp_a_quadratic_energy(name):
         assert all(b <= a * (1.0 + 1e-12) for a, b in pairwise(found))  # as above
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["midpoint", "newmark"])
+def test_the_energy_stays_near_over_a_hundred_thousand_steps(name):
+    """Midpoint is symplectic; the trapezoidal rule, Newmark's mean acceleration, is conjugate to it."""
+    scene = made(name, Chain(), Springs(rule="fixed", stretch=25.0), size=3, time_step=0.02)  # omega h = .3
+    begun = State(Motion(1.1 * scene.mesh.rest, np.random.default_rng(0).normal(size=(3, 3))), None, 0)
+    path = simulate(scene, prepare(scene, Newton()), CONVERGED, first_guess="inertial", frames=100_000, state=begun)
+    found = energies(scene, [begun.now, *(step.state.now for step in path if step.index % 500 == 0)])
+    # It swings by (omega h)^2 at most, and does not drift.
+    assert np.ptp(found) < 0.1 * found[0]
+    assert abs(found[-100:].mean() - found[:100].mean()) < 0.02 * found[0]
+
+
 MINIMISERS = [name for name, target in SOLVERS.items() if load(target).minimises]
 
 
