@@ -37,6 +37,9 @@ from solvers.integrators import INTEGRATORS
 ACROSS = 4
 """Panels in a row."""
 
+_PLAIN = 4.4
+"""The size of a mark."""
+
 ERRORS = (0.1, 0.03, 0.01, 0.003, 0.001)
 """The errors at which the front is told in words."""
 
@@ -147,9 +150,10 @@ def _draw(stem: Path, mesh: str, works: list[WorkPoint], marked: dict[str, Mark]
 
 
 def _sizes(works: Iterable[WorkPoint]) -> dict[float | None, float]:
-    """Sizes of the marks by tolerance, larger for tighter ones; None: fixed iterations, the least."""
+    """Sizes of the marks by tolerance, larger for tighter ones; None: fixed iterations, the least. Methods with steps
+    of their own have no iterations, and the largest marks."""
     tolerances = sorted({work.tolerance for work in works if work.tolerance is not None}, reverse=True)
-    return {None: 2.8, **{tolerance: 4.4 + 1.6 * k for k, tolerance in enumerate(tolerances)}}
+    return {None: 2.8, **{tolerance: _PLAIN + 1.6 * k for k, tolerance in enumerate(tolerances)}}
 
 
 def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dict[float | None, float]) -> None:
@@ -161,7 +165,8 @@ def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dic
         members.sort(key=lambda work: work.time_step)
         look, hollow = marked[label], [older(work) for work in members]
         x, y = [work.seconds for work in members], [work.error for work in members]
-        line(ax, x, y, look, spaced=False, older=hollow, linewidth=0.9, markersize=sizes[tolerance] * size(look))
+        grown = max(_PLAIN, *sizes.values()) if members[0].own_steps else sizes[tolerance]
+        line(ax, x, y, look, spaced=False, older=hollow, linewidth=0.9, markersize=grown * size(look))
     base = default(works)
     if base:
         ax.plot(base.seconds, base.error, "o", mfc="none", mec=INK, markersize=15, mew=1.6, zorder=6)
