@@ -187,7 +187,9 @@ def _draw_steps(
     ax.vlines(n, low, high, color=look.color, alpha=0.5, linewidth=1.2)
     ax.plot(n, middle, color=look.color, linestyle=dash, linewidth=1.8, marker=look.marker, markersize=6, mec=PAGE)
     hollow = [run.run_id in older for run in timed]
-    ax.plot(n[hollow], middle[hollow], look.marker, mfc=PAGE, mec=look.color, mew=1.5, markersize=6, zorder=4)
+    ax.plot(
+        n[hollow], middle[hollow], marker=look.marker, ls="", mfc=PAGE, mec=look.color, mew=1.5, markersize=6, zorder=4
+    )
     solver, comma, settings = name.partition(", ")
     words = shorten(shorten(solver, 20) + comma + settings, _LETTERS)
     if len(set(n)) > 1:

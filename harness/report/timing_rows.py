@@ -52,14 +52,14 @@ def draw_rows(
         face = PAGE if run.run_id in older else look.color
         if run.step is not None:
             step.hlines(row, run.lower or run.step, run.upper or run.step, color=look.color, alpha=0.5, linewidth=2.5)
-            step.plot(run.step, row, look.marker, color=look.color, mfc=face, mew=1.5, markersize=8)
+            step.plot(run.step, row, marker=look.marker, ls="", color=look.color, mfc=face, mew=1.5, markersize=8)
         else:
             step.plot(0.02, row, "x", color=look.color, transform=step.get_yaxis_transform(), markersize=8, mew=2)
             where = step.get_yaxis_transform()
             step.text(0.05, row, run.status, color=look.color, transform=where, va="center", fontsize=9)
         for value, fill in ((run.cold, PAGE), (run.warm, look.color)):
             if value is not None:
-                prepare.plot(value, row, look.marker, color=look.color, mfc=fill, mew=1.5, markersize=7)
+                prepare.plot(value, row, marker=look.marker, ls="", color=look.color, mfc=fill, mew=1.5, markersize=7)
     labels = [shorten(names[run.run_id], int(start / _LETTER)) for run in here]
     _scales(step, [v for run in here for v in (run.lower, run.upper) if v], labels)
     _scales(prepare, [v for run in here for v in (run.cold, run.warm) if v], [""] * len(here))

@@ -43,7 +43,8 @@ def draw_ways(stem: Path, title: str, facts: Sequence[str], points: Sequence[Poi
         for point in points:
             look = looks[point.solver]
             style: dict[str, Any] = mark(look, hollow=False) | {"alpha": 1.0 if point.error <= asked else 0.35}
-            ax.plot(point.cost, point.error, look.marker, color=look.color, ms=6.5 * sized(look), zorder=3, **style)
+            style |= {"marker": look.marker, "ls": "", "color": look.color, "ms": 6.5 * sized(look)}
+            ax.plot(point.cost, point.error, zorder=3, **style)
         for k, point in enumerate(within[: SHOWN + 1]):
             ring: dict[str, Any] = {"mec": INK, "mew": 1.8, "ms": 18} if not k else {"mec": MUTED, "mew": 0.9, "ms": 14}
             ax.plot(point.cost, point.error, "o", mfc="none", zorder=4, **ring)
