@@ -145,7 +145,8 @@ def log_axis(axis: Axis, low: float, high: float, *, unit: str = "power") -> Non
         axis.axes.set_ylim(low, high)
     decades = np.log10(high / low)
     subs = (1.0,) if decades > 2.2 else (1.0, 3.0) if decades > 1.2 else (1.0, 2.0, 5.0)
-    axis.set_major_locator(LogLocator(subs=subs, numticks=7 if decades > 2.2 else 12))
+    most = 12 if decades <= 2.2 else 4 if unit == "plain" and decades > 4.0 else 7  # 1 000 and 10 000 take their room
+    axis.set_major_locator(LogLocator(subs=subs, numticks=most))
     axis.set_major_formatter(_FORMATTERS[unit])
     axis.set_minor_locator(NullLocator())
     if axis is axis.axes.xaxis:
