@@ -24,7 +24,10 @@ KINDS = (
         "refuse_by_name[vbd-",
         "test_a_balloon_of_a_thousand",
         "test_gas_is_minimised_where_its_sparse",
+        *("effects-dashpots-1e6-vbd", "effects-dashpots-1e12-vbd"),
+        *("effects-strain-limits-1e13-vbd", "effects-strain-limits-1e18-vbd", "effects-strain-limits-rigid-vbd"),
     ),  # a kernel for each set of effects
+    *("test_a_factor_in_single_precision", "test_compiled.py::test_no_iter", "test_compiled.py::test_all_vertices_may"),
     *("stability/test_hard_answers.py", "stability/test_properties", "contracts/test_backends_agree.py"),
 )
 """Parts of their names."""
