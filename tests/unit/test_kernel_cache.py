@@ -55,7 +55,8 @@ def asked(checkout: Path, code: str, **environment: str) -> str:
     told = subprocess.run(
         [sys.executable, "-c", code],
         cwd=checkout,
-        env=kept | {"PYTHONPATH": str(checkout)} | environment,
+        # What is edited here may have one length, and one second: bytecode would be taken for today's.
+        env=kept | {"PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": "1"} | environment,
         capture_output=True,
         text=True,
     )
