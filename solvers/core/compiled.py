@@ -245,7 +245,8 @@ class PreparedCompiled(Iterative):
 
     def threads(self) -> int | None:
         """As many as are allowed and as there are groups of subtrees; None for one."""
-        threads = min(numba.get_num_threads(), int(self.plan.top[2]))
+        groups = int(self.plan.top[2])
+        threads = min(numba.get_num_threads(), groups) if groups > 1 else 1
         return threads if threads > 1 else None
 
 

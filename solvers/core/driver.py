@@ -146,8 +146,8 @@ class Iterative(ABC):
 
 def largest(problem: StepProblem) -> float:
     """The first guess's largest coordinate [m], exactly pinned vertices on their targets."""
-    pins, p = problem.system.pins, problem.first_guess
-    if pins.exact.any():
+    s, p = problem.system, problem.first_guess
+    if len(s.free) < s.vertices:
         p = p.copy()
-        p[pins.vertices[pins.exact]] = problem.pin_targets[pins.exact]
+        p[s.pins.vertices[s.pins.exact]] = problem.pin_targets[s.pins.exact]
     return float(np.abs(p).max(initial=0.0))
