@@ -38,8 +38,8 @@ from harness.base.workers import Lost, Workers
 from harness.config.sweep import RunSpec
 from harness.experiments.core import TABLES, ready, watched
 from harness.experiments.plan import Files
+from harness.experiments.run_unit import RunUnit
 from harness.experiments.scheduler import PATIENCE, SILENCE, reach, scheduler
-from harness.experiments.sweep import RunUnit
 from solvers.plugins import Plugin, load
 
 CLOCKS = 60.0
@@ -60,7 +60,7 @@ _AHEAD = 4
 """Tasks that wait at the scheduler for each thread of the workers: more would be kept there for nothing."""
 
 
-class About(NamedTuple):
+class WorkerFacts(NamedTuple):
     """What a worker says of itself: its machine, its versions, its clock."""
 
     machine: str
@@ -71,7 +71,7 @@ class About(NamedTuple):
     clock: float
 
     @classmethod
-    def this(cls) -> About:
+    def this(cls) -> WorkerFacts:
         """Of this process."""
         python = ".".join(map(str, sys.version_info[:2]))
         return cls(machine.describe().id, machine.node(), machine.code_hash(), python, version("distributed"), time())
@@ -128,7 +128,7 @@ def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Gen
 def machines(client: Client, runs: Sequence[RunSpec], say: Callable[[str], None]) -> list[str]:
     """The ids of the workers' machines. Raises InputError for workers of other versions, or without the code that a run
     names; says which clocks differ."""
-    here = About.this()
+    here = WorkerFacts.this()
     before = time()
     plugins = list({plugin for run in runs for plugin in run.own()})
     answered: Any = client.run(_about, plugins, on_error="return")
@@ -158,7 +158,7 @@ def machines(client: Client, runs: Sequence[RunSpec], say: Callable[[str], None]
     return sorted({about.machine for about, _ in answers})
 
 
-def _about(plugins: Sequence[Plugin]) -> tuple[About, dict[str, str]]:
+def _about(plugins: Sequence[Plugin]) -> tuple[WorkerFacts, dict[str, str]]:
     """On a worker: what it is, and which plug-ins it has not, and why."""
     missing = {}
     for plugin in plugins:
@@ -166,7 +166,7 @@ def _about(plugins: Sequence[Plugin]) -> tuple[About, dict[str, str]]:
             load(plugin.target)
         except Exception as error:
             missing[str(plugin)] = f"{type(error).__name__}: {error}"
-    return About.this(), missing
+    return WorkerFacts.this(), missing
 
 
 def do_on(

@@ -2,94 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing
-from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pyarrow as pa
 
 from harness.base import holding, machine, rows
 from harness.base.errors import InputError, Mistake
-from harness.base.files import half_written
 from harness.base.holding import Claims
 from harness.base.progress import Display
-from harness.base.workers import Limits, Lost, Tick
 from harness.config.sweep import RunSpec
-from harness.experiments.code import code, parts
 from harness.experiments.core import do_all, do_together, require_threads, workers_at_once
 from harness.experiments.plan import NEEDED, Files, of_other_code, plan
-from harness.experiments.provenance import common
 from harness.experiments.resume import wanted
+from harness.experiments.run_unit import RunUnit
 
 if TYPE_CHECKING:
     from harness.experiments.cluster import Cluster
-
-
-@dataclass(frozen=True, slots=True)
-class RunUnit:
-    """A run as a unit of a sweep (`harness.experiments.core.Unit`). positions: where to store those of its steps;
-    at_once: so many may be timed at once."""
-
-    run: RunSpec
-    files: Files
-    positions: Path | None = None
-    at_once: int = 1
-
-    @property
-    def title(self) -> str:
-        """The run in words."""
-        return self.run.title
-
-    @property
-    def place(self) -> Path:
-        """See Filed."""
-        return self.files.rows
-
-    @property
-    def ticks(self) -> int:
-        """The steps of the pass that warms up, of the timed ones and of the second pass."""
-        return self.run.frames * (self.run.rounds + 2)
-
-    @property
-    def work(self) -> float:
-        """A rough measure of the run's effort, for the time left."""
-        return (self.run.size or 32) ** 2 * self.ticks * self.run.iterations
-
-    @property
-    def limits(self) -> Limits:
-        """What the sweep says."""
-        return Limits(self.run.time_limit, self.run.memory_limit)
-
-    @property
-    def group(self) -> Hashable:
-        """Runs that are judged by one reference."""
-        return (self.run.scene.digest, self.run.size, self.run.integrator) if self.run.judge else None
-
-    def do(self, tick: Tick) -> str:
-        """See Unit."""
-        from harness.experiments.run import execute  # brings along all that simulates and records
-
-        return _outcome(execute(self.run, self.files, tick, positions=self.positions, at_once=self.at_once))
-
-    def lost(self, lost: Lost) -> str:
-        """See Unit."""
-        return _outcome(_abandoned(self.run, self.files, lost.status, str(lost)))
-
-
-def _abandoned(run: RunSpec, files: Files, status: str, reason: str) -> list[dict[str, Any]]:
-    """The rows of a run whose process gave no answer, written; what it left half written is removed."""
-    for earlier in (files.recording, files.picture):
-        earlier.unlink(missing_ok=True)
-        for half in half_written(earlier):
-            half.unlink(missing_ok=True)
-    found = [common(run) | {"code": code(parts(run))} | {"phase": "run", "status": status, "reason": reason}]
-    rows.write(files.rows, found)
-    return found
 
 
 def _away(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> AbstractContextManager[Cluster]:
@@ -156,13 +89,6 @@ def run_sweep(
         pictured = [Pictured(p.run, p.files.recording, p.files.picture) for p in planned]
         draw_sweep(name, pictured, folder, table, say, at_once=many, older=of_other_code(runs, table))
     return table
-
-
-def _outcome(found: list[dict[str, Any]]) -> str:
-    if found[0]["status"] != "ok":
-        return f"{found[0]['status']}: {found[0]['reason']}"
-    middle = median(row["seconds"] for row in found if row["phase"] == "step")
-    return f"{1e3 * middle:.3g} ms a step"
 
 
 def failures(table: pa.Table) -> list[str]:

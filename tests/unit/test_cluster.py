@@ -14,7 +14,7 @@ import pytest
 from harness.base.errors import InputError
 from harness.config.sweep import RunSpec
 from harness.experiments import cluster
-from harness.experiments.cluster import About
+from harness.experiments.cluster import WorkerFacts
 from solvers.plugins import Plugin
 
 
@@ -44,15 +44,15 @@ def machines(client: Workers, *plugins: Plugin, say: Callable[[str], None] = pri
 
 
 def test_workers_like_this_one_can_do_runs():
-    assert machines(Workers(None, None)) == [About.this().machine]
+    assert machines(Workers(None, None)) == [WorkerFacts.this().machine]
 
 
 @pytest.mark.parametrize("what", ["code", "python", "distributed"])
 def test_a_worker_of_another_version_is_refused_with_both(what: str):
-    other = About.this()._replace(**{what: "0.0.1"})
+    other = WorkerFacts.this()._replace(**{what: "0.0.1"})
     with pytest.raises(InputError) as refused:
         machines(Workers(None, (other, {})))
-    for part in ("tcp://worker-1:1", f"{what} 0.0.1", str(getattr(About.this(), what))):
+    for part in ("tcp://worker-1:1", f"{what} 0.0.1", str(getattr(WorkerFacts.this(), what))):
         assert part in str(refused.value)
     assert "worker-0" not in str(refused.value)
 
@@ -72,7 +72,7 @@ def test_a_worker_that_cannot_be_asked_is_told():
 
 def test_a_worker_that_is_lost_meanwhile_is_no_mistake():
     told: list[str] = []
-    assert machines(Workers(None, OSError("Stream is closed")), say=told.append) == [About.this().machine]
+    assert machines(Workers(None, OSError("Stream is closed")), say=told.append) == [WorkerFacts.this().machine]
     assert "worker-1" in told[0]
     with pytest.raises(InputError, match="all workers were lost"):
         machines(Workers(OSError("Stream is closed")))
@@ -81,7 +81,7 @@ def test_a_worker_that_is_lost_meanwhile_is_no_mistake():
 @pytest.mark.parametrize(("off", "words"), [(3600.0, "ahead"), (-3600.0, "behind"), (1.0, "")])
 def test_clocks_that_differ_are_said(off: float, words: str):
     told: list[str] = []
-    machines(Workers((About.this()._replace(clock=time() + off), {})), say=told.append)
+    machines(Workers((WorkerFacts.this()._replace(clock=time() + off), {})), say=told.append)
     assert [words in line for line in told] == [True] * bool(words)
 
 

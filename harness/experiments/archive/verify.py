@@ -34,7 +34,7 @@ from harness.experiments.archive.merge import sweeps
 from harness.experiments.archive.publish import SUMS, config_of
 from harness.experiments.core import do_all
 from harness.experiments.plan import Files
-from harness.experiments.sweep import RunUnit
+from harness.experiments.run_unit import RunUnit
 
 RATIO, ELSEWHERE = 1.25, 2.0
 """Minima of two runs of the same code lie up to 4 % apart on an idle machine, ratios far more on busy ones; another
