@@ -45,7 +45,7 @@ class Limits(NamedTuple):
     gib: float | None = None
 
 
-class Answer(NamedTuple):
+class PieceOutcome(NamedTuple):
     """What a piece returned, or its error, or in words how it left; clean: whether it left nothing behind."""
 
     value: Any
@@ -94,18 +94,18 @@ def _tie(parent: int) -> None:
             file.write("1000")
 
 
-def _answer(piece: Piece, limits: Limits, tick: Tick) -> Answer:
+def _answer(piece: Piece, limits: Limits, tick: Tick) -> PieceOutcome:
     before = threading.active_count()
     if limits.gib is not None:
         limit(resource.RLIMIT_DATA, data() + limits.gib * 2**30)
     try:
         value: Any = piece(tick)
     except SpringbenchError as error:
-        return Answer(None, error)
+        return PieceOutcome(None, error)
     except BaseException as error:  # SystemExit and GeneratorExit too: whoever called is not to leave
         said = " ".join(str(error).split())[:300]
         why = f"raised {type(error).__name__}{f': {said}' if said else ''} ({where(error, ())})"
-        return Answer(None, why, clean=isinstance(error, Exception))
+        return PieceOutcome(None, why, clean=isinstance(error, Exception))
     finally:
         limit(resource.RLIMIT_DATA, resource.RLIM_INFINITY)
-    return Answer(value, clean=threading.active_count() <= before)
+    return PieceOutcome(value, clean=threading.active_count() <= before)

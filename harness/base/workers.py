@@ -23,7 +23,7 @@ from typing import Any
 
 from harness.base.asides import LOOK, WAITING, begun, ended, is_step
 from harness.base.blame import place
-from harness.base.worker import DUMP, Answer, Limits, Piece, Tick, serve
+from harness.base.worker import DUMP, Limits, Piece, PieceOutcome, Tick, serve
 
 Going = Generator[Connection, None, Any]
 """A piece that is being done: yields whom to wait for, and returns its value."""
@@ -113,7 +113,7 @@ class _Worker:
         """Whether it can be asked."""
         return self._process.is_alive()
 
-    def ask(self, piece: Piece, tick: Tick, limits: Limits) -> Generator[Connection, None, Answer]:
+    def ask(self, piece: Piece, tick: Tick, limits: Limits) -> Generator[Connection, None, PieceOutcome]:
         """The answer to a piece, in the end. Raises Lost."""
         heard, began = _Heard(self._ticks, self._said, tick), monotonic()
         try:

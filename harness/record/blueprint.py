@@ -10,7 +10,7 @@ import rerun.blueprint as rrb
 
 from harness.record import curves
 from harness.record.base import RecordingInfo
-from harness.record.camera import Box
+from harness.record.camera import Extent
 
 BACKGROUND = (38, 40, 46)
 _LEGEND = 0.55
@@ -39,7 +39,7 @@ def scale_name(strain_range: float) -> str:
     return f"Strain: blue = compressed {percent} or more, grey = at rest, orange = stretched {percent} or more"
 
 
-def scene_view(root: str, name: str, box: Box, *, springs_visible: bool) -> rrb.Spatial3DView:
+def scene_view(root: str, name: str, box: Extent, *, springs_visible: bool) -> rrb.Spatial3DView:
     """The mesh under `root`/scene; its springs and the forces on it are there to be switched on."""
     shown: dict[Any, rrb.EntityBehavior] = {f"{root}/scene/springs": rrb.EntityBehavior(visible=springs_visible)}
     shown[f"{root}/scene/forces"] = rrb.EntityBehavior(visible=False)
@@ -62,7 +62,7 @@ def plot(name: str, contents: Sequence[str], *, last: int, legend: bool = True) 
     return rrb.TimeSeriesView(origin="/", contents=list(contents), name=name, plot_legend=corner, axis_x=axis)
 
 
-def blueprint(info: RecordingInfo, box: Box, last: int = 0) -> rrb.Blueprint:
+def blueprint(info: RecordingInfo, box: Extent, last: int = 0) -> rrb.Blueprint:
     """The layout of one recording; last: its last frame."""
     series = rrb.Vertical(
         plot("Energies: change, by its largest", ["+ /energy_change/**"], last=last),

@@ -40,7 +40,7 @@ _NEAREST = 0.3
 """How near the camera comes to the nearest point, in the diagonal of the box."""
 
 
-class Box:
+class Extent:
     """The box that the positions stay in, and what of them a camera must see.
 
     aspect: of the view, its width over its height; first: what is seen first, the positions at rest if left out

@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 
 from harness.record import cells, curves
 from harness.record.blueprint import panels, plot, scene_view
-from harness.record.camera import Box
+from harness.record.camera import Extent
 from harness.record.partial import PartialFile
 from harness.record.reader import Source, looked_at, network, open_recording, positions, properties, triangles
 
@@ -68,11 +68,11 @@ class _Run:
         self.properties: dict[str, Any] = properties(source)[1]
         self.triangles = len(triangles(source))
         self.entities: set[str] = set()
-        self.box: Box | None = None
+        self.box: Extent | None = None
         self.last = 0
         self.curves = residuals(source)
         for frame, _, p in positions(source):
-            self.box = self.box or Box(p, aspect)
+            self.box = self.box or Extent(p, aspect)
             self.box.add(p)
             self.last = max(self.last, frame)
 

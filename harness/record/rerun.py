@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from harness.record import blueprint, curves
 from harness.record.arrows import Arrows
 from harness.record.base import LAYOUT, Frame, RecordingInfo
-from harness.record.camera import Box
+from harness.record.camera import Extent
 from harness.record.obstacles import Obstacles, declared
 from harness.record.partial import PartialFile
 from harness.record.shading import PIN_COLOUR, Shading
@@ -56,7 +56,7 @@ class RerunRecorder:
     def __init__(self, path: Path, info: RecordingInfo) -> None:
         self._info = info
         self._shading = Shading(info)
-        self._box = Box(info.mesh.rest)
+        self._box = Extent(info.mesh.rest)
         self._scalars: dict[str, list[tuple[int, float]]] = {}
         self._styled: dict[str, list[str]] = {}
         self._frames = 0
@@ -81,7 +81,7 @@ class RerunRecorder:
             p = frame.positions.astype(np.float32)
         if not self._frames:
             self._begin()
-            self._box = Box(self._info.mesh.rest, first=p)
+            self._box = Extent(self._info.mesh.rest, first=p)
         strain, of_vertex = self._shading.strains(frame.positions)
         self._stream.set_time("frame", sequence=frame.index)
         self._stream.set_time("time", duration=frame.time)

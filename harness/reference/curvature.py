@@ -42,7 +42,7 @@ SHIFTS = (0.0, *(10.0**k for k in range(-17, 2)))
 Solve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
-class Hessian(NamedTuple):
+class SplitHessian(NamedTuple):
     """H = S + V V' [N/m] without the exactly pinned vertices. sparse: S (3 f, 3 f); columns: V (3 f, r), none where all
     energies are sparse (see `solvers.core.coupled`)."""
 
@@ -128,7 +128,7 @@ def across(problem: StepProblem, p: Positions, at: Curvature, *, most: float = S
     return q
 
 
-def free_hessian(problem: StepProblem, p: Positions) -> Hessian:
+def free_hessian(problem: StepProblem, p: Positions) -> SplitHessian:
     """The objective's Hessian at p."""
     system = problem.system
     _, vertices, weight = system.penalty
@@ -142,10 +142,10 @@ def free_hessian(problem: StepProblem, p: Positions) -> Hessian:
             total = csr_array(total + energy.hessian(p))
     free = (3 * system.free[:, None] + np.arange(3)).ravel()
     V = np.concatenate(columns, axis=2).reshape(p.size, -1)
-    return Hessian(csr_array(total[free][:, free]), V[free])
+    return SplitHessian(csr_array(total[free][:, free]), V[free])
 
 
-def _softest(H: Hessian) -> tuple[NDArray[np.float64], Solve]:
+def _softest(H: SplitHessian) -> tuple[NDArray[np.float64], Solve]:
     """The eigenvector of the smallest eigenvalue of a symmetric matrix, of length 1, and the product with the inverse
     of the matrix, shifted as little as makes it positive definite."""
     size = H.sparse.indptr.size - 1
@@ -169,7 +169,7 @@ def _softest(H: Hessian) -> tuple[NDArray[np.float64], Solve]:
     raise ValueError("a Hessian that no multiple of the identity makes positive definite is not symmetric")
 
 
-def definite(H: Hessian) -> Solve | None:
+def definite(H: SplitHessian) -> Solve | None:
     """The product with the inverse of a symmetric matrix of 3 x 3 blocks; None where it is not positive definite in
     floating point: some pivot of its factor is not positive.
 

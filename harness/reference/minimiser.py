@@ -85,7 +85,7 @@ class Minimum:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reference:
+class KnownMinima:
     """The minima known of one problem, the lowest first: an index is a branch. reason: why there is none."""
 
     minima: tuple[Minimum, ...]
@@ -102,26 +102,26 @@ class Reference:
         """The index of a minimum, by where it lies."""
         return next(i for i, known in enumerate(self.minima) if _same(known, minimum))
 
-    def joined(self, found: Minimum) -> Reference:
+    def joined(self, found: Minimum) -> KnownMinima:
         """With one more minimum; the same reference where it is known already, or is not certified."""
         if not found.certified or any(_same(known, found) for known in self.minima):
             return self
-        return Reference(tuple(sorted((*self.minima, found), key=lambda minimum: minimum.g)))
+        return KnownMinima(tuple(sorted((*self.minima, found), key=lambda minimum: minimum.g)))
 
 
-def find_minima(problem: StepProblem, solver: Solver) -> Reference:
+def find_minima(problem: StepProblem, solver: Solver) -> KnownMinima:
     """The minima to which Newton's method leads from the current positions and from the inertial target."""
     guesses = (FIRST_GUESSES[name](problem).first_guess for name in ("current", "inertial"))
     return reference(polish(problem, guess, solver) for guess in guesses)
 
 
-def reference(found: Iterable[Minimum]) -> Reference:
+def reference(found: Iterable[Minimum]) -> KnownMinima:
     """The certified ones among what was found; where there is none, the reason."""
-    known, reason = Reference(()), ""
+    known, reason = KnownMinima(()), ""
     for one in found:
         known = known.joined(one)
         reason = reason if one.certified else f"no certified minimum: Newton's method ends where {one.flaw}"
-    return known if known.minima else Reference((), reason)
+    return known if known.minima else KnownMinima((), reason)
 
 
 def polish(problem: StepProblem, p: Positions, solver: Solver) -> Minimum:

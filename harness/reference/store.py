@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from harness.base.files import replacing
 from harness.reference.frozen import Arrays, Frozen, agree, bind, freeze, moment_frames, reference_run, thaw
-from harness.reference.minimiser import MINIMUM, Minimum, Reference, find_minima, polish
+from harness.reference.minimiser import MINIMUM, KnownMinima, Minimum, find_minima, polish
 from harness.reference.motion import Field, Unintegrable
 from harness.reference.self_converged import SelfConverged, converge, touches
 from harness.reference.trajectory import Told, Trajectory, integrate
@@ -72,7 +72,7 @@ class Store:
             known |= self._keep(asked, steps)
         return {frame: known[frame] for frame in frames}
 
-    def reference(self, frozen: Frozen) -> Reference:
+    def reference(self, frozen: Frozen) -> KnownMinima:
         """The minima known of a problem, found now if there is none. Its `best` raises Uncertified."""
         path = self.folder / f"minima-{frozen.digest}.npz"
         if path.exists() and (stored := _read(path)).keys() >= set(_CERTIFICATE):  # else by code that certified less
@@ -146,7 +146,7 @@ class Store:
             _write(self._problem(asked, frame), arrays)
         return kept
 
-    def _remember(self, frozen: Frozen, known: Reference) -> None:
+    def _remember(self, frozen: Frozen, known: KnownMinima) -> None:
         arrays = {name: np.array([getattr(minimum, name) for minimum in known.minima]) for name in _CERTIFICATE}
         _write(self.folder / f"minima-{frozen.digest}.npz", arrays)
 
@@ -171,10 +171,10 @@ def _moving(spec: SceneSpec, size: int) -> tuple[Scene, NDArray[np.float64]]:
     return scene, Field(scene).witness()
 
 
-def _minima(arrays: Arrays) -> Reference:
+def _minima(arrays: Arrays) -> KnownMinima:
     numbers = (arrays[name].tolist() for name in ("g", "error", "smallest_eigenvalue", "doubt"))
     columns = zip(arrays["positions"], *numbers, arrays["near"], strict=True)
-    return Reference(tuple(Minimum(*values, kind=MINIMUM) for values in columns))
+    return KnownMinima(tuple(Minimum(*values, kind=MINIMUM) for values in columns))
 
 
 def _read(path: Path) -> Arrays:

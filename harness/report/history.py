@@ -51,7 +51,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class StoredResult:
     """A stored result. value, low, high: the ratio to the yardstick, or the least time [s] alone."""
 
     commit: str
@@ -70,7 +70,7 @@ class GateHistory:
     gate: str
     machine: str
     ratio: bool
-    points: tuple[Point, ...]
+    points: tuple[StoredResult, ...]
     starts: tuple[int, ...]
 
     @property
@@ -103,7 +103,7 @@ def stored_files(places: Iterable[Path]) -> list[Path]:
 def history(files: Sequence[Path]) -> list[GateHistory]:
     """The gates in stored files and their changes; the largest first. Raises InputError for foreign files."""
     stored = sorted(map(read_stored, files), key=lambda s: (s.commit_info.time or s.datetime, s.datetime))
-    points: dict[tuple[str, str, bool], list[Point]] = defaultdict(list)
+    points: dict[tuple[str, str, bool], list[StoredResult]] = defaultdict(list)
     for one in stored:
         for benchmark in one.benchmarks:
             key = benchmark.fullname.rpartition("::")[2], _machine(one), benchmark.extra_info.ratio is not None
@@ -117,13 +117,17 @@ def _machine(stored: Stored) -> str:
     return f"{cpu or 'unknown processor'}, {usable or cores or '?'} cores"
 
 
-def _point(stored: Stored, benchmark: Benchmark) -> Point:
+def _point(stored: Stored, benchmark: Benchmark) -> StoredResult:
     commit = stored.commit_info.id[:7] + (CHANGED if stored.commit_info.dirty else "")
     ratio, least = benchmark.extra_info.ratio, benchmark.stats.min
-    return Point(commit, ratio.median, ratio.low, ratio.high) if ratio else Point(commit, least, least, least)
+    return (
+        StoredResult(commit, ratio.median, ratio.low, ratio.high)
+        if ratio
+        else StoredResult(commit, least, least, least)
+    )
 
 
-def changes(points: Sequence[Point]) -> tuple[int, ...]:
+def changes(points: Sequence[StoredResult]) -> tuple[int, ...]:
     """The starts of the stretches of results that belong together; 0 alone where nothing changed or little is known."""
     if len(points) < FEWEST:
         return (0,)

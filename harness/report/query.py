@@ -42,7 +42,7 @@ _CHARACTERS = 50_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class QueryResult:
     """Names of columns and the rows of values that a query gave; more: whether there are more than these."""
 
     columns: list[str]
@@ -70,7 +70,7 @@ def _shown(value: Any) -> str:
     return "".join(c if c.isprintable() else " " for c in text[:_CELL])
 
 
-def answer(sql: str, results: Path, *, most: int = SHOWN, seconds: float = 15.0) -> Answer:
+def answer(sql: str, results: Path, *, most: int = SHOWN, seconds: float = 15.0) -> QueryResult:
     """What a query says of the tables `rows`, `accuracy` and `ablation`; it can read nothing else and write nothing.
 
     most: rows of the answer; seconds: of processor time that it may take. Raises InputError where there are no rows,
@@ -90,7 +90,7 @@ def answer(sql: str, results: Path, *, most: int = SHOWN, seconds: float = 15.0)
         raise InputError(f"query: {error}; ask for less, or give it more with --seconds") from None
 
 
-def _answered(sql: str, folders: dict[str, list[Path]], most: int) -> Answer:
+def _answered(sql: str, folders: dict[str, list[Path]], most: int) -> QueryResult:
     units = {table: [unit for folder in folders[table] for unit in shelf.units(folder)] for table in _TABLES}
     for _ in range(_TRIES - 1):
         with suppress(union.Unfit):  # units were packed since they were looked for
@@ -104,7 +104,7 @@ def _answered(sql: str, folders: dict[str, list[Path]], most: int) -> Answer:
     raise InputError(damaged or f"query: {why[:2000]}")
 
 
-def _found(sql: str, units: dict[str, list[Path]], most: int) -> Answer:
+def _found(sql: str, units: dict[str, list[Path]], most: int) -> QueryResult:
     with union.connected(MEMORY // 2) as connection:
         try:
             lazily = all(s.type == duckdb.StatementType.SELECT for s in connection.extract_statements(sql))
@@ -123,7 +123,7 @@ def _found(sql: str, units: dict[str, list[Path]], most: int) -> Answer:
         except (ValueError, OverflowError) as error:  # dates and numbers that Python does not have
             raise InputError(f"query: {str(error)[:2000]}") from error
         names = [column[0] for column in found.description]
-        return Answer(names, values[:most], len(values) > most or characters >= _CHARACTERS)
+        return QueryResult(names, values[:most], len(values) > most or characters >= _CHARACTERS)
 
 
 def _offer(connection: duckdb.DuckDBPyConnection, units: dict[str, list[Path]], *, lazily: bool) -> None:

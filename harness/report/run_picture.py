@@ -45,7 +45,7 @@ _RULE, _GAP, _CAPTION = 44, 12, 24
 _EARLIER = 4  # any grid that they are put in is full
 
 
-class Box(NamedTuple):
+class PixelBox(NamedTuple):
     """A place on the page [pixels from the top left]."""
 
     left: int
@@ -54,14 +54,14 @@ class Box(NamedTuple):
     height: int
 
 
-def layout(final: float, whole: float, earlier: int) -> tuple[Box, list[Box]]:
+def layout(final: float, whole: float, earlier: int) -> tuple[PixelBox, list[PixelBox]]:
     """Where the final frame goes and where the earlier ones, so that scenes of these shapes fill their places.
 
     final, whole: width over height of the final frame and of all of them, as they are seen.
     """
     if not earlier:
-        return Box(_LEFT, _TOP, _RIGHT - _LEFT, _HEIGHT), []
-    main = Box(_LEFT, _TOP, int(min(max(_HEIGHT * final, _SLIMMEST), _WIDEST)), _HEIGHT)
+        return PixelBox(_LEFT, _TOP, _RIGHT - _LEFT, _HEIGHT), []
+    main = PixelBox(_LEFT, _TOP, int(min(max(_HEIGHT * final, _SLIMMEST), _WIDEST)), _HEIGHT)
     start = main.left + main.width + _RULE
     room = _RIGHT - start
 
@@ -75,7 +75,8 @@ def layout(final: float, whole: float, earlier: int) -> tuple[Box, list[Box]]:
     _, width, height = tile(columns)
     places = [divmod(k, columns) for k in range(earlier)]
     return main, [
-        Box(start + column * (width + _GAP), _TOP + row * (height + _CAPTION), width, height) for row, column in places
+        PixelBox(start + column * (width + _GAP), _TOP + row * (height + _CAPTION), width, height)
+        for row, column in places
     ]
 
 

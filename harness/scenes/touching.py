@@ -48,7 +48,7 @@ def resisting(
     return _STIFF * np.asarray(assemble(held, projective).diagonal(), np.float64)
 
 
-class Held(Protocol):
+class PinLike(Protocol):
     """What pins tell of themselves (`harness.scenes.effects.base`)."""
 
     @property
@@ -72,7 +72,7 @@ class Held(Protocol):
         ...
 
 
-def require_still(who: str, start: Positions, pins: Sequence[Held]) -> None:
+def require_still(who: str, start: Positions, pins: Sequence[PinLike]) -> None:
     """Raise InputError for exact pins that move."""
     for pin in pins:
         moves = pin.motion is not None or not np.array_equal(pin.targets, start[pin.vertices])

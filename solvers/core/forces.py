@@ -46,7 +46,7 @@ def frequency(system: System) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
+class ForceParts:
     """The forces of a system: springs, their bundles; a form, as in `Forces`; drag (n,) [1/s]; load (n, 3) [N], that of
     the form at the origin."""
 
@@ -59,7 +59,7 @@ class Parts:
     load: Positions
 
     @classmethod
-    def of(cls, system: System, solver: str) -> Parts:
+    def of(cls, system: System, solver: str) -> ForceParts:
         """Raises Unsupported for what it does not know."""
         n = system.vertices
         springs = Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])

@@ -62,7 +62,7 @@ class Admm:
         if not 0.0 < self.weight < np.inf:
             raise ValueError(f"weight: should be positive and finite, not {self.weight}")
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedAdmm:
         """Raises Unsupported for energies that have no projection along edges, NotPositiveDefinite."""
         others = {type(e).__name__ for e in system.energies if not isinstance(e, Springs | StrainLimits | Quadratic)}
         if others:
@@ -75,7 +75,7 @@ class Admm:
         base = measure = prepared(system, weighted, lambda Q: factorise(Q))
         if self.weight != 1.0:
             measure = prepared(system, energies, lambda Q: factorise(Q))
-        return Prepared(base, measure, Objective(system), _Projected.of(system), self.weight)
+        return PreparedAdmm(base, measure, Objective(system), _Projected.of(system), self.weight)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class _Projected:
         )
 
 
-class Prepared(Iterative):
+class PreparedAdmm(Iterative):
     """The method, ready for a system. base: its matrix, and measure: Q, with their factors."""
 
     def __init__(
@@ -128,7 +128,7 @@ class Prepared(Iterative):
 class _Iterating(Iterating):
     """Positions, and u of each edge (m, 3) [m]."""
 
-    def __init__(self, prepared: Prepared, problem: StepProblem, guess: Positions) -> None:
+    def __init__(self, prepared: PreparedAdmm, problem: StepProblem, guess: Positions) -> None:
         self._base, self._measure, edges = prepared.base, prepared.measure, prepared.edges
         self._edges = edges.edges, edges.stiffness, edges.low, edges.high, edges.rest_direction, prepared.weight
         self._step = StepObjective(prepared.objective, problem)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from solvers.about import About, Reference
 from solvers.core import vertex_terms
 from solvers.core.driver import Iterating, Iterative
-from solvers.core.forces import Parts, Whole, frequency, rows_of_four
+from solvers.core.forces import ForceParts, Whole, frequency, rows_of_four
 from solvers.kernels.explicit_steps import Coefficients, Forces, Scratch, Subdivision, compose, integrate
 from solvers.methods.explicit_tables import (
     BLANES_MOAN_4,
@@ -60,7 +60,7 @@ class Explicit:
         """substeps: times the fewest that are stable; error: of the springs' mean length, 0 for none."""
         vertex_terms.require_implicit_euler(system, self.name)
         vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), self.name)
-        method, parts = self.method(), Parts.of(system, self.name)
+        method, parts = self.method(), ForceParts.of(system, self.name)
         omega = frequency(system)
         rate = omega + float(parts.drag.max(initial=0.0))
         needed = substeps * max(1.0, ceil(system.time_step * rate / (_SAFETY * method.limit)))
@@ -204,7 +204,7 @@ class PreparedExplicit(Iterative):
 
     system: System
     method: Composition | Tableau
-    parts: Parts
+    parts: ForceParts
     substeps: int
     tolerance: float
     rate: float

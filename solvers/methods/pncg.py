@@ -46,7 +46,7 @@ class NonlinearCG:
         ),
     )
 
-    def prepare(self, system: System) -> Prepared:
+    def prepare(self, system: System) -> PreparedPncg:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported for contact of single
         vertices and where Q fits nowhere."""
         if without_contact(system) is not system:
@@ -55,11 +55,11 @@ class NonlinearCG:
                 "(Contact); take lbfgs or newton, or state surface-contact"
             )
         metric, objective = Metric(system), Objective(system)
-        return Prepared(metric, objective, metric.choice + objective.interpreted, metric.facts)
+        return PreparedPncg(metric, objective, metric.choice + objective.interpreted, metric.facts)
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared(Iterative):
+class PreparedPncg(Iterative):
     """The method, ready for a system."""
 
     metric: Metric

@@ -19,7 +19,7 @@ from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.accuracy.studies import run_accuracy
 from harness.record.reader import read_replay
 from harness.reference import store
-from harness.reference.minimiser import ROUGH, Reference, certify
+from harness.reference.minimiser import ROUGH, KnownMinima, certify
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.problem import Positions, Prepared, System
 from solvers.registry import SOLVERS
@@ -188,7 +188,7 @@ def test_moments_that_are_one_step_are_measured_once(tmp_path: Path) -> None:
 def test_a_minimum_that_is_not_certified_is_told_and_nothing_is_graded_by_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(store, "find_minima", lambda problem, solver: Reference((), "it ended on a saddle"))
+    monkeypatch.setattr(store, "find_minima", lambda problem, solver: KnownMinima((), "it ended on a saddle"))
     monkeypatch.setattr(store, "polish", lambda problem, p, solver: replace(certify(problem, p), kind=ROUGH))
     made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "early"))
     made.run()

@@ -14,7 +14,7 @@ import pytest
 
 from harness.base.errors import RunFailed
 from harness.experiments.accuracy import curves
-from harness.experiments.accuracy.curves import Curve, kept, measure
+from harness.experiments.accuracy.curves import GradedCurve, kept, measure
 from harness.experiments.accuracy.scales import distances
 from harness.reference.minimiser import polish
 from harness.reference.oracle import Oracle, Reading
@@ -79,7 +79,7 @@ def towards(share: Callable[[int], float]) -> Callable[[int], Positions]:
     return lambda number: minimum() + share(number) * (PROBLEM.current - minimum())
 
 
-def curve(prepared: Any, **more: Any) -> Curve:
+def curve(prepared: Any, **more: Any) -> GradedCurve:
     limits: dict[str, Any] = {"iterations": 200, "time_limit": 60.0, "rounds": 2} | more
     return measure(prepared, PROBLEM, Oracle(PROBLEM.system), PROBLEM.value(minimum()), **limits)
 
@@ -146,7 +146,7 @@ def test_passes_that_differ_in_the_last_bit_are_a_failure() -> None:
         curve(Scripted(iterate))
 
 
-def at_a_saddle(iterate: Callable[[int], Positions]) -> Curve:
+def at_a_saddle(iterate: Callable[[int], Positions]) -> GradedCurve:
     above = polish(FLAT, FLAT.current, Newton())
     limits: dict[str, Any] = {"iterations": 40, "time_limit": 60.0, "rounds": 1}
     return measure(cast("Any", Scripted(iterate)), STARTED, Oracle(FLAT.system), above.g, **limits)

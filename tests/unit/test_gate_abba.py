@@ -8,7 +8,7 @@ from random import Random
 import pytest
 
 from harness.experiments.gates.abba import ORDERS, Result, Turn, confirmed, orders, race
-from harness.experiments.gates.sequential import Answer, Interval, Rule
+from harness.experiments.gates.sequential import RatioInterval, Rule, Verdict
 
 RULE = Rule(1.03)
 
@@ -19,13 +19,13 @@ def clock(seconds: float) -> Callable[[], float]:
 
 @pytest.mark.parametrize(
     ("ratio", "answer"),
-    [(1.0, Answer.HOLDS), (1.05, Answer.FAILS), (1.03, Answer.UNDECIDED)],
+    [(1.0, Verdict.HOLDS), (1.05, Verdict.FAILS), (1.03, Verdict.UNDECIDED)],
 )
-def test_a_race_ends_when_it_knows(ratio: float, answer: Answer):
+def test_a_race_ends_when_it_knows(ratio: float, answer: Verdict):
     # The third ratio is the limit itself: neither above nor below, so that only the budget ends it.
-    found = race(clock(ratio), clock(1.0), RULE, budget=60.0 if answer is not Answer.UNDECIDED else 0.05)
+    found = race(clock(ratio), clock(1.0), RULE, budget=60.0 if answer is not Verdict.UNDECIDED else 0.05)
     assert found.answer is answer
-    if answer is not Answer.UNDECIDED:
+    if answer is not Verdict.UNDECIDED:
         assert len(found.turns) == 16  # the fewest that can decide at an error of 0.1 %
         assert (found.interval.low, found.interval.high) == pytest.approx((ratio, ratio))
 
@@ -56,12 +56,12 @@ def pairs(*ratios: float) -> tuple[Callable[..., object], list[float]]:
 @pytest.mark.parametrize(
     ("ratios", "answer"),
     [
-        ((1.0,), Answer.HOLDS),
-        ((1.06, 1.05), Answer.FAILS),
-        ((1.06, 1.0), Answer.UNDECIDED),  # two processes of the same code may differ by where their memory lies
+        ((1.0,), Verdict.HOLDS),
+        ((1.06, 1.05), Verdict.FAILS),
+        ((1.06, 1.0), Verdict.UNDECIDED),  # two processes of the same code may differ by where their memory lies
     ],
 )
-def test_a_slowdown_is_believed_when_a_second_start_has_it_too(ratios: tuple[float, ...], answer: Answer):
+def test_a_slowdown_is_believed_when_a_second_start_has_it_too(ratios: tuple[float, ...], answer: Verdict):
     start, started = pairs(*ratios)
     found = confirmed(start, RULE, budget=60.0)  # type: ignore[arg-type]
     assert found.answer is answer
@@ -72,21 +72,21 @@ def test_a_slowdown_is_believed_when_a_second_start_has_it_too(ratios: tuple[flo
 @pytest.mark.parametrize(
     ("answer", "limit", "interval", "said"),
     [
-        (Answer.FAILS, 1.03, (1.061, 1.052, 1.07), "slower by 6.1 % [5.2, 7.0]: fails (limit 3.0 %)"),
-        (Answer.HOLDS, 1.03, (1.003, 0.99, 1.012), "no slower than 1.2 %: holds (limit 3.0 %)"),
-        (Answer.HOLDS, 1.03, (0.9, 0.89, 0.91), "ratio 0.9 [0.89, 0.91]: holds (limit 1.03)"),
-        (Answer.FAILS, 0.45, (0.5, 0.48, 0.52), "ratio 0.5 [0.48, 0.52]: fails (limit 0.45)"),
-        (Answer.FAILS, 1.03, (3.0, 2.9, 3.1), "ratio 3 [2.9, 3.1]: fails (limit 1.03)"),
+        (Verdict.FAILS, 1.03, (1.061, 1.052, 1.07), "slower by 6.1 % [5.2, 7.0]: fails (limit 3.0 %)"),
+        (Verdict.HOLDS, 1.03, (1.003, 0.99, 1.012), "no slower than 1.2 %: holds (limit 3.0 %)"),
+        (Verdict.HOLDS, 1.03, (0.9, 0.89, 0.91), "ratio 0.9 [0.89, 0.91]: holds (limit 1.03)"),
+        (Verdict.FAILS, 0.45, (0.5, 0.48, 0.52), "ratio 0.5 [0.48, 0.52]: fails (limit 0.45)"),
+        (Verdict.FAILS, 1.03, (3.0, 2.9, 3.1), "ratio 3 [2.9, 3.1]: fails (limit 1.03)"),
         (
-            *(Answer.UNDECIDED, 1.03, (1.01, 0.96, 1.07)),
+            *(Verdict.UNDECIDED, 1.03, (1.01, 0.96, 1.07)),
             "cannot tell within 120 s: 0.96 to 1.07 (limit 1.03), on a machine with load 7",
         ),
         (
-            *(Answer.UNDECIDED, 1.03, (1.01, 0.0, float("inf"))),
+            *(Verdict.UNDECIDED, 1.03, (1.01, 0.0, float("inf"))),
             "cannot tell within 120 s: 1 turns are too few (limit 1.03), on a machine with load 7",
         ),
     ],
 )
-def test_a_result_says_what_was_found(answer: Answer, limit: float, interval: tuple[float, float, float], said: str):
+def test_a_result_says_what_was_found(answer: Verdict, limit: float, interval: tuple[float, float, float], said: str):
     turn = Turn("ABBA", (1.0, 1.0, 1.0, 1.0))
-    assert str(Result(answer, Rule(limit), Interval(*interval), (turn,), 120.0, 7.2)) == said
+    assert str(Result(answer, Rule(limit), RatioInterval(*interval), (turn,), 120.0, 7.2)) == said

@@ -11,7 +11,7 @@ from harness.cli import app
 from harness.experiments.gates import revisions
 from harness.experiments.gates.against import Request, exit_code, started
 from harness.experiments.gates.pair import Side, changes, workers
-from harness.experiments.gates.sequential import Answer
+from harness.experiments.gates.sequential import Verdict
 from tests.scenes import CLOTH_FILE
 
 GATES = """
@@ -206,10 +206,10 @@ def test_changes_of_exact_facts_are_told():
 @pytest.mark.parametrize(
     ("answers", "code"),
     [
-        ([Answer.HOLDS], 0),
-        ([Answer.HOLDS, Answer.UNDECIDED], 3),
-        ([Answer.UNDECIDED, Answer.FAILS, Answer.HOLDS], 1),
+        ([Verdict.HOLDS], 0),
+        ([Verdict.HOLDS, Verdict.UNDECIDED], 3),
+        ([Verdict.UNDECIDED, Verdict.FAILS, Verdict.HOLDS], 1),
     ],
 )
-def test_one_failure_outweighs_what_is_undecided_and_that_what_holds(answers: list[Answer], code: int):
+def test_one_failure_outweighs_what_is_undecided_and_that_what_holds(answers: list[Verdict], code: int):
     assert exit_code(answers) == code

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from harness.experiments.gates.sequential import Answer, Rule, critical, interval
+from harness.experiments.gates.sequential import Rule, Verdict, critical, interval
 
 TURNS, SAMPLES = 400, 1000
 
@@ -53,7 +53,7 @@ def test_looking_after_every_turn_is_wrong_as_rarely_as_stated(bursts: bool):
     # The limit is the true ratio, so every answer is wrong. At an error of 5 % more than 71 of 1000 would come about
     # once in a thousand repetitions of this test (binomial); the seeds are fixed.
     rule = Rule(1.0, alpha=0.05)
-    wrong = [rule.first(sample(seed, bursts=bursts))[0] is not Answer.UNDECIDED for seed in range(SAMPLES)]
+    wrong = [rule.first(sample(seed, bursts=bursts))[0] is not Verdict.UNDECIDED for seed in range(SAMPLES)]
     assert 0 < sum(wrong) <= 71
 
 
@@ -72,27 +72,27 @@ def test_the_interval_covers_the_truth_at_every_number_of_turns(bursts: bool):
 @pytest.mark.parametrize(("slower", "limit", "within"), [(1.05, 1.03, 200), (1.1, 1.03, 60), (1.02, 1.01, 400)])
 def test_a_slowdown_is_found(slower: float, limit: float, within: int, bursts: bool):
     found = [Rule(limit).first(sample(seed, slower, bursts=bursts)) for seed in range(200)]
-    assert sum(answer is Answer.FAILS and turns <= within for answer, turns in found) >= 190
-    assert not any(answer is Answer.HOLDS for answer, _ in found)
+    assert sum(answer is Verdict.FAILS and turns <= within for answer, turns in found) >= 190
+    assert not any(answer is Verdict.HOLDS for answer, _ in found)
 
 
 def test_equal_programs_hold_and_none_fails():
     found = [Rule(1.03).first(sample(seed, bursts=seed % 2 == 0)) for seed in range(SAMPLES)]
-    assert {answer for answer, _ in found} == {Answer.HOLDS}
+    assert {answer for answer, _ in found} == {Verdict.HOLDS}
 
 
 def test_noise_too_large_for_the_limit_is_undecided_and_not_passed():
     found = [Rule(1.03).first(sample(seed, 1.05, noise=0.5))[0] for seed in range(200)]
-    assert found.count(Answer.UNDECIDED) >= 190  # the interval of 400 such turns is .3 wide
-    assert Answer.HOLDS not in found
+    assert found.count(Verdict.UNDECIDED) >= 190  # the interval of 400 such turns is .3 wide
+    assert Verdict.HOLDS not in found
 
 
 def test_the_first_answer_is_that_of_looking_turn_by_turn():
     rule = Rule(1.03)
     for seed in range(20):
         x = sample(seed, 1.0 + 0.01 * seed)
-        looked = next(((a, n) for n in range(1, TURNS + 1) if (a := rule.judge(x[:n])) is not Answer.UNDECIDED), None)
-        assert rule.first(x) == (looked or (Answer.UNDECIDED, TURNS))
+        looked = next(((a, n) for n in range(1, TURNS + 1) if (a := rule.judge(x[:n])) is not Verdict.UNDECIDED), None)
+        assert rule.first(x) == (looked or (Verdict.UNDECIDED, TURNS))
 
 
 def test_an_answer_is_what_the_interval_says():
@@ -100,8 +100,8 @@ def test_an_answer_is_what_the_interval_says():
         x = sample(seed, 1.0 + 0.005 * seed)
         for n in (10, 20, 50, 400):
             found, answer = interval(x[:n]), Rule(1.03).judge(x[:n])
-            assert (found.low > 1.03) == (answer is Answer.FAILS)
-            assert (found.high < 1.03) == (answer is Answer.HOLDS)
+            assert (found.low > 1.03) == (answer is Verdict.FAILS)
+            assert (found.high < 1.03) == (answer is Verdict.HOLDS)
 
 
 def test_one_turn_that_was_disturbed_without_end_changes_nothing():

@@ -10,11 +10,11 @@ from harness.base import rows
 from harness.cli import app
 from harness.experiments.gates.live import summary
 from harness.experiments.gates.sequential import Rule
-from harness.experiments.gates.study import OTHERS, SCHEMA, Start, read, replay, replay_other
+from harness.experiments.gates.study import OTHERS, SCHEMA, PairTurns, read, replay, replay_other
 from tests.scenes import CLOTH_FILE
 
 
-def starts(biases: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 0.02, turns: int = 500) -> list[Start]:
+def starts(biases: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 0.02, turns: int = 500) -> list[PairTurns]:
     """Recorded starts of the same code, whose second process is so many times as slow, on a machine with bursts."""
     found = []
     for seed, bias in enumerate(biases):
@@ -23,7 +23,7 @@ def starts(biases: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 0.02, tur
         burst = np.repeat(rng.random(turns // 10) < 0.2, 10)
         a[burst] *= rng.uniform(1, 2, (burst.sum(), 2))
         b[burst] *= rng.uniform(1, 2, (burst.sum(), 2))
-        found.append(Start(np.log(bias * a.sum(axis=1) / b.sum(axis=1)), bias * a, b, wall=0.1, load=1.0))
+        found.append(PairTurns(np.log(bias * a.sum(axis=1) / b.sum(axis=1)), bias * a, b, wall=0.1, load=1.0))
     return found
 
 

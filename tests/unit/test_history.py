@@ -9,12 +9,12 @@ from matplotlib.image import imread
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.report.history import Point, changes, history, stored_files
+from harness.report.history import StoredResult, changes, history, stored_files
 from tests.gate_results import series, write
 
 
-def points(values: Any) -> list[Point]:
-    return [Point(f"{k:07x}", float(v), float(v) * 0.985, float(v) * 1.015) for k, v in enumerate(values)]
+def points(values: Any) -> list[StoredResult]:
+    return [StoredResult(f"{k:07x}", float(v), float(v) * 0.985, float(v) * 1.015) for k, v in enumerate(values)]
 
 
 def test_a_step_of_five_percent_in_noise_of_one_is_found_within_a_commit_of_where_it_is():

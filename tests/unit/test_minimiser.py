@@ -18,7 +18,7 @@ from harness.reference.minimiser import (
     ROUGH,
     SADDLE,
     VALLEY,
-    Reference,
+    KnownMinima,
     Uncertified,
     certify,
     find_minima,
@@ -212,7 +212,7 @@ def test_minima_are_known_by_where_they_lie():
     above = find_minima(problem, Newton()).best
     below = polish(problem, lower(above.positions), Newton())
     nudged = replace(above, positions=above.positions + 1e-12)
-    known = Reference(()).joined(above).joined(nudged).joined(below)
+    known = KnownMinima(()).joined(above).joined(nudged).joined(below)
     assert [m.g for m in known.minima] == [below.g, above.g]
     assert known.branch(nudged) == 1
     uncertified = replace(above, positions=above.positions + 0.5, g=-1e9, kind=SADDLE)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from harness.record.blueprint import run_document, scale_name, spring_cadence
-from harness.record.camera import Box
+from harness.record.camera import Extent
 from harness.scenes.mesh.grid import Grid
 from tests.recordings import info
 
@@ -25,7 +25,7 @@ def numbers(component: Any) -> np.ndarray:
     return np.array(component.as_arrow_array().to_pylist()[0])
 
 
-def seen(box: Box, points: np.ndarray, aspect: float) -> np.ndarray:
+def seen(box: Extent, points: np.ndarray, aspect: float) -> np.ndarray:
     """How far points are from the middle of the picture, 1 at its edge, (n, 2): across, up."""
     controls = box.eye()
     eye, target = numbers(controls.position), numbers(controls.look_target)
@@ -38,7 +38,7 @@ def seen(box: Box, points: np.ndarray, aspect: float) -> np.ndarray:
     return np.abs(np.stack([(points - eye) @ right / aspect, (points - eye) @ up], axis=1) / depth[:, None] / tangent)
 
 
-def height(box: Box, points: np.ndarray) -> np.ndarray:
+def height(box: Extent, points: np.ndarray) -> np.ndarray:
     """How high points are seen, 1 at the upper edge of the view, -1 at the lower."""
     controls = box.eye()
     eye, target = numbers(controls.position), numbers(controls.look_target)
@@ -52,7 +52,7 @@ def height(box: Box, points: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("fall", [0.0, -1.0, -5.0])
 def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: float):
     points = np.vstack([CORNER, CORNER + np.array([0.0, fall, 0.0])])
-    box = Box(CORNER, aspect)
+    box = Extent(CORNER, aspect)
     box.add(points)
     places = seen(box, points, aspect)
     assert places.max() <= 1.0
@@ -68,20 +68,20 @@ def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: f
 
 def test_what_is_wide_and_low_stands_in_the_middle_of_the_room_above_the_scale():
     flat = np.array([[x, 0.0, z] for x in (0.0, 1.0) for z in (0.0, 1.0)])
-    heights = height(Box(flat), flat)
+    heights = height(Extent(flat), flat)
     above, below = 1.0 - heights.max(), heights.min() + 0.72
     assert above == pytest.approx(below, abs=0.2), "in half views; shares are tried in steps of 0.2"
 
 
 @pytest.mark.parametrize("bad", [1e6, np.nan, np.inf])
 def test_the_camera_ignores_positions_that_have_blown_up(bad: float):
-    box, same = Box(CORNER), Box(CORNER)
+    box, same = Extent(CORNER), Extent(CORNER)
     box.add(np.array([[bad, 0.0, 0.0]]))
     assert numbers(box.eye().position) == pytest.approx(numbers(same.eye().position))
 
 
 def test_a_single_point_can_be_looked_at():
-    assert np.isfinite(numbers(Box(np.zeros((1, 3))).eye().position)).all()
+    assert np.isfinite(numbers(Extent(np.zeros((1, 3))).eye().position)).all()
 
 
 def test_springs_of_small_meshes_are_drawn_in_every_frame():

@@ -20,7 +20,7 @@ from harness.report import comparison, opengl, page, run_picture
 from harness.report.comparison import draw_comparison
 from harness.report.frames import drawable_frames
 from harness.report.render import Studio, area_vectors, frame_all, natural_angles, spring_strain, vertex_strain
-from harness.report.run_picture import Box, draw_run, layout
+from harness.report.run_picture import PixelBox, draw_run, layout
 from harness.report.style import HEIGHT, PAGE, WIDTH
 
 needs_opengl = pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
@@ -94,11 +94,11 @@ def words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.fixture
-def boxes(monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[Box, list[Box]]]:
+def boxes(monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[PixelBox, list[PixelBox]]]:
     """Where the frames of the last run were drawn."""
-    found: list[tuple[Box, list[Box]]] = []
+    found: list[tuple[PixelBox, list[PixelBox]]] = []
 
-    def kept(*given: Any) -> tuple[Box, list[Box]]:
+    def kept(*given: Any) -> tuple[PixelBox, list[PixelBox]]:
         found.append(layout(*given))
         return found[-1]
 
@@ -109,7 +109,7 @@ def boxes(monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[Box, list[Box]]
 @needs_opengl
 @pytest.mark.parametrize("make", [cloth, lambda: cloth(triangles=False), chain], ids=["cloth", "net", "chain"])
 def test_a_run_is_drawn_large_and_four_frames_before_it(
-    make: Callable[[], Replay], boxes: Callable[[], tuple[Box, list[Box]]], tmp_path: Path
+    make: Callable[[], Replay], boxes: Callable[[], tuple[PixelBox, list[PixelBox]]], tmp_path: Path
 ) -> None:
     draw_run(make(), tmp_path / "run.png")
     image = pixels(tmp_path / "run.png")
@@ -239,7 +239,7 @@ def test_frames_are_drawn_up_to_the_first_that_is_not_finite(value: float) -> No
 
 @needs_opengl
 def test_positions_that_are_not_finite_are_told_in_words(
-    words: list[str], boxes: Callable[[], tuple[Box, list[Box]]], tmp_path: Path
+    words: list[str], boxes: Callable[[], tuple[PixelBox, list[PixelBox]]], tmp_path: Path
 ) -> None:
     draw_run(broken(cloth(), 5), tmp_path / "run.png")
     assert "not finite from frame 10 on" in "\n".join(words)

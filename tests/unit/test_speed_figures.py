@@ -9,7 +9,7 @@ import pytest
 
 from harness.base.columns import SCHEMA
 from harness.report.speed.counts import count
-from harness.report.speed.figures import Figures, Machine, figures
+from harness.report.speed.figures import Figures, MachineLimits, figures
 from harness.report.speed.speed_table import exponents, remarks
 
 
@@ -41,7 +41,7 @@ LIMITS = [
 
 
 def test_bandwidth_is_read_off_between_the_measured_working_sets():
-    machine = Machine(LIMITS)
+    machine = MachineLimits(LIMITS)
     # 100 bytes a second at 1e2 and 1 at 1e8: on logarithmic scales a straight line, level beyond its ends.
     assert machine.bandwidth(1, 1e5) == pytest.approx(10.0, rel=1e-12)
     assert machine.bandwidth(1, 1.0) == pytest.approx(100.0, rel=1e-12)
@@ -94,13 +94,13 @@ def test_figures_say_how_near_the_binding_limit_is():
     assert ours.solves_faster is not None
     assert ours.solves_faster.middle == 3.0
     work = count({"nnz_factor": 100, "flops_per_solve": 2400}, 16, 42)["iteration"]
-    bandwidth = Machine(LIMITS).bandwidth(1, work.working_set)
+    bandwidth = MachineLimits(LIMITS).bandwidth(1, work.working_set)
     assert (ours.binds, ours.touched) == ("bandwidth", work.bytes)
     # At best each byte comes from afar once, 1 s an iteration, and the others at 100 bytes a second.
     at_best = work.working_set / bandwidth + (work.bytes - work.working_set) / 100
     assert ours.reached == pytest.approx(at_best, rel=1e-12)
     bare = count({"nnz_factor": 100}, 16, 42)["iteration"]
-    assert ours.passes == pytest.approx(bare.bytes / Machine(LIMITS).bandwidth(1, bare.working_set), rel=1e-12)
+    assert ours.passes == pytest.approx(bare.bytes / MachineLimits(LIMITS).bandwidth(1, bare.working_set), rel=1e-12)
     assert found["numba cholespy"].reached is None
 
 

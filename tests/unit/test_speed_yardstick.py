@@ -11,7 +11,7 @@ import pytest
 
 from harness.base.errors import RunFailed
 from harness.experiments.speed.yardstick import CHEAP_TEMPORARIES, Yardstick, build
-from harness.report.speed.size_plot import Series, draw_by_size
+from harness.report.speed.size_plot import CandidateLine, draw_by_size
 from harness.report.style import HEIGHT, WIDTH
 from solvers.core import native
 from solvers.methods.local_global import SparseLocalGlobal
@@ -106,9 +106,10 @@ def test_it_takes_the_same_steps_as_ours(program: Path, tmp_path: Path, tunables
 def test_a_picture_has_its_size_whatever_is_in_it(tmp_path: Path, share: bool):
     sizes = (100, 1024, 4096)
     lines = [
-        Series(f"numba x{k}", "numba", "numba", sizes, (0.1 * k, 0.2 * k, 0.5 * k), (False,) * 3) for k in range(1, 7)
+        CandidateLine(f"numba x{k}", "numba", "numba", sizes, (0.1 * k, 0.2 * k, 0.5 * k), (False,) * 3)
+        for k in range(1, 7)
     ]
-    one = [Series("sparse", "sparse", "sparse", (100,), (0.3,), (True,))]
+    one = [CandidateLine("sparse", "sparse", "sparse", (100,), (0.3,), (True,))]
     for name, series in (("full", lines), ("one", one), ("none", [])):
         path = tmp_path / f"{name}.png"
         draw_by_size(path, "Title", ["fact"], series, share=share)

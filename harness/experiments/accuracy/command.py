@@ -24,7 +24,7 @@ def recommend(
 
     from harness.base.progress import display
     from harness.experiments.accuracy.recommend import recommend as find
-    from harness.report.accuracy.runners_up import Point, draw_ways
+    from harness.report.accuracy.runners_up import RunnerUp, draw_ways
 
     found = find(
         scene,
@@ -42,7 +42,7 @@ def recommend(
         table.add_row(name, f"{way.error:.3g}", f"{way.cost:.4g}", str(way))
     out().print(table)
     say(found.verdict)
-    points = [Point(way.spec.solver.name, way.error, way.cost, str(way)) for way in found.ways]
+    points = [RunnerUp(way.spec.solver.name, way.error, way.cost, str(way)) for way in found.ways]
     title = f"Ways to an error of {100 * error:g} %: {scene.stem} {found.best.spec.case.size or ''}".rstrip()
     folder = results / f"recommend-{scene.stem}" / "pictures"
     name = f"ways-{scene.stem}-{found.best.spec.case.size}-{error:g}-{horizon:g}".replace(".", "_")

@@ -61,7 +61,7 @@ def kept(iteration: int) -> bool:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Curve:
+class GradedCurve:
     """The graded iterates: numbers (k,), 0 is the first guess; positions (k, n, 3) [m]; g (k,) [J]; stationarity (k,);
     status and reason of the curve as a whole; seconds (k, rounds) since the solve began; interrupted: in any round."""
 
@@ -84,7 +84,7 @@ def measure(
     iterations: int,
     time_limit: float,
     rounds: int,
-) -> Curve:
+) -> GradedCurve:
     """The curve of a solve from the problem's first guess.
 
     lowest: energy [J] of the lowest minimum known; time_limit: seconds of the solver's own.
@@ -110,7 +110,7 @@ def measure(
     stamps, interrupted = zip(*(_timed(prepared, problem, number, p) for _ in range(rounds)), strict=True)
     seconds = np.stack([stamp[grading.numbers] for stamp in stamps], axis=1)
     g, stationarity, status, reason = grading.g, grading.stationarity, grading.status, grading.reason
-    return Curve(grading.numbers, grading.positions, g, stationarity, status, reason, seconds, any(interrupted))
+    return GradedCurve(grading.numbers, grading.positions, g, stationarity, status, reason, seconds, any(interrupted))
 
 
 class _Grading:

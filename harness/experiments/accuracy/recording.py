@@ -9,16 +9,16 @@ import numpy as np
 
 from harness.base import machine
 from harness.config.accuracy import CurveSpec
-from harness.experiments.accuracy.curves import Curve
+from harness.experiments.accuracy.curves import GradedCurve
 from harness.experiments.accuracy.scales import round_off
 from harness.record.base import Frame, RecordingInfo
 from harness.record.rerun import RerunRecorder
 from harness.reference.frozen import Frozen
-from harness.reference.minimiser import Reference
+from harness.reference.minimiser import KnownMinima
 from harness.scenes.bind import Scene
 
 
-class Step(Protocol):
+class FrozenStep(Protocol):
     """A frozen step: when it was, and what is known of its minima."""
 
     @property
@@ -32,12 +32,14 @@ class Step(Protocol):
         ...
 
     @property
-    def reference(self) -> Reference:
+    def reference(self) -> KnownMinima:
         """The minima."""
         ...
 
 
-def record(spec: CurveSpec, graded: Step, scene: Scene, first_guess: str, curve: Curve, folder: Path) -> Path:
+def record(
+    spec: CurveSpec, graded: FrozenStep, scene: Scene, first_guess: str, curve: GradedCurve, folder: Path
+) -> Path:
     """Write the recording of a curve under `folder`/recordings and return its path. Raises RunFailed."""
     path = folder / "recordings" / f"{spec.label()}-{first_guess}.rrd"
     problem, here = graded.frozen.problem, machine.describe()
@@ -78,7 +80,7 @@ def record(spec: CurveSpec, graded: Step, scene: Scene, first_guess: str, curve:
         recorder.abandon()
 
 
-def _curves(curve: Curve, graded: Step, lowest: float) -> dict[str, list[float]]:
+def _curves(curve: GradedCurve, graded: FrozenStep, lowest: float) -> dict[str, list[float]]:
     problem = graded.frozen.problem
     gap = (np.array(curve.g) - lowest) / max(problem.value(problem.current) - lowest, round_off(problem))
     return {"energy gap": gap.tolist(), "stationarity": curve.stationarity}

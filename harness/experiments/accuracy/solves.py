@@ -12,13 +12,13 @@ from typing import Any
 
 from harness.base import machine
 from harness.config.accuracy import Case, CurveSpec, moment_name
-from harness.experiments.accuracy.curves import Curve, measure
+from harness.experiments.accuracy.curves import GradedCurve, measure
 from harness.experiments.accuracy.failures import lost
 from harness.experiments.accuracy.recording import record
 from harness.experiments.accuracy.scales import distances, stiffness_ratio
 from harness.experiments.provenance import provenance
 from harness.reference.frozen import Frozen, bind
-from harness.reference.minimiser import Minimum, Reference
+from harness.reference.minimiser import KnownMinima, Minimum
 from harness.reference.oracle import Oracle
 from harness.reference.store import Store
 from harness.scenes.bind import Scene
@@ -65,7 +65,7 @@ class GradedStep:
         return Oracle(self.frozen.problem.system)
 
     @property
-    def reference(self) -> Reference:
+    def reference(self) -> KnownMinima:
         """The minima known by now."""
         return self.store.reference(self.frozen)
 
@@ -189,7 +189,7 @@ def _curve(spec: CurveSpec, prepared: Prepared, graded: GradedStep, first_guess:
     return [shared | row for row in _points(curve, graded.frozen.problem.system, against)]
 
 
-def _points(curve: Curve, system: System, minimum: Minimum | None) -> list[Row]:
+def _points(curve: GradedCurve, system: System, minimum: Minimum | None) -> list[Row]:
     rows: list[Row] = []
     for k, number in enumerate(curve.numbers):
         row: Row = {

@@ -15,7 +15,7 @@ from random import Random, SystemRandom
 from time import perf_counter
 from typing import Literal
 
-from harness.experiments.gates.sequential import Answer, Interval, Rule, interval, turn
+from harness.experiments.gates.sequential import RatioInterval, Rule, Verdict, interval, turn
 
 ORDERS = ("ABBA", "BAAB")
 
@@ -53,9 +53,9 @@ class Result:
     """What came of a gate. elapsed: seconds that it took; load: the machine's load average at its end; starts: how many
     pairs of programs were started, the second to confirm what the first found."""
 
-    answer: Answer
+    answer: Verdict
     rule: Rule
-    interval: Interval
+    interval: RatioInterval
     turns: tuple[Turn, ...]
     elapsed: float
     load: float
@@ -63,13 +63,13 @@ class Result:
 
     def __str__(self) -> str:
         limit, (ratio, low, high) = self.rule.limit, (self.interval.ratio, self.interval.low, self.interval.high)
-        if self.answer is Answer.UNDECIDED:
+        if self.answer is Verdict.UNDECIDED:
             held = f"{low:.3g} to {high:.3g}" if low > 0 else f"{len(self.turns)} turns are too few"
             return (
                 f"cannot tell within {self.elapsed:.0f} s: {held} (limit {limit:.3g}), on a machine with {self._load}"
             )
         near = 0.9 <= limit <= 1.5 and ratio < 2
-        if self.answer is Answer.FAILS:
+        if self.answer is Verdict.FAILS:
             if near:
                 bounds = f"[{_percent(low)}, {_percent(high)}]"
                 return f"slower by {_percent(ratio)} % {bounds}: fails (limit {_percent(limit)} %)"
@@ -108,7 +108,7 @@ def playing(
             seconds.append((yield) if who == "A" else b())
         turns.append(Turn(order, tuple(seconds)))
         answer, elapsed = rule.judge([t.log_ratio for t in turns]), perf_counter() - began
-        if answer is not Answer.UNDECIDED or elapsed >= budget:
+        if answer is not Verdict.UNDECIDED or elapsed >= budget:
             return result(rule, turns, elapsed)
     raise AssertionError("orders do not end")
 
@@ -135,15 +135,15 @@ def confirmed(
     """
     with start() as (a, b):
         first = race(a, b, rule, budget=budget)
-    if first.answer is not Answer.FAILS:
+    if first.answer is not Verdict.FAILS:
         return first
     with start() as (a, b):
         second = race(a, b, rule, budget=max(budget - first.elapsed, 0.0))
-    answer = Answer.FAILS if second.answer is Answer.FAILS else Answer.UNDECIDED
+    answer = Verdict.FAILS if second.answer is Verdict.FAILS else Verdict.UNDECIDED
     both, elapsed = (*first.turns, *second.turns), first.elapsed + second.elapsed
     # Each race's interval has its own error; the wider ends hold what both say.
     low, high = (f(getattr(r.interval, end) for r in (first, second)) for f, end in ((min, "low"), (max, "high")))
-    found = Interval(interval([t.log_ratio for t in both], rule.alpha).ratio, low, high)
+    found = RatioInterval(interval([t.log_ratio for t in both], rule.alpha).ratio, low, high)
     return Result(answer, rule, found, both, elapsed, second.load, starts=2)
 
 

@@ -17,8 +17,8 @@ from typing import Any
 from harness.base.errors import InputError
 from harness.experiments.gates.abba import CALL, Result, Timed, confirmed
 from harness.experiments.gates.agreement import difference
-from harness.experiments.gates.pair import Held, Side, Worker, changes, workers
-from harness.experiments.gates.sequential import ALPHA, Answer, Rule
+from harness.experiments.gates.pair import HeldWork, RevisionProcess, Side, changes, workers
+from harness.experiments.gates.sequential import ALPHA, Rule, Verdict
 
 LIMIT = 1.03
 """The ratio of times from which on something counts as slower."""
@@ -84,9 +84,9 @@ def run_gates(
     return found
 
 
-def exit_code(answers: Sequence[Answer]) -> int:
+def exit_code(answers: Sequence[Verdict]) -> int:
     """1 where one fails, else 3 where one is undecided, else 0."""
-    return next((a.value for a in (Answer.FAILS, Answer.UNDECIDED) if a in answers), 0)
+    return next((a.value for a in (Verdict.FAILS, Verdict.UNDECIDED) if a in answers), 0)
 
 
 @contextmanager
@@ -112,9 +112,9 @@ def started(
         yield a, b
 
 
-def _held(alive: Sequence[Worker], request: Request, frames: int) -> list[Held]:
+def _held(alive: Sequence[RevisionProcess], request: Request, frames: int) -> list[HeldWork]:
     """The request's work in both, of so many steps where it is a run's."""
-    held: list[Held] = []
+    held: list[HeldWork] = []
     for worker in alive:
         more: dict[str, Any] = {}
         if request.config:
@@ -123,7 +123,7 @@ def _held(alive: Sequence[Worker], request: Request, frames: int) -> list[Held]:
     return held
 
 
-def _instructions(worker: Worker) -> dict[str, int]:
+def _instructions(worker: RevisionProcess) -> dict[str, int]:
     counted = worker.instructions()
     return {} if counted is None else {"instructions": counted}
 

@@ -14,7 +14,7 @@ from harness.base import columns, rows
 from harness.experiments.gates.abba import confirmed
 from harness.experiments.gates.against import Options, Request, started
 from harness.experiments.gates.pair import Side
-from harness.experiments.gates.sequential import Answer, Rule
+from harness.experiments.gates.sequential import Rule, Verdict
 from harness.experiments.gates.study import competing
 
 SCHEMA = columns.schema_of(
@@ -69,7 +69,9 @@ def summary(path: Path) -> list[tuple[str, ...]]:
     for (gate, condition, planted, limit), held in by.items():
         load, seconds = (median(row[name] for row in held) for name in ("load", "seconds"))
         answers = [row["answer"] for row in held]
-        counts = [str(answers.count(answer.name.lower())) for answer in (Answer.FAILS, Answer.HOLDS, Answer.UNDECIDED)]
+        counts = [
+            str(answers.count(answer.name.lower())) for answer in (Verdict.FAILS, Verdict.HOLDS, Verdict.UNDECIDED)
+        ]
         cells = [f"{load:.1f}", f"{planted:.0%}", f"{limit - 1:.0%}", str(len(held)), *counts, f"{seconds:.1f}"]
         table.append((gate, condition, *cells))
     return table

@@ -43,7 +43,7 @@ class Side:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Held:
+class HeldWork:
     """What a worker holds: its answer, its exact facts, the clock that suits it, and its frames where it has some."""
 
     answer: NDArray[np.float64]
@@ -52,7 +52,7 @@ class Held:
     frames: int
 
 
-class Worker:
+class RevisionProcess:
     """A process that holds one revision's work. Errors are InputErrors, in the revision's own words."""
 
     def __init__(self, side: Side, scratch: Path) -> None:
@@ -87,10 +87,10 @@ class Worker:
             raise InputError(f"{self.side.name}: does not run: {answer['error']}")
         return answer
 
-    def hold(self, do: str, **asked: Any) -> Held:
+    def hold(self, do: str, **asked: Any) -> HeldWork:
         """Ask for work to be held; see `worker.py`."""
         told = self.ask(do, positions=str(self._answer), **asked)
-        return Held(np.load(self._answer), told["facts"], told["clock"], told.get("frames", 0))
+        return HeldWork(np.load(self._answer), told["facts"], told["clock"], told.get("frames", 0))
 
     def instructions(self) -> int | None:
         """The instructions that one call of the work retires, None where the machine does not tell."""
@@ -132,15 +132,15 @@ def _path(side: Side) -> str:
 
 
 @contextmanager
-def workers(*sides: Side) -> Generator[list[Worker]]:
+def workers(*sides: Side) -> Generator[list[RevisionProcess]]:
     """A live worker for each side; all end with the block."""
-    alive: list[Worker] = []
+    alive: list[RevisionProcess] = []
     with TemporaryDirectory(prefix="springbench-") as scratch:
         try:
             for number, side in enumerate(sides):
                 folder = Path(scratch) / str(number)
                 folder.mkdir()
-                alive.append(Worker(side, folder))
+                alive.append(RevisionProcess(side, folder))
             yield alive
         finally:
             for worker in alive:

@@ -65,7 +65,7 @@ class Race:
         from harness.experiments.gates.abba import playing
         from harness.experiments.gates.agreement import difference
         from harness.experiments.gates.scenes import calls_of, timed
-        from harness.experiments.gates.sequential import ALPHA, Answer, Rule
+        from harness.experiments.gates.sequential import ALPHA, Rule, Verdict
 
         rule, benchmark = Rule(limit, error or ALPHA), cast(Any, self._benchmark)
         answer: Any = benchmark.pedantic(candidate) if benchmark.disabled else candidate()
@@ -94,10 +94,10 @@ class Race:
             benchmark.pedantic(lambda: last.append(a()), setup=before, rounds=MOST)
         (result,) = found
         benchmark.extra_info |= told | _told(result, calls, clock)
-        if result.answer is Answer.UNDECIDED:
+        if result.answer is Verdict.UNDECIDED:
             self._item.stash[UNDECIDED] = True
             pytest.skip(str(result))
-        if result.answer is Answer.FAILS:
+        if result.answer is Verdict.FAILS:
             pytest.fail(str(result), pytrace=False)
         return result
 

@@ -36,7 +36,7 @@ MIXTURE = 2.0
 this one 16 turns that agree decide."""
 
 
-class Answer(Enum):
+class Verdict(Enum):
     """What a test says; the value is the exit code of a command that ends with it."""
 
     HOLDS = 0
@@ -45,7 +45,7 @@ class Answer(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Interval:
+class RatioInterval:
     """A ratio of times: the median over the turns, and the ends of the confidence sequence, 0 and inf where open."""
 
     ratio: float
@@ -69,15 +69,15 @@ class Rule:
         if not 0 < self.alpha < 1:
             raise ValueError(f"alpha: came {self.alpha}; wanted a probability between 0 and 1, such as {ALPHA}")
 
-    def judge(self, log_ratios: ArrayLike) -> Answer:
+    def judge(self, log_ratios: ArrayLike) -> Verdict:
         """The answer after the turns so far (n,)."""
         x = np.asarray(log_ratios, float)
         needed = critical(len(x), self.alpha)
         if np.count_nonzero(x > log(self.limit)) >= needed:
-            return Answer.FAILS
-        return Answer.HOLDS if np.count_nonzero(x < log(self.limit)) >= needed else Answer.UNDECIDED
+            return Verdict.FAILS
+        return Verdict.HOLDS if np.count_nonzero(x < log(self.limit)) >= needed else Verdict.UNDECIDED
 
-    def first(self, log_ratios: ArrayLike) -> tuple[Answer, int]:
+    def first(self, log_ratios: ArrayLike) -> tuple[Verdict, int]:
         """The first answer when looking after every turn (n,), and after how many turns it came; n where there is none.
 
         The same as `judge` turn by turn, in one pass: for a replay of many recorded samples.
@@ -87,9 +87,9 @@ class Rule:
         above, below = (np.cumsum(side) >= needed for side in (x > log(self.limit), x < log(self.limit)))
         decided = np.flatnonzero(above | below)
         if not len(decided):
-            return Answer.UNDECIDED, len(x)
+            return Verdict.UNDECIDED, len(x)
         at = int(decided[0])
-        return (Answer.FAILS if above[at] else Answer.HOLDS), at + 1
+        return (Verdict.FAILS if above[at] else Verdict.HOLDS), at + 1
 
 
 def turn(a: Sequence[float], b: Sequence[float]) -> float:
@@ -97,14 +97,14 @@ def turn(a: Sequence[float], b: Sequence[float]) -> float:
     return log(sum(a) / sum(b))
 
 
-def interval(log_ratios: ArrayLike, alpha: float = ALPHA) -> Interval:
+def interval(log_ratios: ArrayLike, alpha: float = ALPHA) -> RatioInterval:
     """The median ratio of the turns (n,), n >= 1, and the confidence sequence at this n."""
     x = np.sort(np.asarray(log_ratios, float))
     n, needed = len(x), critical(len(x), alpha)
     if needed > n:
-        return Interval(exp(float(np.median(x))), 0.0, float("inf"))
+        return RatioInterval(exp(float(np.median(x))), 0.0, float("inf"))
     # At least `needed` turns lie above every m < x_(n - needed + 1), counted from 1: such m are refused.
-    return Interval(exp(float(np.median(x))), exp(x[n - needed]), exp(x[needed - 1]))
+    return RatioInterval(exp(float(np.median(x))), exp(x[n - needed]), exp(x[needed - 1]))
 
 
 @lru_cache(maxsize=4096)

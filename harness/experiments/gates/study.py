@@ -28,7 +28,7 @@ from harness.base.errors import InputError
 from harness.experiments.gates.abba import orders
 from harness.experiments.gates.against import Options, Request, started
 from harness.experiments.gates.pair import Side
-from harness.experiments.gates.sequential import Answer, Rule
+from harness.experiments.gates.sequential import Rule, Verdict
 
 COLUMNS = (
     columns.Column("gate", pa.string(), "", "what takes turns"),
@@ -50,7 +50,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class PairTurns:
     """The turns of one pair of processes: log ratios (n,), the times of A and of B (n, 2) [s], wall [s] a turn, and the
     machine's median load average."""
 
@@ -126,13 +126,13 @@ def _compete(bursts: bool, seed: int) -> None:
             sleep(rng.uniform(1.0, 6.0))
 
 
-def read(paths: Sequence[Path]) -> dict[tuple[str, str], list[Start]]:
+def read(paths: Sequence[Path]) -> dict[tuple[str, str], list[PairTurns]]:
     """The recorded starts by gate and condition. Raises InputError."""
     table = rows.read(paths, SCHEMA).to_pylist()
     by: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for row in table:
         by.setdefault((row["gate"], row["condition"], row["start"]), []).append(row)
-    found: dict[tuple[str, str], list[Start]] = {}
+    found: dict[tuple[str, str], list[PairTurns]] = {}
     for (gate, condition, _), turns in by.items():
         times = np.array([[row[f"call_{k}"] for k in range(4)] for row in turns])
         abba = np.array([row["order"] == "ABBA" for row in turns])[:, None]
@@ -140,28 +140,28 @@ def read(paths: Sequence[Path]) -> dict[tuple[str, str], list[Start]]:
         a, b = np.where(abba, outer, inner), np.where(abba, inner, outer)
         wall = float(np.mean([row["wall"] for row in turns]))
         load = float(np.median([row["load"] for row in turns]))
-        start = Start(np.log(a.sum(axis=1) / b.sum(axis=1)), a, b, wall, load)
+        start = PairTurns(np.log(a.sum(axis=1) / b.sum(axis=1)), a, b, wall, load)
         found.setdefault((gate, condition), []).append(start)
     return found
 
 
-def replay(starts: Sequence[Start], slower: float, rule: Rule, budget: float, replays: int, seed: int = 0) -> Found:
+def replay(starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float, replays: int, seed: int = 0) -> Found:
     """What gates would have answered with A `slower` times as slow as it was, `replays` times over."""
-    rng, answers, seconds = np.random.default_rng(seed), list[Answer](), list[float]()
+    rng, answers, seconds = np.random.default_rng(seed), list[Verdict](), list[float]()
     for _ in range(replays):
         answer, spent = _race(rng, starts, slower, rule, budget)
-        if answer is Answer.FAILS:  # which is believed when it comes twice
+        if answer is Verdict.FAILS:  # which is believed when it comes twice
             again, more = _race(rng, starts, slower, rule, budget - spent)
-            answer, spent = (Answer.FAILS if again is Answer.FAILS else Answer.UNDECIDED), spent + more
+            answer, spent = (Verdict.FAILS if again is Verdict.FAILS else Verdict.UNDECIDED), spent + more
         answers.append(answer)
         seconds.append(spent)
-    fails, holds, undecided = (answers.count(a) / replays for a in (Answer.FAILS, Answer.HOLDS, Answer.UNDECIDED))
+    fails, holds, undecided = (answers.count(a) / replays for a in (Verdict.FAILS, Verdict.HOLDS, Verdict.UNDECIDED))
     return Found(fails, holds, undecided, float(np.median(seconds)))
 
 
 def _race(
-    rng: np.random.Generator, starts: Sequence[Start], slower: float, rule: Rule, budget: float
-) -> tuple[Answer, float]:
+    rng: np.random.Generator, starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
+) -> tuple[Verdict, float]:
     """The answer on some start's turns, and the seconds that it took."""
     start = starts[int(rng.integers(len(starts)))]
     turns = _stretches(rng, len(start.log_ratios), max(1, int(budget / start.wall)))
@@ -189,7 +189,11 @@ OTHERS: dict[str, Callable[[Array, Array], bool]] = {
 
 
 def replay_other(
-    slower_than: Callable[[Array, Array], bool], starts: Sequence[Start], slower: float, seconds: float, replays: int
+    slower_than: Callable[[Array, Array], bool],
+    starts: Sequence[PairTurns],
+    slower: float,
+    seconds: float,
+    replays: int,
 ) -> float:
     """The part of comparisons that call A slower, each of two sessions of so many seconds, A's and then B's."""
     rng, said = np.random.default_rng(0), 0

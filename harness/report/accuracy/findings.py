@@ -13,7 +13,7 @@ from harness.report.accuracy import work_plot
 from harness.report.accuracy.convergence import GUESSES, remarks
 from harness.report.accuracy.growth import TARGET, growths
 from harness.report.accuracy.measured import Curve, Measurements, Values, by_self_converged, without_short
-from harness.report.accuracy.paper import FAR, FIGURE_2, ITERATIONS, Comparison, comparisons
+from harness.report.accuracy.paper import FAR, FIGURE_2, ITERATIONS, PaperComparison, comparisons
 from harness.report.accuracy.profiles import least_ratios
 from harness.report.accuracy.times import STEPS, TARGETS, crossings, power, races, reach, seconds_to
 from harness.report.page import factor
@@ -161,7 +161,7 @@ def _growth(table: Measurements) -> Iterator[str]:
 
 def _paper(table: Measurements) -> Iterator[str]:
     """Every curve of both figures as a row of one table: our error over the paper's, bold where it is far off."""
-    by_curve: dict[str, dict[int, Comparison]] = {}
+    by_curve: dict[str, dict[int, PaperComparison]] = {}
     for found in comparisons(table):
         by_curve.setdefault(found.curve, {})[found.iterations] = found
     if not by_curve:
@@ -175,7 +175,7 @@ def _paper(table: Measurements) -> Iterator[str]:
         yield f"| {curve} | {frames} | " + " | ".join(cells) + " |"
 
 
-def _cell(found: Comparison) -> str:
+def _cell(found: PaperComparison) -> str:
     """Ours, theirs and the ratio."""
     far = "**" if max(found.ratio, 1 / found.ratio) > FAR else ""
     return f"{found.ours:.2g} / {found.theirs:.2g} = {far}{found.ratio:.2g}{far}"

@@ -38,7 +38,7 @@ TARGET = 1e-3
 _FITTED, _COLUMNS, _ABREAST = 3, 4, 3  # sizes that a fit needs; scenes in a row; panels that stay in one row
 
 
-class Growth(NamedTuple):
+class SizeGrowth(NamedTuple):
     """A solver's times to TARGET on the sizes of a scene where it got there.
 
     vertices (k,), seconds (k,): median over the moments; exponent: of the fit, nan for too few sizes;
@@ -56,13 +56,13 @@ class Growth(NamedTuple):
     older: list[bool]
 
 
-def growths(table: Measurements, other: Callable[[Curve], bool] = older) -> list[Growth]:
+def growths(table: Measurements, other: Callable[[Curve], bool] = older) -> list[SizeGrowth]:
     """The growth of each solver on each scene with two sizes or more; other: which curves are of other code."""
     groups: dict[tuple[str, str, str], dict[int, list[Curve]]] = {}
     for curve in table.curves:
         sizes = groups.setdefault((curve.problem.scene, curve.first_guess, curve.label), {})
         sizes.setdefault(curve.problem.vertices, []).append(curve)
-    found: list[Growth] = []
+    found: list[SizeGrowth] = []
     for (scene, guess, label), sizes in groups.items():
         times = {n: middle(curves, TARGET) for n, curves in sorted(sizes.items())}
         reached = {n: t for n, t in times.items() if np.isfinite(t) and t > 0.0}
@@ -70,7 +70,7 @@ def growths(table: Measurements, other: Callable[[Curve], bool] = older) -> list
             lost = [n for n, t in times.items() if t == np.inf]
             hollow = [any(map(other, sizes[n])) for n in reached]
             exponent = _exponent(reached)
-            found.append(Growth(scene, guess, label, [*reached], [*reached.values()], exponent, lost, hollow))
+            found.append(SizeGrowth(scene, guess, label, [*reached], [*reached.values()], exponent, lost, hollow))
     return found
 
 

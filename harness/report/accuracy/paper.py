@@ -61,7 +61,7 @@ _COLORS = ("#0b3c5d", "#2f7fb8", "#3fae8f", "#c9a227", "#d9822b", "#c0392b", "#7
 _HEADINGS = ("Figure 2, by iterations", "Figure 2, by time", "Figure 3, by size", "Figure 3, 21 × 21 by stiffness")
 
 
-class Comparison(NamedTuple):
+class PaperComparison(NamedTuple):
     """Ours against the paper's: which curve, after how many iterations, both errors, over how many frames."""
 
     curve: str
@@ -89,14 +89,14 @@ def stiffness(problem: Problem) -> float:
     return problem.stiffness_ratio / (problem.vertices * problem.time_step**2)
 
 
-def comparisons(table: Measurements) -> list[Comparison]:
+def comparisons(table: Measurements) -> list[PaperComparison]:
     """All points of the paper that our rows have a counterpart of."""
-    found: list[Comparison] = []
+    found: list[PaperComparison] = []
     for curve in _long(table)[:1]:
         for iterations, (theirs, _) in FIGURE_2.items():
             ours = at(curve, iterations)
             if np.isfinite(ours):
-                found.append(Comparison("figure 2", iterations, ours, theirs, 1))
+                found.append(PaperComparison("figure 2", iterations, ours, theirs, 1))
     for (side, k), values in FIGURE_3.items():
         curves = _frames(table, side, k)
         for iterations, theirs in zip(ITERATIONS, values, strict=True):
@@ -104,7 +104,7 @@ def comparisons(table: Measurements) -> list[Comparison]:
             known = [error for error in errors if np.isfinite(error)]
             if known:
                 name = f"figure 3, {side} × {side}, k = {k}"
-                found.append(Comparison(name, iterations, float(np.mean(known)), theirs, len(known)))
+                found.append(PaperComparison(name, iterations, float(np.mean(known)), theirs, len(known)))
     return found
 
 
@@ -175,7 +175,11 @@ def draw_paper(table: Measurements, stem: Path) -> list[Path]:
 
 
 def _figure_2(
-    by_iterations: Axes, by_time: Axes, curves: Sequence[Curve], marked: dict[str, Mark], found: Sequence[Comparison]
+    by_iterations: Axes,
+    by_time: Axes,
+    curves: Sequence[Curve],
+    marked: dict[str, Mark],
+    found: Sequence[PaperComparison],
 ) -> None:
     for curve in curves:
         gap = np.maximum(curve.gap, curve.problem.round_off)
@@ -199,7 +203,7 @@ def _figure_2(
     by_time.plot(*zip(*FIGURE_2_NEWTON, strict=True), marker="D", **empty)
 
 
-def _figure_3(ax: Axes, compared: Sequence[Comparison], keys: Sequence[tuple[int, int]]) -> None:
+def _figure_3(ax: Axes, compared: Sequence[PaperComparison], keys: Sequence[tuple[int, int]]) -> None:
     """Ours and theirs in one colour for each curtain, with the ratios below."""
     for row, (side, k) in enumerate(keys):
         color = _COLORS[list(FIGURE_3).index((side, k))]

@@ -19,7 +19,7 @@ SHOWN = 4
 """Runners-up that are told in words."""
 
 
-class Point(NamedTuple):
+class RunnerUp(NamedTuple):
     """A way: its solver's name, its relative error, its wall seconds a simulated second, and all of it in words."""
 
     solver: str
@@ -28,7 +28,7 @@ class Point(NamedTuple):
     words: str
 
 
-def draw_ways(stem: Path, title: str, facts: Sequence[str], points: Sequence[Point], asked: float) -> list[Path]:
+def draw_ways(stem: Path, title: str, facts: Sequence[str], points: Sequence[RunnerUp], asked: float) -> list[Path]:
     """The picture of ways, the cheapest first, and the files it left. The first that keeps to the error `asked` is
     the recommended one."""
     within = [point for point in points if point.error <= asked]
@@ -64,6 +64,6 @@ def draw_ways(stem: Path, title: str, facts: Sequence[str], points: Sequence[Poi
     return files(stem)
 
 
-def _told(point: Point, best: Point | None = None) -> str:
+def _told(point: RunnerUp, best: RunnerUp | None = None) -> str:
     times = f", {quantity(point.cost / best.cost)} times as long" if best else ""
     return f"{point.words}: an error of {100 * point.error:.2g} % for {duration(point.cost)} a simulated second{times}"

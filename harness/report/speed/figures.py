@@ -84,7 +84,7 @@ class Figures(NamedTuple):
         return self.code not in ("", machine.code_hash())
 
 
-class Machine:
+class MachineLimits:
     """The measured limits of one size's turns: bandwidth by working set, and flops, by number of threads."""
 
     def __init__(self, rows: Sequence[Row]) -> None:
@@ -135,7 +135,7 @@ def figures(table: pa.Table) -> list[Figures]:
         groups[found[0]["scene"], found[0]["size"]][labels[found[0]["run_id"]]] = found
     out: list[Figures] = []
     for group in groups.values():
-        limits = Machine([row for found in group.values() for row in found if row["solver"] == MACHINE])
+        limits = MachineLimits([row for found in group.values() for row in found if row["solver"] == MACHINE])
         for label, found in group.items():
             if found[0]["solver"] != MACHINE:
                 out.append(_figures(label, found, group, limits))
@@ -158,7 +158,7 @@ def _labels(firsts: Sequence[Row]) -> dict[str, str]:
     }
 
 
-def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], limits: Machine) -> Figures:
+def _figures(label: str, found: Sequence[Row], group: Mapping[str, list[Row]], limits: MachineLimits) -> Figures:
     first = found[0]
     known = Figures(
         *(first["scene"], first["size"], first["vertices"], label, first["threads"]),

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from harness.report.origin import machine_and_commit
 from harness.report.speed.figures import STEP, Figures
-from harness.report.speed.size_plot import Series, draw_by_size
+from harness.report.speed.size_plot import CandidateLine, draw_by_size
 from harness.report.style import OLDER
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class SpeedPicture:
     """One picture: the stem of its file, its title, what it shows of a candidate, whether that is a share."""
 
     stem: str
@@ -23,11 +23,11 @@ class Picture:
 
 
 PICTURES = (
-    Picture("step", f"Milliseconds a step of {STEP} iterations", lambda f: f.step),
-    Picture("global", "Milliseconds a global step: one solve, three right-hand sides", lambda f: f.global_),
-    Picture("local", "Milliseconds a local step", lambda f: f.local),
-    Picture("prepare", "Milliseconds to prepare, warm", lambda f: f.warm or f.cold),
-    Picture("limit", "Part of the limit that binds an iteration", lambda f: f.reached, share=True),
+    SpeedPicture("step", f"Milliseconds a step of {STEP} iterations", lambda f: f.step),
+    SpeedPicture("global", "Milliseconds a global step: one solve, three right-hand sides", lambda f: f.global_),
+    SpeedPicture("local", "Milliseconds a local step", lambda f: f.local),
+    SpeedPicture("prepare", "Milliseconds to prepare, warm", lambda f: f.warm or f.cold),
+    SpeedPicture("limit", "Part of the limit that binds an iteration", lambda f: f.reached, share=True),
 )
 
 
@@ -48,9 +48,9 @@ def draw(found: Sequence[Figures], folder: Path) -> None:
             draw_by_size(path, picture.title, [scene, *facts], _series(members, picture), share=picture.share)
 
 
-def _series(members: Sequence[Figures], picture: Picture) -> list[Series]:
+def _series(members: Sequence[Figures], picture: SpeedPicture) -> list[CandidateLine]:
     """A line for each candidate of a scene."""
-    lines: list[Series] = []
+    lines: list[CandidateLine] = []
     for label in dict.fromkeys(f.label for f in members):
         mine = [f for f in members if f.label == label]
         points = sorted((f.vertices, value, f.older) for f in mine if (value := picture.value(f)) is not None)
@@ -60,5 +60,5 @@ def _series(members: Sequence[Figures], picture: Picture) -> list[Series]:
             [point[1] for point in points],
             [point[2] for point in points],
         )
-        lines.append(Series(label, alone, mine[0].solver, n, values, older))
+        lines.append(CandidateLine(label, alone, mine[0].solver, n, values, older))
     return lines

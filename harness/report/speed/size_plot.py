@@ -20,7 +20,7 @@ from harness.report.style import HEIGHT, PAGE, RC, WIDTH, looks
 _LEFT, _TOP, _NAMES, _BELOW = 110, 130, 400, 70
 
 
-class Series(NamedTuple):
+class CandidateLine(NamedTuple):
     """The line of a candidate: its name, what it is called with one thread, its solver, vertices and values (k,), and
     which of them (k,) other code than today's measured."""
 
@@ -32,7 +32,7 @@ class Series(NamedTuple):
     older: Sequence[bool]
 
 
-def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[Series], *, share: bool) -> None:
+def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[CandidateLine], *, share: bool) -> None:
     """Draw to `path`, WIDTH x HEIGHT pixels, PNG; `share`: values are parts of a whole, drawn in percent.
 
     Candidates have the colour and the marker of their solver, and a line style of their own; with more threads than one
@@ -77,7 +77,7 @@ def draw_by_size(path: Path, title: str, facts: Sequence[str], series: Sequence[
         save(page, path)
 
 
-def _scales(ax: Axes, drawn: Sequence[Series], share: bool) -> None:
+def _scales(ax: Axes, drawn: Sequence[CandidateLine], share: bool) -> None:
     """Vertices by logarithms; times by logarithms too, shares from nothing up."""
     sizes = sorted({n for line in drawn for n in line.vertices})
     ax.set_xscale("log")

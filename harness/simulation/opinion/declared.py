@@ -59,7 +59,7 @@ Force = Callable[[Array, Array, float], tuple[Array, float]]
 round-off."""
 
 
-class Held(NamedTuple):
+class PinnedVertex(NamedTuple):
     """A pin: its weight [N/m], where it is (3,) [m] and how fast (3,) [m/s] at a time [s]."""
 
     weight: float
@@ -82,7 +82,7 @@ class Opinion:
     needs: Callable[[Array], Begin] | None = None
     force: Force | None = None
     decay: Callable[[Array], Array] | None = None
-    pins: dict[int, Held] = field(default_factory=dict[int, Held])
+    pins: dict[int, PinnedVertex] = field(default_factory=dict[int, PinnedVertex])
     shortest: float = np.inf
     reach: float = 0.0
 

@@ -27,7 +27,7 @@ FRACTIONS = (1e-3, 1e-2, 0.1, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class SamplePoint:
     """The state that a step starts from, shifts (n, 3) [m] of its unknown from where the velocity leads, and a
     direction (n, 3)."""
 
@@ -36,7 +36,7 @@ class Point:
     direction: Array
 
 
-def points(scene: Scene, declared: Declared, frames: int) -> Iterator[Point]:
+def points(scene: Scene, declared: Declared, frames: int) -> Iterator[SamplePoint]:
     """The points of a scene, the same each time; steps are any of the scene's frames, and every fifth the first."""
     rng, rest = np.random.default_rng(0), scene.mesh.rest
     begun = start(scene).now
@@ -63,7 +63,7 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[Point]:
         shift = some * rng.normal(size=rest.shape)
         far = np.linalg.norm(shift, axis=1).max()
         shift *= min(1.0, limit / far) if far else 1.0
-        yield Point(
+        yield SamplePoint(
             State(type(begun)(p, v), type(begun)(*before) if index else None, index, led(k, some / dt**2, rest)),
             shift,
             rng.normal(size=rest.shape),

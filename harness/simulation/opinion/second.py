@@ -17,7 +17,7 @@ from harness.scenes.bind import Scene
 from harness.scenes.spec import SceneSpec
 from harness.simulation.opinion.compare import Finding, Place, differ, energies, steps
 from harness.simulation.opinion.declared import Array
-from harness.simulation.opinion.points import Point, points
+from harness.simulation.opinion.points import SamplePoint, points
 from harness.simulation.opinion.sides import Side, side
 from harness.simulation.opinion.stages import STAGED, stages
 from harness.simulation.opinion.steps import state
@@ -61,7 +61,7 @@ class _Answer:
         return Solution(x, 0, float("nan"), float("nan"), "iterations", v)
 
 
-def _compared(sides: list[Side], scene: Scene, integrator: str, point: Point) -> Iterator[Finding]:
+def _compared(sides: list[Side], scene: Scene, integrator: str, point: SamplePoint) -> Iterator[Finding]:
     """What differs at one point."""
     index, now, before = point.state.index, point.state.now, point.state.before
     own = sides[index % len(sides)]
@@ -90,7 +90,7 @@ def _compared(sides: list[Side], scene: Scene, integrator: str, point: Point) ->
     yield from energies(at)
 
 
-def _staged(own: Side, scene: Scene, integrator: str, point: Point, time: float) -> Iterator[Finding]:
+def _staged(own: Side, scene: Scene, integrator: str, point: SamplePoint, time: float) -> Iterator[Finding]:
     """The same for an integrator of several unknowns, each of which is answered by where the velocity leads."""
     now, dt = point.state.now, own.declared.time_step
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.simulation.opinion.declared import Array, Begin, Declared, Held, Moment, Opinion, chosen
+from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion, PinnedVertex, chosen
 from harness.simulation.opinion.derivatives import Values, Wide, wide
 from harness.simulation.opinion.edges import along_edges, of_springs
 from harness.simulation.opinion.motion import place, speed
@@ -106,7 +106,7 @@ def pins(effect: Any, declared: Declared) -> Opinion:
     return Opinion(pins=held, reach=_reach(effect.motion))
 
 
-def pin(weight: float, motion: Any, q: Wide) -> Held:
+def pin(weight: float, motion: Any, q: Wide) -> PinnedVertex:
     """A pin of a point declared at q (3,) [m]."""
 
     def there(time: float) -> Wide:
@@ -115,4 +115,4 @@ def pin(weight: float, motion: Any, q: Wide) -> Held:
     def moving(time: float) -> Wide:
         return speed(motion, q, time)
 
-    return Held(weight, there, moving)
+    return PinnedVertex(weight, there, moving)
