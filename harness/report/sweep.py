@@ -46,7 +46,7 @@ def draw_sweep(
     write_bibtex(folder / "references.bib", table["reference"].to_pylist())
     drawn = [p for p in pictured if p.run.record and p.recording.exists()]
     wanting = [p for p in drawn if p.run.pictures and _stale(p.picture, [p.recording])]
-    groups = [group for group in _groups(drawn, folder) if group.old_recording or group.old_picture]
+    groups = [group for group in compared(drawn, folder) if group.old_recording or group.old_picture]
 
     def times() -> None:
         if any(p.run.pictures for p in pictured):
@@ -91,7 +91,7 @@ def _draw_runs(
             say(f"{wanting[number].picture} is not drawn: its process {outcome}")
 
 
-def _draw_groups(groups: Sequence[_Group], say: Callable[[str], None], *, pictures: bool) -> None:
+def _draw_groups(groups: Sequence[Compared], say: Callable[[str], None], *, pictures: bool) -> None:
     """What compares the runs of groups: recordings, and pictures where these can be drawn."""
     if not groups:
         return
@@ -131,7 +131,7 @@ def _stale(made: Path, sources: Iterable[Path]) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class _Group:
+class Compared:
     """Runs that differ in nothing but their solver or its settings, by what they differ in; and what compares them."""
 
     label: str
@@ -155,13 +155,13 @@ class _Group:
         return next(iter(self.runs.values())).run.pictures and _stale(self.picture, self.recordings.values())
 
 
-def _groups(drawn: list[Pictured], folder: Path) -> list[_Group]:
+def compared(drawn: list[Pictured], folder: Path) -> list[Compared]:
     """Those of two runs and more, by scene and size."""
     alike: dict[str, list[Pictured]] = {}
     for p in drawn:
         alike.setdefault(f"{p.run.scene_name}-{p.run.size}", []).append(p)
     return [
-        _Group(
+        Compared(
             label,
             {_distinct(p, some): p for p in some},
             folder / "recordings" / f"{label}-solvers.rrd",
@@ -179,6 +179,6 @@ def _distinct(p: Pictured, group: list[Pictured]) -> str:
         return {**run.solver.parameters, **{option: getattr(run, option) for option in OPTIONS}}
 
     own = [settings(other.run) for other in group if other.run.solver.name == p.run.solver.name]
-    varied = [(k, v) for k, v in settings(p.run).items() if any(other[k] != v for other in own)]
+    varied = [(k, v) for k, v in settings(p.run).items() if any(k not in other or other[k] != v for other in own)]
     short = {name: option.short for name, option in OPTIONS.items()}
     return ", ".join([p.run.solver.name, *(short.get(k, f"{k} {{}}").format(v) for k, v in varied)])

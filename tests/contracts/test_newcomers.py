@@ -109,9 +109,10 @@ def test_no_report_and_little_else_knows_a_solver_by_name():
     assert constants("harness") & set(SOLVERS) - {"sparse"} == DEFAULTS
 
 
-def test_no_report_knows_an_effect_by_name():
+@pytest.mark.parametrize("folder", ["report", "experiments"])
+def test_no_report_and_no_experiment_knows_an_effect_by_name(folder: str):
     # `springs` is a column of rows: how many a mesh has.
-    assert constants("harness/report") & set(EFFECTS) <= {"springs"}
+    assert constants(f"harness/{folder}") & set(EFFECTS) <= {"springs"}
 
 
 def test_a_sweep_and_its_reports_take_a_new_solver_and_effect(configs: Path):

@@ -16,6 +16,7 @@ import pytest
 from harness.base.errors import InputError
 from harness.config.load import load_any
 from harness.experiments.code import code, parts
+from harness.report.sweep import Pictured, compared
 from solvers.plugins import Refused
 from solvers.registry import EVERY
 from tests.often import often
@@ -213,6 +214,13 @@ def test_opened_or_not_a_run_has_one_name_and_one_code(beside: Path):
     assert code(parts(closed)) == code(parts(opened))
     shipped = load_any(ROOT / "configs" / "quickstart.yaml", opens=False).runs()[0]
     assert not shipped.own()
+
+
+def test_two_of_one_solver_are_told_apart_by_what_only_one_of_them_says(beside: Path):
+    sweep = configs(beside, WAYS["beside"])
+    sweep.write_text(sweep.read_text().replace("patience: 5}", "patience: 5}, './mine.py:Mine'"))
+    (group,) = compared([Pictured(run, beside, beside) for run in load_any(sweep).runs()], beside)
+    assert list(group.runs) == ["./mine.py:Mine, patience 5", "./mine.py:Mine"]
 
 
 def test_a_file_beside_the_config_travels_between_processes(beside: Path):

@@ -35,9 +35,31 @@ def left(**how):
     return len(os.listdir("/proc/self/task")) - before
 """
 
+DEAD = """
+import os, sys, threading
+import numpy as np, rerun as rr
+
+os.mkfifo(sys.argv[1])
+reader = os.open(sys.argv[1], os.O_RDONLY | os.O_NONBLOCK)
+stream = rr.RecordingStream("app", batcher_config=rr.ChunkBatcherConfig.NEVER(), send_properties=False)
+stream.save(sys.argv[1])
+for _ in range(20):
+    stream.log("a", rr.Scalars(np.random.rand(20_000)))  # more than a pipe holds
+os.close(reader)  # from now on its writer meets an error, as on a disk that is full
+ending = threading.Thread(target=stream.disconnect, daemon=True)
+ending.start()
+ending.join(1.0)
+print(int(ending.is_alive()), flush=True)
+os._exit(0)
+"""
+
 
 def told(code: str, path: Path) -> int:
-    command = [sys.executable, "-c", f"{STREAM}\nprint({code})", path]
+    return said(f"{STREAM}\nprint({code})", path)
+
+
+def said(program: str, path: Path) -> int:
+    command = [sys.executable, "-c", program, path]
     return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
@@ -51,6 +73,13 @@ def test_the_public_call_for_layouts_leaves_threads_that_nothing_ends(tmp_path: 
     # Way round: `PartialFile.lay_out`.
     found = told("left(layout=True, clean=True)", tmp_path / "a.rrd")
     assert found > 0, "send_blueprint leaves no threads any more: call it instead"
+
+
+def test_no_public_call_lets_go_of_a_stream_whose_writer_has_died(tmp_path: Path):
+    # Way round: `PartialFile` keeps such a stream, by `Py_IncRef`, and takes back its clean-up at exit.
+    assert said(DEAD, tmp_path / "a.rrd"), (
+        "disconnect does not wait for a dead writer any more: call it, and keep nothing"
+    )
 
 
 def test_a_file_that_was_cut_within_a_message_is_not_read_at_all(tmp_path: Path):

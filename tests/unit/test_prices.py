@@ -67,5 +67,5 @@ def test_what_is_of_one_solver_is_refused(cloth: Path, also: list[str]):
 
 
 def test_what_has_no_effect_beside_the_plain_ones_has_no_price(cloth: Path):
-    with pytest.raises(InputError, match="which have no price"):
+    with pytest.raises(InputError, match="no effect that has a price"):
         priced(only(load_scene(cloth)))

@@ -2,7 +2,7 @@
 
     price = median over rounds of (CPU time an iteration of plain + effect) / (the same of plain)
 
-The plain scene has springs, gravity, drag by velocity filters, and pins. Both scenes go step by step in turns, each to
+The plain scene has the effects that say that they are `plain`. Both scenes go step by step in turns, each to
 the tolerance that is asked for, so that a drift of the machine meets both alike. Rounds end once the price is known to
 CLOSE, or after as many as are allowed. A round that has taken ENOUGH ends with the next step that counts, and then
 LEAST rounds will do, so that the slowest solvers take minutes as well.
@@ -25,13 +25,13 @@ from scipy.sparse import csr_array
 from harness.base.errors import InputError
 from harness.base.statistics import Interval, ratio
 from harness.scenes.bind import Scene, build
+from harness.scenes.effects.base import Effect
 from harness.scenes.spec import SceneSpec
 from harness.simulation.algebraic import Stop
 from harness.simulation.step import Step, prepare, simulate
 from solvers.energies.springs import Springs
 from solvers.problem import NotPositiveDefinite, ProjectiveEnergy, Solver, Unsupported
 
-PLAIN = {"springs", "gravity", "ether-drag", "pins"}
 ALL = "all"
 """The name of all effects together."""
 CLOSE, LEAST = 0.03, 3
@@ -84,9 +84,10 @@ class _Run:
 
 def priced(scene: SceneSpec) -> list[str]:
     """The kinds of effects that have a price, and all of them together; raises InputError where there is none."""
-    kinds = list(dict.fromkeys(effect.kind for effect in scene.effects if effect.kind not in PLAIN))
+    kinds = list(dict.fromkeys(effect.kind for effect in scene.effects if not _plain(effect)))
     if not kinds:
-        raise InputError(f"{scene.path}: has no effect beside {', '.join(sorted(PLAIN))}, which have no price here")
+        listed = ", ".join(dict.fromkeys(effect.kind for effect in scene.effects))
+        raise InputError(f"{scene.path}: has no effect that has a price; those without one: {listed or 'none'}")
     return [*kinds, ALL]
 
 
@@ -94,7 +95,12 @@ def only(scene: SceneSpec, *kinds: str) -> SceneSpec:
     """The scene with these effects alone, and the plain ones; with all of them where they are ALL."""
     if ALL in kinds:
         return scene
-    return scene.model_copy(update={"effects": tuple(e for e in scene.effects if e.kind in PLAIN.union(kinds))})
+    return scene.model_copy(update={"effects": tuple(e for e in scene.effects if e.kind in kinds or _plain(e))})
+
+
+def _plain(effect: Effect) -> bool:
+    """Whether it says that it has no price."""
+    return bool(getattr(effect, "plain", False))
 
 
 def prices(scene: SceneSpec, size: int, solver: Solver, stop: Stop, *, frames: int, rounds: int) -> Iterator[Price]:

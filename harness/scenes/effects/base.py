@@ -102,7 +102,8 @@ class Effect(Protocol):
 
     Its class states `exact_to`, a class variable: the order of the error, by steps, up to which integrators keep their
     own with it; infinite where it is smooth and they take it where it acts. One that does not say so promises nothing.
-    It may state `damps`, a class variable, True where it takes energy out of any motion; and
+    It may state class variables: `damps`, True where it takes energy out of any motion; `plain`, True where scenes have
+    it that the prices of effects are told against, so that it has none; and
     `called_for(seen: Seen) -> str`, a class method: by what evidence the motion of a scene that does not list it asks
     for it, "" where it does not.
     """

@@ -23,6 +23,7 @@ class EtherDrag(Model):
 
     exact_to: ClassVar[float] = inf
     damps: ClassVar[bool] = True
+    plain: ClassVar[bool] = True
 
     kind: Literal["ether-drag"] = "ether-drag"
     rate: NonNegativeFloat

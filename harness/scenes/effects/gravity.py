@@ -15,6 +15,7 @@ class Gravity(Model):
     """Weight on every vertex: its mass times one acceleration."""
 
     exact_to: ClassVar[float] = inf
+    plain: ClassVar[bool] = True
 
     kind: Literal["gravity"] = "gravity"
     acceleration: Vector = (0.0, -9.81, 0.0)

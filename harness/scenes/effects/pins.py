@@ -17,6 +17,7 @@ class Pins(Selection):
     """Holds every vertex that any of its selectors names."""
 
     exact_to: ClassVar[float] = inf
+    plain: ClassVar[bool] = True
 
     kind: Literal["pins"] = "pins"
     weight: PositiveFloat | Literal["exact"] = Field(default=1e10)

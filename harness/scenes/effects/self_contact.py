@@ -11,7 +11,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from harness.base.errors import InputError
 from harness.base.model import Model
-from harness.scenes.effects.base import Contribution, Pin
+from harness.scenes.effects.base import Contribution, Pin, Seen
 from harness.scenes.intersections import Apart, crossings
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.touching import ENDS, outline, require_open, require_still, resisting, told
@@ -19,6 +19,11 @@ from solvers.contact.self_contact import SelfContact as Energy
 from solvers.contact.surface import Surface
 from solvers.problem import Energy as AnyEnergy
 from solvers.problem import Positions
+
+NEAR = 0.5
+"""Of the mean rest length: vertices that come closer than that lie as good as inside each other."""
+LOOKS = 30
+"""How many frames of a motion are looked at for vertices that come close, evenly spread."""
 
 
 class SelfContact(Model):
@@ -73,3 +78,38 @@ class SelfContact(Model):
 
         apart = (Apart(((edges, mesh.triangles),)),)
         return Contribution(derived=(derived,), checks=(check,), once=("self-contact",), ends=ENDS, apart=apart)
+
+    @classmethod
+    def called_for(cls, seen: Seen) -> str:
+        """See `harness.scenes.effects.base.Effect`: vertices as good as inside each other."""
+        frames, n = len(seen.positions), len(seen.mesh.rest)
+        reach = NEAR * seen.length
+        known = _codes(np.concatenate([seen.mesh.springs, _pairs(seen.mesh.rest, reach)]), n)
+        most, closest, at = 0, np.inf, 0
+        for frame in np.unique(np.linspace(0, frames - 1, LOOKS).astype(int)):
+            p = seen.positions[frame]
+            pairs = _pairs(p, reach)
+            pairs = pairs[~np.isin(_codes(pairs, n), known)]
+            if len(pairs) > most:
+                most, at = len(pairs), int(frame)
+            if len(pairs):
+                closest = min(closest, float(np.linalg.norm(p[pairs[:, 0]] - p[pairs[:, 1]], axis=1).min()))
+        if not most:
+            return ""
+        return (
+            f"{most} pairs of vertices without a spring between them are closer than {NEAR:g} mean rest lengths at "
+            f"{seen.time(at):.2f} s, two come as close as {closest / seen.length:.2g}; contact with obstacles "
+            "does not keep them apart"
+        )
+
+
+def _pairs(p: NDArray[np.float64], reach: float) -> NDArray[np.int64]:
+    """Pairs of vertices (k, 2) that are closer than `reach` [m]."""
+    from scipy.spatial import KDTree  # for those who look
+
+    return KDTree(p).query_pairs(reach, output_type="ndarray").astype(np.int64)
+
+
+def _codes(pairs: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """One number for each pair, whichever end comes first."""
+    return pairs.min(axis=1) * n + pairs.max(axis=1)

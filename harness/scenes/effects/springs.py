@@ -18,6 +18,7 @@ class Springs(Model):
     """Springs k/2 (length - rest length)^2 along the mesh's edges; those of no stiffness are left out."""
 
     exact_to: ClassVar[float] = inf
+    plain: ClassVar[bool] = True
 
     kind: Literal["springs"] = "springs"
     rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
