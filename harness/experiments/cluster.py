@@ -45,11 +45,9 @@ from solvers.plugins import Plugin, load
 CLOCKS = 60.0
 """Seconds by which a worker's clock may differ from the client's before that is said."""
 
-_QUEUED = 60
-"""So many times PATIENCE the first job of a batch system may be queued."""
-
-_TRIES = 4
-"""How often a run is handed out whose worker is lost."""
+_QUEUED, _TRIES = 60, 4
+"""So many times PATIENCE the first job of a batch system may be queued; how often a run is handed out whose worker is
+lost."""
 
 _GONE = "the scheduler is gone; what was done is kept, and the same command does the rest"
 
@@ -291,7 +289,7 @@ def _do(unit: RunUnit, folder: Path, token: str, code: str, tables: Sequence[Map
                 (place / part).mkdir(exist_ok=True)
             here = RunUnit(unit.run, Files.of(unit.run, place), None, unit.at_once)
             try:
-                told = process.do(partial(watched, here), _quiet, here.limits)
+                told = process.do(partial(watched, here), lambda _: None, here.limits)
             except Lost as lost:
                 told = here.lost(lost)
             made = [] if shared else [here.files.rows, here.files.recording]
@@ -300,7 +298,3 @@ def _do(unit: RunUnit, folder: Path, token: str, code: str, tables: Sequence[Map
         return Done(me, useless=f"cannot write: {error}")
     finally:
         _PROCESSES.append(process)
-
-
-def _quiet(said: str) -> None:
-    pass

@@ -157,11 +157,10 @@ class _Moved(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class PreparedRosenbrock(Iterative):
     """objective: of the energies alone; drag: d (n,) [N s/m]; refine: steps in a frame; tolerance [m]: of each where
-    they differ, else 0."""
+    they differ, else 0; factorisations: of a step that is tried."""
 
     residual_of: ClassVar[ResidualOf] = "none"
     factorisations: ClassVar[int] = 1
-    """Of a step that is tried."""
 
     system: System
     table: Rosenbrock
@@ -266,9 +265,7 @@ class _Frame:
         raise NotPositiveDefinite(f"after {time:.6g} s of the frame the Hessian is not finite, or nothing balances it")
 
     def moved(self, p: Positions, v: Positions, h: float, *, exact: bool = True) -> _Moved | None:
-        """A step of h [s] from positions p and velocities v; None where the matrix has no factor.
-
-        exact: whether it must be the exact one."""
+        """A step of h [s] from positions p, velocities v; None where no factor is. exact: of the matrix itself."""
         table, step, m, d = self._of.table, self._step, self._mass, self._drag
         s = 1.0 / (table.gamma * h)
         hessian = step.hessian(p)

@@ -1,0 +1,93 @@
+"""`run --error`: what cannot be asked, what a run leaves, and what it takes from rows measured before."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from harness.base import rows
+from harness.cli import app
+from harness.config.load import load_scene
+from harness.config.sweep import SolverSpec
+from harness.experiments.accuracy.accuracy_rows import SCHEMA
+from harness.experiments.asked.known import known, problem, promising, way_rows
+from harness.experiments.asked.libraries import LIBRARIES
+from harness.experiments.asked.search import foresee, search
+from harness.experiments.asked.ways import Asked
+from harness.experiments.provenance import provenance
+
+SCENES = Path(__file__).parents[2] / "configs" / "scenes"
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--error", "2"), "--error: came 2; wanted a number between 0 and 1"),
+        (("--error", "nan"), "--error: came nan"),
+        (("--error", "1e-3", "--horizon", "-1"), "--horizon: came -1; wanted seconds above 0"),
+        (("--error", "1e-3", "--solver", "newton"), "--solver: with --error, solver and steps are chosen"),
+        (("--error", "1e-3", "--integrator", "bdf2"), "--integrator: with --error"),
+        (("--horizon", "1"), "--horizon: is of a run with --error"),
+        (("--check",), "--check: is of a run with --error"),
+    ],
+)
+def test_what_cannot_be_asked_is_the_users_mistake(options, told, tmp_path, capsys):
+    given = ["run", str(SCENES / "chain.yaml"), "--results", str(tmp_path), *options]
+    found = CliRunner().invoke(app, given)
+    assert found.exit_code == 2
+    assert told in " ".join((found.stderr + capsys.readouterr().err).split())
+
+
+def rows_of(folder: Path, *options: str) -> list[dict[str, Any]]:
+    """The rows that a run of a small chain to an error leaves."""
+    given = ["run", str(SCENES / "chain.yaml"), "--size", "5", "--error", "1e-3", "--horizon", "0.2", *options]
+    found = CliRunner().invoke(app, [*given, "--results", str(folder)])
+    assert found.exit_code == 0, found.output
+    return rows.read((folder / "chain" / "accuracy").glob("*.parquet"), SCHEMA).to_pylist()
+
+
+def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_path):
+    row, *tried = rows_of(tmp_path, "--check", "--positions", str(tmp_path / "p.npz"))
+    assert row["kind"] == "asked"
+    assert {"way"} == {one["kind"] for one in tried}
+    assert all(one["promised"] > 0.0 for one in tried)
+    assert row["error"] <= row["estimated"] <= row["asked"] == 1e-3
+    assert row["accepted"] > 0
+    assert (tmp_path / "chain" / row["recording"]).is_file()
+    assert np.load(tmp_path / "p.npz")["positions"].shape == (6, 5, 3)
+
+
+def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, monkeypatch):
+    few = [("own", SolverSpec(name, {})) for name in ("velocity-verlet", "blanes-moan-4", "rodas")]  # the last is dear
+    monkeypatch.setattr("harness.experiments.asked.ways.tried", lambda: few)
+    monkeypatch.setattr("harness.experiments.asked.known.tried", lambda: few)
+    asked = Asked.of(load_scene(SCENES / "single-spring.yaml"), 2, 0.2)
+    seen = foresee(asked, 1e-3, lambda line: None)
+    answer = search(asked, 1e-3, seen, lambda line: None)
+    promises: dict[str, float] = {"velocity-verlet": 1.0, "blanes-moan-4": 1.9, "rodas": 2.1}
+    answer = replace(answer, tried=tuple((one, promises[one.way.solver]) for one, _ in answer.tried))
+    shared = {"problem": problem(asked), "asked": 1e-3} | provenance()
+    rows.write(tmp_path / "s-2-asked-0.001.parquet", [shared | row for row in way_rows(answer, [], 1e-3)], SCHEMA)
+
+    found = known(tmp_path, asked)
+    assert promising(found, 4e-3) == (1e-3, few[:2])
+    assert promising(found, 2e-2) == (1e-3, [])
+    assert promising([], 1e-3)[1] == []
+    again = way_rows(replace(answer, tried=answer.tried[:1]), found, 1e-3)
+    assert {row["solver"] for row in again} == set(promises), "what is not tried again is not forgotten"
+    assert not known(tmp_path, replace(asked, frames=asked.frames + 1))
+    monkeypatch.setattr("harness.base.machine.code_hash", lambda: "other")
+    assert not known(tmp_path, asked)
+
+
+@pytest.mark.long
+def test_peers_have_rows_beside_it(tmp_path):
+    beside = [row for row in rows_of(tmp_path, "--peers") if row["kind"] == "peer"]
+    assert [peer["solver"] for peer in beside] == list(LIBRARIES)
+    assert all(peer["reason"] or peer["estimated"] <= 1e-3 for peer in beside)
+    assert [peer["status"] for peer in beside][:2] == ["ok", "ok"]
