@@ -18,7 +18,7 @@ from harness.experiments.accuracy.units import references
 from harness.experiments.asked.known import Row, known, problem, promising, way_rows
 from harness.experiments.asked.peers import peers as peers_of
 from harness.experiments.asked.search import Answer, foresee, search
-from harness.experiments.asked.ways import Asked
+from harness.experiments.asked.ways import Asked, in_words
 from harness.experiments.provenance import provenance
 from harness.experiments.run import save_positions
 from harness.record.base import Frame, RecordingInfo
@@ -88,9 +88,7 @@ def _searched(asked: Asked, error: float, seen: Growth, before: Sequence[Row], s
     nearest, pairs = promising(before, error)
     if not pairs:
         return search(asked, error, seen, say)
-    names = ", ".join(
-        solver.name if integrator == "own" else f"{integrator} with {solver.name}" for integrator, solver in pairs
-    )
+    names = ", ".join(in_words(integrator, solver.name) for integrator, solver in pairs)
     say(f"worth trying by rows measured before, for an error of {nearest:g}: {names}; --again tries all ways")
     try:
         return search(asked, error, seen, say, pairs)
@@ -140,16 +138,11 @@ def _row(name: str, asked: Asked, error: float, answer: Answer) -> dict[str, Any
         "solver": best.way.solver,
         "parameters": json.dumps({}),
         **stated(best.way.solver),
-        "integrator": best.way.integrator,
         "time_step": asked.frame,
         "threads": 1,
         "horizon": asked.horizon,
         "asked": error,
-        "estimated": best.estimated,
-        "local_tolerance_m": best.tolerance,
-        "accepted": path.accepted,
-        "rejected": path.rejected,
-        "factorisations": path.factorisations,
+        **best.columns,
         "iterations_done": path.iterations,
         "seconds": [path.seconds],
         "seconds_per_simulated": path.seconds / asked.horizon,

@@ -41,22 +41,17 @@ class Kept:
 
     def rows(self) -> list[dict[str, Any]]:
         """A row for each frame of each round."""
-        best, path, scene = self.answer.best, self.answer.best.path, self.scene
+        best, scene = self.answer.best, self.scene
         shared = {
             "phase": "step",
             "status": "ok",
             "reason": self.answer.note or None,
             "vertices": scene.system.vertices,
             "springs": len(scene.springs.edges),
-            "integrator": best.way.integrator,
             "max_iterations": None,
             "first_guess": None,
             "asked": self.asked,
-            "estimated": best.estimated,
-            "local_tolerance_m": best.tolerance,
-            "accepted": path.accepted,
-            "rejected": path.rejected,
-            "factorisations": path.factorisations,
+            **best.columns,
             "estimate_seconds": self.answer.seconds,
             "choice": "; ".join([f"{best.way} of {len(self.answer.tried)} ways", *self.said]),
         }

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf, sqrt
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,18 @@ class Found:
     def tolerance(self) -> float | None:
         """Of the error of a step [m]; None where steps have one length."""
         return None if self.way.follower.even else self.setting
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """What rows of any table say of it."""
+        return {
+            "integrator": self.way.integrator,
+            "estimated": self.estimated,
+            "local_tolerance_m": self.tolerance,
+            "accepted": self.path.accepted,
+            "rejected": self.path.rejected,
+            "factorisations": self.path.factorisations,
+        }
 
     def again(self) -> Path:
         """The same once more."""

@@ -79,7 +79,12 @@ class Way:
     follower: Follower
 
     def __str__(self) -> str:
-        return self.solver if self.integrator == "own" else f"{self.integrator} with {self.solver}"
+        return in_words(self.integrator, self.solver)
+
+
+def in_words(integrator: str, solver: str) -> str:
+    """What a way is called, by the names of both."""
+    return solver if integrator == "own" else f"{integrator} with {solver}"
 
 
 def tried() -> list[tuple[str, SolverSpec]]:
