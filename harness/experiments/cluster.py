@@ -39,15 +39,14 @@ from harness.config.sweep import RunSpec
 from harness.experiments.core import TABLES, ready, watched
 from harness.experiments.plan import Files
 from harness.experiments.run_unit import RunUnit
-from harness.experiments.scheduler import PATIENCE, SILENCE, reach, scheduler
+from harness.experiments.scheduler import PATIENCE, QUEUED, SILENCE, reach, scheduler
 from solvers.plugins import Plugin, load
 
 CLOCKS = 60.0
 """Seconds by which a worker's clock may differ from the client's before that is said."""
 
-_QUEUED, _TRIES = 60, 4
-"""So many times PATIENCE the first job of a batch system may be queued; how often a run is handed out whose worker is
-lost."""
+_TRIES = 4
+"""How often a run is handed out whose worker is lost."""
 
 _GONE = "the scheduler is gone; what was done is kept, and the same command does the rest"
 
@@ -111,7 +110,7 @@ def cluster(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> Gen
             raise InputError(Mistake(f"{on}: {why}; start one with `dask scheduler`", key="--on")) from None
         # Its log would put tracebacks beside what the user is told of a scheduler that is gone.
         with silence_logging_cmgr(SILENCE), client, client.as_current():
-            for waits in range(0 if address is on else _QUEUED, -1, -1):
+            for waits in range(0 if address is on else QUEUED, -1, -1):
                 try:
                     client.wait_for_workers(1, timeout=PATIENCE)
                     break

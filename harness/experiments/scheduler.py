@@ -22,6 +22,9 @@ from harness.base.errors import InputError, Mistake
 PATIENCE = 10.0
 """Seconds in which a scheduler has to answer, and to have a worker."""
 
+QUEUED = 60
+"""So many times PATIENCE the first job of a batch system may be queued."""
+
 SILENCE = logging.CRITICAL
 """What Dask says of workers that end is not for the user, who is told what became of runs."""
 

@@ -265,7 +265,8 @@ class _Frame:
         raise NotPositiveDefinite(f"after {time:.6g} s of the frame the Hessian is not finite, or nothing balances it")
 
     def moved(self, p: Positions, v: Positions, h: float, *, exact: bool = True) -> _Moved | None:
-        """A step of h [s] from positions p, velocities v; None where no factor is. exact: of the matrix itself."""
+        """A step of h [s] from positions p and velocities v; None where the matrix has no factor.
+        exact: whether it must be the exact one."""
         table, step, m, d = self._of.table, self._step, self._mass, self._drag
         s = 1.0 / (table.gamma * h)
         hessian = step.hessian(p)

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from harness.report.ablation import Row, of_kind, sentences
-from harness.report.site.accuracy import LOG, axis
-from harness.report.site.marks import drawn
+from harness.report.site.marks import LOG, axis, drawn
 from harness.report.site.runs import references
 from harness.report.site.script import number
 from harness.report.style import looks

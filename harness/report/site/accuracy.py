@@ -29,14 +29,13 @@ from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
 from harness.report.page import step_words
 from harness.report.site import paper, winners
-from harness.report.site.marks import drawn
+from harness.report.site.marks import axis, drawn
 from harness.report.site.runs import references
 from harness.report.site.script import numbers as _numbers
 from harness.report.style import looks
 
 Item = dict[str, Any]
 
-LOG = {"type": "log"}
 _COMMAND = "springbench accuracy CONFIG --again"
 _SHARES = {"range": [-0.02, 1.05], "tickformat": ".0%"}
 
@@ -62,11 +61,6 @@ def charts(everything: Measurements, folder: Path) -> dict[str, Item]:
     made = {name: chart | shared for name, chart in made.items()}
     made |= {"winners": winners.chart(table), "liu2013": paper.chart(everything)}
     return {name: chart | {"command": _COMMAND} for name, chart in made.items() if chart["items"]}
-
-
-def axis(column: str, title: str, how: Mapping[str, Any] = LOG) -> Item:
-    """What a chart can be drawn by: a column of its items, and how Plotly draws the axis."""
-    return {"column": column, "title": title, "axis": how}
 
 
 def _run(table: Measurements, curve: Curve, pictures: Mapping[str, Item]) -> Item:

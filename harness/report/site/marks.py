@@ -1,7 +1,8 @@
-"""Colours, marks and line styles of `harness.report.style` as Plotly and the page's legends name them."""
+"""Colours, marks and line styles of `harness.report.style`, and axes, as Plotly and the page's legends name them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from harness.report.style import BOWTIE, CORNERS, DASH_DOTTED, DASHED, DOTTED, HOURGLASS, LOZENGE, STARS, Mark
@@ -16,7 +17,14 @@ _SYMBOLS: dict[Any, str] = {
 }  # fmt: skip
 _DASHES: dict[Any, str] = {"-": "solid", DASHED: "dash", DOTTED: "dot", DASH_DOTTED: "dashdot"}
 
+LOG = {"type": "log"}
+
 
 def drawn(mark: Mark) -> dict[str, str]:
     """A mark in Plotly's names."""
     return {"color": mark.color, "symbol": _SYMBOLS[mark.marker], "dash": _DASHES.get(mark.dash, "longdash")}
+
+
+def axis(column: str, title: str, how: Mapping[str, Any] = LOG) -> dict[str, Any]:
+    """What a chart can be drawn by: a column of its items, and how Plotly draws the axis."""
+    return {"column": column, "title": title, "axis": how}

@@ -6,12 +6,11 @@ from typing import Any
 
 from harness.report.accuracy.measured import Measurements, by_other_code
 from harness.report.accuracy.paper import comparisons, own
-from harness.report.site.marks import drawn
+from harness.report.site.marks import axis, drawn
 from harness.report.site.script import numbers
 from harness.report.style import DASHED, MUTED, Mark
 
 _MARKS = {"ours": Mark("#0072b2", "o"), "Liu et al. 2013": Mark(MUTED, "D", DASHED)}
-_LOG = {"type": "log"}
 _NOTE = "Relative error (g − g*)/(g0 − g*) after iterations of local-global: ours, and as the paper's figures show it."
 
 
@@ -37,8 +36,8 @@ def chart(table: Measurements) -> dict[str, Any]:
         "title": "The paper reproduced",
         "note": " ".join([_NOTE, *by_other_code(own(table), table.newest)]),
         "filters": ["curve"],
-        "x": [{"column": "iterations", "title": "iterations", "axis": _LOG}],
-        "y": [{"column": "error", "title": "relative error", "axis": _LOG}],
+        "x": [axis("iterations", "iterations")],
+        "y": [axis("error", "relative error")],
         "hover": [
             *(["iterations", "iterations"], ["error", "relative error"]),
             *(["ratio", "ours over theirs"], ["frames", "our frames"]),

@@ -6,8 +6,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from harness.report.site.accuracy import LOG, axis
-from harness.report.site.marks import drawn
+from harness.report.site.marks import LOG, axis, drawn
 from harness.report.site.runs import MACHINE, references
 from harness.report.site.script import number
 from harness.report.speed.figures import Figures, figures

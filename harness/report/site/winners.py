@@ -7,10 +7,9 @@ from typing import Any
 from harness.report.accuracy.measured import Measurements, by_self_converged
 from harness.report.accuracy.winners import CLOSE, Cell, cells, families
 from harness.report.page import count
-from harness.report.site.marks import drawn
+from harness.report.site.marks import axis, drawn
 from harness.report.site.script import numbers
 
-_LOG = {"type": "log"}
 _NOTE = (
     "Each point is the family of methods that keeps to an error for the least processor time, whatever its steps and "
     "tolerances; where none stands nobody came so near. Stiffness number: k dt²/m at dt = 1/30 s. Errors are those of "
@@ -30,8 +29,8 @@ def chart(table: Measurements) -> dict[str, Any]:
         "note": " ".join([_NOTE, *by_self_converged(table.works)]),
         "shape": "points",
         "filters": [],
-        "x": [{"column": "number", "title": "stiffness number k dt²/m", "axis": _LOG}],
-        "y": [{"column": "error", "title": "relative error", "axis": _LOG}],
+        "x": [axis("number", "stiffness number k dt²/m")],
+        "y": [axis("error", "relative error")],
         "hover": [
             *(["scene", "scene"], ["error", "error"], ["number", "stiffness number"], ["setting", "cheapest"]),
             *(["price", "processor seconds a simulated second"], ["next", "next family"], ["ahead", "which takes"]),
