@@ -94,8 +94,8 @@ def test_a_limit_to_the_size_of_files_is_no_outcome_of_a_run_either(config: Path
     assert told.returncode == 1, told.stderr
     assert "cannot be written: File too large" in told.stderr
     assert "Traceback" not in told.stderr
-    outcomes = rows.read(tmp_path.rglob("rows/*.parquet"))
-    assert outcomes.select(["status", "reason"]).to_pylist() == []
+    outcomes = rows.read(tmp_path.rglob("rows/*.parquet")).select(["status", "reason"]).to_pylist()
+    assert list(tmp_path.rglob("*.parquet")) == [], outcomes
 
 
 @pytest.mark.long

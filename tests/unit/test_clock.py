@@ -115,7 +115,7 @@ def test_a_process_that_was_stopped_says_so() -> None:
     said, _ = child.communicate()
     interrupted, lost = said.split()
     assert interrupted == "True"
-    assert float(lost) >= 0.05  # of 0.1, less what it computes in it
+    assert float(lost) >= 0.09  # of 0.1: CPU time is known to some milliseconds, where a host counts it
 
 
 PROBLEM = first_problem(scene(Chain(), Gravity(), Pins(at=("first",), weight=1e4), size=4))
