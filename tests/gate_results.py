@@ -32,7 +32,7 @@ def write(folder: Path, gates: dict[str, Any], *, ratio: bool = True) -> Path:
             for gate, v in gates.items()
         ]
         commit = {"id": f"{k:07x}" * 5, "time": f"2026-01-{k + 1:02}T12:00:00+00:00", "dirty": False}
-        stored = {"machine_info": {"cpu": {"brand_raw": "a processor", "count": 2}, "affinity": 2}}
+        stored = {"machine_info": {"cpu": {"brand_raw": "A processor", "count": 2}, "affinity": 2}}
         stored |= {"commit_info": commit, "datetime": "2026-03-01T00:00:00", "benchmarks": told}
         (folder / f"{k * 7 % 31:04}_gates.json").write_text(json.dumps(stored))
     return folder

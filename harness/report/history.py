@@ -102,9 +102,13 @@ def stored_files(places: Iterable[Path]) -> list[Path]:
 
 def history(files: Sequence[Path]) -> list[GateHistory]:
     """The gates in stored files and their changes; the largest first. Raises InputError for foreign files."""
-    stored = sorted(map(read_stored, files), key=lambda s: (s.commit_info.time or s.datetime, s.datetime))
+    return histories(map(read_stored, files))
+
+
+def histories(stored: Iterable[Stored]) -> list[GateHistory]:
+    """The same of what was read from files."""
     points: dict[tuple[str, str, bool], list[StoredResult]] = defaultdict(list)
-    for one in stored:
+    for one in sorted(stored, key=lambda s: (s.commit_info.time or s.datetime, s.datetime)):
         for benchmark in one.benchmarks:
             key = benchmark.fullname.rpartition("::")[2], _machine(one), benchmark.extra_info.ratio is not None
             points[key].append(_point(one, benchmark))

@@ -14,11 +14,10 @@ from matplotlib.ticker import MaxNLocator
 
 from harness.base.files import replacing
 from harness.report.history import CHANGED, FEWEST, GateHistory
-from harness.report.style import DPI, INK, MUTED, RC, WARNING, WIDTH
+from harness.report.style import DPI, FASTER, INK, MUTED, RC, SLOWER, WIDTH
 
 MOST = 12
 """Panels; the gates that changed most are shown."""
-_SLOWER, _FASTER = WARNING, "#1b7f5c"
 _ROW = 190
 """Pixels of a panel's height."""
 
@@ -67,7 +66,7 @@ def _panel(axis: Any, series: GateHistory) -> None:
     for start, end, level in zip(series.starts, ends, series.levels, strict=True):
         axis.plot([start - 0.35, end - 1 + 0.35], [unit * level] * 2, color=INK, lw=1.8, solid_capstyle="round")
     for at, ratio in series.changes:
-        color = _SLOWER if ratio > 1 else _FASTER
+        color = SLOWER if ratio > 1 else FASTER
         axis.axvline(at - 0.5, color=color, lw=1.0, ls=(0, (4, 2)))
         told = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "fontsize": 8.5, "color": color}
         axis.annotate(f"{100 * (ratio - 1):+.1f} %", (at - 0.5, 1.0), xytext=(0, 3), ha="center", va="bottom", **told)
@@ -80,7 +79,7 @@ def _panel(axis: Any, series: GateHistory) -> None:
     axis.set_ylabel("of yardstick" if series.ratio else "ms", fontsize=8.5)
     ticks = _ticks(series)
     axis.set_xticks(ticks, [series.points[k].commit for k in ticks])
-    colors = {at: _SLOWER if ratio > 1 else _FASTER for at, ratio in series.changes}
+    colors = {at: SLOWER if ratio > 1 else FASTER for at, ratio in series.changes}
     for at, label in zip(ticks, axis.get_xticklabels(), strict=True):
         label.set_color(colors.get(at, MUTED))
     axis.yaxis.set_major_locator(MaxNLocator(4))

@@ -24,6 +24,9 @@ OLDER = "Hollow marks: measured by other code than today's."
 WARNING = "#b3261e"
 """Words that a reader must not miss."""
 
+SLOWER, FASTER = WARNING, "#1b7f5c"
+"""Where gates changed."""
+
 STRAIN_MAP = LinearSegmentedColormap.from_list("strain", STRAIN_COLOURS, N=512)
 """The scale of the recordings, from -strain_range to strain_range."""
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from harness.report.site import update
-from tests import accuracy_rows, figure_results, site_results
+from tests import accuracy_rows, figure_results, gate_results, site_results
 from tests.browser import chromium
 from tests.site_results import fails, run
 
@@ -27,6 +27,7 @@ VIEWS = {
     },
     **{plot: f"plots?sweep={sweep}&plot={plot}" for sweep, plot in (("cases", "hard"), ("machine", "speed"))},
     **{plot: f"plots?sweep=effects&plot={plot}" for plot in ("ablation", "prices")},
+    "gates": "plots?sweep=bench&plot=gates",
 }
 
 FITS = "document.documentElement.scrollWidth <= innerWidth"
@@ -57,6 +58,7 @@ def studies(tmp_path_factory: pytest.TempPathFactory) -> str:
     figure_results.sweep(folder / "cases")
     figure_results.speed(folder / "machine")
     figure_results.ablation(folder / "effects")
+    gate_results.write(folder / "bench" / "Linux-CPython-3.11-64bit", {"solve": gate_results.series(2, 8, (4, 1.2))})
     return results(folder, COUNT).as_uri()
 
 

@@ -20,7 +20,7 @@ from harness.report.site import build, keep, update
 from harness.report.site.failures import Failed, causes
 from harness.report.site.script import column
 from harness.report.site.sentences import sentences
-from tests import accuracy_rows, figure_results, site_results
+from tests import accuracy_rows, figure_results, gate_results, site_results
 from tests.site_results import fails, run
 
 COUNT = 40
@@ -128,6 +128,25 @@ def test_accuracy_s_charts_are_there_with_the_solvers_marks(results: Path):
     assert set(chart["marks"]) == {"numba", "dense"}
     assert "Liu" in chart["references"]["numba"]["cited"]
     assert chart["references"]["numba"]["bibtex"].startswith("@misc{liu2013")
+
+
+def test_stored_gates_are_a_chart_with_their_changes(tmp_path: Path):
+    gates = {"solve": gate_results.series(2, 12, (6, 1.2)), "step": gate_results.series(3, 12)}
+    there = gate_results.write(tmp_path / "bench" / "Linux-CPython-3.11-64bit", gates)
+    (there / "0099_damaged.json").write_text("{")
+    told: list[str] = []
+    update(tmp_path, say=told.append)
+    assert len(told) == 1
+    assert "0099_damaged.json" in told[0]
+    chart = read(tmp_path, "bench/gates")
+    slower = next(item for item in chart["items"] if item["label"].startswith("slower"))
+    assert (slower["gate"], slower["commit"]) == ("solve", ["0000006"])
+    levels = next(item["value"] for item in chart["items"] if item["label"] == "their level")
+    assert levels[3] / levels[0] == pytest.approx(1.2, rel=0.02)
+    (sweep,) = read(tmp_path, "index")["sweeps"]
+    assert [said.get("filter") for said in sweep["findings"]] == [{"gate": "solve"}, None]
+    assert sweep["gates"] == 2
+    assert all(made["commit"] and made["cpu"] == "A processor" for made in sweep["made"])
 
 
 def test_points_of_other_code_than_the_newest_are_told_in_every_chart(tmp_path: Path):

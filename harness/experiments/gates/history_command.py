@@ -27,6 +27,8 @@ def history(
     from harness.report.history import FEWEST, history_table, stored_files
     from harness.report.history import history as tell
     from harness.report.history_plot import draw_history
+    from harness.report.site import keep
+    from harness.report.site.folders import stored
 
     if output.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise InputError(Mistake("wanted a name that ends in .png, .svg or .pdf", output, key="--output"))
@@ -44,3 +46,6 @@ def history(
     output.parent.mkdir(parents=True, exist_ok=True)
     drawn = draw_history(found, output)
     say(f"the picture of {drawn} gates is {output}")
+    for place in places or PLACES:
+        if stored(place) and (place.parent / "index.html").is_file():
+            keep(place.parent, place, say)

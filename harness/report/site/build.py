@@ -14,7 +14,7 @@ from harness.base.errors import InputError
 from harness.base.files import replacing
 from harness.report.site import script
 from harness.report.site.assets import place
-from harness.report.site.folders import KINDS, Folder, folder_of, folders
+from harness.report.site.folders import KINDS, Folder, folder_of, folders, stored
 from harness.report.site.overview import Overview, overview
 
 SUMMARY = "summary.json"
@@ -90,6 +90,8 @@ def _state(folder: Folder, code: str, recorded: bool) -> str:
         own = [(home / f"{unit}.parquet").stat().st_mtime_ns for unit in shelf.own_files(home)]
         packed = shelf.packed_file(home)
         told += [len(own), max(own, default=0), packed.stat().st_mtime_ns if packed.exists() else 0]
+    of_gates = [path.stat().st_mtime_ns for path in stored(folder.path)]
+    told += [len(of_gates), max(of_gates, default=0)]
     for part in ("pictures", "recordings", "report"):
         told.append(sum(1 for _ in (folder.path / part).glob("*")))
     return sha256(repr(told).encode()).hexdigest()[:16]

@@ -11,6 +11,9 @@ from harness.base.errors import InputError, Mistake
 KINDS = ("rows", "accuracy", "ablation")
 """The folders of rows that a sweep's folder may have, by what made them."""
 
+_STORED = "*bit/[0-9][0-9][0-9][0-9]_*.json"
+"""Results of gates, as pytest-benchmark calls them: in a folder for the system and Python, by number."""
+
 
 class Folder(NamedTuple):
     """A sweep's results. path; name: for people; slug: of its data, a name that files and URLs take; up: the way to it
@@ -20,6 +23,11 @@ class Folder(NamedTuple):
     name: str
     slug: str
     up: str
+
+
+def stored(folder: Path) -> list[Path]:
+    """The stored results of gates in a folder."""
+    return sorted(folder.glob(_STORED))
 
 
 def folder_of(path: Path, results: Path) -> Folder:
@@ -34,6 +42,7 @@ def folders(results: Path) -> list[Folder]:
     if not results.is_dir():
         raise InputError(Mistake("is no folder; wanted a folder of results, or that of one sweep", results))
     found = {folder.parent for kind in KINDS for folder in shelf.folders(results, kind) if shelf.units(folder)}
+    found |= {path.parent.parent for depth in ("", "*/") for path in results.glob(depth + _STORED)}
     seen = [path for path in found if not any(part.startswith(".") for part in path.relative_to(results).parts)]
     if not seen:
         raise InputError(Mistake("holds no rows; run a sweep first, or name a folder of results", results))

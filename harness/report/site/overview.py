@@ -18,7 +18,7 @@ from harness.base import rows, shelf
 from harness.base.files import replacing
 from harness.report.site import ablation, frames, hard, provenance, runs, speed
 from harness.report.site.failures import Failed, causes
-from harness.report.site.folders import Folder
+from harness.report.site.folders import Folder, stored
 from harness.report.site.sentences import sentences
 
 Say = Callable[[str], None]
@@ -50,8 +50,9 @@ class _Told(NamedTuple):
 def overview(folder: Folder, home: Path, *, recorded: bool, say: Say) -> Overview:
     """What the rows of a sweep say. home: the folder of its data, where scripts of single runs are written; recorded:
     whether meshes and recordings become scripts too, which takes longer."""
-    kinds = {"rows": _runs, "accuracy": _accuracy, "ablation": _ablation}
-    there = [kind for kind in kinds if shelf.units(folder.path / kind)]
+    kinds = {"rows": _runs, "accuracy": _accuracy, "ablation": _ablation, "gates": _gates}
+    there = [kind for kind in kinds if kind != "gates" and shelf.units(folder.path / kind)]
+    there += ["gates"] if stored(folder.path) else []
     told = [kinds[kind](folder, home, recorded, say) for kind in there]
     made = [one for each in told for one in each.made]
     summary: dict[str, Any] = {
@@ -169,6 +170,16 @@ def _ablation(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
     said = [{"words": f"{one}.", "chapter": "Effects"} for one in words]
     return _Told(dict(scripts), plots, said, [], provenance.made(table, shelf.FILE), {"ablations": len(words)})
+
+
+def _gates(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
+    from harness.report.site import gates
+
+    known = gates.read(stored(folder.path), say)
+    scripts, found = gates.charts(known)
+    plots = [(name, chart["title"]) for name, chart in scripts.items()]
+    facts = {"gates": len({item["gate"] for chart in scripts.values() for item in chart["items"]})}
+    return _Told(scripts, plots, found, [], gates.made(known), facts)
 
 
 def _plain(folder: Folder, kind: str) -> pa.Table:

@@ -6,12 +6,13 @@ springbench.chart = (() => {
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const at = (item, column, k) => (Array.isArray(item[column]) ? item[column][k] : item[column]);
 
+  const figure = value => (typeof value === "string" ? value : number(value));
   const older = (item, k) => Boolean(Array.isArray(item.older) ? item.older[k] : item.older);
 
   function told(chart, item, k) {
     const rows = chart.hover.map(([column, words]) => {
       const value = at(item, column, k);
-      return value === null || value === undefined ? null : element("tr", {}, element("td", {}, words), element("td", {}, typeof value === "string" ? value : number(value)));
+      return value === null || value === undefined ? null : element("tr", {}, element("td", {}, words), element("td", {}, figure(value)));
     });
     if (older(item, k)) rows.push(element("tr", {}, element("td", {}, "code"), element("td", {}, "other than the newest rows'")));
     return [element("b", {}, item.label), item.what, element("table", {}, element("tbody", {}, ...rows.filter(Boolean)))];
@@ -40,7 +41,7 @@ springbench.chart = (() => {
     const hollow = item[x.column].map((_, k) => older(item, k));
     return {
       x: item[x.column], y: item[y.column], name: item.label, xaxis: `x${tail}`, yaxis: `y${tail}`, meta: { item },
-      mode: points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
+      mode: item.joined ? "lines" : points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
       line: { color: ink, dash: mark.dash, width: 1.7, shape: chart.shape === "hv" ? "hv" : undefined },
       // Marks stand apart: so many of a line at most, whatever the number of its points.
       marker: { symbol: hollow.map(yes => mark.symbol + (yes ? "-open" : "")), color: ink, size: item.small ? 5 : item.large ? 13 : 8, maxdisplayed: points ? 0 : chart.shape === "hv" ? 4 : 9, line: { width: hollow.map(yes => (yes ? 1.6 : 0)), color: ink } },
@@ -122,7 +123,7 @@ springbench.chart = (() => {
         }
         const full = plot._fullData[curve], box = plot.getBoundingClientRect(), axes = [plot._fullLayout[full.xaxis.replace("x", "xaxis")], plot._fullLayout[full.yaxis.replace("y", "yaxis")]];
         show(axes[0]._offset + axes[0].d2p(one.x[k]) + box.left, axes[1]._offset + axes[1].d2p(one.y[k]) + box.top, told(chart, one.meta.item, k));
-        springbench.tell(`${one.name}: ${number(one.x[k])}, ${number(one.y[k])}`);
+        springbench.tell(`${one.name}: ${figure(one.x[k])}, ${figure(one.y[k])}`);
       } else return;
       event.preventDefault();
     };

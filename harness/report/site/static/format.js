@@ -29,8 +29,8 @@ Object.assign(springbench, (() => {
   // By which code and on which machine figures were made: each pair once, the newest of them first.
   const commit = text => (text || "unknown").slice(0, 10) + (/dirty/.test(text) ? "-dirty" : "");
   function madeBy(some, most = 2) {
-    const told = [...new Set(some.map(one => `${one.cpu || "unknown processor"} (machine ${(one.machine || "unknown").slice(0, 6)}), code ${commit(one.commit)}`))];
-    const machines = new Set(some.map(one => one.machine)).size;
+    const told = [...new Set(some.map(one => `${one.cpu || "unknown processor"}${one.machine ? ` (machine ${one.machine.slice(0, 6)})` : ""}, code ${commit(one.commit)}`))];
+    const machines = new Set(some.map(one => one.machine || one.cpu)).size;
     const compare = machines > 1 ? ` · ${machines} machines: compare times within one, ratios of such times across them` : "";
     return `made on ${told.slice(0, most).join("; on ")}${told.length > most ? `; and by ${told.length - most} more` : ""}${compare}`;
   }

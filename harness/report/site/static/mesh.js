@@ -92,7 +92,7 @@ Object.assign(springbench, (() => {
     box.onkeydown = event => { if (event.key === "Escape" && event.target.tagName !== "INPUT") close(); };
     const figures = springbench.definitions(chart.hover.map(([column, words]) => [words, Array.isArray(item[column]) ? item[column][k] : item[column]])
       .map(([words, value]) => [words, typeof value === "number" ? number(value) : value]));
-    const made = sweep.made[0] || {}, command = chart.command.replace("CONFIG", springbench.quoted(sweep.config || "CONFIG.yaml"));
+    const made = item.made?.[k] || sweep.made[0] || {}, command = chart.command.replace("CONFIG", springbench.quoted(sweep.config || "CONFIG.yaml"));
     const settings = Object.entries(JSON.parse(item.parameters || "{}")).map(pair => pair.join(" ")).join(", ");
     const scrub = element("div"), own = item.recording && sweep.up + item.recording;
     put(box, shut, element("h2", {}, springbench.glyph(chart.marks[item.label]), ` ${item.label}`), element("p.label", {}, item.what),
@@ -102,7 +102,7 @@ Object.assign(springbench, (() => {
         element("div", {}, element("h3", {}, "Do it again"), springbench.commandBox(command, "Command that repeats the measurement"),
           springbench.method(chart.references?.[item.label]),
           own && element("h3", {}, `Recording of ${item.label}'s solve`), own && springbench.replayBox(item.recording, own, sweep.replays?.[item.recording] && `site/data/${encodeURIComponent(sweep.slug)}/${sweep.replays[item.recording]}.js`, `${item.label}: ${item.what}`),
-          element("p.muted", {}, `Made by code ${springbench.commit(made.commit)} on ${made.cpu || "an unknown machine"}${sweep.made.length > 1 ? `, and by ${sweep.made.length - 1} more (see the overview)` : ""}.`)),
+          element("p.muted", {}, `Made by code ${springbench.commit(made.commit)} on ${made.cpu || "an unknown machine"}${sweep.made.length > 1 && !item.made ? `, and by ${sweep.made.length - 1} more (see the overview)` : ""}.`)),
         item.picture && element("figure", {}, element("a", { href: sweep.up + item.picture.path }, element("img", { src: sweep.up + item.picture.path, alt: `The step's mesh, by ${item.picture.of}` })),
           element("figcaption", {}, `Not this point: the mesh where ${item.picture.of} came nearest the minimum of this step.`))));
     await scrubber(scrub, sweep, item, k);

@@ -9,6 +9,7 @@
     if (sweep.curves) told.push(many(sweep.curves, "solve"));
     if (sweep.works) told.push(many(sweep.works, "simulation"));
     if (sweep.ablations) told.push(many(sweep.ablations, "verdict"));
+    if (sweep.gates) told.push(many(sweep.gates, "gate"));
     if (sweep.sizes?.length) told.push(`size${sweep.sizes.length > 1 ? `s ${sweep.sizes[0]} to ${sweep.sizes.at(-1)}` : ` ${sweep.sizes[0]}`}`);
     if (sweep.took) told.push(`${duration(sweep.took)} timed`);
     return told.join(" · ");
@@ -22,13 +23,13 @@
 
   function made(sweep) {
     return sweep.made.slice(0, 3).map(m => element("div", {},
-      `${m.cpu || "unknown processor"}, ${many(m.cores || 0, "core")}, ${m.memory_gib ?? "?"} GiB`, element("br"),
+      `${m.cpu || "unknown processor"}, ${many(m.cores || 0, "core")}${m.memory_gib ? `, ${m.memory_gib} GiB` : ""}`, element("br"),
       element("span.muted", {}, `code `, element("code", {}, commit(m.commit)),
-        ` · machine ${(m.machine || "unknown").slice(0, 6)} · ${day(m.from) === day(m.to) ? day(m.to) : `${day(m.from)} to ${day(m.to)}`}`)));
+        `${m.machine ? ` · machine ${m.machine.slice(0, 6)}` : ""} · ${day(m.from) === day(m.to) ? day(m.to) : `${day(m.from)} to ${day(m.to)}`}`)));
   }
 
   function way(sweep, finding) {
-    if (finding.plot) return address("plots", { sweep: sweep.slug, plot: finding.plot });
+    if (finding.plot) return address("plots", { sweep: sweep.slug, plot: finding.plot, ...finding.filter });
     if (finding.filter) return address("runs", { sweep: sweep.slug, ...finding.filter });
     if (finding.runs?.length > 1) return address("compare", { sel: finding.runs.map(id => `${sweep.slug}/${id}`).join(",") });
     if (finding.runs?.length) return address("runs", { sweep: sweep.slug, run: `${sweep.slug}/${finding.runs[0]}` });
@@ -41,7 +42,7 @@
       const one = way(sweep, finding), run = finding.runs?.length > 1 && address("runs", { sweep: sweep.slug, run: `${sweep.slug}/${finding.runs[0]}` });
       return element("li", {}, finding.words.replace(/\|/g, " "), one && " ",
         run && element("a", { href: run }, "the run"), run && ", ",
-        one && element("a", { href: one }, finding.plot ? "the map" : finding.runs?.length > 1 ? "compare" : "show"));
+        one && element("a", { href: one }, finding.plot === "hard" ? "the map" : finding.plot ? "the plot" : finding.runs?.length > 1 ? "compare" : "show"));
     };
     list.append(...some.slice(0, 6).map(line));
     if (some.length <= 6) return [list];

@@ -88,7 +88,7 @@
       const one = (axes, name) => axes.find(a => a.column === name) || axes[0], x = one(chart.x, next.get("x")), y = one(chart.y, next.get("y"));
       const items = chart.items.filter(item => chart.filters.every(key => chosen[key] === "all" || item[key] === chosen[key]));
       const hidden = new Set((next.get("off") || "").split("~").filter(Boolean)), labels = [...new Set(items.map(item => item.label))];
-      const words = { problem: "Step", scene: "Scene", gap: "To a gap of", curve: "Of the paper" };
+      const words = { problem: "Step", scene: "Scene", gap: "To a gap of", curve: "Of the paper", gate: "Gate" };
       const plotBox = anew || !current ? element("div.plot", { tabIndex: 0, role: "group", "aria-label": `Plot: ${chart.title}. Arrow keys go through its points, Enter opens one.` }) : current.plotBox;
       const names = element("ul.legend", { "aria-label": "Solvers" }, ...springbench.chart.legend(labels, chart, items, hidden, off => change({ off: [...off].join("~") })));
       choice.replaceChildren(...chart.filters.filter(key => distinct(key).length > 1).map(key => pick(words[key] || key, key, distinct(key), chosen[key])),
