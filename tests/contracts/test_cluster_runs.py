@@ -1,4 +1,5 @@
-"""A real scheduler and workers on the loopback: a crash is a row, a worker that is killed costs its run at hand."""
+"""A real scheduler and workers on the loopback: a crash is a row, a worker that is killed costs its run at hand, and
+runs of one machine are timed one at a time."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 import pytest
-from distributed import LocalCluster
+from distributed import Client, LocalCluster
 
 from harness.base.machine import node
 from harness.config.load import load_any
@@ -41,11 +42,57 @@ def test_runs_are_done_by_workers_and_a_crash_is_a_row(tmp_path: Path, monkeypat
     assert not [*(tmp_path / "r").rglob("*partial*")]
 
 
-SWEEP = """
-scenes: [scene.yaml]
-solvers: [sparse]
-options: {frames: 4, rounds: 1, iterations: [5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16], record: false}
-"""
+RUNS, FRAMES, ROUNDS, SLEEP = 12, 2, 2, 0.02
+"""Of a sweep, and seconds that each solve lasts at least; who sleeps leaves its core to the others."""
+
+NOTE = (
+    f"import os, time; began = time.monotonic(); time.sleep({SLEEP}); "
+    "[open({noted!r}, 'a').write(f'{{stop.iterations}} {{os.getpid()}} {{began}} {{time.monotonic()}}\\n')]"
+)
+"""A solver that notes of each solve its run, its process, and from when to when it lasted by the machine's clock."""
+
+
+def lock_by(folder: Path, *, shared: bool) -> None:
+    """In a worker: the machine's locks lie in a folder that all share, or in one of this worker's own."""
+    os.environ["SPRINGBENCH_LOCKS"] = str(folder / ("shared" if shared else str(os.getpid())))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("shared", [True, False], ids=["locked", "without-the-lock"])
+def test_of_four_workers_of_a_machine_one_is_timed_at_a_time(tmp_path: Path, shared: bool):
+    noted = tmp_path / "noted"
+    (tmp_path / "noting.py").write_text(SOURCE.replace("pass  # while solving", NOTE.format(noted=str(noted))))
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    sweep = tmp_path / "sweep.yaml"
+    options = f"frames: {FRAMES}, rounds: {ROUNDS}, iterations: {list(range(1, RUNS + 1))}, record: false"
+    sweep.write_text(f"scenes: [scene.yaml]\nsolvers: ['./noting.py:Mine']\noptions: {{{options}, pictures: false}}\n")
+    quiet: Any = {"dashboard_address": None, "silence_logs": 50, "local_directory": tmp_path}
+    with LocalCluster(n_workers=4, threads_per_worker=1, **quiet) as started, Client(started) as client:
+        client.run(lock_by, tmp_path, shared=shared)
+        found: Any = started
+        rows = done(sweep, tmp_path / "r", found.scheduler_address).to_pylist()
+    assert {row["status"] for row in rows} == {"ok"}
+    assert {row["timing"] for row in rows} == {"exclusive"}
+    lines = [line.split() for line in noted.read_text().splitlines()]
+    assert len({process for _, process, *_ in lines}) == 4
+    timed, looked = list[tuple[int, float, float]](), list[tuple[int, float, float]]()
+    for run in range(1, RUNS + 1):
+        solves = [(float(began), float(ended)) for number, _, began, ended in lines if int(number) == run]
+        measured, second = solves[:-FRAMES], solves[-FRAMES:]
+        took = [row["seconds"] for row in rows if row["max_iterations"] == run and row["phase"] == "step"]
+        own = [ended - began for began, ended in measured[-FRAMES * ROUNDS :]]
+        assert all(SLEEP <= mine <= told for mine, told in zip(own, took, strict=True))  # these are what rows time
+        timed.append((run, measured[0][0], measured[-1][1]))
+        looked += [(run, *solve) for solve in second]
+    at_once = {
+        frozenset([a, b])
+        for a, began, ended in timed
+        for b, *other in timed + looked
+        if a != b
+        if other[0] < ended and other[1] > began
+    }
+    print(f"{len(at_once)} pairs of {RUNS} runs overlapped")
+    assert not at_once if shared else at_once
 
 
 MANY, EVERY = 200, 10.0
