@@ -35,6 +35,7 @@ SOLVERS = {
     "rodas": "solvers.methods.rosenbrock:Rodas",
     "pncg": "solvers.methods.pncg:NonlinearCG",
     "admm": "solvers.methods.admm:Admm",
+    "a-jacobi": "solvers.methods.a_jacobi:AggregatedJacobi",
 }
 
 OPTIONAL = {

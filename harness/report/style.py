@@ -68,6 +68,8 @@ BOWTIE: Any = ((-1, -1), (-1, 1), (1, -1), (1, 1), (-1, -1))
 """Two triangles that meet at their points, one above the other and side by side."""
 LOZENGE: Any = ((-1, 0), (0, 0.5), (1, 0), (0, -0.5), (-1, 0))
 """A diamond that lies on its side."""
+ARROWHEAD: Any = ((0, 1), (0.9, -0.8), (0, -0.25), (-0.9, -0.8), (0, 1))
+"""A triangle that points up, notched below."""
 _MARKERS: tuple[Any, ...] = (
     "s",
     "o",
@@ -89,6 +91,7 @@ _MARKERS: tuple[Any, ...] = (
     HOURGLASS,
     BOWTIE,
     LOZENGE,
+    ARROWHEAD,
 )
 
 # Okabe and Ito's palette, less its yellow and black, and five more: for families in the order of the registry.

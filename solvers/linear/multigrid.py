@@ -131,7 +131,7 @@ def _coarsen(A: csr_array) -> tuple[Level, csr_array]:
     n = len(A.indptr) - 1
     of, count = kernels.aggregate(A.indptr, A.indices, A.data, _STRENGTH, _DOMINANCE)
     diagonal = np.asarray(A.diagonal(), np.float64)
-    largest = _largest(A, diagonal)
+    largest = largest_eigenvalue(A, diagonal)
     inside = np.flatnonzero(of >= 0)
     start = np.concatenate([[0], np.cumsum(of >= 0)])
     T = csr_array((np.ones(len(inside)), of[inside], start.astype(A.indptr.dtype)), shape=(n, count))
@@ -153,7 +153,7 @@ def _coarsen(A: csr_array) -> tuple[Level, csr_array]:
     return level, coarse
 
 
-def _largest(A: csr_array, diagonal: NDArray[np.float64]) -> float:
+def largest_eigenvalue(A: csr_array, diagonal: NDArray[np.float64]) -> float:
     """The largest eigenvalue of D^-1 A: the power method's, and no more than Gershgorin's bound."""
     bound = float(((abs(A) @ np.ones(len(diagonal))) / diagonal).max())
     v = np.random.default_rng(0).normal(size=len(diagonal))  # a bit of everything, and always the same

@@ -41,7 +41,7 @@ NEAR = 1e-3
 CLEAR = 1e-2
 """Of the least inertia, the smallest eigenvalue that a minimum has at least: a flatter one is hardly one."""
 
-SLOW = ("dense", "sparse", "numba", "chebyshev", "admm")
+SLOW = ("dense", "sparse", "numba", "chebyshev", "admm", "a-jacobi")
 """Take as many iterations as k dt^2/m; `test_properties` holds each of their iterates to the same."""
 SOFT = {"vbd": 0.0}
 """Powers of ten of the stiffness number up to which a method converges in time: one vertex at a time is slow."""

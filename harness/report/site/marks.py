@@ -5,7 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from harness.report.style import BOWTIE, CORNERS, DASH_DOTTED, DASHED, DOTTED, HOURGLASS, LOZENGE, STARS, Mark
+from harness.report.style import (
+    ARROWHEAD,
+    BOWTIE,
+    CORNERS,
+    DASH_DOTTED,
+    DASHED,
+    DOTTED,
+    HOURGLASS,
+    LOZENGE,
+    STARS,
+    Mark,
+)
 
 _SYMBOLS: dict[Any, str] = {
     "o": "circle", "s": "square", "^": "triangle-up", "v": "triangle-down", "<": "triangle-left",
@@ -14,6 +25,7 @@ _SYMBOLS: dict[Any, str] = {
     STARS[0]: "star-diamond", STARS[1]: "hexagram", STARS[2]: "star-triangle-up", STARS[3]: "star-square",
     STARS[4]: "star-triangle-down", CORNERS[0]: "triangle-nw", CORNERS[1]: "triangle-ne", CORNERS[2]: "triangle-sw",
     CORNERS[3]: "triangle-se", HOURGLASS: "hourglass", BOWTIE: "bowtie", LOZENGE: "diamond-wide",
+    ARROWHEAD: "arrow",
 }  # fmt: skip
 _DASHES: dict[Any, str] = {"-": "solid", DASHED: "dash", DOTTED: "dot", DASH_DOTTED: "dashdot"}
 

@@ -1,0 +1,139 @@
+"""Projective dynamics whose global step is Jacobi's, several sweeps in one (A-Jacobi: Lan et al. 2022).
+
+    p <- p - S grad g(p),   S = sum over i < l of (I - D^-1 Q)^i D^-1,   D the diagonal of Q
+
+S grad g is what l sweeps of Jacobi's method make of Q x = grad g from x = 0. Their sum is a sparse matrix that is
+computed once, so that an iteration is a pass over the springs and one product, whatever l. Its rows reach l - 1 rings
+of neighbours. I - S Q = (I - D^-1 Q)^l, and the eigenvalues of D^-1 Q lie between 0 and 2, for Q is dominated by its
+diagonal: so S is positive definite, 2 S^-1 - Q is too, and as Q majorises the Hessian no iteration raises the energy.
+
+The iterations are accelerated by Chebyshev's polynomials, as Wang (2015) does those of Jacobi's method
+(`solvers.methods.chebyshev`). These expect eigenvalues of I - S Q that are not negative: for odd l, S is divided by the
+largest that S Q may have, 1 + (m - 1)^l where m is that of D^-1 Q. No factor of Q is used but to know the residual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, cast
+
+import numpy as np
+from scipy.sparse import csr_array, dia_array
+
+from solvers.about import About, Reference
+from solvers.contact.touching import without_contact
+from solvers.core.acceleration import Interpreted, Scheme
+from solvers.core.driver import Iterating, Iterative
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
+from solvers.core.prefactored import PreparedLocalGlobal, prepared, projective
+from solvers.kernels.accelerate_coefficients import CHEBYSHEV
+from solvers.linear.multigrid import largest_eigenvalue
+from solvers.matrices import without_zeros
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.problem import Positions, StepProblem, System, Unsupported
+
+if TYPE_CHECKING:
+    from solvers.contact.local_global import Idle
+
+_SCHEME = Scheme("a-jacobi", CHEBYSHEV, 1, 0, True)
+_MOST = 8
+"""Sweeps: with more a row of S on a cloth has hundreds of entries."""
+
+
+@dataclass(frozen=True)
+class AggregatedJacobi:
+    """Projective dynamics without a factor. sweeps: l, of Jacobi's method in an iteration, 1 to 8."""
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+    about: ClassVar[About] = About(
+        "accelerated local-global",
+        Reference(
+            "Lan, Lei and Ma, Guanqun and Yang, Yin and Zheng, Changxi and Li, Minchen and Jiang, Chenfanfu",
+            2022,
+            "Penetration-free projective dynamics on the GPU",
+            "10.1145/3528223.3530069",
+        ),
+    )
+
+    sweeps: int = 2
+
+    def __post_init__(self) -> None:
+        """Raises ValueError."""
+        if not 1 <= self.sweeps <= _MOST:
+            raise ValueError(f"sweeps: should be from 1 to {_MOST}, not {self.sweeps}")
+
+    def prepare(self, system: System) -> PreparedAggregatedJacobi:
+        """Raises Unsupported for energies that are not projective, contact among them, NotPositiveDefinite."""
+        if without_contact(system) is not system:
+            raise Unsupported(
+                "a-jacobi: Q, of which its matrix is made once, has no rows for what begins to touch (Contact); take "
+                "numba, chebyshev or vbd"
+            )
+        energies = projective(system, "a-jacobi")
+        measure = cast("Idle", CompiledLocalGlobal().prepare(system))
+        base = prepared(system, energies, lambda Q: (Aggregated(Q, self.sweeps), f"{self.sweeps} sweeps of Jacobi"))
+        return PreparedAggregatedJacobi(base, measure, Objective(system))
+
+
+class Aggregated:
+    """So many sweeps of Jacobi's method for Q x = b from x = 0, as one matrix. nonzeros: its entries."""
+
+    def __init__(self, Q: csr_array, sweeps: int) -> None:
+        n = len(Q.indptr) - 1
+        inverse = csr_array(dia_array((1.0 / Q.diagonal()[None, :], np.array([0])), shape=(n, n)))
+        S = term = inverse
+        for _ in range(sweeps - 1):
+            term = csr_array(term - inverse @ (Q @ term))
+            S = csr_array(S + term)
+        if sweeps % 2:
+            S = csr_array(S / (1.0 + max(0.0, largest_eigenvalue(Q, Q.diagonal()) - 1.0) ** sweeps))
+        self.matrix = without_zeros(S)
+        self.nonzeros: int | None = int(self.matrix.nnz)
+
+    def solve(self, b: Positions, out: Positions) -> None:
+        """Write S b (n, 3) to `out`."""
+        out[:] = self.matrix @ b
+
+
+class PreparedAggregatedJacobi(Iterative):
+    """The method, ready for a system. base: Q, with S for its factor; measure: an iteration of local-global from p
+    tells the residual at p, and is asked for nothing else."""
+
+    def __init__(self, base: PreparedLocalGlobal, measure: Idle, objective: Objective) -> None:
+        self.base, self.measure, self.objective = base, measure, objective
+        self.choice = f"{base.choice}; for the residual alone {measure.choice}"
+        self.facts = base.facts
+
+    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+        """See Iterative."""
+        return _Iterating(self, problem, guess)
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """See Iterative."""
+        return self.measure.gauge(problem)(p)
+
+    def scale(self, problem: StepProblem) -> float:
+        """See Iterative."""
+        return self.base.scale(problem)
+
+    def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """The gradient and the product with S, at the first guess."""
+        step = StepObjective(self.objective, problem)
+        p = step.placed(problem.first_guess)
+        gradient, out = step.gradient(p), np.zeros_like(p)
+        return {"local": lambda: step.gradient(p), "global": lambda: self.base.correction(gradient, out)}
+
+
+class _Iterating(Interpreted):
+    """See Interpreted, whose residual is that of Q's factor."""
+
+    def __init__(self, prepared: PreparedAggregatedJacobi, problem: StepProblem, guess: Positions) -> None:
+        super().__init__(prepared.base, _SCHEME, StepObjective(prepared.objective, problem), guess)
+        self._gauge = prepared.measure.gauge(problem)
+
+    def residual(self) -> float:
+        """See Iterating."""
+        return self._gauge(self.positions)

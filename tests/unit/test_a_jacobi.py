@@ -1,0 +1,68 @@
+"""Projective dynamics by A-Jacobi: what its matrix stands for, what sweeps do, and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from solvers.core.prefactored import prepared, projective
+from solvers.methods.a_jacobi import Aggregated, AggregatedJacobi
+from solvers.methods.newton import Newton
+from solvers.problem import StopRule, Unsupported
+from tests.effects import SCENES, stepped
+from tests.scenes import cloth, first_problem
+
+HANGING = first_problem(cloth(8, "exact", stretch=100.0))
+
+
+def made(sweeps: int):
+    """Q over the free vertices, dense, and the matrix that stands for so many sweeps."""
+    found = []
+    prepared(HANGING.system, projective(HANGING.system, ""), lambda Q: (found.append(Q) or Aggregated(Q, sweeps), ""))
+    return found[0].toarray(), Aggregated(found[0], sweeps).matrix.toarray()
+
+
+@pytest.mark.parametrize("sweeps", [2, 4])
+def test_its_matrix_does_so_many_sweeps_of_jacobis_method(sweeps):
+    Q, S = made(sweeps)
+    b = np.random.default_rng(0).normal(size=len(Q))
+    x = np.zeros_like(b)
+    for _ in range(sweeps):
+        x += (b - Q @ x) / np.diag(Q)
+    np.testing.assert_allclose(S @ b, x, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("sweeps", [1, 2, 3, 4])
+def test_its_inverse_majorises_the_hessian_as_q_does(sweeps):
+    Q, S = made(sweeps)
+    products = np.linalg.eigvals(S @ Q)
+    assert np.abs(products.imag).max() <= 1e-12
+    assert products.real.min() > 0.0
+    assert products.real.max() <= 1.0 + 1e-2  # the largest eigenvalue of D^-1 Q is an estimate
+
+
+@pytest.mark.parametrize("sweeps", [1, 2, 5])
+def test_it_ends_at_the_minimum_whatever_the_sweeps(sweeps):
+    wanted = Newton().prepare(HANGING.system).solve(HANGING, StopRule(100, 1e-12)).positions
+    found = AggregatedJacobi(sweeps).prepare(HANGING.system).solve(HANGING, StopRule(5000, 1e-8))
+    assert found.stopped == "tolerance"
+    np.testing.assert_allclose(found.positions, wanted, rtol=0, atol=1e-6)
+
+
+def test_more_sweeps_take_fewer_iterations():
+    one, two, four = (
+        AggregatedJacobi(l).prepare(HANGING.system).solve(HANGING, StopRule(5000, 1e-3)).iterations for l in (1, 2, 4)
+    )
+    assert one > two > four
+
+
+@pytest.mark.parametrize(("scene", "name"), [("contact", "Contact"), ("gas", "Gas")], ids=lambda x: x)
+def test_what_has_no_rows_in_q_is_refused_by_name(scene, name):
+    with pytest.raises(Unsupported, match=f"a-jacobi: .*{name}"):
+        AggregatedJacobi().prepare(stepped(SCENES[scene]()).system)
+
+
+@pytest.mark.parametrize("sweeps", [0, -1, 9])
+def test_sweeps_are_from_one_to_eight(sweeps):
+    with pytest.raises(ValueError, match="sweeps: should be from 1 to 8"):
+        AggregatedJacobi(sweeps)
