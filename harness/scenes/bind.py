@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from harness.base.errors import InputError, Mistake
 from harness.scenes.effects.base import Contribution, Force, Pin, Steady, VelocityFilter
 from harness.scenes.mesh.base import Mesh
+from harness.scenes.mesh.topology import by_area
 from harness.scenes.motion import KeyedMotion
 from harness.scenes.spec import SceneSpec
 from harness.scenes.start import Rest
@@ -181,8 +182,14 @@ def _doubt(spec: SceneSpec) -> None:
 
 
 def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
+    if spec.mass is not None and spec.mass_per_area is not None:
+        raise InputError(Mistake("is given beside `mass`; leave out one of them", key="mass_per_area"))
     if spec.mass is not None:
         return spec.mass * mesh.shares
+    if spec.mass_per_area is not None:
+        if mesh.dimension != 2 or not len(mesh.triangles):
+            raise InputError(Mistake("needs a surface, and this mesh is none; give `mass`", key="mass_per_area"))
+        return spec.mass_per_area * by_area(mesh.rest, mesh.triangles)
     if mesh.mass is None:
         raise InputError(Mistake("is missing; this mesh brings no masses, so give the total [kg]", key="mass"))
     return mesh.mass

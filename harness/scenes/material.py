@@ -43,15 +43,23 @@ from numpy.typing import NDArray
 
 from harness.base.errors import InputError, Mistake, did_you_mean
 from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
+from harness.scenes.weave import Weave
 
 Scale = Callable[[Mesh, str, int | None], NDArray[np.float64] | float]
 """(mesh, family, reference) -> what a family's constant is multiplied by: one factor, or one a spring."""
 
 
 def spring_stiffness(
-    mesh: Mesh, *, rule: str, stretch: float, shear: float, bend: float, reference: int | None = None
+    mesh: Mesh,
+    *,
+    rule: str,
+    stretch: float | Weave,
+    shear: float | Weave,
+    bend: float,
+    reference: int | None = None,
 ) -> NDArray[np.float64]:
-    """The stiffness of each spring, (m,) [N/m], from a constant for each family and one of `RULES`.
+    """The stiffness of each spring, (m,) [N/m], from a constant for each family, or by its direction, and one of
+    `RULES`.
 
     Raises InputError for an unknown rule, a constant that is not finite or below zero, a rule that does not
     fit the mesh, and a `reference` that is missing (liu2013) or has no meaning (the others).
@@ -62,9 +70,13 @@ def spring_stiffness(
         raise InputError(Mistake(f"has no meaning for the rule {rule}; leave it out", key="reference"))
     k = np.zeros(len(mesh.springs))
     for family, constant in ((STRETCH, stretch), (SHEAR, shear), (BEND, bend)):
+        of = mesh.families[family]
+        if isinstance(constant, Weave):
+            k[of] = constant.of(mesh, mesh.springs[of]) * RULES[rule](mesh, family, reference)
+            continue
         if not 0 <= constant < np.inf:
             raise InputError(Mistake(f"{constant} is no stiffness; wanted a finite number >= 0", key=family))
-        k[mesh.families[family]] = constant * RULES[rule](mesh, family, reference)
+        k[of] = constant * RULES[rule](mesh, family, reference)
     return _relieved(mesh, k) if rule == "continuum" else k
 
 

@@ -93,6 +93,8 @@ class SceneFields(Model):
     """One sentence about the scene."""
     mass: float | None = Field(default=None, gt=0, le=1e12)
     """Total mass [kg]; may be left out where the mesh brings masses of its own."""
+    mass_per_area: float | None = Field(default=None, gt=0, le=1e12)
+    """Instead of `mass`: of the mesh's triangles at rest [kg/m^2]."""
     time_step: TimeStep
     """Time step [s], a number or a fraction such as "1/30"."""
     alternate_time_step: TimeStep | None = None
@@ -179,6 +181,8 @@ class SceneSpec(SceneFields):
                 content["effects"][int(place[len("effects[") : -1])] = told
         if self.start:
             content["start"] = self.start.model_dump(mode="json")
+        if self.mass_per_area is not None:
+            content["mass_per_area"] = self.mass_per_area
         if self.alternate_time_step is not None:
             content["alternate_time_step"] = self.alternate_time_step
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

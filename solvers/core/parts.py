@@ -79,6 +79,12 @@ class Parts:
 
     def begun(self, edges: Edges | None, problem: StepProblem) -> Edges | None:
         """The edges in a step."""
+        if edges is not None and any(map(is_lagged, self.limits)):
+            from solvers.energies.strain_limits import StrainLimits
+
+            limits = [e for e in problem.energies if isinstance(e, StrainLimits)]
+            low, high = (np.concatenate([getattr(e, at) for e in limits]) for at in ("low", "high"))
+            edges = edges._replace(low=low, high=high)
         if edges is None or not self.dashpots:
             return edges
         from solvers.energies.dashpots import Dashpots

@@ -16,6 +16,7 @@ there its energy curves down by more than the weight curves up. Small weights ar
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -33,7 +34,7 @@ from solvers.energies.springs import Springs
 from solvers.energies.strain_limits import StrainLimits
 from solvers.kernels import admm as kernels
 from solvers.linear.choice import factorise
-from solvers.problem import Positions, StepProblem, System, Unsupported
+from solvers.problem import Energy, Positions, StepProblem, System, Unsupported, is_lagged
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Admm:
         base = measure = prepared(system, weighted, lambda Q: factorise(Q))
         if self.weight != 1.0:
             measure = prepared(system, energies, lambda Q: factorise(Q))
-        return PreparedAdmm(base, measure, Objective(system), _Projected.of(system), self.weight)
+        return PreparedAdmm(base, measure, Objective(system), _Projected.of(system.energies), self.weight)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +91,9 @@ class _Projected:
     rest_direction: NDArray[np.float64]
 
     @classmethod
-    def of(cls, system: System) -> _Projected:
-        springs = Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
-        limits = [energy for energy in system.energies if isinstance(energy, StrainLimits)]
+    def of(cls, energies: Sequence[Energy]) -> _Projected:
+        springs = Springs.joined([energy for energy in energies if isinstance(energy, Springs)])
+        limits = [energy for energy in energies if isinstance(energy, StrainLimits)]
         return cls(
             np.concatenate([springs.edges, *(e.edges for e in limits)]),
             np.concatenate([springs.stiffness, *(e.stiffness for e in limits)]),
@@ -130,6 +131,8 @@ class _Iterating(Iterating):
 
     def __init__(self, prepared: PreparedAdmm, problem: StepProblem, guess: Positions) -> None:
         self._base, self._measure, edges = prepared.base, prepared.measure, prepared.edges
+        if any(isinstance(energy, StrainLimits) and is_lagged(energy) for energy in problem.system.energies):
+            edges = _Projected.of(problem.energies)
         self._edges = edges.edges, edges.stiffness, edges.low, edges.high, edges.rest_direction, prepared.weight
         self._step = StepObjective(prepared.objective, problem)
         self._constant = self._base.constant(problem)

@@ -27,6 +27,7 @@ ENERGIES = {
     "contact": ["solvers.contact.energy", "solvers.contact.planes", "harness.scenes.obstacles"],
     "self-contact": ["solvers.contact.self_contact", "solvers.contact.barrier", "harness.scenes.intersections"],
     "surface-contact": ["solvers.contact.obstacles", "harness.scenes.shapes"],
+    "sewing": ["solvers.energies.sewing"],
     "strain-limits": ["solvers.energies.strain_limits"],
     "dashpots": ["solvers.energies.dashpots"],
     "air-drag": ["solvers.energies.quadratic"],

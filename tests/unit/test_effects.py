@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -20,6 +20,8 @@ from harness.scenes.effects.wind import Wind
 from harness.scenes.material import spring_stiffness
 from harness.scenes.mesh.chain import Chain
 from harness.scenes.mesh.grid import Grid
+from harness.simulation.opinion.declared import Declared
+from harness.simulation.opinion.selected import chosen as opinion_of
 from solvers.energies.springs import Springs as SpringsEnergy
 from solvers.registry import load
 from tests.scenes import scene
@@ -145,6 +147,9 @@ SELECTED = {
         [0, 1, 2],
     ),
     "a part and vertices": ({"at": ("top_corners",), "indices": (7,)}, [0, 4, 7]),
+    "a ball, its surface included": ({"sphere": {"center": (0.0, 0.0, -0.5), "radius": 0.5}}, [1, 2, 3, 7]),
+    "what is nearest, the first of two alike": ({"nearest": ((0.0, 9.0, -0.5), (0.25, 0.0, -9.0))}, [2]),
+    "the boundary": ({"loops": (0,)}, MESH.parts["boundary"]),
     "every third of all": ({"every": 3}, np.arange(N)[::3]),
     "every second of a part": ({"at": ("top",), "every": 2}, [0, 2, 4]),
 }
@@ -165,6 +170,45 @@ def test_pins_have_their_weight(weight, wanted):
 def test_pins_weigh_what_the_assignments_do_unless_told():
     (pin,) = bound(Pins(at=("top",))).pins
     assert pin.weight == 1e10
+
+
+SHEET = Grid().build(5)
+HOLED = replace(
+    SHEET,
+    triangles=SHEET.triangles[~(SHEET.triangles == 12).any(axis=1)],
+    attributes={"weight": np.arange(25) / 25},
+)
+"""Without its middle, which lies between two diagonals."""
+
+
+@pytest.mark.parametrize(
+    ("selectors", "wanted"),
+    [
+        ({"loops": (1,)}, [6, 7, 11, 13, 17, 18]),
+        ({"holes": (0,)}, [6, 7, 11, 13, 17, 18]),
+        ({"holes": (0,), "every": 2}, [6, 11, 17]),
+        ({"attribute": {"name": "weight", "low": 0.9}}, [23, 24]),
+        ({"attribute": {"name": "weight", "high": 0.08}, "indices": (9,)}, [0, 1, 2, 9]),
+    ],
+)
+def test_holes_and_numbers_of_a_file_choose_vertices_as_the_second_opinion_has_it(selectors, wanted):
+    pins = Pins.model_validate(selectors)
+    assert pins.chosen(HOLED, "pins").tolist() == wanted == opinion_of(Declared(HOLED, np.ones(25), DT, ()), pins)
+
+
+def test_a_holeless_sheet_and_unknown_numbers_are_refused():
+    for selectors, told in (
+        ({"holes": (0,)}, "the mesh has 0 holes"),
+        ({"loops": (1,)}, "the mesh has 1 boundary loops"),
+        ({"attribute": {"name": "heat"}}, "came 'heat'; this mesh has none"),
+        ({"sphere": {"center": (9.0, 0.0, 0.0), "radius": 0.1}}, "no vertex of the mesh lies in the sphere"),
+    ):
+        with pytest.raises(InputError, match=told):
+            bound(Pins.model_validate(selectors))
+
+
+def test_selectors_that_are_not_used_are_not_written_down():
+    assert set(Pins(at=("top",)).model_dump()) == {"at", "indices", "box", "every", "kind", "weight", "motion"}
 
 
 REFUSED = {

@@ -20,6 +20,7 @@ from harness.record.compare import Look, side_by_side
 from harness.record.reader import read_replay
 from harness.report import inspect as module
 from harness.report.inspect import inspect, view
+from harness.scenes.mesh.files import File
 from tests.recordings import info, record
 
 
@@ -78,6 +79,16 @@ def test_a_frame_is_exported_as_a_surface(suffix: str, cloth: Path, tmp_path: Pa
         assert np.abs(mesh.point_data["strain"]).max() == pytest.approx(
             replay.scalars["/strain/largest"][1][5], rel=1e-4
         )
+
+
+def test_what_is_exported_is_read_as_a_mesh(cloth: Path, chain: Path, tmp_path: Path):
+    for recording in (cloth, chain):
+        printed(recording, export=tmp_path / "mesh.vtp")
+        mesh, replay = File(path=tmp_path / "mesh.vtp").build(), read_replay(recording, [-1])
+        np.testing.assert_array_equal(mesh.rest, replay.positions[0])
+        np.testing.assert_array_equal(mesh.triangles, replay.triangles)
+        if not len(replay.triangles):
+            np.testing.assert_array_equal(mesh.springs, replay.springs)
 
 
 def test_the_last_frame_of_a_chain_is_exported_as_lines(chain: Path, tmp_path: Path):

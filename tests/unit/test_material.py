@@ -18,6 +18,7 @@ from harness.scenes.mesh.generator import Generator
 from harness.scenes.mesh.grid import Grid, Net
 from harness.scenes.mesh.solids import Block, Tower
 from harness.scenes.mesh.surfaces import Balloon, Skirt
+from harness.scenes.weave import Weave
 
 ROUND_OFF = 1e-9
 """Relative error of a sparse solve with a few thousand unknowns and a condition number below 1e6."""
@@ -49,6 +50,26 @@ def pull(mesh: Mesh, k: np.ndarray, *, fixed: np.ndarray, moved: np.ndarray, axi
     if len(free):
         u[free] = np.asarray(spsolve(stiffness[free][:, free].tocsc(), -(stiffness @ u)[free]))
     return float((stiffness @ u)[3 * moved + axis].sum())
+
+
+def test_a_woven_cloth_resists_by_warp_weft_and_bias():
+    mesh, weave = Grid(diagonals="both").build(9), Weave(warp=400.0, weft=100.0, bias=25.0, direction=(0.0, 0.0, -2.0))
+    k = spring_stiffness(mesh, rule="continuum", stretch=weave, shear=weave, bend=0.0)
+    i, j = mesh.springs.T
+    across, down = np.abs(mesh.rest[i] - mesh.rest[j])[:, [0, 2]].T > 1e-9
+    wanted = np.where(across & down, 25.0, np.where(down, 400.0, 100.0))
+    np.testing.assert_allclose(k, wanted, rtol=1e-12)
+    turned = Weave(warp=400.0, weft=100.0, bias=25.0, direction=(1.0, 0.0, 0.0))
+    at_angles = turned.of(mesh, np.array([[0, 1], [0, 10], [0, 11], [0, 19], [0, 9]]))
+    # At atan(1/2), cos 2 theta is 3/5: .36 of the warp, or of the weft, and .64 of the bias.
+    np.testing.assert_allclose(at_angles, [400.0, 25.0, 160.0, 52.0, 100.0], rtol=1e-12)
+
+
+def test_a_weave_needs_a_surface_along_its_warp():
+    up = Weave(warp=1.0, weft=1.0, bias=1.0, direction=(0.0, 1.0, 0.0))
+    for mesh, told in ((Chain().build(3), "need a mesh of triangles"), (Grid().build(3), "stands upright on the mesh")):
+        with pytest.raises(InputError, match=told):
+            up.of(mesh, mesh.springs)
 
 
 def membrane(size: int, **material) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.surfaces import Skirt
 from harness.scenes.spec import SceneSpec
 from harness.simulation.observe import penetration
+from harness.simulation.opinion.second import second_opinion
 from tests.scenes import scene
 
 
@@ -28,6 +31,21 @@ def test_a_mesh_without_masses_needs_a_total_mass():
     spec = SceneSpec(mesh=Chain(), time_step=0.1, frames=1, path=Path("scene.yaml"))
     with pytest.raises(InputError, match="mass: is missing"):
         build(spec, 3)
+
+
+def test_a_woven_cloth_of_a_mass_per_area_weighs_that_and_the_second_opinion_agrees():
+    woven = Springs.model_validate({"stretch": {"warp": 400, "weft": 200, "bias": 10, "direction": (0, 1, 0)}})
+    given: dict[str, Any] = {"mass_per_area": 0.2, "time_step": 0.1, "frames": 1, "effects": (woven,)}
+    given["path"] = Path("scene.yaml")
+    spec = SceneSpec(mesh=Skirt(), **given)
+    made = build(spec, 8)
+    corners = made.mesh.rest[made.mesh.triangles]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    assert made.system.mass.sum() == pytest.approx(0.2 * area, rel=1e-12)
+    assert second_opinion(spec, made, "implicit-euler") == "agrees"
+    for mesh, more, told in ((Chain(), {}, "needs a surface"), (Skirt(), {"mass": 1.0}, "is given beside `mass`")):
+        with pytest.raises(InputError, match=told):
+            build(SceneSpec.model_validate({"mesh": mesh, **given, **more}), 8)
 
 
 def test_pins_of_several_effects_are_joined_in_the_order_of_their_vertices():

@@ -15,6 +15,7 @@ EFFECTS = {
     "pins": "harness.scenes.effects.pins:Pins",
     "rayleigh": "harness.scenes.effects.rayleigh:Rayleigh",
     "self-contact": "harness.scenes.effects.self_contact:SelfContact",
+    "sewing": "harness.scenes.effects.sewing:Sewing",
     "springs": "harness.scenes.effects.springs:Springs",
     "strain-limits": "harness.scenes.effects.strain_limits:StrainLimits",
     "surface-contact": "harness.scenes.effects.surface_contact:SurfaceContact",

@@ -11,6 +11,7 @@ from harness.base.model import Model
 from harness.scenes.effects.base import Contribution
 from harness.scenes.material import spring_stiffness
 from harness.scenes.mesh.base import Mesh
+from harness.scenes.weave import Weave
 from solvers.energies import springs
 
 
@@ -25,8 +26,9 @@ class Springs(Model):
     """What the numbers below mean when the mesh size changes. `continuum`: the material stays the same;
     `fixed`: each spring has the stiffness given [N/m]; `liu2013`: stiffness in proportion to resolution,
     given at the size `reference`."""
-    stretch: NonNegativeFloat
-    """Along the mesh's lines. Continuum: EA [N] for chains and trusses, [N/m] for cloth, [Pa] for solids."""
+    stretch: NonNegativeFloat | Weave
+    """Along the mesh's lines. Continuum: EA [N] for chains and trusses, [N/m] for cloth, [Pa] for solids; or one for
+    each of warp, weft and bias, of a woven cloth."""
     shear: NonNegativeFloat | None = None
     """Across the mesh's cells, in the same unit; as `stretch` if left out."""
     bend: NonNegativeFloat = 0.0

@@ -23,7 +23,8 @@ class Mesh:
     dimension: 1 chain and truss, 2 cloth, 3 solid; spacing: the typical rest length h [m];
     resolution: the mesh size, mostly vertices along a side; 0 for a mesh from a file;
     parts: named sets of vertices (`corners`, `top`, `left`, ...), each (q,), sorted;
-    mass: (n,) [kg] where a file gives absolute masses, else None.
+    mass: (n,) [kg] where a file gives absolute masses, else None;
+    attributes: numbers by vertex that a file names, each (n,).
     All arrays are read-only.
     """
 
@@ -37,10 +38,11 @@ class Mesh:
     resolution: int = 0
     parts: Mapping[str, NDArray[np.int64]] = field(default_factory=dict[str, NDArray[np.int64]])
     mass: NDArray[np.float64] | None = None
+    attributes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict[str, NDArray[np.float64]])
 
     def __post_init__(self) -> None:
         arrays = [self.rest, self.springs, self.triangles, self.shares, self.mass]
-        for array in [*arrays, *self.families.values(), *self.parts.values()]:
+        for array in [*arrays, *self.families.values(), *self.parts.values(), *self.attributes.values()]:
             if array is not None:
                 array.flags.writeable = False
 

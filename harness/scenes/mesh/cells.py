@@ -41,12 +41,15 @@ _MAX_PAIRS = 200_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """points: (n, 3) [m]; polygons: corners k >= 2 -> (f, k); segments: (s, 2); tetrahedra: (t, 4)."""
+    """points: (n, 3) [m]; polygons: corners k >= 2 -> (f, k); segments: (s, 2); tetrahedra: (t, 4); groups: the points
+    of what the file names; attributes: numbers by point that it names, each (n,)."""
 
     points: Points
     polygons: Mapping[int, Indices] = field(default_factory=dict[int, Indices])
     segments: Indices = field(default_factory=lambda: NO_PAIRS)
     tetrahedra: Indices = field(default_factory=lambda: np.empty((0, 4), np.int64))
+    groups: Mapping[str, Indices] = field(default_factory=dict[str, Indices])
+    attributes: Mapping[str, Points] = field(default_factory=dict[str, Points])
 
     @property
     def lines_only(self) -> bool:
@@ -120,7 +123,8 @@ def network(cells: Cells, rule: SpringRule, path: Path) -> Mesh:
         dimension=dimension,
         spacing=float(np.median(np.linalg.norm(rest[i] - rest[j], axis=1))),
         resolution=0,
-        parts=box_parts(rest),
+        parts=box_parts(rest) | dict(cells.groups),
+        attributes=cells.attributes,
     )
 
 

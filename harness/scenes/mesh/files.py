@@ -1,4 +1,4 @@
-"""Meshes from files: OBJ, the assignment's JSON scenes, and every format that meshio reads."""
+"""Meshes from files: OBJ, the assignment's JSON scenes, VTP, and every format that meshio reads."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from harness.base import child
 from harness.base.errors import InputError, Mistake
 from harness.base.model import Model
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.cells import MAX_COORDINATE, Cells, SpringRule, check_file, network
-from harness.scenes.mesh.foreign import Block, read
+from harness.scenes.mesh.foreign import Found, read
 from harness.scenes.mesh.obj import read_obj
 from harness.scenes.mesh.scene_json import read_scene_json
 from harness.scenes.mesh.topology import NO_PAIRS, Indices
@@ -29,11 +28,12 @@ MEMORY, MEMORY_PER_BYTE = 2**29, 20
 
 
 class File(Model):
-    """A mesh from a file; its size is the file's own. Parts: the sides of its bounding box."""
+    """A mesh from a file; its size is the file's own. Parts: the sides of its bounding box, and the groups that the
+    file names; attributes: what it tells of its points."""
 
     kind: Literal["file"] = "file"
     path: Path
-    """An OBJ, a JSON scene of the assignment (its OBJ is read), or a file that meshio reads (PLY, VTK, ...)."""
+    """An OBJ, a JSON scene of the assignment (its OBJ is read), a VTP, or a file that meshio reads (PLY, VTK, ...)."""
     springs: SpringRule | None = None
     """Springs along `edges` of faces alone, or between all `face_pairs`; by default as JSON scenes want it
     (face_pairs), and edges for all other files."""
@@ -52,11 +52,12 @@ class File(Model):
 
 
 def _read_meshio(path: Path) -> Cells:
-    """The points and cells that meshio finds; whatever goes wrong there is an InputError."""
+    """What is found in a child; whatever goes wrong there is an InputError."""
     check_file(path)
     state = path.stat()
-    points, blocks = _read(path, state.st_mtime_ns, state.st_size)
-    problem = _problem(points, blocks)
+    found = _read(path, state.st_mtime_ns, state.st_size)
+    points, blocks = found.points, found.blocks
+    problem = _problem(points, blocks) or _problem_of_groups(found)
     if problem:
         raise InputError(Mistake(problem, path))
     groups: dict[int, list[Indices]] = {}
@@ -68,17 +69,27 @@ def _read_meshio(path: Path) -> Cells:
         polygons={corners: np.concatenate(groups[corners]) for corners in sorted(groups)},
         segments=np.concatenate([NO_PAIRS, *(data for kind, data in blocks if kind == "line")]),
         tetrahedra=np.concatenate([np.empty((0, 4), np.int64), *(data for kind, data in blocks if kind == "tetra")]),
+        groups=found.groups,
+        attributes=found.attributes,
     )
 
 
 @lru_cache(maxsize=2)  # a scene builds its mesh several times, and a child takes a while to start
-def _read(path: Path, changed: int, size: int) -> tuple[NDArray[np.float64], list[Block]]:
-    """What meshio finds in a file of so many bytes, changed last at a time [ns]."""
+def _read(path: Path, changed: int, size: int) -> Found:
+    """What is in a file of so many bytes, changed last at a time [ns]."""
     limits = child.Allowance(SECONDS + size / BYTES_PER_SECOND, MEMORY + MEMORY_PER_BYTE * size)
     try:
         return child.call(read, path, limits=limits)
     except child.NoAnswer as error:
         raise InputError(Mistake(f"cannot be read as a mesh: {error}", path)) from None
+
+
+def _problem_of_groups(found: Found) -> str:
+    """What is wrong with the groups, or nothing."""
+    for name, group in found.groups.items():
+        if group[0] < 0 or group[-1] >= len(found.points):
+            return f"its group {name[:40]!r} names the point {group[-1]}; wanted 0 to {len(found.points) - 1}"
+    return ""
 
 
 def _problem(points: np.ndarray, blocks: list[tuple[str, Indices]]) -> str:

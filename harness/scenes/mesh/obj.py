@@ -20,7 +20,7 @@ from harness.scenes.mesh.generator import MAX_VERTICES
 from harness.scenes.mesh.topology import NO_PAIRS
 
 _RENDERING = {"bevel", "c_interp", "d_interp", "shadow_obj", "trace_obj", "mtllib", "usemtl", "maplib", "usemap", "lod"}
-_PASSED_OVER = _RENDERING | {"vt", "vn", "vp", "p", "g", "o", "s", "mg"}
+_PASSED_OVER = _RENDERING | {"vt", "vn", "vp", "p", "s", "mg"}
 _TOKEN = re.compile(r"([+-]?[0-9]+)(/[+-]?[0-9]*(/[+-]?[0-9]*)?)?")
 _MOST_MISTAKES = 20
 
@@ -56,6 +56,9 @@ class _Reader:
         self.lines: dict[int, list[int]] = defaultdict(list)
         self.segments: list[list[int]] = []
         self.segment_lines: list[int] = []
+        self.colours: list[tuple[float, ...]] = []
+        self.groups: dict[str, set[int]] = defaultdict(set)
+        self.named: list[str] = []
         self.mistakes: list[Mistake] = []
 
     def read(self, number: int, text: str) -> None:
@@ -64,12 +67,16 @@ class _Reader:
         try:
             if keyword == "v":
                 self.points.append(_point(words))
+                self.colours += [_colour(words[3:])] if len(words) == 6 else []
+            elif keyword in ("g", "o"):
+                self.named = words
             elif keyword == "f":
                 corners = self._corners(words)
                 if len(set(corners)) < len(corners):
                     raise ValueError("a face names a vertex twice; each corner must be another vertex")
                 self.polygons[len(corners)].append(corners)
                 self.lines[len(corners)].append(number)
+                self._belong(corners)
             elif keyword == "l":
                 corners = self._corners(words)
                 segments = [[a, b] for a, b in pairwise(corners)]
@@ -77,10 +84,15 @@ class _Reader:
                     raise ValueError("a line joins a vertex to itself; its ends must differ")
                 self.segments += segments
                 self.segment_lines += [number] * len(segments)
+                self._belong(corners)
             elif keyword and keyword not in _PASSED_OVER:
                 raise ValueError(f"unknown keyword {keyword[:40]!r}; wanted v, f, l or what OBJ files may carry")
         except ValueError as error:
             self.mistakes.append(Mistake(str(error), self.path, number))
+
+    def _belong(self, corners: list[int]) -> None:
+        for name in self.named:
+            self.groups[name].update(corners)
 
     def _corners(self, words: list[str]) -> list[int]:
         """Zero-based vertices; whether they exist is known only at the end of the file."""
@@ -107,7 +119,10 @@ class _Reader:
             self._check_range(self.segments, self.segment_lines)
         if self.mistakes:
             raise InputError(sorted(self.mistakes, key=lambda m: m.line or 0)[:_MOST_MISTAKES])
+        colours = self.colours if len(self.colours) == len(self.points) else []
         return Cells(
+            groups={name: np.array(sorted(group), np.int64) for name, group in self.groups.items()},
+            attributes=dict(zip(("red", "green", "blue"), np.array(colours).T.copy(), strict=False)),
             points=np.array(self.points, np.float64),
             polygons={k: np.array(self.polygons[k], np.int64) for k in sorted(self.polygons)},
             segments=np.array(self.segments, np.int64) if self.segments else NO_PAIRS,
@@ -127,6 +142,10 @@ def _point(words: list[str]) -> tuple[float, float, float]:
         raise ValueError(f"a vertex needs 3 coordinates (and at most a weight and a colour), came {len(words)}")
     x, y, z = map(_coordinate, words[:3])
     return x, y, z
+
+
+def _colour(words: list[str]) -> tuple[float, ...]:
+    return tuple(map(_coordinate, words))
 
 
 def _coordinate(word: str) -> float:

@@ -87,19 +87,6 @@ class Opinion:
     reach: float = 0.0
 
 
-def chosen(declared: Declared, selection: Any) -> list[int]:
-    """The vertices that a selection names: parts, indices and a box together, then every k-th."""
-    mesh, named = declared.mesh, set(selection.indices)
-    for part in selection.at:
-        named |= set(mesh.parts[part].tolist())
-    if selection.box:
-        low, high = selection.box.low, selection.box.high
-        named |= {i for i, x in enumerate(mesh.rest) if all(a <= c <= b for a, c, b in zip(low, x, high, strict=True))}
-    if not (selection.at or selection.indices or selection.box):
-        named = set(range(len(mesh.rest)))
-    return sorted(named)[:: selection.every]
-
-
 def counts(edges: NDArray[np.int64], weight: Array, n: int) -> Array:
     """The sum (n,) of the weights (m,) of the edges (m, 2) at each vertex; an edge from a vertex to itself is none."""
     i, j = edges.T

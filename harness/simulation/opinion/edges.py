@@ -2,6 +2,7 @@
 
     springs         k/2 (|x_i - x_j| - r)^2                                     Liu et al. 2013, eq. 7
     strain limits   k/2 (|x_i - x_j| - t)^2, t the allowed length nearest       Bouaziz et al. 2014, section 5.1
+    sewing          k/2 max(0, |x_i - x_j| - l(t))^2, l from the length at rest to the gap, evenly
     dashpots        c rate/2 (n.(x_i - x_j) - n.(o_i - o_j))^2, of which the gradient is the force -c n n'(v_i - v_j)
 
 with n the direction of the edge where the step starts, and o the origin from which the velocity of x is told.
@@ -16,13 +17,15 @@ import numpy as np
 from harness.scenes.mesh.base import Mesh
 from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion, counts
 from harness.simulation.opinion.derivatives import Values, Wide, length, wide
+from harness.simulation.opinion.selected import chosen
 
 
-def stiffness(mesh: Mesh, effect: Any, stretch: float, shear: float, bend: float) -> Array:
+def stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, bend: float) -> Array:
     """The stiffness (m,) [N/m] of each of a mesh's springs, by the effect's rule (see `harness.scenes.material`)."""
     k, h = np.zeros(len(mesh.springs)), mesh.spacing
-    for family, constant in {"stretch": stretch, "shear": shear, "bend": bend}.items():
+    for family, given in {"stretch": stretch, "shear": shear, "bend": bend}.items():
         for e in mesh.families[family]:
+            constant = given if isinstance(given, float) else _woven(mesh, given, *mesh.springs[e].tolist())
             if effect.rule == "fixed":
                 k[e] = constant
             elif effect.rule == "liu2013":
@@ -37,6 +40,19 @@ def stiffness(mesh: Mesh, effect: Any, stretch: float, shear: float, bend: float
     if effect.rule == "continuum" and bend:
         _relieve(mesh, k)
     return k
+
+
+def _woven(mesh: Mesh, weave: Any, i: int, j: int) -> float:
+    """The constant of one spring of a woven cloth, by the angle from the warp to it."""
+    normal = np.zeros(3)
+    for a, b, c in mesh.triangles:
+        area = np.cross(mesh.rest[b] - mesh.rest[a], mesh.rest[c] - mesh.rest[a])
+        normal += sum(k in (i, j) for k in (a, b, c)) * area
+    edge, warp = mesh.rest[j] - mesh.rest[i], np.array(weave.direction)
+    across = np.cross(normal, warp)
+    angle = np.arctan2(edge @ across * np.linalg.norm(normal), edge @ np.cross(across, normal))
+    straight = np.cos(2 * angle) ** 2
+    return float((weave.warp if np.cos(2 * angle) >= 0 else weave.weft) * straight + weave.bias * (1 - straight))
 
 
 def _relieve(mesh: Mesh, k: Array) -> None:
@@ -83,6 +99,28 @@ def strain_limits(effect: Any, declared: Declared) -> Opinion:
         return wide(k) / 2 * (l - allowed) ** 2
 
     return Opinion(lambda moment: values, counts(edges, k, len(declared.mass)))
+
+
+def sewing(effect: Any, declared: Declared) -> Opinion:
+    """Threads between what is nearest at rest."""
+    rest, rows = declared.mesh.rest, (chosen(declared, effect.first), chosen(declared, effect.second))
+    pairs = {(i, min(rows[1], key=lambda j: float(np.linalg.norm(rest[i] - rest[j])))) for i in rows[0]}
+    pairs |= {(min(rows[0], key=lambda i: float(np.linalg.norm(rest[i] - rest[j]))), j) for j in rows[1]}
+    edges = np.array(sorted(pairs), np.int64)
+    r, k = _lengths(declared.rest, edges), np.full(len(edges), effect.stiffness / len(edges))
+
+    def begin(moment: Moment) -> Values:
+        since, whole = moment.until - effect.begin, effect.end - effect.begin
+        done = (1.0 if since >= 0 else 0.0) if whole == 0 else min(max(since / whole, 0.0), 1.0)
+        longest = np.where(r < effect.gap, r, r + done * (effect.gap - r))
+
+        def values(x: Wide) -> Wide:
+            l = _lengths(x, edges)
+            return wide(k) / 2 * np.where(np.real(l) > longest, l - longest, 0 * l) ** 2
+
+        return values
+
+    return Opinion(begin, counts(edges, k, len(declared.mass)))
 
 
 def dashpots(effect: Any, declared: Declared) -> Opinion:

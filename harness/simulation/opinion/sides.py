@@ -10,6 +10,7 @@ import numpy as np
 
 from harness.scenes.bind import Scene
 from harness.scenes.effects.effect_names import EFFECTS
+from harness.scenes.mesh.base import Mesh
 from harness.scenes.spec import SceneSpec
 from harness.simulation.opinion import contact, edges, forces, self_contact, surface_contact, surfaces, vertices
 from harness.simulation.opinion.declared import Array, Begin, Declared, Opinion
@@ -28,6 +29,7 @@ _OPINIONS: dict[str, Callable[[Any, Declared], Opinion]] = {
     "pins": vertices.pins,
     "rayleigh": vertices.rayleigh,
     "self-contact": self_contact.self_contact,
+    "sewing": edges.sewing,
     "springs": edges.springs,
     "strain-limits": edges.strain_limits,
     "surface-contact": surface_contact.surface_contact,
@@ -60,7 +62,7 @@ class Side:
 def side(spec: SceneSpec, scene: Scene) -> Side:
     """What is thought of a scene that was built of the spec."""
     mesh, dt = scene.mesh, spec.time_step
-    mass = np.asarray(mesh.mass if spec.mass is None else spec.mass * mesh.shares)
+    mass = _mass(spec, mesh)
     declared = Declared(mesh, mass, dt, tuple(spec.effects), not getattr(scene.integrator, "splits", False))
     bound = [effect.bind(mesh, mass, dt).by(scene.integrator) for effect in declared.effects]
     # In the order in which a scene lines them up: each effect's, then what follows from all of those.
@@ -83,6 +85,14 @@ def side(spec: SceneSpec, scene: Scene) -> Side:
                 resists = resists + share
     begins = [opinion.needs(resists) if opinion.needs else opinion.begin for opinion in opinions]
     return Side(declared, opinions, begins, owned, outside)
+
+
+def _mass(spec: SceneSpec, mesh: Mesh) -> Array:
+    """The masses (n,) [kg]."""
+    if spec.mass_per_area is not None:
+        area = sum(float(np.linalg.norm(np.cross(b - a, c - a))) / 2 for a, b, c in mesh.rest[mesh.triangles])
+        return spec.mass_per_area * area * mesh.shares
+    return np.asarray(mesh.mass if spec.mass is None else spec.mass * mesh.shares)
 
 
 def _known(effect: Any) -> bool:

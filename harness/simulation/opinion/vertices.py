@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion, PinnedVertex, chosen
+from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion, PinnedVertex
 from harness.simulation.opinion.derivatives import Values, Wide, wide
 from harness.simulation.opinion.edges import along_edges, of_springs
 from harness.simulation.opinion.motion import place, speed
+from harness.simulation.opinion.selected import chosen
 from harness.simulation.opinion.surfaces import damped_bending
 
 

@@ -1,0 +1,52 @@
+"""The boundary of a surface: loops of edges that one triangle has alone, and which of them are holes."""
+
+from __future__ import annotations
+
+from itertools import groupby
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.scenes.mesh.base import Mesh
+
+Indices = NDArray[np.int64]
+
+_ALIKE = 9
+"""Digits by which lengths of loops are told apart: round-off decides no order."""
+
+
+class Loop(NamedTuple):
+    """A connected piece of the boundary. vertices (k,): sorted; length [m]; hole: whether the connected surface that it
+    belongs to has a longer one."""
+
+    vertices: Indices
+    length: float
+    hole: bool
+
+
+def loops(mesh: Mesh) -> list[Loop]:
+    """Of a mesh at rest, the longest first; of those alike that with the lowest vertex."""
+    if not len(mesh.triangles):
+        return []
+    from scipy.sparse import coo_array  # for those who ask
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(mesh.rest)
+    sides = np.sort(np.concatenate([mesh.triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+    edges, count = np.unique(sides, axis=0, return_counts=True)
+    open_ = edges[count == 1]
+
+    def pieces(pairs: Indices) -> Indices:
+        graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+        return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+    surface, of = pieces(edges), pieces(open_)
+    long = np.linalg.norm(mesh.rest[open_[:, 0]] - mesh.rest[open_[:, 1]], axis=1)
+    length = np.bincount(of[open_[:, 0]], long, minlength=n)
+    found = [np.flatnonzero(of == k) for k in np.unique(of[open_[:, 0]]).tolist()]
+    rounded = {int(x[0]): float(f"{length[of[x[0]]]:.{_ALIKE}g}") for x in found}
+    found.sort(key=lambda x: (-rounded[int(x[0])], int(x[0])))
+    by_surface = groupby(sorted(found, key=lambda x: int(surface[x[0]])), key=lambda x: int(surface[x[0]]))
+    rims = {int(next(of_one)[0]) for _, of_one in by_surface}  # sorting keeps the order: the longest is first
+    return [Loop(x, float(length[of[x[0]]]), int(x[0]) not in rims) for x in found]

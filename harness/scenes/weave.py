@@ -1,0 +1,68 @@
+"""Cloth that is stiffer along one thread than along the other, and softest between them.
+
+    k(theta) = (warp if cos 2 theta >= 0, else weft) cos^2 2 theta + bias sin^2 2 theta
+
+theta: from the warp's direction to a spring, in the plane that touches the mesh at rest. So springs along the warp have
+its stiffness, those across it that of the weft, and those at 45 degrees that of the bias; in between it is smooth, and
+no stiffness is below the least of the three. On a grid along both threads a strain of the warp or the weft is resisted
+by these springs and by the diagonals, of constant s = bias: C11 = warp + s, C22 = weft + s, C12 = C66 = s
+(`harness.scenes.material`, with both diagonals). The rule between the directions is our own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import NonNegativeFloat, model_validator
+
+from harness.base.errors import InputError, Mistake
+from harness.base.model import Model, Vector
+from harness.scenes.mesh.base import Mesh
+
+_ACROSS = 1e-6
+"""Of the direction's length: less than that in the plane of the mesh is none."""
+
+
+class Weave(Model):
+    """The stiffness of a woven cloth along its threads and between them, in the unit of `stretch`."""
+
+    warp: NonNegativeFloat
+    """Along the warp."""
+    weft: NonNegativeFloat
+    """Across it."""
+    bias: NonNegativeFloat
+    """At 45 degrees to both."""
+    direction: Vector
+    """Of the warp, in the rest shape, of any length but zero; on curved meshes what of it lies along the surface."""
+
+    @model_validator(mode="after")
+    def _directed(self) -> Weave:
+        if not any(self.direction):
+            raise ValueError("the direction of the warp should not be zero")
+        return self
+
+    def of(self, mesh: Mesh, springs: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The constants (m,) of springs (m, 2); raises InputError where the mesh has no surface along the warp."""
+        if mesh.dimension != 2 or not len(mesh.triangles):
+            raise InputError(Mistake("warp and weft need a mesh of triangles; give one number", key="stretch"))
+        a, b, c = (mesh.rest[mesh.triangles[:, k]] for k in range(3))
+        area, normals = np.cross(b - a, c - a), np.zeros_like(mesh.rest)
+        for k in range(3):
+            np.add.at(normals, mesh.triangles[:, k], area)
+        i, j = springs.T
+        normal = normals[i] + normals[j]
+        normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+        warp = np.array(self.direction) / np.linalg.norm(self.direction)
+        along, edge = (_flat(x, normal) for x in (np.tile(warp, (len(i), 1)), mesh.rest[j] - mesh.rest[i]))
+        size = np.linalg.norm(along, axis=1)
+        if len(bad := np.flatnonzero(size < _ACROSS)):
+            where = f"the warp stands upright on the mesh at the spring {i[bad[0]]}-{j[bad[0]]}"
+            raise InputError(Mistake(f"{where}; give a direction along the cloth", key="stretch"))
+        product = size * np.linalg.norm(edge, axis=1)
+        cosine = np.einsum("ij,ij->i", along, edge) / np.where(product > 0.0, product, 1.0)
+        twice = 2.0 * np.minimum(cosine**2, 1.0) - 1.0
+        return np.where(twice >= 0.0, self.warp, self.weft) * twice**2 + self.bias * (1.0 - twice**2)
+
+
+def _flat(x: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    return x - np.einsum("ij,ij->i", x, normal)[:, None] * normal
