@@ -1,11 +1,13 @@
 """What a sweep takes beside its timed passes, and what a second core saves; on an idle machine.
 
     python -m tests.sweep_costs short [RUNS]        500 runs of five solvers, sizes 8 to 16, if left out
+    python -m tests.sweep_costs isolation [RUNS]    the same by one worker, and in the process that asks
     python -m tests.sweep_costs cores [CASES]       10 cases of configs/hard.yaml by five solvers, judged and drawn
 
 `short` prints what each run takes beside its timed passes, of the wall's time and of all processes' CPU, and the memory
-of the process that asks for them, when half of the runs have ended and when all have. `cores` does a sweep by one
-worker and by two and prints
+of the process that asks for them, when half of the runs have ended and when all have. `isolation` prints what of it a
+worker adds, which is the fixed cost of isolation (process, messages, locks), and its share of the sweep: the rest is
+what runs ask for, a second pass, its judging, and rows. `cores` does a sweep by one worker and by two and prints
 
     t = timed / wall            of one worker: the share that two may not do side by side
     speed-up / (1 / (t + (1 - t) / 2))          .9 is wanted
@@ -68,7 +70,7 @@ class Weighed(Quiet):
 
 
 def sweep(runs: list[RunSpec], folder: Path, workers: int | None) -> Took:
-    """Do runs in a process of its own. Raises RuntimeError where it fails."""
+    """Do runs in a process of its own; workers: by how many, 0 by none. Raises RuntimeError where it fails."""
     folder.mkdir(parents=True)
     mine, theirs = (context := get_context("spawn")).Pipe()
     process = context.Process(target=_sweep, args=(theirs, runs, folder, workers))
@@ -100,7 +102,7 @@ def _sweep(answer: Any, runs: list[RunSpec], folder: Path, workers: int | None) 
 
     runs_of._timed = noting
     weighed = Weighed()
-    run_sweep("costs", runs, folder, weighed, lambda said: None, at_once=workers)
+    run_sweep("costs", runs, folder, weighed, lambda said: None, at_once=workers, isolated=workers != 0)
     wall = monotonic() - began
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     cpu = sum(one.ru_utime + one.ru_stime for one in used)
@@ -115,19 +117,39 @@ def _asked(folder: Path, **asked: Any) -> list[RunSpec]:
     return load_any(path).runs()
 
 
-def short(count: int, folder: Path) -> dict[str, float]:
-    """What so many short runs take beside their timed passes, a run in milliseconds."""
+def _short(count: int, folder: Path) -> list[RunSpec]:
+    """So many short runs, whose kernels are compiled."""
     scene = {"scenes": [os.path.relpath(CONFIGS / "scenes" / "hanging-cloth.yaml", folder)]}
     same = scene | {"sizes": list(SIZES), "solvers": list(SOLVERS)}
     each = range(1, 1 + ceil(count / len(SIZES) / len(SOLVERS)))
     sweep(_asked(folder, **same, options=SHORT | {"iterations": 1, "frames": 2}), folder / "first", None)
-    took = sweep(_asked(folder, **same, options=SHORT | {"iterations": list(each)})[:count], folder / "all", None)
-    told = took._asdict() | {"runs": count, "cores": len(os.sched_getaffinity(0))}
+    return _asked(folder, **same, options=SHORT | {"iterations": list(each)})[:count]
+
+
+def _beside(took: Took, count: int) -> dict[str, float]:
+    """What a run takes beside its timed passes, in milliseconds."""
     beside = {"wall_ms_beside": took.wall - took.timed, "cpu_ms_beside": took.cpu - took.timed_cpu}
-    return told | {name: 1e3 * seconds / count for name, seconds in beside.items()}
+    return {name: 1e3 * seconds / count for name, seconds in beside.items()}
 
 
-def cores(cases: int, folder: Path) -> dict[str, float]:
+def short(count: int, folder: Path) -> dict[str, Any]:
+    """What so many short runs take beside their timed passes, a run in milliseconds."""
+    took = sweep(_short(count, folder), folder / "all", None)
+    return took._asdict() | {"runs": count, "cores": len(os.sched_getaffinity(0))} | _beside(took, count)
+
+
+def isolation(count: int, folder: Path) -> dict[str, Any]:
+    """What a worker adds to so many short runs, a run in milliseconds, and its share of what they take in all."""
+    runs = _short(count, folder)
+    took = {name: sweep(runs, folder / name, workers) for name, workers in {"here": 0, "by_1": 1}.items()}
+    here, by_1 = (_beside(one, count) for one in took.values())
+    added = {name: by_1[name] - here[name] for name in here}
+    whole = {"wall_ms_beside": took["by_1"].wall, "cpu_ms_beside": took["by_1"].cpu}
+    share = {name: added[name] * count / 1e3 / whole[name] for name in added}
+    return {"runs": count, "here": here, "by_1": by_1, "added": added, "share_of_sweep": share}
+
+
+def cores(cases: int, folder: Path) -> dict[str, Any]:
     """What two workers save of a sweep of hard cases, one worker's share of timed passes, and what that allows."""
     hard = load_any(CONFIGS / "hard.yaml").runs()
     scenes = list(dict.fromkeys(run.scene_name for run in hard))
@@ -141,8 +163,10 @@ def cores(cases: int, folder: Path) -> dict[str, float]:
     return told | {"allowed": allowed, "share_of_allowed": one.wall / two.wall / allowed}
 
 
+COMMANDS = {"short": (short, 500), "isolation": (isolation, 500), "cores": (cores, 10)}
+"""By name, and how many of what is asked for."""
+
 if __name__ == "__main__":
-    what, number = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else None
+    (what, usual), asked = COMMANDS[sys.argv[1]], sys.argv[2:]
     with TemporaryDirectory() as temporary:
-        found = short(number or 500, Path(temporary)) if what == "short" else cores(number or 10, Path(temporary))
-    print(json.dumps(found, indent=1))
+        print(json.dumps(what(int(asked[0]) if asked else usual, Path(temporary)), indent=1))

@@ -7,13 +7,14 @@ import importlib.metadata
 import os
 import platform
 import subprocess
+import sys
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from harness.base.errors import InputError, Mistake
 
@@ -167,14 +168,22 @@ def pinned_threads(threads: int) -> Generator[None]:
     # Loaded here: BLAS can only be limited once it is loaded, NumPy and SciPy bring one each, and a process
     # that computes nothing should not wait for them.
     import numba
-    from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
     import_module("scipy.linalg")
     require_threads(threads)
     before = numba.get_num_threads()
-    with threadpool_limits(threads, user_api="blas"):
+    with _pools(len(sys.modules)).limit(limits=threads, user_api="blas"):
         numba.set_num_threads(threads)
         try:
             yield
         finally:
             numba.set_num_threads(before)
+
+
+@lru_cache(maxsize=1)
+def _pools(modules: int) -> Any:
+    """The libraries with threads that are loaded; they come with modules, so it is enough to look when there are more:
+    the system's list of what is loaded takes longer to read than a short run's rows to write."""
+    from threadpoolctl import ThreadpoolController  # pyright: ignore[reportMissingTypeStubs]
+
+    return ThreadpoolController()

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -31,14 +32,25 @@ _FEW = 8
 
 
 def write(path: Path, rows: Iterable[Row], schema: pa.Schema = SCHEMA) -> None:
-    """Write one file's rows under a partial name and rename: a kill leaves the whole file or none, and so does an
-    error. Raises CannotWrite."""
-    rows = list(rows)
-    unknown = {key for row in rows for key in row} - set(schema.names)
+    """Write one file's rows as `store` does. Raises CannotWrite."""
+    store(path, encoded(rows, schema))
+
+
+def encoded(rows: Iterable[Row], schema: pa.Schema = SCHEMA) -> bytes:
+    """A file's rows as Parquet."""
+    rows, file = list(rows), io.BytesIO()
+    unknown = set[str]().union(*rows) - set(schema.names)
     if unknown:
         raise ValueError(f"rows have no columns {sorted(unknown)}")
+    pq.write_table(pa.Table.from_pylist(rows, schema=schema), file)
+    return file.getvalue()
+
+
+def store(path: Path, content: bytes) -> None:
+    """Write a file under a partial name, wait for the disk, and rename: a kill leaves the whole file or none, and so
+    does an error. Raises CannotWrite."""
     with replacing(path) as partial, partial.open("wb") as file:
-        pq.write_table(pa.Table.from_pylist(rows, schema=schema), file)
+        file.write(content)
         file.flush()
         os.fsync(file.fileno())
 

@@ -16,6 +16,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
+from time import monotonic
 from typing import Any, NamedTuple
 
 from harness.base.blame import where
@@ -31,8 +32,8 @@ returns."""
 DUMP = signal.SIGUSR1
 """Makes a worker say where it is."""
 
-_THOROUGH = 64
-"""After so many pieces what earlier ones left is looked through too: a cache may have let go of it since."""
+_THOROUGH = 10.0
+"""After so many seconds what earlier pieces left is looked through too: a cache may have let go of it since."""
 
 _PARENT_DIES = 1
 """`PR_SET_PDEATHSIG`: Linux sends a process a signal when its parent dies."""
@@ -69,7 +70,7 @@ def serve(
     ready()
     gc.freeze()  # what the parent had need not be looked through after each piece
     me = os.getpid()
-    pieces = 0
+    looked = monotonic()
     with suppress(EOFError, ConnectionError):
         while (asked := calls.recv()) is not None:
             piece, limits = asked
@@ -77,8 +78,8 @@ def serve(
             if os.getpid() != me:  # a copy of this process that the piece has made
                 os._exit(0)
             calls.send(answer)
-            pieces += 1
-            if pieces % _THOROUGH == 0:
+            if monotonic() - looked > _THOROUGH:
+                looked = monotonic()
                 gc.unfreeze()
             gc.collect()  # now, and not while the next piece is timed
             gc.freeze()  # compiled kernels leave 10^5 objects, which take longer to look through than a short run

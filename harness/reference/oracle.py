@@ -91,10 +91,13 @@ class Oracle:
 
     def floor(self, problem: StepProblem, p: Positions) -> float:
         """What round-off may make of the residual [J^(1/2)] at p."""
+        return self._floor(gradient_round_off(problem, p))
+
+    def _floor(self, bound: NDArray[np.float64]) -> float:
+        """The same of the bound (n,) [N] on the round-off at each vertex."""
         loose = self._system.unpinned
-        bound, stiffness = gradient_round_off(problem, p)[loose], self._Q.diagonal()[loose]
         with np.errstate(over="ignore"):
-            return FACTOR * float(np.sqrt(np.sum(bound**2 / stiffness)))
+            return FACTOR * float(np.sqrt(np.sum(bound[loose] ** 2 / self._Q.diagonal()[loose])))
 
     def yardstick(self, problem: StepProblem) -> float:
         """The residual [J^(1/2)] at the current positions, or what round-off may make of it there, if that is more."""
@@ -105,11 +108,11 @@ class Oracle:
 
     def stationarity(self, problem: StepProblem, p: Positions) -> Reading:
         """How stationary p (n, 3) [m] is."""
-        yardstick, gradient = self.yardstick(problem), problem.gradient(p)
+        yardstick, gradient, bound = self.yardstick(problem), problem.gradient(p), gradient_round_off(problem, p)
         reached = self.length(gradient) / yardstick
-        doubtless = gradient - within(gradient, FACTOR * gradient_round_off(problem, p))
+        doubtless = gradient - within(gradient, FACTOR * bound)
         beyond = min(reached, self.length(doubtless) / yardstick)
-        return Reading(reached, self.floor(problem, p) / yardstick, beyond)
+        return Reading(reached, self._floor(bound) / yardstick, beyond)
 
 
 def stiffness(system: System) -> csr_array:
