@@ -29,6 +29,7 @@ from harness.experiments.gallery import gallery
 from harness.experiments.gates.command import gate
 from harness.experiments.gates.history_command import history
 from harness.experiments.gates.study_command import study
+from harness.experiments.show import show
 from harness.experiments.speed.command import speed
 
 if TYPE_CHECKING:
@@ -174,6 +175,7 @@ app.command()(publish)
 app.command()(verify)
 app.command()(figure)
 app.command()(gallery)
+app.command()(show)
 app.command()(gate)
 app.command()(history)
 app.add_typer(study, name="gate-study")

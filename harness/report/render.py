@@ -195,9 +195,16 @@ class Studio:
     ) -> None:
         self._plotter.close()
 
-    def draw(self, replay: Replay, frame: int, view: View, more: Sequence[pv.PolyData] = ()) -> NDArray[np.uint8]:
+    def draw(
+        self,
+        replay: Replay,
+        frame: int,
+        view: View,
+        more: Sequence[pv.PolyData] = (),
+        dots: Sequence[tuple[Points, str]] = (),
+    ) -> NDArray[np.uint8]:
         """A recorded frame as pixels (height, width, 3), or 4 without a background, with more solids than its
-        obstacles; it must be finite."""
+        obstacles, and with dots at points (q, 3) in a colour; it must be finite."""
         plotter = self._plotter
         plotter.clear_actors()
         plotter.camera.position = tuple(view.position)
@@ -211,7 +218,8 @@ class Studio:
             self._surface(replay, frame, p)
         else:
             self._springs(replay, frame, p)
-        self._pins(replay, p)
+        for at, colour in ((p[replay.pinned], PIN_COLOUR), *dots):
+            self._dots(replay, p, at, colour)
         for solid in (*solids(replay, frame), *more):
             plotter.add_mesh(solid, color=_SOLID, smooth_shading=solid.n_cells > 6, **_MATERIAL)
         plotter.reset_camera_clipping_range()
@@ -264,12 +272,11 @@ class Studio:
         thin = min(0.07 * spacing(replay), 0.007 * _extent(p))
         return max(thin, 1.1 * _extent(p) / self._height)
 
-    def _pins(self, replay: Replay, p: NDArray[np.float32]) -> None:
-        if len(replay.pinned):
+    def _dots(self, replay: Replay, p: NDArray[np.float32], at: Points, colour: str) -> None:
+        if len(at):
             spaced = min(0.3 * spacing(replay), 0.009 * _extent(p))
             radius = max(spaced, 0.004 * _extent(p), 0.0 if len(replay.triangles) else 2.2 * self._tube(replay, p))
-            pins = _balls(p[replay.pinned], radius)
-            self._plotter.add_mesh(pins, color=PIN_COLOUR, smooth_shading=True, **_MATERIAL)
+            self._plotter.add_mesh(_balls(at, radius), color=colour, smooth_shading=True, **_MATERIAL)
 
     def _shadow(self, replay: Replay, p: NDArray[np.float32], ground: float, behind: str) -> None:
         """A soft shadow on the ground: the scene seen from the light, as a blurred picture on an unlit plane."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Self
+from collections.abc import Iterator
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +95,12 @@ class Selection(Model):
         given = self.at, self.indices, self.box, self.sphere, self.nearest, self.loops, self.holes, self.attribute
         return any(map(bool, given))
 
+    def told(self) -> str:
+        """The selectors that are used, in words."""
+        given = self.model_dump(mode="json", include=set(Selection.model_fields), exclude_none=True)
+        used = (f"{key} {_in_words(value)}" for key, value in given.items() if value and (key, value) != ("every", 1))
+        return ", ".join(used)
+
     def chosen(self, mesh: Mesh, name: str) -> Indices:
         """The vertices (q,), sorted; raises InputError, which speaks of `name`, for what the mesh does not have."""
         n, rest = len(mesh.rest), mesh.rest
@@ -119,14 +126,28 @@ class Selection(Model):
             sets.append(_between(mesh, self.attribute, f"{name}: attribute"))
         vertices = distinct(np.concatenate(sets), n)[:: self.every] if self.names else np.arange(0, n, self.every)
         if not len(vertices):
-            given = self.model_dump(mode="json", include=_PLACES, exclude_none=True)
-            said = "; ".join(f"{key} from {value}" for key, value in given.items())
-            raise InputError(f"{name}: no vertex of the mesh lies in the {said}")
+            raise InputError(f"{name}: no vertex of the mesh lies in the {self.told()}")
         return vertices
 
 
 _LATER = {"sphere", "nearest", "loops", "holes", "attribute"}
-_PLACES = {"box", "sphere", "attribute"}
+
+
+def selections(effect: Any) -> Iterator[tuple[str, Selection]]:
+    """Those that an effect has: itself, by no name, and its fields."""
+    if isinstance(effect, Selection):
+        yield "", effect
+    for key, value in effect:
+        if isinstance(value, Selection):
+            yield key, value
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, dict):
+        return " ".join(f"{key} {_in_words(one)}" for key, one in cast(dict[str, Any], value).items())
+    if isinstance(value, list):
+        return "(" + ", ".join(_in_words(one) for one in cast(list[Any], value)) + ")"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _numbered(found: list[Loop], wanted: tuple[int, ...], name: str, what: str) -> list[Indices]:

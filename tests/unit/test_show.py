@@ -1,0 +1,53 @@
+"""A scene as it starts: which vertices its effects choose, in words and in colours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from PIL import Image
+from typer.testing import CliRunner
+
+from harness.cli import app
+from harness.report import opengl
+from harness.report.style import numbered
+
+SCENE = """
+mesh: {kind: grid, plane: vertical}
+mass: 0.3
+time_step: 1/30
+frames: 2
+default_size: 5
+effects:
+  - {kind: springs, stretch: 100}
+  - {kind: pins, at: [top_corners]}
+  - {kind: sewing, first: {at: [left]}, second: {at: [right], every: 2}, stiffness: 10}
+"""
+
+
+@pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
+def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
+    (tmp_path / "cloth.yaml").write_text(SCENE)
+    picture = tmp_path / "cloth.png"
+    told = CliRunner().invoke(app, ["show", str(tmp_path / "cloth.yaml"), "-o", str(picture)])
+    assert told.exit_code == 0, told.output
+    lines = " ".join(told.output.split())
+    assert "effects[1] pins: 2 vertices (at (top_corners)): 0, 4" in lines
+    assert "effects[2] sewing: second: 3 vertices (at (right), every 2): 4, 14, 24" in lines
+    assert "boundary loops (loops): 0: 4 m" in lines
+    with Image.open(picture) as drawn:
+        pixels = np.asarray(drawn.convert("RGB"), np.float64) / 255
+    hue = pixels - pixels.mean(axis=2, keepdims=True)
+    for k in range(3):  # lit from one side, so lighter and darker: by its hue
+        colour = np.array(to_rgb(numbered(k).color))
+        wanted = colour - colour.mean()
+        alike = (hue @ wanted) / np.maximum(np.linalg.norm(hue, axis=2) * np.linalg.norm(wanted), 1e-9)
+        assert int(((alike > 0.98) & (np.linalg.norm(hue, axis=2) > 0.3)).sum()) > 100
+
+
+def test_a_picture_that_is_none_is_refused(tmp_path: Path):
+    (tmp_path / "cloth.yaml").write_text(SCENE)
+    told = CliRunner().invoke(app, ["show", str(tmp_path / "cloth.yaml"), "-o", str(tmp_path / "cloth.jpg")])
+    assert told.exit_code != 0
