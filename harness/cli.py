@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from harness.base.commands import Again, Changed, Check, Commands, Error, Horizon, InThisProcess, Peers, Results, Rows
-from harness.base.console import aligned, err, out
+from harness.base.console import aligned, err, narrow, out
 from harness.base.console import say as _say
 from harness.base.errors import InputError, Mistake
 from harness.config.command_line import taking
@@ -160,7 +160,7 @@ def report(
 
     page = update(results, recorded=True, viewer=viewer, say=_say)
     for picture, cells in draw_maps(results, older_of):
-        out().print(summary(cells))
+        out().print(narrow(summary(cells)))
         _say(f"the map is {picture}")
     _say(f"the page is {page}; a browser opens it, and needs no network for it")
 

@@ -11,10 +11,13 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from rich.console import Console, Group
+    from rich.table import Column, Table
 
 _LONGEST = 4_000
 """Characters of a line: names in foreign files may have millions."""
+WIDTH = 100
+"""Columns that tables of our own take at most, wherever they are printed."""
 _PIPE = 240
 """Columns of a pipe or a file, which has no width of its own, and where no cell should be cut."""
 
@@ -36,6 +39,46 @@ def err() -> Console:
     from rich.console import Console
 
     return Console(stderr=True)
+
+
+def narrow(table: Table, beside: int = 1, width: int = WIDTH) -> Group:
+    """A table in parts of `width` characters at most: as many of its columns as fit, beside the first of them, without
+    those that say nothing. What is wider alone is folded."""
+    from rich.console import Console, Group
+    from rich.constrain import Constrain
+    from rich.measure import Measurement
+    from rich.text import Text
+
+    first, wide = table.columns[:beside], Console(width=1000)
+    groups: list[list[Column]] = [[]]
+    for column in table.columns[beside:]:
+        if table.row_count and all(cell in ("", "–") for cell in column.cells):
+            continue
+        natural = Measurement.get(wide, wide.options, _with(table, [*first, *groups[-1], column])).maximum
+        if groups[-1] and natural > width:
+            groups.append([])
+        groups[-1].append(column)
+    parts = [_with(table, [*first, *group]) for group in groups]
+    for part in parts:
+        part.width = min(Measurement.get(wide, wide.options, part).maximum, width)
+    parts[0].title = table.title
+    words = Text.from_markup(str(table.caption or ""), style="table.caption")
+    return Group(*parts, *([Constrain(words, width)] if words else []))
+
+
+def _with(table: Table, columns: Sequence[Column]) -> Table:
+    """These columns of a table, without its title and caption."""
+    from rich.table import Table
+
+    part = Table(box=table.box, padding=table.padding, pad_edge=table.pad_edge, title_justify="left")
+    part.collapse_padding = table.collapse_padding
+    for one in columns:
+        part.add_column(
+            one.header, justify=one.justify, vertical=one.vertical, no_wrap=one.no_wrap, overflow=one.overflow
+        )
+    for cells, row in zip(zip(*(one.cells for one in columns), strict=True), table.rows, strict=True):
+        part.add_row(*cells, end_section=row.end_section)
+    return part
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> Iterator[str]:

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from harness.base.console import narrow
 from harness.base.errors import InputError, Mistake
 
 RATIO_MARGIN = 0.10
@@ -114,7 +115,7 @@ def compare(base: Path, new: Path, console: Console) -> int:
         change, verdict = _judged(before, after, same)
         verdicts.append(verdict)
         table.add_row(*map(escape, (name.rpartition("::")[2], _figure(before), _figure(after), change, verdict)))
-    console.print(table)
+    console.print(narrow(table))
     if not same:
         console.print("The files come from different machines: minima are not judged, ratios with a wider margin.")
     bad = sum(verdict in REGRESSIONS for verdict in verdicts)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from harness.base import rows, shelf
@@ -222,10 +223,17 @@ def percent(share: float | None) -> str:
 
 
 def summary(cells: Sequence[Judged]) -> Table:
-    """A row for each solver: how many cases ended how, the shares of those it did not refuse, the worst residual."""
-    table = Table("solver", *(outcome.words for outcome in OUTCOMES), "right", "finite", "worst")
-    table.caption, table.caption_justify = "none of these are times: they may be compared across machines", "left"
-    for score in scores(cells):
+    """A row for each solver: how many cases ended how, in the ways that any did; the shares of those it did not refuse,
+    the worst residual."""
+    found = scores(cells)
+    there = [k for k, _ in enumerate(OUTCOMES) if any(score.counts[k] for score in found)]
+    table = Table(box=SIMPLE_HEAD, caption_justify="left")
+    table.caption = "none of these are times: they may be compared across machines"
+    table.add_column("solver", vertical="bottom")
+    for words in (*(OUTCOMES[k].words for k in there), "part right", "part finite", "worst residual"):
+        table.add_column("\n".join(words.rsplit(" ", 1)), justify="right", vertical="bottom")
+    for score in found:
         worst = "" if score.worst.worst is None else f"{score.worst.worst:.1e}"
-        table.add_row(score.solver, *map(str, score.counts), percent(score.right), percent(score.finite), worst)
+        counts = (str(score.counts[k]) for k in there)
+        table.add_row(score.solver, *counts, percent(score.right), percent(score.finite), worst)
     return table

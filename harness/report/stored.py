@@ -26,6 +26,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from harness.base import rows, shelf, statistics
+from harness.base.console import narrow
 from harness.base.errors import InputError, Mistake
 
 MARGIN = 0.10
@@ -96,7 +97,7 @@ def compare(old: Path, new: Path, console: Console, yardstick: str | None = None
     if not compared:
         said = "; ".join(dict.fromkeys(refused.values())) or "they have no run in common"
         raise InputError(f"{old} and {new} cannot be compared: {said}")
-    console.print(table)
+    console.print(narrow(table))
     for name, reason in refused.items():
         console.print(f"not compared: {name}: {reason}", markup=False)
     if yardstick:

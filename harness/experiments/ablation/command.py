@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from harness.base.commands import Again, Changed, InThisProcess, Results
-from harness.base.console import err, out, say
+from harness.base.console import err, narrow, out, say
 
 SOLVER, TOLERANCE = "hybrid", 1e-4
 """It takes all effects, and converges: what an effect changes is not to drown in the solver's own error."""
@@ -55,7 +55,7 @@ def ablate(
     if rows[0]["status"] != "ok":  # of the whole scene, with which all others are compared
         say(f"{sweep.name}: {rows[0]['status']}: {rows[0]['reason']}")
         raise typer.Exit(1)
-    out().print(ablation_table(rows))
+    out().print(narrow(ablation_table(rows)))
     for line in sentences(rows):
         say(line)
     picture.parent.mkdir(parents=True, exist_ok=True)
@@ -92,6 +92,6 @@ def _prices(
     sweep = load_any(scene, solvers=minimising, sizes=[size] if size else [], **usual | given.obj)
     folder = claimed(results / sweep.name, scene)
     paths = price_all(sweep, folder, display(err()), say, again=again, changed=changed, isolated=not here)
-    out().print(price_table([row for path in paths for row in read(path)]))
+    out().print(narrow(price_table([row for path in paths for row in read(path)])))
     say(f"rows are in {paths[0].parent}")
     keep(results, folder, say)

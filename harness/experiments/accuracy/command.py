@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from harness.base.commands import Results
-from harness.base.console import err, out, say
+from harness.base.console import err, narrow, out, say
 
 
 def recommend(
@@ -40,7 +40,7 @@ def recommend(
     table = Table("", "error" if integrated else f"error ({found.checked.truth})", "wall s per simulated s", "way")
     for name, way in (("predicted", found.best), ("measured", found.checked)):
         table.add_row(name, f"{way.error:.3g}", f"{way.cost:.4g}", str(way))
-    out().print(table)
+    out().print(narrow(table))
     say(found.verdict)
     points = [RunnerUp(way.spec.solver.name, way.error, way.cost, str(way)) for way in found.ways]
     title = f"Ways to an error of {100 * error:g} %: {scene.stem} {found.best.spec.case.size or ''}".rstrip()

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from harness.base.commands import Results
-from harness.base.console import out, say
+from harness.base.console import narrow, out, say
 
 
 def goals(
@@ -62,7 +62,7 @@ def goals(
         for one in found
     ]
     rows.write(folder / "accuracy" / "goals.parquet", written, SCHEMA)
-    out().print(table)
+    out().print(narrow(table))
     say(f"rows are in {folder / 'accuracy'}")
     raise typer.Exit(0 if all(one.holds for one in found) else 1)
 

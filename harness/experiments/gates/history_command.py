@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from harness.base.console import out, say
+from harness.base.console import narrow, out, say
 from harness.base.errors import InputError, Mistake
 
 PLACES = (Path("results/bench"), Path(".benchmarks"))
@@ -38,7 +38,7 @@ def history(
         where = ", ".join(map(str, places or PLACES))
         raise InputError(f"history: no stored results in {where}; {hint}")
     found = tell(files)
-    out().print(history_table(found))
+    out().print(narrow(history_table(found)))
     if not any(len(series.points) >= FEWEST for series in found):
         most = max((len(series.points) for series in found), default=0)
         say(f"too little to tell changes from noise: at most {most} results of a gate, wanted {FEWEST}; {hint}")

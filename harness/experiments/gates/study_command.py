@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from harness.base.console import out, say
+from harness.base.console import narrow, out, say
 from harness.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def live(
     table = Table("gate", "beside it", "load", "planted", "limit", "gates", "fails", "holds", "cannot tell", "median s")
     for row in summary(found):
         table.add_row(*row)
-    out().print(table)
+    out().print(narrow(table, beside=2))
 
 
 @study.command()
@@ -110,4 +110,4 @@ def replay(
             load = f"{median(start.load for start in starts):.1f}"
             cells = [gate, condition, load, f"{slower - 1:.0%}", f"{limit - 1:.0%}", *parts, f"{found.seconds:.1f}"]
             table.add_row(*cells, *(f"{part:.1%}" for part in others))
-    out().print(table)
+    out().print(narrow(table, beside=2))

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from harness.base.commands import Again, Changed, InThisProcess, Results
-from harness.base.console import err, out, say
+from harness.base.console import err, narrow, out, say
 from harness.base.errors import InputError, Mistake
 
 
@@ -41,7 +41,7 @@ def speed(
     folder = claimed(results / sweep.name, config)
     how = {"again": again, "changed": changed, "isolated": not here}
     found = figures(run_speed(sweep, folder, display(err()), say, budget=budget, **how))
-    out().print(speed_table(found))
+    out().print(narrow(speed_table(found), beside=2))
     for line in remarks(found):
         say(line)
     draw(found, folder / "pictures")
