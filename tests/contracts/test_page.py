@@ -225,6 +225,13 @@ def test_a_point_of_a_curve_leads_to_its_solve_by_keys(tab: Tab, page: str):
     point.get_by_text("springbench accuracy").wait_for()
     assert "point=" in tab.view()
     assert "A processor" in point.inner_text()
+    plot.press("+")
+    shown.wait_for_function("location.hash.includes('zoom=')")
+    layout = "document.querySelector('.plot')._fullLayout"
+    ranges = f"Object.fromEntries(['xaxis', 'yaxis'].map(name => [name, {layout}[name].range]))"
+    zoomed = shown.evaluate(ranges)
+    link = tab.open(page, tab.view()[1:]).evaluate(ranges)
+    assert all(link[name] == pytest.approx(zoomed[name], rel=1e-3) for name in zoomed), "a link shows what was seen"
     shown.get_by_label("Shown").select_option("stationarity")
     shown.wait_for_function("!location.hash.includes('point=')")
     assert not point.is_visible(), "the card goes when something else is shown"

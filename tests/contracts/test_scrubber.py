@@ -71,5 +71,16 @@ def test_each_iterate_is_shown_beside_the_reference_by_its_distance(tmp_path: Pa
         slider.press("Home")
         assert left.evaluate(COLOURED) > 0.1
         assert right.evaluate(COLOURED) == 0.0, "the reference has no distance from itself"
+        slider.press("ArrowRight")
+        left.press("ArrowRight")
+        tab.wait_for_function("/at=.*turn=/.test(location.hash)")
+        link, told_then = tab.evaluate("location.href"), told.inner_text()
+        seen = left.evaluate("canvas => canvas.toDataURL()")
+        tab.goto("about:blank")
+        tab.goto(link)
+        slider.wait_for()
+        tab.wait_for_function("document.documentElement.dataset.ready === location.hash")
+        assert told.inner_text() == told_then, "a link shows the iterate"
+        assert left.evaluate("canvas => canvas.toDataURL()") == seen, "turned as it was"
         tab.screenshot(path=tmp_path / "scrubber.png")
         assert not said

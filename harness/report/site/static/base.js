@@ -35,13 +35,30 @@ window.springbench = (() => {
     const words = new URLSearchParams(Object.entries(query).filter(([, value]) => value !== "" && value != null)).toString();
     return `#${view}${words ? `?${words}` : ""}`;
   }
-  // Change parameters of this view; kept: as a step of its own in the browser's history.
-  function change(changes, kept = false) {
+  // Change parameters of this view; step: as one of its own in the browser's history.
+  let kept = {}, soon;
+  function change(changes, step = false) {
     const { view, query } = where();
-    const next = address(view, { ...Object.fromEntries(query), ...changes });
+    const next = address(view, { ...Object.fromEntries(query), ...kept, ...changes });
+    kept = {};
     if (next === location.hash) return;
-    if (kept) location.hash = next;
+    if (step) location.hash = next;
     else location.replace(next);
+  }
+
+  // Parameters of what is shown already, such as how a mesh is turned: nothing is drawn anew, and browsers take few of
+  // these changes a second.
+  function keep(changes) {
+    const from = where().view;
+    Object.assign(kept, changes);
+    clearTimeout(soon);
+    soon = setTimeout(() => {
+      const { view, query } = where(), next = address(view, { ...Object.fromEntries(query), ...kept });
+      kept = {};
+      if (view !== from || next === location.hash) return;
+      history.replaceState(null, "", next);
+      if (document.documentElement.dataset.ready) document.documentElement.dataset.ready = next;
+    }, 200);
   }
 
   // An element: element("a.link", {href: "#"}, "words", child...); properties that begin with "on" are listeners.
@@ -97,5 +114,5 @@ window.springbench = (() => {
     return chosen ? chosen === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   };
 
-  return { give, script, data, where, address, change, element, put, tell, copy, save, isDark, views: {} };
+  return { give, script, data, where, address, change, keep, element, put, tell, copy, save, isDark, views: {} };
 })();

@@ -1,7 +1,7 @@
 // One way to draw lines and points, for all plots: by Plotly, with a legend, a remark and keys of our own.
 "use strict";
 springbench.chart = (() => {
-  const { element, script, number, colour, glyph } = springbench;
+  const { element, script, number, colour, glyph, keep, where } = springbench;
   const tip = element("div.tip", { hidden: true, role: "tooltip" });
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const at = (item, column, k) => (Array.isArray(item[column]) ? item[column][k] : item[column]);
@@ -56,8 +56,18 @@ springbench.chart = (() => {
     }];
   }
 
-  // Draw the items of a chart, by the columns x and y, a panel for each of `item.panel`.
-  async function draw(plot, chart, items, x, y, { hidden = new Set(), onPoint = () => {}, small = false } = {}) {
+  // What of the axes is shown, as a parameter of the URL: "x:0,2;y:-3,1"; nothing where all of it is.
+  const zoomed = layout => Object.keys(layout).filter(key => /^[xy]axis\d*$/.test(key) && layout[key].autorange === false && layout[key].range)
+    .map(key => `${key.replace("axis", "")}:${layout[key].range.map(v => Number(Number(v).toPrecision(5))).join(",")}`).join(";");
+  function zoom(layout, asked) {
+    for (const part of (asked || "").split(";")) {
+      const [, axis, low, high] = /^([xy]\d*):([-\d.e+]+),([-\d.e+]+)$/.exec(part) || [], of = axis && layout[axis.replace(/^[xy]/, "$&axis")];
+      if (of) Object.assign(of, { range: [Number(low), Number(high)], autorange: false });
+    }
+  }
+
+  // Draw the items of a chart, by the columns x and y, a panel for each of `item.panel`; zoomKey: of the URL.
+  async function draw(plot, chart, items, x, y, { hidden = new Set(), onPoint = () => {}, small = false, zoomKey = "zoom" } = {}) {
     await script("site/plotly.js");
     const panels = [...new Set(items.map(item => item.panel ?? ""))], narrow = plot.clientWidth < 640 && panels.length > 1;
     plot.style.height = narrow ? `${330 * panels.length}px` : "";
@@ -91,10 +101,13 @@ springbench.chart = (() => {
         if (item.status && item.status !== "ok") traces.push(...failed(item, x, y, tail, colour(chart.marks[item.label].color)));
       }
     });
+    zoom(layout, where().query.get(zoomKey));
     await Plotly.react(plot, traces, layout, { displayModeBar: false, responsive: true, showTips: false });
     plot.removeAllListeners("plotly_hover");
     plot.removeAllListeners("plotly_unhover");
     plot.removeAllListeners("plotly_click");
+    plot.removeAllListeners("plotly_relayout");
+    plot.on("plotly_relayout", () => keep({ [zoomKey]: zoomed(plot.layout) }));
     plot.on("plotly_hover", ({ points: [p], event }) => {
       if (!p.data.meta) return;
       const box = plot.getBoundingClientRect();
@@ -106,7 +119,8 @@ springbench.chart = (() => {
     keys(plot, chart, onPoint);
   }
 
-  // Left and right go along a line, up and down to the next line, Enter opens the point, Home shows all again.
+  // Left and right go along a line, up and down to the next line, Enter opens the point, plus and minus zoom, Home shows
+  // all again.
   function keys(plot, chart, onPoint) {
     let line = -1, k = 0;
     plot.onkeydown = event => {
@@ -114,6 +128,10 @@ springbench.chart = (() => {
       const step = { ArrowRight: [0, 1], ArrowLeft: [0, -1], ArrowDown: [1, 0], ArrowUp: [-1, 0] }[event.key];
       if (event.key === "Enter" && line >= 0) onPoint(lines[line][0].meta.item, k);
       else if (event.key === "Home") Plotly.relayout(plot, Object.fromEntries(Object.keys(plot.layout).filter(key => /^[xy]axis/.test(key)).map(key => [`${key}.autorange`, plot.layout[key].autorange === "reversed" ? "reversed" : true])));
+      else if (event.key === "+" || event.key === "-") Plotly.relayout(plot, Object.fromEntries(Object.keys(plot.layout).filter(key => /^[xy]axis/.test(key)).map(key => {
+        const [a, b] = plot._fullLayout[key].range, middle = (a + b) / 2, by = event.key === "+" ? 0.35 : 0.7;
+        return [`${key}.range`, [middle - by * (b - a), middle + by * (b - a)]];
+      })));
       else if (step && lines.length) {
         line = line < 0 ? 0 : (line + step[0] + lines.length) % lines.length;
         const [one, curve] = lines[line];

@@ -56,7 +56,7 @@
       const plot = element("div.plot.small", { tabIndex: 0, role: "group", "aria-label": `Plot: ${words} by frame. Arrow keys go through its points.` });
       box.append(plot);
       const chart = { marks, hover: [["frame", "frame"], [column, words]] };
-      drawings.push(() => springbench.chart.draw(plot, chart, items, { column: "frame", title: "frame", axis: {} }, { column, title: words, axis: how }, { small: true }));
+      drawings.push(() => springbench.chart.draw(plot, chart, items, { column: "frame", title: "frame", axis: {} }, { column, title: words, axis: how }, { small: true, zoomKey: `zoom-${column}` }));
     }
     for (const draw of drawings) await draw();  // all of them have their places now
   }

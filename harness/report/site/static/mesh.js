@@ -1,7 +1,7 @@
 // Meshes on a canvas, turned by dragging or by arrow keys, coloured by a number at each vertex; and solves, iterate by iterate.
 "use strict";
 Object.assign(springbench, (() => {
-  const { element, put, data, number } = springbench;
+  const { element, put, data, number, keep, where } = springbench;
   // From near to far: a scale that is read in grey as well (viridis).
   const RAMP = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
   const ramp = t => {
@@ -18,7 +18,9 @@ Object.assign(springbench, (() => {
     const low = [1e30, 1e30, 1e30], high = [-1e30, -1e30, -1e30];
     for (let i = 0; i < points.length; i++) { low[i % 3] = Math.min(low[i % 3], points[i]); high[i % 3] = Math.max(high[i % 3], points[i]); }
     const middle = low.map((v, c) => (v + high[c]) / 2), size = low.map((v, c) => high[c] - v), radius = Math.hypot(...size) / 2 || 1;
-    return { middle, radius, turn: size[1] <= size[0] ? -0.45 : 0.9, tilt: 0.35, seen: new Set() };
+    const turned = (where().query.get("turn") || "").split(",").map(Number), asked = turned.length === 2 && turned.every(Number.isFinite);
+    const [turn, tilt] = asked ? turned : [size[1] <= size[0] ? -0.45 : 0.9, 0.35];
+    return { middle, radius, turn, tilt, seen: new Set() };
   }
 
   function mesh(view, { springs, triangles }, label) {
@@ -68,7 +70,7 @@ Object.assign(springbench, (() => {
         ink.stroke();
       }
     }
-    const turn = (across, up) => { view.turn += across; view.tilt = Math.max(-1.5, Math.min(1.5, view.tilt + up)); for (const one of view.seen) one(); };
+    const turn = (across, up) => { view.turn += across; view.tilt = Math.max(-1.5, Math.min(1.5, view.tilt + up)); for (const one of view.seen) one(); keep({ turn: `${view.turn.toFixed(2)},${view.tilt.toFixed(2)}` }); };
     view.seen.add(paint);
     canvas.onpointerdown = event => { from = [event.clientX, event.clientY]; canvas.setPointerCapture(event.pointerId); };
     canvas.onpointermove = event => {
@@ -132,8 +134,8 @@ Object.assign(springbench, (() => {
       words.textContent = `${item.label}, iteration ${found.iterations[j]}: the vertex furthest away is ${number(most)} m from the reference.`;
       slider.setAttribute("aria-valuetext", `iteration ${found.iterations[j]}`);
     };
-    slider.oninput = show;
-    const wanted = at ?? found.iterations.at(-1);
+    slider.oninput = () => { show(); keep({ at: found.iterations[Number(slider.value)] }); };
+    const wanted = where().query.has("at") ? Number(where().query.get("at")) : at ?? found.iterations.at(-1);
     slider.value = found.iterations.reduce((b, v, j) => (Math.abs(v - wanted) < Math.abs(found.iterations[b] - wanted) ? j : b), 0);
     box.append(words, slider, element("div.scrub", {}, element("figure", {}, left.canvas, element("figcaption", {}, `the iterate of ${item.label}, by its distance from the reference`), scaleBox(`${number(found.nearest)} m`, `${number(found.farthest)} m`)),
       element("figure", {}, right.canvas, element("figcaption", {}, `the reference: the last iterate of ${found.reference.of}, ${number(found.reference.distance)} m from the certified minimum`))));

@@ -50,12 +50,12 @@
     let last = "", current = null, pointed = "";
 
     const pick = (words, key, names, value, named = name => name) => element("label.field", {}, element("span", {}, words),
-      element("select", { "aria-label": words, onchange: event => change({ [key]: event.target.value, point: "" }) }, ...names.map(name => element("option", { value: name, selected: name === value }, named(name)))));
+      element("select", { "aria-label": words, onchange: event => change({ [key]: event.target.value, point: "", at: "", turn: "", zoom: "" }) }, ...names.map(name => element("option", { value: name, selected: name === value }, named(name)))));
 
     async function update(next) {
       const sweep = sweeps.find(one => one.slug === next.get("sweep")) || sweeps[0], plots = plotsOf(sweep);
       const plot = plots.find(one => one.id === next.get("plot")) || plots.find(one => one.id === "convergence") || plots[0];
-      const drawn = [...next].filter(([key]) => key !== "point").join("&") + sweep.slug + plot.id;
+      const drawn = [...next].filter(([key]) => !["point", "at", "turn"].includes(key)).join("&") + sweep.slug + plot.id;
       const anew = last.split("\n")[1] !== `${sweep.slug}/${plot.id}`;
       if (drawn !== last.split("\n")[0]) {
         last = `${drawn}\n${sweep.slug}/${plot.id}`;
@@ -76,7 +76,7 @@
           await drawChart(sweep, plot, chart, next, anew);
         }
       }
-      await showPoint(sweep, next.get("point") || "");
+      await showPoint(sweep, next.get("point") || "", `${next.get("at")} ${next.get("turn")}`);
     }
 
     async function drawChart(sweep, plot, chart, next, anew) {
@@ -89,7 +89,7 @@
       const items = chart.items.filter(item => chart.filters.every(key => chosen[key] === "all" || item[key] === chosen[key]));
       const hidden = new Set((next.get("off") || "").split("~").filter(Boolean)), labels = [...new Set(items.map(item => item.label))];
       const words = { problem: "Step", scene: "Scene", gap: "To a gap of", curve: "Of the paper", gate: "Gate" };
-      const plotBox = anew || !current ? element("div.plot", { tabIndex: 0, role: "group", "aria-label": `Plot: ${chart.title}. Arrow keys go through its points, Enter opens one.` }) : current.plotBox;
+      const plotBox = anew || !current ? element("div.plot", { tabIndex: 0, role: "group", "aria-label": `Plot: ${chart.title}. Arrow keys go through its points, Enter opens one, plus and minus zoom, Home shows all.` }) : current.plotBox;
       const names = element("ul.legend", { "aria-label": "Solvers" }, ...springbench.chart.legend(labels, chart, items, hidden, off => change({ off: [...off].join("~") })));
       choice.replaceChildren(...chart.filters.filter(key => distinct(key).length > 1).map(key => pick(words[key] || key, key, distinct(key), chosen[key])),
         ...(chart.y.length > 1 ? [pick("Shown", "y", chart.y.map(a => a.column), y.column, name => one(chart.y, name).title)] : []),
@@ -100,22 +100,24 @@
       if (plotBox !== current?.plotBox) body.replaceChildren(element("div.frame", {}, plotBox, names));
       else body.querySelector(".legend").replaceWith(names);
       const redraw = () => springbench.chart.draw(plotBox, chart, items, x, y, {
-        hidden, onPoint: (item, k) => change({ point: `${chart.items.indexOf(item)}.${k}` }, true),
+        hidden, onPoint: (item, k) => change({ point: `${chart.items.indexOf(item)}.${k}`, at: "", turn: "" }, true),
       });
       current = { plotBox, chart, redraw };
       await redraw();
     }
 
-    async function showPoint(sweep, asked) {
-      if (asked === pointed) return;
-      pointed = asked;
+    async function showPoint(sweep, asked, how) {
+      if (`${asked} ${how}` === pointed) return;
+      const another = asked !== pointed.split(" ")[0];
+      pointed = `${asked} ${how}`;
       point.replaceChildren();
       const [number, k] = asked.split(".").map(Number), item = asked && current?.chart.items[number];
       point.hidden = !item;
       if (!item) return;
-      const close = () => { change({ point: "" }); current.plotBox.focus(); };
+      const close = () => { change({ point: "", at: "", turn: "" }); current.plotBox.focus(); };
       if (item.runs) await springbench.detail(point, item.runs[k], { close });
       else await springbench.solve(point, sweep, current.chart, item, k, close);
+      if (!another) return;
       point.scrollIntoView({ block: "nearest" });
       point.focus({ preventScroll: true });
     }
