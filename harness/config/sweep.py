@@ -37,8 +37,8 @@ class Kept(Model):
 
     convergence_frames: tuple[Annotated[int, Field(ge=1)], ...] | None = None
     """Frames whose convergence is measured; null is the first, the middle and the last."""
-    strain_range: float = Field(default=0.1, gt=0, le=10)
-    """Strain at the ends of the colour scale (0.1 is 10 %), the same for the whole sweep."""
+    strain_range: float | None = Field(default=None, gt=0, le=10)
+    """Strain at the ends of a recording's colour scale (0.1 is 10 %); null takes it from where the run ends."""
     record: bool = True
     """Whether a Rerun recording is written for each run."""
     pictures: bool = True

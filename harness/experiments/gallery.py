@@ -33,7 +33,7 @@ def gallery(
 def _strains(tiles: list[Any]) -> list[str]:
     """What colours mean, where they mean the same in all tiles."""
     ranges = {tile.replay.strain_range for tile in tiles}
-    return [f"strain: blue −{100 * ranges.pop():g} %, orange as much stretched"] if len(ranges) == 1 else []
+    return [f"strain: blue −{100 * ranges.pop():g} % or more, orange as much stretched"] if len(ranges) == 1 else []
 
 
 def _tile(path: Path) -> Any:
@@ -44,6 +44,7 @@ def _tile(path: Path) -> Any:
     from harness.config.load import load_any
     from harness.record.base import Replay
     from harness.record.obstacles import declared, listed
+    from harness.record.shading import STRAIN_RANGE
     from harness.report.contact_sheet import Tile
     from harness.scenes.bind import build
     from harness.simulation.measure import Settings, steps
@@ -69,7 +70,7 @@ def _tile(path: Path) -> Any:
         springs=scene.springs.edges,
         rest_lengths=scene.springs.rest_length,
         pinned=scene.system.pins.vertices,
-        strain_range=run.strain_range,
+        strain_range=run.strain_range or STRAIN_RANGE,
         scalars={},
         properties={
             **declared(listed(run.scene.effects)),

@@ -30,6 +30,7 @@ from harness.experiments.provenance import asked, common, tolerance
 from harness.record.base import Frame, RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
+from harness.record.shading import strain_range
 from harness.record.verify import require_last
 from harness.reference.grade import Graded
 from harness.reference.judge import Judge, reference
@@ -41,7 +42,7 @@ from harness.simulation.measure import Measured, Settings, digest, measure
 from harness.simulation.observe import observe, require_numbers
 from harness.simulation.step import prepare
 from solvers import sources
-from solvers.problem import Solver
+from solvers.problem import Positions, Solver
 from solvers.registry import SOLVERS, load, minimises
 
 
@@ -122,7 +123,9 @@ def _to_error(run: RunSpec, error: float, files: Files, tick: Tick, positions: P
             save_positions(positions, seen[1:])
         if run.record:
             chosen = {name: told[0][name] for name in ("status", "integrator", "estimated")}
-            recorder = _recorder(run, files, found.scene, chosen | {"milliseconds_per_step": 1e3 * found.median})
+            recorder = _recorder(
+                run, files, found.scene, chosen | {"milliseconds_per_step": 1e3 * found.median}, seen[-1]
+            )
             try:
                 for k, p in enumerate(seen):
                     recorder.frame(Frame(k, found.scene.time(k), p, {}, float("nan"), 0))
@@ -161,7 +164,7 @@ def _second_pass(
         if run.record:
             seconds = [t.seconds for t in measured.timings if t.phase == "step"]
             facts = {"status": "ok", "milliseconds_per_step": 1e3 * float(np.median(seconds))}
-            recorder = _recorder(run, files, scene, facts)
+            recorder = _recorder(run, files, scene, facts, measured.final)
             cleanup.callback(recorder.abandon)
         graded = Graded(measured.prepared, _solver(run), {1, (run.frames + 1) // 2, run.frames})
         found = observe(
@@ -236,8 +239,8 @@ def _reference(motion: _Motion) -> NDArray[np.float64] | None:
         return None
 
 
-def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]) -> RerunRecorder:
-    """facts: how the run ended, among the recording's properties."""
+def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any], *ends: Positions) -> RerunRecorder:
+    """facts: how the run ended, among the recording's properties; ends: positions by which its colours are scaled."""
     files.recording.parent.mkdir(parents=True, exist_ok=True)
     here = machine.describe()
     properties = {
@@ -266,7 +269,7 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
             rest_lengths=scene.springs.rest_length,
             pinned=scene.system.pins.vertices,
             time_step=run.scene.time_step,
-            strain_range=run.strain_range,
+            strain_range=run.strain_range or strain_range(ends, scene.springs.edges, scene.springs.rest_length),
             properties=properties,
             obstacles=listed(run.scene.effects),
         ),

@@ -18,7 +18,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from harness.record.shading import LEVELS, palette
+from harness.record.shading import LEVELS, palette, percent
 
 _DIRECTION = np.array([0.62, 0.38, 0.78]) / np.linalg.norm([0.62, 0.38, 0.78])
 """From where the camera looks: a little from above and from the side, y is up."""
@@ -33,6 +33,9 @@ _BELOW = 0.72
 """b: the rest of the lower half is the scale's."""
 _SCALE_AT, _SCALE_HEIGHT, _SCALE_WIDTH = -0.84, 0.035, 0.62
 """The scale's upper edge, its height, and half its width, in half views."""
+
+_WORD = 0.085
+"""How far above its place the viewer is given a word that is to stand there."""
 
 _MARGIN = 1.04
 _SHARES = np.linspace(0.2, 1.0, 5)
@@ -92,8 +95,12 @@ class Extent:
         eye, target = ((x, y, z) @ _AXES for z in (distance, middle))
         return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=eye, look_target=target, eye_up=(0, 1, 0))
 
-    def scale(self, strain_range: float) -> tuple[rr.Mesh3D, rr.Points3D]:
-        """The strip of colours in the room below, facing the camera, and its numbers."""
+    def scale(self, strain_range: float, ends: tuple[float, float] = (0.0, 0.0)) -> tuple[rr.Mesh3D, rr.Points3D]:
+        """The strip of colours in the room below, facing the camera, and its numbers.
+
+        ends: the smallest and the largest strain of a spring; where the strip does not reach one it ends in a tip, with
+        that figure.
+        """
         x, y, distance = self._camera()
         near = self._ends[-2]
         half = _HALF_VIEW * (distance - near)
@@ -104,14 +111,25 @@ class Extent:
         edges = np.array([[at, height, near] for at in across for height in (low, top)]) @ _AXES
         first = 2 * np.arange(LEVELS - 1)[:, None, None]
         faces = (first + np.array([[0, 2, 1], [1, 2, 3]])).reshape(-1, 3)
-        strip = rr.Mesh3D(
-            vertex_positions=edges, triangle_indices=faces, vertex_colors=np.repeat(palette()[:-1], 2, axis=0)
-        )
-        marks = np.array([[at, low, near] for at in across[:: (LEVELS - 1) // 4]]) @ _AXES
-        words = [f"{100 * strain_range * share:+g} %" for share in (-1, -0.5, 0, 0.5, 1)]
+        colours = np.repeat(palette()[:-1], 2, axis=0)
+        words = [percent(strain_range * share) for share in (-1, -0.5, 0, 0.5, 1)]
         words[2] = "strain 0"
+        marks = [[at, low, near] for at in across[:: (LEVELS - 1) // 4]]
+        for k, way, end in ((0, -1, ends[0]), (len(across) - 1, 1, ends[1])):
+            if way * end > strain_range:
+                tip = [across[k] + way * 2 * (top - low), (low + top) / 2, near]
+                edges = np.vstack([edges, tip @ _AXES])
+                faces = np.vstack([faces, [2 * k, 2 * k + 1, len(edges) - 1]])
+                colours = np.vstack([colours, colours[2 * k]])
+                marks.append([tip[0], top + _WORD * half, near])
+                words.append(f"to {percent(end, 2)}")
+        strip = rr.Mesh3D(vertex_positions=edges, triangle_indices=faces, vertex_colors=colours)
         return strip, rr.Points3D(
-            marks, labels=words, show_labels=True, radii=rr.Radius.ui_points(1), colors=(255, 255, 255)
+            np.array(marks) @ _AXES,
+            labels=words,
+            show_labels=True,
+            radii=rr.Radius.ui_points([1.0] * 5 + [0.1] * (len(words) - 5)),
+            colors=(255, 255, 255),
         )
 
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -34,3 +35,9 @@ def column(batch: pa.RecordBatch, name: str) -> Any:
 def scalar(batch: pa.RecordBatch, name: str, row: int) -> Any:
     """One row of a column."""
     return column(batch, name)[row]
+
+
+def replaced(batch: pa.RecordBatch, name: str, rows: Sequence[NDArray[Any]]) -> pa.RecordBatch:
+    """The batch with other numbers in a component, row by row."""
+    at = batch.schema.get_field_index(name)
+    return batch.set_column(at, batch.schema.field(at), pa.array(rows, batch.schema.field(at).type))

@@ -1,24 +1,29 @@
 """Recordings of one scene and size side by side in one file: a view for each solver, one plot for each quantity.
 
-The chunks of each recording are copied as they are, under the name of its solver.
+The chunks of each recording are copied as they are, under the name of its solver; where the scales of strain differ,
+all are coloured by the longest.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
+from rerun.chunk import Chunk
 
 from harness.record import cells, curves
 from harness.record.blueprint import panels, plot, scene_view
 from harness.record.camera import Extent
 from harness.record.partial import PartialFile
 from harness.record.reader import Source, looked_at, network, open_recording, positions, properties, triangles
+from harness.record.shading import colours, strains, widest
 
 _QUANTITIES = {
     "/residual/log10": "log10 residual [J^(1/2)]",
@@ -28,11 +33,20 @@ _QUANTITIES = {
     "/iterations": "Iterations of a step",
 }
 _SHOWN = 3
-"""How many of them are seen at once; the others share tabs with the convergence and the runs."""
+"""How many of them are seen at once; the others are behind a tab."""
+
+
+_STRAINED = ("/scene/mesh", "/scene/springs")
+_PAINTED = (
+    ("Mesh3D:vertex_positions", "Mesh3D:vertex_colors"),
+    ("Points3D:positions", "Points3D:colors"),
+    ("LineStrips3D:strips", "LineStrips3D:colors"),
+)
+"""Components that tell where something is, and the colours of its strain."""
 
 
 class Look(NamedTuple):
-    """How a run's lines are drawn: a colour such as `#0072b2`."""
+    """How a run's lines are drawn: a colour such as `#0072b2`, which is lighter here where it is dark."""
 
     color: str
 
@@ -45,7 +59,13 @@ def side_by_side(out: Path, recordings: Mapping[str, Path], title: str, looks: M
     file = PartialFile(out, f"springbench side by side {title}", title, title)
     try:
         aspect = 1.0 if len(recordings) < 3 else 0.75
-        runs = [_copy(file, path, name, k, looks[name], aspect) for k, (name, path) in enumerate(recordings.items())]
+        with ExitStack() as opened:
+            sources = {name: opened.enter_context(open_recording(path)) for name, path in recordings.items()}
+            longest = max(float(network(source)["strain_range"][0]) for source in sources.values())
+            runs = [
+                _copy(file, _Run(name, k, source, aspect, longest), source, looks[name])
+                for k, (name, source) in enumerate(sources.items())
+            ]
         for frame in sorted(set[int]().union(*(run.curves for run in runs))):
             drawn = {run.name: run.curves[frame] for run in runs if frame in run.curves}
             colours = curves.colours(_colour(looks[name]) for name in drawn)
@@ -60,11 +80,15 @@ def side_by_side(out: Path, recordings: Mapping[str, Path], title: str, looks: M
 class _Run:
     """One recording: where it went and what its views need to know."""
 
-    def __init__(self, name: str, k: int, source: Source, aspect: float) -> None:
+    def __init__(self, name: str, k: int, source: Source, aspect: float, strain_range: float) -> None:
         fixed = network(source)
+        self.strain_range, self._anew = strain_range, float(fixed["strain_range"][0]) != strain_range
+        self._springs = fixed["springs"].reshape(-1, 2).astype(np.int64)
+        self._rest_lengths = fixed["rest_lengths"].astype(float)
+        self.ends = (0.0, 0.0)  # the smallest and the largest strain of a spring
         # Entities take few characters unescaped; the number keeps names apart that differ in others.
         self.name, self.root = name, f"/{k + 1}-{re.sub(r'[^A-Za-z0-9_.]+', '-', name)}"
-        self.strain_range, self.time_step = float(fixed["strain_range"][0]), float(fixed["time_step"][0])
+        self.time_step = float(fixed["time_step"][0])
         self.properties: dict[str, Any] = properties(source)[1]
         self.triangles = len(triangles(source))
         self.entities: set[str] = set()
@@ -75,19 +99,42 @@ class _Run:
             self.box = self.box or Extent(p, aspect)
             self.box.add(p)
             self.last = max(self.last, frame)
+            self._vertices = len(p)
+            self.ends = widest(self.ends, self._strains(p)[0])
+
+    def _strains(self, p: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Of the springs and of the vertices."""
+        return strains(p.astype(float), self._springs, self._rest_lengths)
+
+    def coloured(self, chunk: Chunk) -> Chunk:
+        """A piece of a recording; what shows strain by the scale of all."""
+        batch = chunk.to_record_batch() if self._anew and chunk.entity_path in _STRAINED else None
+        for places, painted in _PAINTED if batch else ():
+            if batch and {places, painted} <= set(batch.schema.names):
+                rows = [self._painted(cells.cell(batch, places, k)) for k in range(batch.num_rows)]
+                (chunk,) = Chunk.from_record_batch(cells.replaced(batch, painted, rows))
+        return chunk
+
+    def _painted(self, places: NDArray[np.float32]) -> NDArray[np.uint32]:
+        """The colours of vertices, or of springs, whose two ends each were recorded."""
+        p = places.reshape(-1, 3).astype(float)
+        if len(p) == self._vertices:
+            return colours(self._strains(p)[1], self.strain_range)
+        length = np.linalg.norm(p[1::2] - p[::2], axis=1)
+        with np.errstate(all="ignore"):
+            strain = np.where(self._rest_lengths > 0.0, length / self._rest_lengths - 1.0, 0.0)
+        return colours(strain, self.strain_range)
 
 
-def _copy(file: PartialFile, path: Path, name: str, k: int, look: Look, aspect: float) -> _Run:
-    with open_recording(path) as source:
-        run = _Run(name, k, source, aspect)
-        for chunk in source.chunks(content="/**"):
-            run.entities.add(chunk.entity_path)
-            file.stream.send_chunks(chunk.with_entity_path(run.root + chunk.entity_path))
+def _copy(file: PartialFile, run: _Run, source: Source, look: Look) -> _Run:
+    for chunk in source.chunks(content="/**"):
+        run.entities.add(chunk.entity_path)
+        file.stream.send_chunks(run.coloured(chunk).with_entity_path(run.root + chunk.entity_path))
     for entity in run.entities & set(_QUANTITIES):
-        lines = rr.SeriesLines(names=name, colors=_colour(look), widths=1.5)
+        lines = rr.SeriesLines(names=run.name, colors=_colour(look), widths=1.5)
         file.stream.log(run.root + entity, lines, static=True)
     if run.box:
-        strip, numbers = run.box.scale(run.strain_range)
+        strip, numbers = run.box.scale(run.strain_range, run.ends)
         file.stream.log(f"{run.root}/scene/scale", strip, static=True)
         file.stream.log(f"{run.root}/scene/scale/numbers", numbers, static=True)
     file.flush()
@@ -105,8 +152,15 @@ def residuals(source: Source) -> dict[int, list[float]]:
     return found
 
 
+def on_dark(color: str) -> str:
+    """A colour such as `#0072b2`, mixed with white where it is dark, as on the page of results when that is dark."""
+    parts = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
+    by = max(0.0, 0.5 - float(np.dot((0.2126, 0.7152, 0.0722), parts)) / 255)
+    return "#" + "".join(f"{round(part + (255 - part) * by):02x}" for part in parts)
+
+
 def _colour(look: Look) -> int:
-    return int(look.color[1:] + "ff", 16)
+    return int(on_dark(look.color)[1:] + "ff", 16)
 
 
 def _layout(runs: list[_Run]) -> rrb.Blueprint:
@@ -116,18 +170,23 @@ def _layout(runs: list[_Run]) -> rrb.Blueprint:
     known, last = [entity for entity in _QUANTITIES if entity in entities], max(run.last for run in runs)
     plots = [_plot(runs, entity, _QUANTITIES[entity], last, legend=entity == known[0]) for entity in known]
     frames = sorted(set[int]().union(*(run.curves for run in runs)))
-    drawn = [curves.view(f"/curves/frame_{frame}", f"Residual in frame {frame}") for frame in frames]
+    drawn = [curves.view(f"/curves/frame_{frame}", f"Residual in frame {frame}, by iteration") for frame in frames]
     table = rrb.TextDocumentView(origin="/runs", name="Runs")
     first = runs[0]
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Grid(*scenes, grid_columns=columns),
-            rrb.Horizontal(*plots[:_SHOWN], rrb.Tabs(*drawn, *plots[_SHOWN:], table, active_tab=0)),
+            # Each behind a tab of its own over the whole width, so that no title is cut.
+            rrb.Tabs(*_named({"By frame": plots[:_SHOWN], "Convergence": drawn, "More": plots[_SHOWN:]}), table),
             row_shares=[2, 1],
         ),
         *panels(first.time_step),
         auto_views=False,
     )
+
+
+def _named(rows: Mapping[str, Sequence[Any]]) -> Iterator[rrb.Horizontal]:
+    return (rrb.Horizontal(*views, name=name) for name, views in rows.items() if views)
 
 
 def _plot(runs: list[_Run], entity: str, name: str, last: int, *, legend: bool) -> rrb.TimeSeriesView:

@@ -33,7 +33,7 @@ from harness.record.base import LAYOUT, Frame, RecordingInfo
 from harness.record.camera import Extent
 from harness.record.obstacles import Obstacles, declared
 from harness.record.partial import PartialFile
-from harness.record.shading import PIN_COLOUR, Shading
+from harness.record.shading import PIN_COLOUR, Shading, widest
 
 FLUSH = 20
 """Frames between flushes at most: what a kill may cost. A piece of an entity costs some 1.5 kB, and .5 kB of index."""
@@ -65,6 +65,7 @@ class RerunRecorder:
         self._pins: NDArray[np.float32] | None = None
         self._unseen = 1e-6 * info.mesh.size
         self._springs_shown = False
+        self._ends = (0.0, 0.0)  # the smallest and the largest strain of a spring
         self._curves: dict[int, tuple[Sequence[float], Sequence[float]]] = {}  # residual and objective, by frame
         self._energies: dict[str, dict[int, float]] = {}
         self._file = PartialFile(path, blueprint.application(info), info.run_id, info.title)
@@ -97,6 +98,7 @@ class RerunRecorder:
         for name, value in frame.energies.items():
             self._energies.setdefault(name, {})[frame.index] = value
         largest = float(np.abs(strain).max(initial=0.0))
+        self._ends = widest(self._ends, strain)
         self._add(frame.index, {"/strain/largest": largest, "/iterations": frame.iterations})
         crossed = {} if frame.intersections is None else {"/intersections": frame.intersections}
         self._add(frame.index, crossed | {"/residual": frame.residual, "/residual/log10": _log10(frame.residual)})
@@ -200,7 +202,7 @@ class RerunRecorder:
         self._springs_shown = due
 
     def _log_scale(self) -> None:
-        strip, numbers = self._box.scale(self._info.strain_range)
+        strip, numbers = self._box.scale(self._info.strain_range, self._ends)
         self._stream.log("/scene/scale", strip, static=True)
         self._stream.log("/scene/scale/numbers", numbers, static=True)
 

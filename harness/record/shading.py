@@ -8,6 +8,8 @@ recording's compression then finds equal neighbours, and the rounding is too fin
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,10 @@ colour-blind, and grey enough in the middle that light and shadow still show."""
 PIN_COLOUR = "#c5299b"
 """Of what is pinned, here and in pictures: on no scale of strain, clear on light and on dark."""
 
+STRAIN_RANGE = 0.1
+"""The end of the scale where a run says nothing of its strains."""
+LEAST_RANGE = 1e-3
+
 LEVELS = 65
 NORMAL_STEPS = 32
 NEUTRAL = (128, 128, 128, 255)
@@ -40,13 +46,54 @@ def palette() -> NDArray[np.uint8]:
     return np.vstack([np.rint(colours), NEUTRAL]).astype(np.uint8)
 
 
+def strain_range(
+    positions: Iterable[Positions], springs: NDArray[np.int64], rest_lengths: NDArray[np.float64]
+) -> float:
+    """The end of a scale that shows the strains at these positions, each (n, 3) [m]: see `scale_end`."""
+    found = [strains(p, springs, rest_lengths)[1] for p in positions if len(rest_lengths)]
+    return scale_end(np.concatenate(found)) if found else STRAIN_RANGE
+
+
+def scale_end(strain: NDArray[np.float64]) -> float:
+    """The end of a scale that shows these strains of vertices: the round number above what 99 % of them have, so that
+    a few at a pin do not leave all others grey; STRAIN_RANGE where none is finite."""
+    known = np.abs(strain[np.isfinite(strain)])
+    if not len(known):
+        return STRAIN_RANGE
+    wanted = max(float(np.quantile(known, 0.99)), LEAST_RANGE)
+    decade = 10.0 ** np.floor(np.log10(wanted) + 1e-9)
+    return float(next(step * decade for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * decade >= 0.999 * wanted))
+
+
+def percent(strain: float, digits: int = 3) -> str:
+    """A strain with its sign."""
+    return f"{100 * strain:+.{digits}g} %".replace("-", "−")
+
+
+def colours(strain: NDArray[np.float64], end: float) -> NDArray[np.uint32]:
+    """The colour of each strain as 0xRRGGBBAA, shape (len(strain),), on the scale from -end to end."""
+    with np.errstate(invalid="ignore"):
+        level = np.rint((np.clip(strain / end, -1, 1) + 1) * (LEVELS - 1) / 2)
+    return _packed()[np.where(np.isnan(level), LEVELS, level).astype(np.intp)]
+
+
+@cache
+def _packed() -> NDArray[np.uint32]:
+    return palette().view(">u4").astype(np.uint32).ravel()
+
+
+def widest(ends: tuple[float, float], strain: NDArray[np.float64]) -> tuple[float, float]:
+    """The smallest and the largest of these strains and of `ends`; what is not finite counts for nothing."""
+    known = strain[np.isfinite(strain)]
+    return float(known.min(initial=ends[0])), float(known.max(initial=ends[1]))
+
+
 class Shading:
     """Strains, colours and normals of one run's mesh."""
 
     def __init__(self, info: RecordingInfo) -> None:
         self._range, self._triangles = info.strain_range, info.mesh.triangles
         self._springs, self._rest_lengths = info.springs, info.rest_lengths
-        self._packed = palette().view(">u4").astype(np.uint32).ravel()
 
     def strains(self, p: Positions) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The strain of each spring (m,), and of each vertex (n,) the one of largest magnitude among its springs.
@@ -57,9 +104,7 @@ class Shading:
 
     def colours(self, strain: NDArray[np.float64]) -> NDArray[np.uint32]:
         """The colour of each strain as 0xRRGGBBAA, shape (len(strain),)."""
-        with np.errstate(invalid="ignore"):
-            level = np.rint((np.clip(strain / self._range, -1, 1) + 1) * (LEVELS - 1) / 2)
-        return self._packed[np.where(np.isnan(level), LEVELS, level).astype(np.intp)]
+        return colours(strain, self._range)
 
     def normals(self, p: NDArray[np.float32]) -> NDArray[np.float32]:
         """The unit normal of each vertex, rounded to 1/32, shape (n, 3); zero where there is none."""

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from harness.record.base import Replay
-from harness.report.frames import drawable_frames, shown_limit
+from harness.report.frames import drawable_frames, shown_ends, shown_limit
 from harness.report.origin import made_by
 from harness.report.page import (
     count,
@@ -71,7 +71,12 @@ def draw_comparison(replays: Mapping[str, Replay], path: Path) -> None:
     with matplotlib.rc_context(RC), Studio(grid.width, grid.height) as studio:
         page = new_page()
         _title(page, panels)
-        strain_scale(page, limit, pins=any(len(replay.pinned) for replay in replays.values()))
+        strain_scale(
+            page,
+            limit,
+            shown_ends(finite, [-1] * len(finite)),
+            pins=any(len(replay.pinned) for replay in replays.values()),
+        )
         for k, (heading, panel) in enumerate(panels.items()):
             row, column = divmod(k, grid.panel_columns)
             left, top = round(_LEFT + column * across), round(_TOP + row * down)

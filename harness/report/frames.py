@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.record.base import Replay
-from harness.report.render import vertex_strain
+from harness.record.shading import scale_end
+from harness.report.render import spring_strain, vertex_strain
 
 _BLOWN_UP = 1e4  # coordinates this many times larger than the start's are drawn as if not finite
 
@@ -23,10 +24,12 @@ def drawable_frames(replay: Replay) -> NDArray[np.int64]:
 
 
 def shown_limit(replays: Sequence[Replay], frames: Sequence[int]) -> float:
-    """The end of a scale that shows the strains of these frames, one of each recording: the round number above what
-    99 % of the vertices have, so that a few at a pin do not leave all others grey."""
-    strains = np.concatenate([np.abs(vertex_strain(r, k)) for r, k in zip(replays, frames, strict=True)])
-    strains = strains[np.isfinite(strains)]
-    wanted = max(float(np.quantile(strains, 0.99)) if len(strains) else 0.0, 1e-3)
-    decade = 10.0 ** np.floor(np.log10(wanted) + 1e-9)
-    return float(next(step * decade for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * decade >= 0.999 * wanted))
+    """The end of a scale that shows the strains of these frames, one of each recording (`scale_end`)."""
+    return scale_end(np.concatenate([vertex_strain(r, k) for r, k in zip(replays, frames, strict=True)]))
+
+
+def shown_ends(replays: Sequence[Replay], frames: Sequence[int]) -> tuple[float, float]:
+    """The smallest and the largest strain of a spring in these frames; 0 where there is none below, or above."""
+    strain = np.concatenate([spring_strain(r, k) for r, k in zip(replays, frames, strict=True)] or [np.zeros(0)])
+    known = strain[np.isfinite(strain)]
+    return float(known.min(initial=0.0)), float(known.max(initial=0.0))

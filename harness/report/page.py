@@ -13,13 +13,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 from PIL import Image
 
 from harness.base.files import replacing
 from harness.record.base import Replay
-from harness.record.shading import PIN_COLOUR
+from harness.record.shading import PIN_COLOUR, percent
 from harness.report.style import DPI, HEIGHT, INK, MUTED, PAGE, STRAIN_MAP, WIDTH
 
 
@@ -73,22 +74,30 @@ def header(page: Figure, headline: str, facts: Sequence[str], *, letters: int = 
     text(page, 41, 82, "   ·   ".join(facts), size=11.5, color=MUTED)
 
 
-def strain_scale(page: Figure, limit: float, *, pins: bool) -> None:
-    """The colour bar in the upper right corner: percent ticks below, what they mean in words above."""
+def strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, pins: bool) -> None:
+    """The colour bar in the upper right corner: percent ticks below, what they mean in words above. ends: the smallest
+    and the largest strain of a spring, told above; where the bar does not reach them it ends in a tip."""
     left, top, width = 1180, 50, 380
     bar = axes(page, left, top, width, 12)
     bar.imshow(np.linspace(0, 1, 512)[None], cmap=STRAIN_MAP, aspect="auto", interpolation="bilinear")
     bar.set_axis_off()
-    for place, word, align in ((0.0, "compressed", "left"), (0.5, "at rest", "center"), (1.0, "stretched", "right")):
-        text(page, left + place * width, top - 8, word, size=10, ha=align)
+    for place, word, end, align in ((0.0, "compressed", ends[0], "left"), (1.0, "stretched", ends[1], "right")):
+        told = f"{word}, to {percent(end, 2)}" if end else f"{word}: none"
+        text(page, left + place * width, top - 8, told, size=9.5, ha=align)
+    text(page, left + width / 2, top - 8, "at rest", size=9.5, ha="center")
+    for place, beyond, tip in ((0.0, ends[0] < -limit, -14), (1.0, ends[1] > limit, 14)):
+        if beyond:
+            at = left + place * width
+            corners = [(at, top), (at, top + 12), (at + tip, top + 6)]
+            shape = [(x / WIDTH, 1 - y / HEIGHT) for x, y in corners]
+            page.add_artist(Polygon(shape, closed=True, color=STRAIN_MAP(place), transform=page.transFigure))
     for place in (0.0, 0.25, 0.5, 0.75, 1.0):
-        percent = 100 * limit * (2 * place - 1)
         align = {0.0: "left", 1.0: "right"}.get(place, "center")
-        label = f"{percent:+.3g} %".replace("-", "−") if percent else "0"
+        label = percent(limit * (2 * place - 1)) if place != 0.5 else "0"
         text(page, left + place * width, top + 31, label, size=9, color=MUTED, ha=align)
     if pins:
-        text(page, left - 36, top + 12, "pinned", size=10, ha="right")
-        text(page, left - 96, top + 11, "●", size=11, color=PIN_COLOUR, ha="right")
+        text(page, left - 40, top + 12, "pinned", size=10, ha="right")
+        text(page, left - 100, top + 11, "●", size=11, color=PIN_COLOUR, ha="right")
 
 
 def headline(replay: Replay) -> str:

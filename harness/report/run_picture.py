@@ -20,7 +20,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from harness.record.base import Replay
-from harness.report.frames import drawable_frames, shown_limit
+from harness.report.frames import drawable_frames, shown_ends, shown_limit
 from harness.report.origin import made_by
 from harness.report.page import (
     clock,
@@ -35,7 +35,7 @@ from harness.report.page import (
     strain_scale,
     text,
 )
-from harness.report.render import Studio, area_vectors, frame_all, natural_angles, shape, spring_strain
+from harness.report.render import Studio, area_vectors, frame_all, natural_angles, shape
 from harness.report.solids import seen
 from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, RULE, WIDTH
 
@@ -93,8 +93,10 @@ def draw_run(replay: Replay, path: Path, *, camera: tuple[float, float] | None =
         replay = replace(replay, strain_range=shown_limit([replay] * len(shown), shown.tolist()))
     with matplotlib.rc_context(RC):
         page = new_page()
-        header(page, headline(replay), [*_facts(replay), *_strain(replay, shown)])
-        strain_scale(page, replay.strain_range, pins=len(replay.pinned) > 0)
+        header(page, headline(replay), _facts(replay))
+        strain_scale(
+            page, replay.strain_range, shown_ends([replay] * len(shown), shown.tolist()), pins=len(replay.pinned) > 0
+        )
         made_by(page, [replay], HEIGHT - 12)
         if len(shown):
             _frames(page, replay, shown, camera)
@@ -111,14 +113,6 @@ def _facts(replay: Replay) -> list[str]:
     if "milliseconds_per_step" in known:
         facts.append(f"{quantity(float(known['milliseconds_per_step']))} ms a step")
     return facts
-
-
-def _strain(replay: Replay, shown: NDArray[np.int64]) -> list[str]:
-    """What the scale may not reach, in words."""
-    if not len(shown) or not len(replay.springs):
-        return []
-    largest = max(float(np.abs(spring_strain(replay, int(k))).max()) for k in shown)
-    return [f"largest strain shown {100 * largest:.3g} %"]
 
 
 def _frames(page: Figure, replay: Replay, shown: NDArray[np.int64], camera: tuple[float, float] | None) -> None:

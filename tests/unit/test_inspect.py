@@ -16,8 +16,9 @@ import pyvista as pv
 from rich.console import Console
 
 from harness.base.errors import InputError, RunFailed
+from harness.record.cells import cell
 from harness.record.compare import Look, side_by_side
-from harness.record.reader import read_replay
+from harness.record.reader import open_recording, read_replay
 from harness.report import inspect as module
 from harness.report.inspect import inspect, view
 from harness.scenes.mesh.files import File
@@ -124,6 +125,21 @@ def test_two_recordings_are_compared_in_metres_and_rest_lengths(cloth: Path, tmp
 
 def test_two_equal_recordings_do_not_differ(cloth: Path, tmp_path: Path):
     assert "max 0 0 rms 0 0" in printed(cloth, record(tmp_path / "same.rrd"))
+
+
+def test_recordings_side_by_side_have_the_longest_scale(tmp_path: Path):
+    short, long = info("chain", strain_range=0.02), info("chain", strain_range=0.4)
+    paths = {"a": record(tmp_path / "a.rrd", short), "b": record(tmp_path / "b.rrd", long)}
+    side_by_side(tmp_path / "both.rrd", paths, "chain 9", dict.fromkeys(paths, Look("#0072b2")))
+    seen: dict[str, list[Any]] = {}
+    with open_recording(tmp_path / "both.rrd") as source:
+        for chunk in source.chunks(content="/**", components=["Points3D:colors", "LineStrips3D:colors"]):
+            batch = chunk.to_record_batch()
+            for name in {"Points3D:colors", "LineStrips3D:colors"} & set(batch.schema.names):
+                rows = [cell(batch, name, k).tolist() for k in range(batch.num_rows)]
+                seen.setdefault(chunk.entity_path, []).extend(rows)
+    for part in ("mesh", "springs"):
+        assert seen[f"/1-a/scene/{part}"] == seen[f"/2-b/scene/{part}"], "the same positions have the same colours"
 
 
 def test_recordings_side_by_side_can_be_inspected(cloth: Path, tmp_path: Path):

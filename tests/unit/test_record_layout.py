@@ -10,8 +10,9 @@ import pytest
 
 from harness.record.blueprint import run_document, scale_name, spring_cadence
 from harness.record.camera import Extent
+from harness.record.shading import LEVELS
 from harness.scenes.mesh.grid import Grid
-from tests.recordings import info
+from tests.recordings import MESHES, info
 
 CORNER = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 2.0]])
 
@@ -61,9 +62,18 @@ def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: f
     strip, numbers_below = box.scale(0.1)
     below = listed(strip.vertex_positions)
     assert seen(box, below, aspect).max() <= 1.0
-    assert listed(numbers_below.labels).tolist() == ["-10 %", "-5 %", "strain 0", "+5 %", "+10 %"]
+    assert listed(numbers_below.labels).tolist() == ["−10 %", "−5 %", "strain 0", "+5 %", "+10 %"]
     lowest = height(box, points).min()
     assert height(box, below).max() < lowest, "the scale covers no data"
+
+
+@pytest.mark.parametrize(
+    ("ends", "told"), [((-0.05, 0.39), ["to +39 %"]), ((-0.2, 0.05), ["to −20 %"]), ((-0.1, 0.1), [])]
+)
+def test_the_scale_ends_in_a_tip_with_a_figure_where_strain_lies_beyond(ends: tuple[float, float], told: list[str]):
+    strip, words = Extent(MESHES["cloth"].rest).scale(0.1, ends)
+    assert listed(words.labels).tolist()[5:] == told
+    assert len(listed(strip.triangle_indices)) == 2 * (LEVELS - 1) + len(told)
 
 
 def test_what_is_wide_and_low_stands_in_the_middle_of_the_room_above_the_scale():

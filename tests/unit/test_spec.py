@@ -109,7 +109,7 @@ def test_what_a_sweep_leaves_out_comes_from_the_scene_or_the_defaults(folder: Pa
     (run,) = load_any(folder / "cloth.yaml", sizes=[4]).runs()
     assert (run.sweep, run.scene_name, run.solver.name, run.size) == ("cloth", "cloth", "numba", 4)
     assert (run.iterations, run.tolerance, run.first_guess, run.threads) == (50, None, "current", "auto")
-    assert (run.frames, run.rounds, run.convergence_frames, run.strain_range) == (5, 2, None, 0.1)
+    assert (run.frames, run.rounds, run.convergence_frames, run.strain_range) == (5, 2, None, None)
     assert run.scene.time_step == 1 / 30
     assert run.record
     assert run.pictures

@@ -13,6 +13,7 @@ from harness.experiments.accuracy.curves import GradedCurve
 from harness.experiments.accuracy.scales import round_off
 from harness.record.base import Frame, RecordingInfo
 from harness.record.rerun import RerunRecorder
+from harness.record.shading import strain_range
 from harness.reference.frozen import Frozen
 from harness.reference.minimiser import KnownMinima
 from harness.scenes.bind import Scene
@@ -43,6 +44,7 @@ def record(
     """Write the recording of a curve under `folder`/recordings and return its path. Raises RunFailed."""
     path = folder / "recordings" / f"{spec.label()}-{first_guess}.rrd"
     problem, here = graded.frozen.problem, machine.describe()
+    finite = [p for p in curve.positions if np.isfinite(p).all()]
     info = RecordingInfo(
         title=f"{spec.case.title}, {graded.moment}: {spec.solver.name} from the {first_guess} positions",
         run_id=f"{spec.unit_id(here.id)}-{first_guess}",
@@ -51,7 +53,7 @@ def record(
         rest_lengths=scene.springs.rest_length,
         pinned=problem.system.pins.vertices,
         time_step=problem.system.time_step,
-        strain_range=0.1,
+        strain_range=strain_range(finite[-1:], scene.springs.edges, scene.springs.rest_length),
         properties={
             "scene": spec.case.scene_name,
             "size": spec.case.size,

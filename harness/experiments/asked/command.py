@@ -23,6 +23,7 @@ from harness.experiments.provenance import provenance
 from harness.experiments.run import save_positions
 from harness.record.base import Frame, RecordingInfo
 from harness.record.rerun import RerunRecorder
+from harness.record.shading import strain_range
 from harness.reference.growth import Growth
 from solvers.problem import Positions
 
@@ -180,7 +181,7 @@ def _record(path: Path, name: str, asked: Asked, answer: Answer) -> Path:
         rest_lengths=scene.springs.rest_length,
         pinned=scene.system.pins.vertices,
         time_step=asked.frame,
-        strain_range=0.1,
+        strain_range=strain_range(best.path.positions[-1:], scene.springs.edges, scene.springs.rest_length),
         properties={
             **properties,
             "status": "ok",

@@ -24,6 +24,7 @@ from matplotlib.legend import Legend
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 
+from harness.record.shading import percent
 from harness.report.figures.asked import Asked
 from harness.report.figures.direct import label_directly
 from harness.report.figures.drawing import draw_grid, draw_picture, draw_plot, handle, names, write_cells
@@ -147,14 +148,20 @@ def _strain_scale(figure: Figure, axes: Sequence[Axes], panels: Sequence[Panel],
     if not pictures:
         return 0.0
     limit = pictures[0].limit
+    low, high = (float(end([0.0, *(end(panel.strain) for panel in pictures)])) for end in (np.nanmin, np.nanmax))
+    cut = {"min": low < -limit, "max": high > limit}
+    extend = "both" if all(cut.values()) else next((end for end, beyond in cut.items() if beyond), "neither")
     bar = figure.colorbar(
         ScalarMappable(Normalize(-limit, limit), STRAIN_MAP), ax=list(axes), location="bottom", shrink=0.8, aspect=45,
-        pad=0.02, ticks=np.linspace(-limit, limit, 5 if asked.width * 8.0 / asked.size > _FIVE else 3).tolist(),
+        extend=extend, pad=0.02,
+        ticks=np.linspace(-limit, limit, 5 if asked.width * 8.0 / asked.size > _FIVE else 3).tolist(),
     )  # fmt: skip
     bar.outline.set_visible(False)
     bar.ax.xaxis.set_major_formatter(ticks(lambda e: f"{100 * e:+.3g} %".replace("-", "−") if e else "at rest"))
     bar.ax.tick_params(length=2.0, width=0.5, labelsize=asked.small)
-    words = wrapped("strain of a vertex's most strained spring", asked.width / INCH * 58.0, asked.small)
+    ends = [percent(end, 2) for end, beyond in zip((low, high), cut.values(), strict=True) if beyond]
+    further = f"; tips: to {' and '.join(ends)}" if ends else ""
+    words = wrapped(f"strain of a vertex's most strained spring{further}", asked.width / INCH * 58.0, asked.small)
     bar.set_label("\n".join(words), fontsize=asked.small)
     return (1.45 * asked.small * (len(words) + 1.0) + _BAR) / 72.0
 
