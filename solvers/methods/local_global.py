@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers import matrices, memory
@@ -27,6 +28,17 @@ from solvers.core.prefactored import PreparedLocalGlobal, facts, only_springs, p
 from solvers.energies.springs import TINY
 from solvers.linear.factors import DenseCholesky, SparseLU
 from solvers.problem import Positions, Prepared, System, Unsupported
+
+_LARGE = 2**19
+"""Entries of a matrix that no cache of a core holds."""
+
+
+def _times(matrix: NDArray[np.float64], x: Positions) -> Positions:
+    """A dense matrix times x (k, 3). A large one as (x' matrix')', with the same sums in half of the time: BLAS copies
+    one of two factors before it multiplies them, and this way it is not all of the matrix."""
+    if matrix.size < _LARGE:
+        return matrix @ x
+    return np.ascontiguousarray((np.ascontiguousarray(x.T) @ matrix.T).T)
 
 
 @dataclass(frozen=True)
@@ -57,11 +69,10 @@ class DenseLocalGlobal:
         r, rest_direction = springs.rest_length[:, None], springs.rest_direction
 
         def project(p: Positions, y: Positions, out: Positions) -> None:
-            v = A @ p
+            v = _times(A, p)
             length = np.sqrt(np.einsum("ij,ij->i", v, v))[:, None]
             d = r * np.where(length <= TINY, rest_direction, v / np.maximum(length, TINY))
-            np.matmul(AtK, d, out=out)
-            out += y
+            np.add(_times(AtK, d), y, out=out)
 
         free = system.free
         exact = system.pins.vertices[system.pins.exact]

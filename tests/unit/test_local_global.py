@@ -12,6 +12,7 @@ from scipy.sparse import csr_array
 from solvers.core.prefactored import only_springs
 from solvers.energies.springs import TINY, Springs
 from solvers.matrices import assemble
+from solvers.methods import local_global
 from solvers.methods.local_global import DenseLocalGlobal, SparseLocalGlobal
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import NotPositiveDefinite, Pins, Positions, StepProblem, StopRule, System, Unsupported
@@ -243,3 +244,11 @@ def test_stiffness_beyond_the_digits_of_inertia_leaves_numbers(backend):
     solution = backend.prepare(system).solve(problem, StopRule(5, 1e-6))
     assert np.isfinite(solution.positions).all()
     assert np.isfinite(solution.residual)
+
+
+def test_the_product_with_a_large_dense_matrix_is_the_same(monkeypatch):
+    problem = first_problem(cloth(12))
+    usual = iterates(DenseLocalGlobal(), problem, 10)
+    monkeypatch.setattr(local_global, "_LARGE", 0)
+    for one, other in zip(usual, iterates(DenseLocalGlobal(), problem, 10), strict=True):
+        np.testing.assert_allclose(other, one, rtol=0.0, atol=1e-12)  # metres, beside an extent of one
