@@ -2,39 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.scenes.mesh.base import STRETCH, Mesh
-from harness.scenes.mesh.grid import Grid
-from harness.scenes.mesh.topology import assemble, by_area
+from harness.scenes.mesh.stack import Stack
 from solvers.contact.self_contact import SelfContact
 from solvers.contact.surface import Surface
 from solvers.problem import Positions
 
 THICKNESS, RANGE = 0.02, 0.03
-
-
-class Two(Grid):
-    """Two level sheets, one above the other."""
-
-    kind: Literal["two"] = "two"  # pyright: ignore[reportIncompatibleVariableOverride]
-    apart: float = 0.2
-
-    def generate(self, size: int) -> Mesh:
-        one = super().generate(size)
-        n, m = len(one.rest), len(one.springs)
-        rest = np.concatenate([one.rest, one.rest + np.array([0.0, self.apart, 0.0])])
-        families = {
-            name: np.concatenate([one.springs[rows], one.springs[rows] + n]) for name, rows in one.families.items()
-        }
-        triangles = np.concatenate([one.triangles, one.triangles + n])
-        weights, whole = by_area(rest, triangles), 2 * m
-        assert sum(map(len, families.values())) == whole
-        assert STRETCH in families
-        return assemble(rest=rest, springs=families, triangles=triangles, weights=weights, spacing=one.spacing)
 
 
 def sides(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -43,7 +19,7 @@ def sides(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def touching(seed: int = 0, *, size: int = 5, noise: float = 0.004) -> tuple[SelfContact, Positions, NDArray[np.int64]]:
     """The contact of two sheets, positions where they touch, nearly parallel edges among them, and the triangles."""
-    mesh, rng = Two().build(size), np.random.default_rng(seed)
+    mesh, rng = Stack(apart=0.2).build(size), np.random.default_rng(seed)
     n = len(mesh.rest) // 2
     surface = Surface.of(
         mesh.rest, sides(mesh.triangles), mesh.triangles, rng.uniform(0.5, 2.0, 2 * n), THICKNESS, RANGE

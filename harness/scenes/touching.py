@@ -26,15 +26,21 @@ _NAMED = 3
 ENDS = ("keeps apart what it finds at the end of a step",)
 
 
-def outline(mesh: Mesh) -> NDArray[np.int64]:
-    """The edges (m, 2) that may touch: sides of triangles, and springs of stretch that run between other vertices."""
+def outline(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The edges (m, 2) that may touch, sides of triangles and springs of stretch that run between other vertices, and
+    what points may touch (f, 3): triangles, and such springs i, j as triangles i, j, j.
+
+    Without those, two ropes that lie side by side would feel nothing: nearly parallel edges do not press.
+    """
     triangles = mesh.triangles
     sides = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
     inside = np.zeros(len(mesh.rest), bool)
     inside[triangles] = True
     ropes = mesh.springs[mesh.families.get(STRETCH, np.empty(0, np.int64))]
     ropes = ropes[~inside[ropes].all(axis=1) & (ropes[:, 0] != ropes[:, 1])]
-    return np.unique(np.sort(np.concatenate([sides, ropes]), axis=1), axis=0)
+    ropes = np.unique(np.sort(ropes, axis=1), axis=0)
+    edges = np.unique(np.concatenate([np.sort(sides, axis=1), ropes]), axis=0)
+    return edges, np.concatenate([triangles, ropes[:, [0, 1, 1]]])
 
 
 def resisting(

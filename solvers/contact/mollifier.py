@@ -15,6 +15,9 @@ from solvers.compiling import inner
 MOLLIFIED = 1e-3
 """Of |u|^2 |v|^2 at rest, the |u x v|^2 up to which edges count as nearly parallel (Li et al. 2020)."""
 
+_LEAST = 1e-200
+"""A smaller m leaves no force."""
+
 
 class Crossed(NamedTuple):
     """Two edges: u, v, |u|^2, u v, |v|^2 and c = |u x v|^2."""
@@ -57,11 +60,14 @@ def add_mollified(edges, factor, energy, keep, g, dc, H):
     m, m1, m2 = factor
     f, f1, f2 = energy
     for a in range(3):
-        bu, bv = 2.0 * (vv * u[a] - uv * v[a]), 2.0 * (uu * v[a] - uv * u[a])
+        # As 2 v x (u x v) and 2 u x (v x u): what is divided by m below has to vanish as the square root of m does.
+        i, j = (a + 1) % 3, (a + 2) % 3
+        wi, wj = u[j] * v[a] - u[a] * v[j], u[a] * v[i] - u[i] * v[a]
+        bu, bv = 2.0 * (v[i] * wj - v[j] * wi), 2.0 * (u[j] * wi - u[i] * wj)
         dc[a], dc[3 + a], dc[6 + a], dc[9 + a] = -bu, bu, -bv, bv
     mixed, bent = keep * f1 * m1, keep * f * m2
     share, rest = 0.0, 1.0 - keep
-    if m > 0.0 and rest > 0.0 and f1 != 0.0:
+    if m > _LEAST and rest > 0.0 and f1 != 0.0:
         share = m * f2 / (f1 * f1)
         bent += rest * m1 * m1 / share
         share *= rest * f1 * f1

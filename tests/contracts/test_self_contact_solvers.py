@@ -18,6 +18,7 @@ from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.self_contact import SelfContact
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.stack import Stack
 from harness.scenes.motion import Key, KeyedMotion
 from harness.scenes.spec import SceneSpec
 from harness.scenes.start import Collapsed, Scaled
@@ -30,7 +31,6 @@ from solvers.methods.newton import Newton
 from solvers.problem import StopRule, Unsupported
 from solvers.registry import SOLVERS, load
 from tests.scenes import scene
-from tests.self_contacts import Two
 
 TAKE = ("newton", "newton-cg", "pncg", "lbfgs", "hybrid")
 THICKNESS = 0.01
@@ -120,7 +120,7 @@ def test_where_nothing_is_near_the_motion_is_that_without(name):
 
 
 def test_two_free_sheets_that_collide_keep_their_momentum():
-    made = scene(Two(apart=0.05), Springs(stretch=100.0, shear=20.0), APART, size=5)
+    made = scene(Stack(apart=0.05), Springs(stretch=100.0, shear=20.0), APART, size=5)
     p, v = made.mesh.rest, np.zeros_like(made.mesh.rest)
     v[len(p) // 2 :] = (0.1, -2.0, 0.0)
     state, mass = State(integrators.Motion(p, v), None, 0), made.system.mass
@@ -145,7 +145,7 @@ STARTS = {
 @pytest.mark.parametrize("name", STARTS)
 def test_a_start_that_is_not_free_is_refused_with_the_pairs(name):
     begin, words = STARTS[name]
-    made = scene(Two(apart=0.2), Springs(stretch=100.0), APART, size=3)
+    made = scene(Stack(apart=0.2), Springs(stretch=100.0), APART, size=3)
     (check,) = APART.bind(made.mesh, made.system.mass, 1 / 30).checks
     with pytest.raises(InputError, match=words):
         check(begin.positions(made.mesh.rest), ())
@@ -154,7 +154,7 @@ def test_a_start_that_is_not_free_is_refused_with_the_pairs(name):
 
 def test_a_mesh_through_itself_at_rest_is_refused():
     with pytest.raises(InputError, match=r"passes through itself at rest.*edge \d+-\d+ through triangle"):
-        scene(Two(apart=0.0), Springs(stretch=100.0), APART, size=3)
+        scene(Stack(apart=0.0), Springs(stretch=100.0), APART, size=3)
 
 
 def test_exact_pins_that_move_are_refused():

@@ -10,9 +10,10 @@ from pydantic import ValidationError
 
 from harness.base.errors import InputError
 from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
-from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.chain import Chain, Rope
 from harness.scenes.mesh.grid import Grid, Net
 from harness.scenes.mesh.solids import Block, Tower
+from harness.scenes.mesh.stack import Stack
 from harness.scenes.mesh.surfaces import Balloon, Skirt
 
 ROUND_OFF = 1e-12
@@ -149,6 +150,34 @@ def test_a_tower_tapers_and_stands_on_four_feet():
     assert mesh.rest[mesh.parts["base"]].tolist() == [[0.5, 0, 0.5], [0.5, 0, -0.5], [-0.5, 0, -0.5], [-0.5, 0, 0.5]]
     assert np.all(mesh.rest[mesh.parts["top"], 1] == 2.0)
     assert np.ptp(mesh.rest[mesh.parts["top"], 0]) == 0.5
+
+
+def test_a_stack_is_so_many_grids_each_turned_against_the_one_below():
+    one, mesh = Grid().build(3), Stack(layers=3, apart=0.1, turn=90.0).build(3)
+    assert len(mesh.rest) == Stack(layers=3).count(3) == 27
+    for k in range(3):
+        layer = mesh.rest[9 * k : 9 * k + 9]
+        assert layer[:, 1] == pytest.approx(0.1 * k)
+        assert len(mesh.springs) == 3 * len(one.springs)
+    np.testing.assert_array_equal(mesh.rest[:9], one.rest)
+    np.testing.assert_allclose(mesh.rest[9:18, [0, 2]], one.rest[:, [2, 0]] * (1, -1), atol=ROUND_OFF)
+    for family, rows in one.families.items():
+        first, *_, last = (
+            mesh.springs[mesh.families[family]].reshape(3, -1, 2) if len(rows) else (one.springs[rows],) * 2
+        )
+        np.testing.assert_array_equal(first, one.springs[rows])
+        assert len(rows) == 0 or (last - first == 18).all()
+    assert mesh.parts["lowest"].tolist() == list(range(9))
+    assert mesh.parts["highest"].tolist() == list(range(18, 27))
+    assert mesh.parts["left"].tolist() == [i + 9 * k for k in range(3) for i in one.parts["left"].tolist()]
+    assert mesh.shares.sum() == pytest.approx(1.0)
+
+
+def test_a_rope_is_a_chain_with_springs_that_resist_bending():
+    mesh = Rope(length=2.0).build(5)
+    np.testing.assert_array_equal(mesh.rest, Chain(length=2.0).build(5).rest)
+    assert mesh.springs[mesh.families[BEND]].tolist() == [[0, 2], [1, 3], [2, 4]]
+    assert mesh.dimension == 1
 
 
 def test_mass_goes_by_area_and_by_volume():

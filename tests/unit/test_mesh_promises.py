@@ -10,7 +10,7 @@ import pytest
 
 from harness.base.errors import InputError
 from harness.scenes.mesh.base import BEND, SHEAR, STRETCH, Mesh
-from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.chain import Chain, Rope
 from harness.scenes.mesh.generator import MAX_VERTICES, Generator
 from harness.scenes.mesh.grid import Grid, Net
 from harness.scenes.mesh.mesh_names import MESHES
@@ -23,6 +23,7 @@ ROUND_OFF = 1e-12
 
 GENERATORS: list[Generator] = [
     Chain(length=2.0, direction=(1.0, -1.0, 0.5)),
+    Rope(),
     Grid(diagonals="none"),
     Grid(width=1.5, height=0.7, diagonals="one", skip_one=True),
     Grid(plane="vertical", skip_one=True),

@@ -93,6 +93,33 @@ def test_clamped_blocks_are_positive_semidefinite_and_never_less_than_exact_ones
     assert np.linalg.eigvalsh(exact)[:, 0].min() < 0.0
 
 
+@pytest.mark.parametrize("bent", [0.0, 1e-60, 1e-20, 1e-9])
+def test_edges_on_nearly_one_line_have_blocks_of_the_size_of_all_others(bent):
+    # A straight chain, pushed together: what is divided by the mollifier has to vanish as it does.
+    rest = np.zeros((4, 3))
+    rest[:, 0] = 0.03 * np.arange(4)
+    edges = np.array([[0, 1], [1, 2], [2, 3]])
+    contact = SelfContact(Surface.of(rest, edges, edges[:, [0, 1, 1]], np.ones(4), THICKNESS, RANGE))
+    p = rest * (0.9, 1.0, 1.0)
+    p[1:, 1] = bent
+    exact, clamped = (contact.blocks(p, keep).values for keep in (1.0, 0.0))
+    assert len(exact) == 5  # two edges, and four vertices with edges next to their own
+    assert np.abs(clamped).max() < 10 * np.abs(exact).max()
+    assert np.linalg.eigvalsh(clamped)[:, 0].min() >= -1e-13 * np.abs(clamped).max()
+
+
+def test_ropes_side_by_side_press_upon_each_other():
+    rest = np.array([[x, y, 0.0] for y in (0.0, 0.2) for x in (0.0, 0.1, 0.2, 0.3)])
+    edges = np.array([[0, 1], [1, 2], [2, 3], [4, 5], [5, 6], [6, 7]])
+    contact = SelfContact(Surface.of(rest, edges, edges[:, [0, 1, 1]], np.ones(8), THICKNESS, RANGE))
+    p, g = rest.copy(), np.zeros((8, 3))
+    p[4:, 1] = THICKNESS + 0.5 * RANGE
+    contact.add_gradient(p, g)
+    assert (g[:4, 1] > 0.0).all()
+    assert (g[4:, 1] < 0.0).all()
+    assert np.isinf(contact.value(p - [[0.0, y, 0.0] for y in [0.0] * 4 + [0.51 * RANGE] * 4]))
+
+
 def test_forces_have_no_sum_and_no_moment():
     contact, p, _ = touching()
     g = np.zeros_like(p)

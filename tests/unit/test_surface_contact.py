@@ -16,6 +16,7 @@ from harness.scenes.effects.surface_contact import SurfaceContact
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.body import Body
 from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.stack import Stack
 from harness.scenes.mesh.surfaces import Balloon
 from harness.scenes.motion import Key, KeyedMotion
 from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
@@ -29,7 +30,7 @@ from solvers.methods.newton import Newton
 from solvers.problem import Positions, StopRule
 from solvers.registry import SOLVERS, load
 from tests.scenes import scene
-from tests.self_contacts import Two, way
+from tests.self_contacts import way
 
 BALL = Solid(mesh=Balloon(radius=0.3), size=4, offset=(0.02, -0.33, 0.01))
 RULE = StopRule(100, 1e-4)
@@ -219,7 +220,7 @@ def test_it_slides_above_the_angle_of_friction_and_rests_below_within_a_twentiet
 
 def test_sheets_that_collide_with_friction_keep_their_momentum():
     rough = SelfContact(thickness=0.01, friction=0.5)
-    made = scene(Two(apart=0.05), Springs(stretch=100.0, shear=20.0), rough, size=5)
+    made = scene(Stack(apart=0.05), Springs(stretch=100.0, shear=20.0), rough, size=5)
     p, v = made.mesh.rest, np.zeros_like(made.mesh.rest)
     upper = np.arange(len(p)) >= len(p) // 2
     v[upper] = (1.0, -2.0, 0.0)

@@ -53,7 +53,7 @@ class SelfContact(Model):
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
         """The barrier as one energy, its stiffness by the other effects'; raises InputError for a mesh that touches
         itself at rest."""
-        edges, rest = outline(mesh), mesh.rest
+        (edges, faces), rest = outline(mesh), mesh.rest
         if not len(edges):
             return Contribution()
         reach = self.thickness if self.range is None else self.range
@@ -61,7 +61,7 @@ class SelfContact(Model):
             raise InputError(f"self-contact: the mesh passes through itself at rest, {told(crossed)}; repair it")
 
         def energy(stiffness: NDArray[np.float64]) -> Energy:
-            surface = Surface.of(rest, edges, mesh.triangles, stiffness, self.thickness, reach)
+            surface = Surface.of(rest, edges, faces, stiffness, self.thickness, reach)
             if (surface.near[1] <= 0.0).any():
                 raise InputError("self-contact: the mesh touches itself at rest; move what touches apart, or join it")
             return Energy(surface, self.friction, self.creep)

@@ -61,7 +61,7 @@ class SurfaceContact(Model):
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
         """The barrier as one energy, its stiffness by the other effects'; raises InputError for a bad obstacle."""
-        edges, n, shapes = outline(mesh), len(mesh.rest), self.shapes(mesh.rest)
+        (edges, faces), n, shapes = outline(mesh), len(mesh.rest), self.shapes(mesh.rest)
         if not len(edges):
             return Contribution()
         sizes = np.cumsum([0, *(len(points) for points, _ in shapes)]).tolist()
@@ -84,7 +84,7 @@ class SurfaceContact(Model):
             return [motion.moved(motion.back(p, begin), end) for motion in motions if motion is not None]
 
         def energy(stiffness: NDArray[np.float64]) -> ObstacleContact:
-            own, others = Side.of(mesh.rest, edges, mesh.triangles), Side.of(points, ends, triangles, n)
+            own, others = Side.of(mesh.rest, edges, faces), Side.of(points, ends, triangles, n)
             against = Against(own, others, stiffness, self.thickness, self.reach)
             return ObstacleContact.of(against, place, carry, self.friction, self.creep)
 

@@ -1,4 +1,4 @@
-"""A chain: vertices on a straight line, a spring from each to the next."""
+"""A chain: vertices on a straight line, a spring from each to the next; a rope resists bending too."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import AfterValidator
 
-from harness.scenes.mesh.base import STRETCH, Mesh
+from harness.scenes.mesh.base import BEND, STRETCH, Mesh
 from harness.scenes.mesh.generator import Generator, Metres
-from harness.scenes.mesh.topology import assemble, by_length, offset_pairs
+from harness.scenes.mesh.topology import NO_PAIRS, Indices, assemble, by_length, offset_pairs
 
 
 def _not_zero(direction: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -45,10 +45,25 @@ class Chain(Generator):
         pairs = offset_pairs(np.arange(size), (1,))
         return assemble(
             rest=rest,
-            springs={STRETCH: pairs},
+            springs={STRETCH: pairs, BEND: self._bends(size)},
             weights=by_length(rest, pairs),
             dimension=1,
             spacing=self.length / (size - 1),
             resolution=size,
             parts={"first": [0], "last": [size - 1], "ends": [0, size - 1]},
         )
+
+    def _bends(self, size: int) -> Indices:
+        """Springs against bending (k, 2)."""
+        return NO_PAIRS
+
+
+class Rope(Chain):
+    """A chain with springs from each vertex to the next but one (BEND), which resist bending."""
+
+    kind: Literal["rope"] = "rope"  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    SPRINGS: ClassVar[int] = 2
+
+    def _bends(self, size: int) -> Indices:
+        return offset_pairs(np.arange(size), (2,))

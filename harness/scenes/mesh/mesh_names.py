@@ -4,7 +4,9 @@ from solvers.plugins import Table
 
 MESHES: dict[str, str] = {
     "chain": "harness.scenes.mesh.chain:Chain",
+    "rope": "harness.scenes.mesh.chain:Rope",
     "grid": "harness.scenes.mesh.grid:Grid",
+    "stack": "harness.scenes.mesh.stack:Stack",
     "net": "harness.scenes.mesh.grid:Net",
     "skirt": "harness.scenes.mesh.surfaces:Skirt",
     "balloon": "harness.scenes.mesh.surfaces:Balloon",

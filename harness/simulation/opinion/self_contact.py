@@ -65,12 +65,16 @@ class Touching:
     def __init__(self, declared: Declared) -> None:
         mesh = declared.mesh
         self.rest: Array = np.asarray(mesh.rest, float)
-        self.triangles = mesh.triangles
         covered = set(mesh.triangles.ravel().tolist())
         found = {tuple(sorted(pair)) for t in mesh.triangles.tolist() for pair in combinations(t, 2)}
-        for i, j in mesh.springs[mesh.families["stretch"]].tolist():
-            if i != j and not (i in covered and j in covered):
-                found.add((min(i, j), max(i, j)))
+        ropes = {
+            (min(i, j), max(i, j))
+            for i, j in mesh.springs[mesh.families["stretch"]].tolist()
+            if i != j and not (i in covered and j in covered)
+        }
+        found |= ropes
+        flat = np.array([(i, j, j) for i, j in sorted(ropes)], int).reshape(-1, 3)  # which points may touch as well
+        self.triangles = np.concatenate([mesh.triangles, flat])
         self.edges = np.array(sorted(found), int).reshape(-1, 2)
         self.points = np.unique(np.append(self.edges, self.triangles))[:, None]
 

@@ -1,0 +1,61 @@
+"""Sheets that lie one above the other."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from harness.scenes.mesh.base import Mesh
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.topology import Indices, Points, assemble
+
+
+class Stack(Grid):
+    """Layers of a grid, which no spring joins, from the lowest to the highest, each numbered as a grid is.
+
+    `size` vertices along the width of each. Springs: those of all layers, family by family. Parts: those of a grid in
+    all layers, and lowest, highest. Mass goes by area. Dimension 2.
+    """
+
+    kind: Literal["stack"] = "stack"  # pyright: ignore[reportIncompatibleVariableOverride]
+    layers: Annotated[int, Field(ge=1, le=10_000)] = 2
+    """How many."""
+    apart: Annotated[float, Field(ge=0.0, le=1e6)] = 0.01
+    """From each to the next [m], along +y where they lie, along +z where they hang."""
+    turn: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+    """By how much each is turned in its plane against the one below [degrees]."""
+
+    COUNTS: ClassVar[str] = "vertices along the width of each layer"
+
+    def count(self, size: int) -> int:
+        """See Generator."""
+        return self.layers * super().count(size)
+
+    def generate(self, size: int) -> Mesh:
+        """See Generator."""
+        one = super().generate(size)
+        n, middle = len(one.rest), one.rest.mean(axis=0)
+        normal = np.array([0.0, 1.0, 0.0] if self.plane == "horizontal" else [0.0, 0.0, 1.0])
+        first = n * np.arange(self.layers)[:, None, None]
+        arm, layers = one.rest - middle, list[Points]()
+        for k in range(self.layers):
+            angle = np.deg2rad(k * self.turn)
+            turned = np.cos(angle) * arm + np.sin(angle) * np.cross(normal, arm) if self.turn else arm
+            layers.append(middle + turned + k * self.apart * normal)
+
+        def in_all(rows: Indices) -> Indices:
+            return (rows + first).reshape(-1, rows.shape[1])
+
+        parts = {name: (part + first[:, 0]).ravel() for name, part in one.parts.items()}
+        return assemble(
+            rest=np.concatenate(layers),
+            springs={family: in_all(one.springs[rows]) for family, rows in one.families.items()},
+            triangles=in_all(one.triangles),
+            weights=np.tile(one.shares, self.layers),
+            dimension=2,
+            spacing=one.spacing,
+            resolution=size,
+            parts={**parts, "lowest": np.arange(n), "highest": np.arange(n) + n * (self.layers - 1)},
+        )
