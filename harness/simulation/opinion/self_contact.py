@@ -141,9 +141,10 @@ class Touching:
         n: Wide = z / d[:, None]
         weights: list[Wide] = []
         for i in range(4):
-            bumped = p[rows].astype(np.clongdouble)
-            bumped[:, i] += 1e-100j * n
-            weights.append(np.imag(length(_between(four, bumped.reshape(-1, 3), edges))) / np.longdouble(1e-100))
+            same = rows == rows[:, i : i + 1]  # a rope's edge names a vertex twice, bumped once in both
+            bumped = p[rows] + 1e-100j * same[:, :, None] * n[:, None, :]
+            slope = np.imag(length(_between(four, bumped.reshape(-1, 3), edges))) / np.longdouble(1e-100)
+            weights.append(np.where(same[:, :i].any(axis=1), 0, slope))
         scale, m, stiff = self._of(rows, p, t, r, k, edges)
         at = (d / scale - t) / r
         inside = (at > 0) & (at < 1)
