@@ -37,7 +37,9 @@ COLUMNS = (
     Column("springs", _INT, "", "springs of the mesh"),
     Column("time_step", _REAL, "s", "the time step dt"),
     Column("integrator", _TEXT, "", "how time is integrated, by name: implicit-euler, bdf2, midpoint, sdirk-4, ..."),
-    Column("first_guess", _TEXT, "", "where each step's iteration starts: assignment, current, inertial or motion"),
+    Column(
+        "first_guess", _TEXT, "", "where each step's iteration starts: assignment, current, inertial, motion or coarse"
+    ),
     Column("max_iterations", _INT, "", "the iteration limit of a step"),
     Column(
         "tolerance",

@@ -90,6 +90,9 @@ class _Expansion:
     def curves(self, study: CurveStudy, at: Key) -> Iterator[CurveSpec]:
         """One for each problem and solver; solvers that do not minimise have none."""
         how = How(study.threads, study.rounds, study.time_limit)
+        if "coarse" in study.first_guess:
+            problem = "a curve's clock begins at its first guess, and this one is a solve itself; compare it in a sweep"
+            self.document.report(f"coarse: {problem}", (*at, "first_guess"))
         solvers = [solver for solver in self._solvers(study, at) if minimises(load(EVERY[solver.name]))]
         for case, moment, solver in product(self._cases(study, at), study.moment, solvers):
             if isinstance(moment, int) and moment > case.scene.frames:

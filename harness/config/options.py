@@ -59,7 +59,8 @@ class Chosen(Model):
             "forces at their unknowns, else `current`",
         ),
     ]
-    """Where a step's iteration starts."""
+    """Where a step's iteration starts; coarse: where the same scene on a mesh of half the size goes, which is solved
+    first, within the step's time."""
     threads: Annotated[Threads | Literal["auto"], Option("{} thr.", "threads")] = 1
     """Threads of Numba and of BLAS; auto: as many as there are cores that nobody else uses."""
     frames: Annotated[Frames, Option("{} frames", "", _OF_SCENE)]

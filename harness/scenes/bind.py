@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,7 @@ from harness.scenes.effects.base import Contribution, Force, Pin, Steady, Veloci
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.topology import by_area
 from harness.scenes.motion import KeyedMotion
+from harness.scenes.selection import Selection
 from harness.scenes.spec import SceneSpec
 from harness.scenes.start import Rest
 from solvers import integrators
@@ -28,6 +30,8 @@ if TYPE_CHECKING:  # for those who have any
 
 _LOG = logging.getLogger("springbench")
 AT_REST = Rest()
+COARSEST = 9
+"""The size from which on a mesh is not halved: a solve there costs next to nothing."""
 LONG = 1.0
 """Time steps [s] beyond it are asked about: what moves in them is over within a few of them."""
 
@@ -42,7 +46,8 @@ class Scene:
     velocity: of every vertex at the start [m/s], less the start's spin; integrator: its factor and speed are the
     system's;
     apart: what may not pass through what, nothing without an effect that sees to it;
-    alternate: the same in every second step, where that is of another length.
+    alternate: the same in every second step, where that is of another length;
+    halved: binds the same on a mesh of half the size, None where there is none.
     """
 
     mesh: Mesh
@@ -57,6 +62,7 @@ class Scene:
     start: Rest = AT_REST
     apart: tuple[Apart, ...] = ()
     alternate: Scene | None = None
+    halved: Callable[[], Scene] | None = None
 
     def at(self, index: int) -> Scene:
         """The scene in the step that follows step `index`."""
@@ -128,7 +134,15 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
         start=start,
         apart=tuple(one for part in parts for one in part.apart),
         alternate=None if other in (None, spec.time_step) else build(spec.stepped(other), size, integrator),
+        halved=_halved(spec, size, integrator),
     )
+
+
+def _halved(spec: SceneSpec, size: int, integrator: str) -> Callable[[], Scene] | None:
+    """None for meshes of one size alone, the coarsest ones, and effects that name vertices by their numbers."""
+    half = (size + 1) // 2
+    numbered = any(isinstance(e, Selection) and (e.indices or e.every > 1) for e in spec.effects)
+    return None if half < COARSEST or numbered else partial(build, spec, half, integrator)
 
 
 def _bound(spec: SceneSpec, i: int, mesh: Mesh, mass: NDArray[np.float64]) -> Contribution:

@@ -25,7 +25,7 @@ from solvers.plugins import Plugin, Table
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 """Names of scenes and sweeps; they become names of files in the results."""
 
-FirstGuess = Literal["assignment", "current", "inertial", "motion"]
+FirstGuess = Literal["assignment", "current", "inertial", "motion", "coarse"]
 
 
 def named_in(table: Table) -> Any:

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import reduce
+from weakref import WeakKeyDictionary
 
-from harness.scenes.bind import Scene
+from harness.base.errors import InputError
+from harness.scenes.bind import COARSEST, Scene
 from harness.simulation.algebraic import LocalErrors, Stated, Stop
-from harness.simulation.stages import Stages, require_mass
+from harness.simulation.coarser import Coarser
+from harness.simulation.stages import Guess, Stages, require_mass
 from solvers.core.clearing import begun_free
 from solvers.integrators import IMPLICIT_EULER, Integrator, Motion
+from solvers.methods.hybrid import Hybrid
 from solvers.problem import Positions, Prepared, Solution, Solver, Start, StepProblem, StopRule, System, Unsupported
 
 
@@ -59,10 +63,11 @@ def start(scene: Scene) -> State:
 
 
 def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
-    """The next step's problem from a state, that of its first unknown; `first_guess` is a key of `FIRST_GUESSES`."""
+    """The next step's problem from a state, that of its first unknown; `first_guess` is a key of `FIRST_GUESSES`, or
+    COARSE, which solves the step on a coarser mesh and raises Unsupported where there is none."""
     usual = scene.integrator
     if not isinstance(usual, Integrator):
-        return FIRST_GUESSES[first_guess](_stages(scene, state).first())
+        return _of_stages(first_guess)(_stages(scene, state).first())
     scene, time = scene.at(state.index), scene.time(state.index)
     dt = scene.system.time_step
     # `before` was filtered when it was `now`. Filtered once more it has decayed as long as `now` has (an integrating
@@ -84,7 +89,8 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
         held = now.positions[system.pins.vertices] + method.when * (held - now.positions[system.pins.vertices])
     current = _pinned(system, now.positions, held)
     stated = StepProblem(system, target, force, held, current, current, begun)
-    return begun_free(FIRST_GUESSES[first_guess](stated))
+    guessed = _coarse(scene, state, stated) if first_guess == COARSE else FIRST_GUESSES[first_guess](stated)
+    return begun_free(guessed)
 
 
 def prepare(scene: Scene, solver: Solver) -> Prepared:
@@ -128,7 +134,7 @@ def _single(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, 
 def _staged(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, state: State) -> Step:
     """The step of an integrator of several unknowns."""
     begun = _stages(scene, state)
-    done = begun.done(prepared, stop, FIRST_GUESSES[first_guess])
+    done = begun.done(prepared, stop, _of_stages(first_guess))
     after = State(done.end.motion, begun.now, state.index + 1, done.end.acceleration)
     return Step(*done.stages[-1], after, done.iterations, done.stages, stop, done.end.error)
 
@@ -206,3 +212,44 @@ FIRST_GUESSES: dict[str, Callable[[StepProblem], StepProblem]] = {
     "inertial": _inertial,
     "motion": _motion,
 }
+
+COARSE = "coarse"
+"""The first guess that is no function of the problem alone: it is where the coarser mesh goes."""
+
+_NEAR_ENOUGH = StopRule(100, 1e-2)
+"""Of the solves on coarser meshes: what these err by, being coarse, is more."""
+
+_COARSER: WeakKeyDictionary[Scene, Coarser] = WeakKeyDictionary()
+
+
+def _coarse(scene: Scene, state: State, stated: StepProblem) -> StepProblem:
+    """Where the same scene on a mesh of half the size goes in this step, which itself starts from a coarser one (nested
+    iteration: Kronsjö and Dahlquist 1972); the mesh's own shape is kept beside that displacement."""
+    level = _COARSER.get(scene)
+    if level is None:
+        if scene.halved is None:
+            raise Unsupported(
+                "first_guess: coarse needs the scene on a mesh of half the size, and there is none: the mesh is from a "
+                f"file, or smaller than {2 * COARSEST - 1}, or effects name vertices by `indices` or `every`; take "
+                "current, inertial or motion"
+            )
+        try:
+            coarse = scene.halved()
+        except InputError as error:
+            raise Unsupported(f"first_guess: coarse needs the scene on a mesh of half the size: {error}") from error
+        level = _COARSER[scene] = Coarser.of(scene, coarse, prepare(coarse, Hybrid()))
+    there = State(level.down(state.now), level.down(state.before) if state.before else None, state.index)
+    below = problem(level.scene, there, COARSE if level.scene.halved else "current")
+    found = level.prepared.solve(below, _NEAR_ENOUGH).positions
+    guess = stated.current + level.up(found - below.current)
+    return replace(stated, first_guess=_pinned(stated.system, guess, stated.pin_targets))
+
+
+def _of_stages(first_guess: str) -> Guess:
+    """A first guess of each unknown of a step that has several. Raises Unsupported."""
+    if first_guess == COARSE:
+        raise Unsupported(
+            "first_guess: coarse is for integrators of one unknown a step (implicit-euler, bdf2, midpoint); "
+            "take motion, current or inertial"
+        )
+    return FIRST_GUESSES[first_guess]

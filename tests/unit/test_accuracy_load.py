@@ -14,7 +14,7 @@ from harness.config.load import load_any
 from harness.report.accuracy.convergence import GUESSES
 from harness.scenes.bind import build
 from harness.scenes.spec import FirstGuess
-from harness.simulation.step import FIRST_GUESSES
+from harness.simulation.step import COARSE, FIRST_GUESSES
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SHIPPED = [path for path in sorted(CONFIGS.glob("*.yaml")) if {"curves:", "work:"} & {*path.read_text().splitlines()}]
@@ -61,10 +61,11 @@ def test_a_study_of_curves_asks_for_each_moment_and_solver_that_minimises(folder
     }
 
 
-def test_studies_take_every_first_guess_and_reports_have_words_for_each(folder: Path) -> None:
-    guesses = get_args(FirstGuess)
+def test_studies_take_every_first_guess_that_is_no_solve_and_reports_have_words_for_each(folder: Path) -> None:
+    *guesses, coarse = get_args(FirstGuess)
+    assert coarse == COARSE
     asked = CONFIG.replace("rounds: 7", f"rounds: 7, first_guess: [{', '.join(guesses)}]")
-    assert {unit.first_guesses for unit in loaded(folder, asked).curves} == {guesses}
+    assert {unit.first_guesses for unit in loaded(folder, asked).curves} == {tuple(guesses)}
     assert set(GUESSES) == set(FIRST_GUESSES) == set(guesses)
 
 
@@ -113,6 +114,7 @@ MISTAKES = [
     ("horizon: 0.5", "horizon: 0.51", 7, "is no multiple of the time step 0.0333333 s"),
     ("horizon: 0.5", "horizon: 0", 7, "greater than 0"),
     ("rounds: 7", "time_limit: -1", 5, "greater than 0"),
+    ("rounds: 7", "first_guess: [coarse]", 5, "this one is a solve itself"),
     ("cloth.yaml, ", "clod.yaml, ", 2, "there is no file"),
     ("{name: newton}", "{name: newton, order: 2}", 3, "unknown key"),
 ]

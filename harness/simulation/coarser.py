@@ -1,0 +1,66 @@
+"""From a mesh to a coarser one of the same body, and back: by weights that keep all linear functions of the rest shape.
+
+    f(x) = sum_j w_j f(x_j)   with   sum_j w_j = 1,   sum_j w_j x_j = x,   and sum_j w_j^2 |x_j - x|^4 least
+
+over the vertices x_j nearest to x at rest (moving least squares: Lancaster and Salkauskas 1981). So a motion that is
+rigid, or an affine strain, passes without change, whatever the meshes, and a vertex that both have keeps its value.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from harness.scenes.bind import Scene
+from solvers.integrators import Motion
+from solvers.problem import Positions, Prepared
+
+_NEAREST = 12
+"""Vertices that a value is taken from: the corners of a cell of a block, and what lies beside."""
+
+
+@dataclass(frozen=True, eq=False)
+class Coarser:
+    """A scene on a coarser mesh, ready to be solved. restrict (coarse, fine), prolong (fine, coarse): see above."""
+
+    scene: Scene
+    prepared: Prepared
+    restrict: csr_array
+    prolong: csr_array
+
+    @classmethod
+    def of(cls, fine: Scene, coarse: Scene, prepared: Prepared) -> Coarser:
+        """Between two scenes that differ in their meshes' size alone."""
+        a, b = fine.mesh.rest, coarse.mesh.rest
+        return cls(coarse, prepared, interpolation(a, b), interpolation(b, a))
+
+    def down(self, motion: Motion) -> Motion:
+        """The motion of the coarser mesh's vertices."""
+        return Motion(self.restrict @ motion.positions, self.restrict @ motion.velocity)
+
+    def up(self, displacement: Positions) -> Positions:
+        """A displacement of the coarser mesh's vertices [m] as that of the finer one's, (n, 3)."""
+        return self.prolong @ displacement
+
+
+def interpolation(known: Positions, wanted: Positions) -> csr_array:
+    """The weights w (wanted, known), of points at rest (n, 3) [m]."""
+    from scipy.spatial import cKDTree  # for those who need it
+
+    tree: Any = cKDTree(known)
+    found = tree.query(wanted, k=min(_NEAREST, len(known)))
+    distance, near = (np.reshape(x, (len(wanted), -1)) for x in found)
+    scale = np.maximum(distance.max(axis=1), np.finfo(np.float64).tiny)[:, None]
+    inverse = 1.0 / np.maximum(distance / scale, 1e-4) ** 4
+    away = (known[near] - wanted[:, None, :]) / scale[:, :, None]
+    linear = np.concatenate([np.ones((*near.shape, 1)), away], axis=2)
+    normal = np.einsum("nki,nk,nkj->nij", linear, inverse, linear)
+    # Points of a line or a plane leave directions undetermined, which need no weights.
+    pseudo_inverse: Any = np.linalg.pinv  # of stacks of matrices, which its types do not tell
+    first = np.asarray(pseudo_inverse(normal, rcond=1e-13, hermitian=True), np.float64)[:, :, 0]
+    weights = inverse * np.einsum("nki,ni->nk", linear, first)
+    start = np.arange(0, near.size + 1, near.shape[1])
+    return csr_array((weights.ravel(), near.ravel(), start), shape=(len(wanted), len(known)))
