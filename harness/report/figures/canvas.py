@@ -34,8 +34,10 @@ from harness.report.page import ticks
 from harness.report.style import INK, MUTED, STRAIN_MAP
 
 INCH = 25.4
-_PANEL, _PICTURE = 62.0, 36.0
+_PANEL, _PICTURE = 58.0, 36.0
 """Millimetres that a panel and that a picture wants for its width, at a type of 8 points."""
+_COLUMN = 1.5
+"""Rows of frames together are so high at most, in the figure's width: a page of two columns has room for them."""
 _TALL = 48.0 / INCH
 """A frame wider than 85 mm becomes flatter: as high as 0.3 of its width and this [inches]."""
 _FIVE = 55.0
@@ -75,12 +77,13 @@ def compose(panels: Sequence[Panel], title: str, asked: Asked) -> Figure:
         figure = Figure((asked.width / INCH, 4.0), dpi=DPI, facecolor=asked.background, layout="constrained")
         FigureCanvasAgg(figure)
         columns = _columns(panels, asked)
-        heights = _heights(panels, columns, asked)
+        subjects = list(dict.fromkeys(panel.subject for panel in panels))
+        heads = [_head(panel, asked, columns, several=len(subjects) > 1) for panel in panels]
+        heights = _heights(panels, heads, columns, asked)
         grid = figure.add_gridspec(len(heights), columns, height_ratios=heights)
         axes = [figure.add_subplot(grid[divmod(k, columns)]) for k in range(len(panels))]
-        subjects = list(dict.fromkeys(panel.subject for panel in panels))
-        for ax, panel in zip(axes, panels, strict=True):
-            _draw(ax, panel, asked, columns, several=len(subjects) > 1)
+        for ax, panel, head in zip(axes, panels, heads, strict=True):
+            _draw(ax, panel, head, asked, columns)
         below = _strain_scale(figure, axes, panels, asked)
         direct = label_directly(axes, panels, asked)
         whole = ": ".join([title, subjects[0]] if len(subjects) == 1 and subjects[0] else [title])
@@ -101,14 +104,15 @@ def _columns(panels: Sequence[Panel], asked: Asked) -> int:
     return -(-len(panels) // rows)
 
 
-def _heights(panels: Sequence[Panel], columns: int, asked: Asked) -> list[float]:
+def _heights(panels: Sequence[Panel], heads: Sequence[list[str]], columns: int, asked: Asked) -> list[float]:
     """The height of each row of panels [inches]."""
     width = asked.width / INCH / columns
-    wanted = [_height(panel, width, asked) for panel in panels]
+    room = _COLUMN * asked.width / INCH / -(-len(panels) // columns)
+    wanted = [_height(panel, len(head), width, room, asked) for panel, head in zip(panels, heads, strict=True)]
     return [max(wanted[k : k + columns]) for k in range(0, len(wanted), columns)]
 
 
-def _height(panel: Panel, width: float, asked: Asked) -> float:
+def _height(panel: Panel, head: int, width: float, room: float, asked: Asked) -> float:
     line = 1.45 * asked.small / 72.0
     if isinstance(panel, CellMap):
         rows, columns = names(panel)
@@ -117,24 +121,28 @@ def _height(panel: Panel, width: float, asked: Asked) -> float:
         return width / panel.aspect + line * (1 + len(panel.facts))
     if panel.y.kind == "names":
         return line * (1.25 * len(panel.y.names) + 4.0)
-    return min(0.86 * width, 0.3 * width + _TALL) * panel.aspect + 3.0 * line
+    return min(min(0.86 * width, 0.3 * width + _TALL) * panel.aspect, room) + max(3.0, head + 1.0) * line
 
 
-def _draw(ax: Axes, panel: Panel, asked: Asked, columns: int, *, several: bool) -> None:
+def _head(panel: Panel, asked: Asked, columns: int, *, several: bool) -> list[str]:
+    """What stands above a panel of curves or cells, in lines."""
+    if isinstance(panel, Picture):
+        return [panel.title, *panel.facts]
+    words = [panel.subject if several else "", panel.title, panel.y.words if isinstance(panel, Plot) else ""]
     room = asked.width / columns / INCH * 72.0 - 6.0 * asked.size
+    return [line for one in words if one for line in wrapped(one, room, asked.small)]
+
+
+def _draw(ax: Axes, panel: Panel, head: Sequence[str], asked: Asked, columns: int) -> None:
     if isinstance(panel, Picture):
         draw_picture(ax, panel, asked, asked.width / INCH / columns)
-        ax.set_title("\n".join([panel.title, *panel.facts]), loc="center", fontsize=asked.small, color=INK)
+        ax.set_title("\n".join(head), loc="center", fontsize=asked.small, color=INK)
         return
-    head = [panel.subject] if several else []
-    head += [panel.title] if panel.title else []
     if isinstance(panel, Plot):
-        head += [panel.y.words] if panel.y.words else []
         draw_plot(ax, panel, asked)
     else:
         draw_grid(ax, panel, asked)
-    lines = [line for words in head for line in wrapped(words, room, asked.small)]
-    ax.set_title("\n".join(lines), loc="center", x=0.0, ha="left", fontsize=asked.small)
+    ax.set_title("\n".join(head), loc="center", x=0.0, ha="left", fontsize=asked.small)
 
 
 def wrapped(words: str, room: float, size: float) -> list[str]:

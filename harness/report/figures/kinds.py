@@ -54,13 +54,14 @@ def _rows_alone(panels: Callable[[Path], list[Entry]]) -> Callable[[Path, of_run
 
 _ACCURACY, _SWEEP = of_accuracy.WANTED, "rows of `springbench run CONFIG`"
 _BOTH = (("gap", "time"), ("gap", "iterations"))
+_PROFILES = tuple(("performance", gap) for gap in ("1e-1", "1e-3", "1e-6"))
 
 KINDS: dict[str, Kind] = {
     "convergence": Kind("Convergence", _ACCURACY, _rows_alone(of_accuracy.convergence), _BOTH),
     "times": Kind("Time to accuracy", _ACCURACY, _rows_alone(of_accuracy.times), (("alone",), ("over-1",))),
     "winners": Kind("The cheapest way to an error", _ACCURACY, _rows_alone(of_winners.winners)),
     "work": Kind("Work and precision", _ACCURACY, _rows_alone(of_accuracy.work)),
-    "profiles": Kind("Profiles", _ACCURACY, _rows_alone(of_accuracy.profiles), (("performance",),)),
+    "profiles": Kind("Profiles", _ACCURACY, _rows_alone(of_accuracy.profiles), _PROFILES),
     "growth": Kind("Growth with size", _ACCURACY, _rows_alone(of_accuracy.growth)),
     "liu2013": Kind("Liu et al. 2013, reproduced", f"{_ACCURACY}, of liu2013.yaml", _rows_alone(of_accuracy.paper)),
     "timing": Kind("Time a step", _SWEEP, of_runs.timing, (("step",), ("prepare",))),

@@ -36,7 +36,8 @@ def make(name: str, kind: Kind, results: Path, older: Older, folder: Path, asked
     entries = kind.panels(results, older)
     if not entries:
         raise InputError(Mistake(f"holds nothing to draw as {name}; wanted {kind.wanted}", results))
-    picked = entry.chosen(entries, asked.selectors or kind.usual)
+    usual = [one for one in kind.usual if any(set(one) <= set(known.parts) for known in entries)]
+    picked = entry.chosen(entries, asked.selectors or usual)
     panels = kind.draw(picked)
     if len({type(panel) for panel in panels}) > 1:
         parts = ", ".join(":".join(one.parts) for one in picked)

@@ -12,6 +12,10 @@ from harness.report.site.script import number
 from harness.report.style import looks
 
 _PERCENT = {"ticksuffix": " %", "zeroline": True}
+_COMMANDS = {
+    "ablation": "springbench ablate CONFIG --again",
+    "prices": "springbench ablate CONFIG --all-solvers --again",
+}
 _NAMES = {"type": "category", "autorange": "reversed"}
 
 
@@ -20,9 +24,7 @@ def charts(rows: Sequence[Row]) -> tuple[dict[str, dict[str, Any]], list[str]]:
     made = {"ablation": _effects(rows), "prices": _prices(rows)}
     by_whole = [_of(whole, rows) for whole in of_kind(rows, "whole") if whole["status"] == "ok"]
     words = [f"{some[0]['scene']}: {said}" for some in by_whole for said in sentences(some)]
-    return {
-        name: chart | {"command": "springbench ablate CONFIG"} for name, chart in made.items() if chart["items"]
-    }, words
+    return {name: chart | {"command": _COMMANDS[name]} for name, chart in made.items() if chart["items"]}, words
 
 
 def _of(whole: Row, rows: Sequence[Row]) -> list[Row]:
