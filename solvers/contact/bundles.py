@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.contact.energy import Contact
+from solvers.contact.energy import Contact, Planes
 from solvers.contact.touching import ContactEnergy
 from solvers.kernels.half_spaces import HalfSpaces
 from solvers.kernels.springs import Bundles
@@ -17,7 +17,14 @@ def half_spaces(contacts: list[ContactEnergy], row: NDArray[np.int64], bundles: 
     known = [contact for contact in contacts if isinstance(contact, Contact)]
     fields = [np.concatenate(field) for field in zip(*(contact.planes for contact in known), strict=True)]
     slip = np.concatenate([np.full(len(contact.planes.vertices), contact.slip) for contact in known])
-    vertices, normal, offset, anchor, stiffness, grip = fields
+    return of_planes(Planes(*fields), slip, row, bundles, unknowns)
+
+
+def of_planes(
+    planes: Planes, slip: NDArray[np.float64], row: NDArray[np.int64], bundles: Bundles, unknowns: int
+) -> HalfSpaces:
+    """Half-spaces, and what they slip by in a step (k,) [m]."""
+    vertices, normal, offset, anchor, stiffness, grip = planes
     rows = row[vertices]
     order = np.argsort(rows, kind="stable")
     order = order[rows[order] < unknowns]

@@ -131,12 +131,12 @@ class Corrections:
         """Conjugate gradients; Q times a direction follows from the residuals that Q^-1 was asked for."""
         U = _columns(rows, len(plain))
         pulls = csr_array(U * rows.weight) @ U.T
-        model = _Model(self.plain, pulls, -gradient - (U @ (rows.weight * rows.gap)).reshape(-1, 3))
+        model = Model(self.plain, pulls, -gradient - (U @ (rows.weight * rows.gap)).reshape(-1, 3))
         model.iterate(model.product, _ITERATIONS)
         return model.x
 
 
-class _Model(Iteration):
+class Model(Iteration):
     """(Q + W) x = b, preconditioned by Q^-1; solve: Q^-1 of it; pulls: W (3n, 3n)."""
 
     def __init__(self, solve: Callable[[Positions], Positions], pulls: csr_array, b: Positions) -> None:

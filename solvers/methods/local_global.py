@@ -24,6 +24,7 @@ from scipy.sparse import csr_array
 from solvers import matrices, memory
 from solvers.about import LIU_2013, LOCAL_GLOBAL, About
 from solvers.contact.touching import without_contact
+from solvers.core.bounds import without_bounded
 from solvers.core.prefactored import PreparedLocalGlobal, facts, only_springs, prepared, projective
 from solvers.energies.springs import TINY
 from solvers.linear.factors import DenseCholesky, SparseLU
@@ -101,6 +102,10 @@ class SparseLocalGlobal:
         """Raises Unsupported for energies that are not projective, NotPositiveDefinite."""
         if without_contact(system) is not system:
             from solvers.contact.local_global import local_global  # for those who need it
+
+            return local_global(self, system)
+        if without_bounded(system) is not system:
+            from solvers.contact.pairs_local_global import local_global
 
             return local_global(self, system)
         return prepared(system, projective(system, "sparse"), lambda Q: (SparseLU(Q), "SuperLU"))

@@ -14,6 +14,7 @@ import numpy as np
 
 from solvers.about import LIU_2013, LOCAL_GLOBAL, About
 from solvers.contact.touching import without_contact
+from solvers.core.bounds import without_bounded
 from solvers.core.compiled import FAR, PreparedCompiled, compiled
 from solvers.core.prefactored import Project, prepared, projective
 from solvers.energies.springs import Springs
@@ -41,6 +42,10 @@ class CompiledLocalGlobal:
         """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
         if without_contact(system) is not system:
             from solvers.contact.local_global import local_global  # for those who need it
+
+            return local_global(self, system)
+        if without_bounded(system) is not system:
+            from solvers.contact.pairs_local_global import local_global
 
             return local_global(self, system)
         energies = projective(system, "numba")

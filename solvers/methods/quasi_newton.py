@@ -19,6 +19,7 @@ import numpy as np
 
 from solvers.contact.touching import without_contact
 from solvers.core.acceleration import Accelerating, Engine, Interpreted, Scheme, window_for
+from solvers.core.bounds import without_bounded
 from solvers.core.compiled import FAR, PreparedCompiled, compiled
 from solvers.core.driver import Iterative, largest
 from solvers.core.fixed_objective import Objective
@@ -40,7 +41,7 @@ def prepare(system: System, scheme: Scheme, linear: Linear, precision: Precision
     """Factorise Q and compile. Raises Unsupported for energies that the method does not take, NotPositiveDefinite."""
     bare = without_contact(system)
     energies = (
-        projective(bare, scheme.name)
+        projective(without_bounded(bare), scheme.name)
         if scheme.projective
         else [energy for energy in bare.energies if isinstance(energy, ProjectiveEnergy)]
     )

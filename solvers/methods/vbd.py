@@ -21,6 +21,7 @@ again at w_1. With these restarts rho needs no tuning: too large a one is no wor
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 from solvers.about import About, Reference
 from solvers.contact.touching import ContactEnergy, touching, without_contact
 from solvers.core import colouring, vertex_terms
+from solvers.core.bounds import is_bounded, without_bounded
 from solvers.core.driver import Iterating, Iterative, largest
 from solvers.core.parts import Parts, split
 from solvers.core.vertex_elements import Beside
@@ -44,7 +46,9 @@ from solvers.vectors.springs import LANES
 from solvers.vectors.vbd import NUMBERS
 
 if TYPE_CHECKING:
+    from solvers.contact.energy import Planes
     from solvers.contact.local_global import Idle
+    from solvers.core.fixed_objective import Objective
 
 _FAR = 1e100
 """Where springs end that fill up bundles: at no vertex, whatever the unit of length."""
@@ -78,7 +82,7 @@ class VertexBlockDescent:
 
     def prepare(self, system: System) -> PreparedVertexBlockDescent:
         """Raises Unsupported for other energies, NotPositiveDefinite."""
-        bare, n = without_contact(system), system.vertices
+        bare, n = without_bounded(without_contact(system)), system.vertices
         parts, beside = split(bare), Beside.of(system)
         unknown = {*parts.unknown} - {type(energy).__name__ for energy in beside.energies}
         if unknown:
@@ -111,7 +115,7 @@ class VertexBlockDescent:
             kernels.Blocks(bundles, shares, len(order), bundles.in_lanes(majorant)),
             row,
             held,
-            float(majorant[row[system.unpinned]].sum()),
+            majorant[row],
             measure,
             f"vertices in {coloured.colours} colours; for the residual alone {measure.choice}",
         )
@@ -120,8 +124,8 @@ class VertexBlockDescent:
 @dataclass(frozen=True, eq=False)
 class PreparedVertexBlockDescent(Iterative):
     """parts: of the energies; beside: those of elements; blocks: of the free vertices; row (n,): where each vertex is
-    in them; held: what inertia and pins hold each row with [N/m]; trace: of the majorant, over vertices that no pin
-    holds [N/m]; measure: one iteration of local-global from p tells the residual at p, and is asked for nothing else.
+    in them; held: what inertia and pins hold each row with [N/m]; majorant (n,): of all but contact [N/m]; measure: one
+    iteration of local-global from p tells the residual at p, and is asked for nothing else.
     """
 
     system: System
@@ -131,7 +135,7 @@ class PreparedVertexBlockDescent(Iterative):
     blocks: kernels.Blocks
     row: NDArray[np.int64]
     held: NDArray[np.float64]
-    trace: float
+    majorant: NDArray[np.float64]
     measure: Idle
     choice: str
 
@@ -142,7 +146,20 @@ class PreparedVertexBlockDescent(Iterative):
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """See Iterative."""
-        return _Iterating(self, problem, guess)
+        sweeps = _Iterating(self, problem, guess)
+        if not any(map(is_bounded, self.system.energies)):
+            return sweeps
+        from solvers.contact.pairs_vbd import Guarded  # for those who need it
+        from solvers.core.objective import StepObjective
+
+        step, gauge = StepObjective(self._objective, problem), self.measure.gauge(problem)
+        return Guarded(sweeps, step, guess, self.majorant, self.spectral_radius, gauge)
+
+    @cached_property
+    def _objective(self) -> Objective:
+        from solvers.core.fixed_objective import Objective
+
+        return Objective(self.system)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """See Iterative; by an iteration of local-global, where nothing is touched."""
@@ -150,7 +167,7 @@ class PreparedVertexBlockDescent(Iterative):
 
     def scale(self, problem: StepProblem) -> float:
         """See Iterative."""
-        return largest(problem) * self.trace**0.5
+        return largest(problem) * float(self.majorant[self.system.unpinned].sum()) ** 0.5
 
     def in_rows(self, x: Positions) -> NDArray[np.float64]:
         """x (n, 3) in rows of four, and the two rows that fill up bundles."""
@@ -190,6 +207,31 @@ class _Iterating(Iterating):
     def residual(self) -> float:
         """See Iterating."""
         return self._gauge(self.positions)
+
+    def alone(self, p: Positions) -> Positions:
+        """See `solvers.contact.pairs_vbd.Sweeps`."""
+        if p is not self.positions:
+            self._begin_at(p)
+        self._sweep(1)
+        return self.positions
+
+    def pushed(self, p: Positions, planes: Planes) -> Positions:
+        """See `solvers.contact.pairs_vbd.Sweeps`."""
+        from solvers.contact.bundles import of_planes
+
+        made = self._prepared
+        self._begin_at(p)
+        self._spaces = of_planes(
+            planes, np.ones(len(planes.vertices)), made.row, made.blocks.bundles, made.blocks.unknowns
+        )
+        self._sweep(1)
+        self._spaces = None
+        return self.positions
+
+    def _begin_at(self, p: Positions) -> None:
+        """Forget all sweeps before."""
+        self._rows.reshape(-1, 4)[self._prepared.row, :3] = p
+        self._work.omega[0], self._work.level[0] = 0.0, np.nan
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
         """See Iterating; all at once where no residual may end them."""

@@ -1,0 +1,145 @@
+"""Contact by pairs for vertex block descent: each sweep goes by a model in which vertices know nothing of each other.
+
+    g_i.(x_i - p_i) + 4/2 (x_i - p_i)' H_ii (x_i - p_i)      for each vertex i of a pair, at the positions p of a sweep
+
+g: the gradient of the barriers and their friction; H_ii: the diagonal blocks of a pair's second derivatives, clamped. A
+positive semidefinite H of four vertices is not more than four times the diagonal of its blocks, so that this is not
+less than the quadratic model, whatever colours the four have. A sweep leads from p to q; gone is t (q - p), where t is
+the first of 1, 1/2, ... that is no longer than is safe and lowers the objective enough. Where none does, each vertex
+goes along its own block instead, which descends.
+
+(Chen, Liu, Yang and Yuksel 2024 put contact into the vertices' own blocks: their energy ends where they touch, and
+vertices may pass through each other.) Steps are extrapolated by Chebyshev's factors, as sweeps without contact are,
+where the way to that is free and the objective does not rise. While nothing is in range sweeps are those without
+contact, to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.contact.energy import Planes
+from solvers.core.bounds import PairBlocks
+from solvers.core.descent import Point, search
+from solvers.core.driver import Iterating
+from solvers.core.objective import StepObjective
+from solvers.problem import Positions
+
+Array = NDArray[np.float64]
+
+_LEAST = 1e-6
+"""Of what holds a vertex: so much resists it in every direction."""
+
+
+class Separable(NamedTuple):
+    """The model at a point: of vertices (v,) the gradient (v, 3) [N] and four times the diagonal blocks (v, 3, 3)
+    [N/m]."""
+
+    vertices: NDArray[np.int64]
+    gradient: Positions
+    block: Array
+
+    def planes(self, p: Positions, held: Array) -> Planes:
+        """The same as half-spaces: along each of three axes, from both sides; p (n, 3) [m]: where it was made; held
+        (n,) [N/m]: what holds the vertices."""
+        curve, axes = np.linalg.eigh(self.block)
+        k = np.maximum(curve, _LEAST * held[self.vertices, None])
+        normal = np.swapaxes(axes, 1, 2)
+        offset = np.einsum("vai,vi->va", normal, p[self.vertices]) - np.einsum("vai,vi->va", normal, self.gradient) / k
+        both = np.concatenate([normal, -normal], axis=1).reshape(-1, 3)
+        ends = np.concatenate([offset, -offset], axis=1).ravel()
+        none = np.zeros(len(both))
+        vertices = np.repeat(self.vertices, 6)
+        return Planes(vertices, both, ends, np.zeros_like(both), np.concatenate([k, k], axis=1).ravel(), none)
+
+
+class Sweeps(Protocol):
+    """Vertex block descent without contact, in one step."""
+
+    def alone(self, p: Positions) -> Positions:
+        """Where a sweep leads from p, both (n, 3), and what is extrapolated from sweeps before: all since the last
+        `pushed` were alone."""
+        ...
+
+    def pushed(self, p: Positions, planes: Planes) -> Positions:
+        """Where a sweep leads from p with half-spaces, extrapolated by nothing."""
+        ...
+
+
+class Guarded(Iterating):
+    """See the module. majorant (n,) [N/m]: of all but contact; gauge: tells the residual of positions."""
+
+    def __init__(
+        self,
+        sweeps: Sweeps,
+        step: StepObjective,
+        guess: Positions,
+        majorant: Array,
+        radius: float,
+        gauge: Callable[[Positions], float],
+    ) -> None:
+        self._sweeps, self._step, self._majorant, self._gauge = sweeps, step, majorant, gauge
+        self._squared, self._factor = radius**2, 0.0
+        self.positions = step.placed(guess)
+        self._older = self.positions
+
+    def residual(self) -> float:
+        """See Iterating."""
+        return self._gauge(self.positions)
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        p, blocks = self.positions, self._blocks(self.positions)
+        if not blocks:
+            q = self._sweeps.alone(p)
+            if self._step.reach(p, q - p) == 1.0 and not self._blocks(q):
+                self.positions, self._older, self._factor = q, p, 0.0
+                return True
+        at, model = Point(p, self._step.gradient(p)), self._model(p, blocks)
+        q = self._sweeps.pushed(p, model.planes(p, self._majorant))
+        found = search(self._step, at, q - p) or search(self._step, at, self._each(at.gradient, model))
+        if found is None:
+            return False
+        self.positions, self._older = self._further(found.positions), p
+        return True
+
+    def _blocks(self, p: Positions) -> list[PairBlocks]:
+        found = (energy.blocks(p, 0.0) for energy in self._step.bounded)
+        return [blocks for blocks in found if len(blocks.vertices)]
+
+    def _model(self, p: Positions, blocks: list[PairBlocks]) -> Separable:
+        gradient, total, known = np.zeros_like(p), np.zeros((len(p), 3, 3)), np.zeros(len(p), bool)
+        for energy in self._step.bounded:
+            energy.add_gradient(p, gradient)
+        for one in blocks:
+            k = one.vertices.shape[1]
+            own = np.einsum("piajb,ij->piab", one.values.reshape(-1, k, 3, k, 3), np.eye(k))
+            moves = one.vertices >= 0
+            np.add.at(total, one.vertices[moves], k * own[moves])
+            known[one.vertices[moves]] = True
+        vertices = np.flatnonzero(known)
+        return Separable(vertices, gradient[vertices], total[vertices])
+
+    def _each(self, gradient: Positions, model: Separable) -> Positions:
+        """Each vertex along its own block."""
+        block = self._majorant[:, None, None] * np.eye(3)
+        block[model.vertices] += model.block
+        return np.asarray(-np.linalg.solve(block, gradient[:, :, None])[:, :, 0], np.float64)
+
+    def _further(self, q: Positions) -> Positions:
+        """Extrapolated from where the iteration before began, where that is free and no higher; else q."""
+        if not self._squared:
+            return q
+        before = self._factor
+        w = 4.0 / (4.0 - self._squared * before) if before > 1.0 else 2.0 / (2.0 - self._squared) if before else 1.0
+        self._factor = w
+        if w > 1.0:
+            way = self._step.placed(self._older + w * (q - self._older)) - q
+            if self._step.reach(q, way) == 1.0 and self._step.rise(q, q + way)[0] <= 0.0:
+                return q + way
+            self._factor = 0.0
+        return q
