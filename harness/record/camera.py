@@ -6,12 +6,14 @@ With x to the right, y up and z towards the camera, a point is seen from (cx, cy
 
 a the view's width over its height, and b < 1 for what stays free below. All are linear in cx, cy and D: of the points
 only four maxima count, and the nearest camera that sees all of them follows. Where that leaves room on two sides, h is
-replaced by smaller shares of it until it does not, so that the points stand in the middle.
+replaced by smaller shares of it until it does not, so that the points stand in the middle. Of several directions the
+one is taken in which the mesh fills the view well, over all frames.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
@@ -20,11 +22,13 @@ from numpy.typing import NDArray
 
 from harness.record.shading import LEVELS, palette, percent
 
-_DIRECTION = np.array([0.62, 0.38, 0.78]) / np.linalg.norm([0.62, 0.38, 0.78])
-"""From where the camera looks: a little from above and from the side, y is up."""
-
-_RIGHT = np.cross((0, 1, 0), _DIRECTION) / np.linalg.norm(np.cross((0, 1, 0), _DIRECTION))
-_AXES = np.stack([_RIGHT, np.cross(_DIRECTION, _RIGHT), _DIRECTION])
+_AROUND, _UP = 38.5, 20.8
+"""From where the camera looks, if nowhere else is better [degrees]: from the side, and a little from above; y is up."""
+_OTHERS = [(around, up) for around in (40, 20, 60, 80, -20, -40, -60, -80) for up in (15, 30, 40)]
+_BETTER = 1.15
+"""How much more of its view the mesh must fill, over all frames, where the camera looks from elsewhere."""
+_AS_GOOD = 0.97
+"""Of the best: the first of these is taken."""
 
 _HALF_VIEW = math.tan(math.radians(55 / 2))
 """The viewer's angle of view is 55 degrees, from bottom to top."""
@@ -43,6 +47,15 @@ _NEAREST = 0.3
 """How near the camera comes to the nearest point, in the diagonal of the box."""
 
 
+_SUPPORTS = 32
+"""Of more vertices than twice this only those count that are the outermost along so many axes: of a ball of them the
+others lie 2 % further out at most."""
+
+
+_LEAST = 1e-3
+"""Of a view: what is seen as a line, or as a point, fills so much of it."""
+
+
 class Extent:
     """The box that the positions stay in, and what of them a camera must see.
 
@@ -55,44 +68,32 @@ class Extent:
     ) -> None:
         self._low, self._high, self._aspect = rest.min(axis=0), rest.max(axis=0), aspect
         self._limit = 10 * np.linalg.norm(self._high - self._low)
-        side, room = np.outer(_SHARES, [aspect * _HALF_VIEW, _HALF_VIEW]).T
-        zero, one = np.zeros(len(_SHARES)), np.ones(len(_SHARES))
-        right, left = np.array([one, zero, side]), np.array([-one, zero, side])
-        up, down = np.array([zero, one, room]), np.array([zero, -one, _BELOW * room])
-        self._directions = np.hstack([right, left, up, down, [[0, 0], [0, 0], [1, -1]]]).T @ _AXES
-        self._ends = np.full(len(self._directions), -np.inf)
-        self._see(rest if first is None or not np.isfinite(first).all() else first)
+        self._seen = [_outermost(rest if first is None or not np.isfinite(first).all() else first)]
+        self._sight: _Sight | None = None
 
     def add(self, p: NDArray[np.floating]) -> None:
         """Widen the box to positions (n, 3) [m], unless they have blown up beyond showing."""
         low, high = np.minimum(self._low, p.min(axis=0)), np.maximum(self._high, p.max(axis=0))
         if np.linalg.norm(high - low) <= self._limit:
             self._low, self._high = low, high
-            self._see(p)
+            self._seen.append(_outermost(p))
+            self._sight = None
 
-    def _see(self, p: NDArray[np.floating]) -> None:
-        ends = [float((p @ direction).max()) for direction in self._directions]
-        self._ends = np.maximum(self._ends, ends)
-
-    def _camera(self) -> tuple[float, float, float]:
-        """cx, cy and D."""
-        right, left, up, down = self._ends[:-2].reshape(4, -1)
-        near, side, room = self._ends[-2], 2 * self._aspect * _HALF_VIEW, (1 + _BELOW) * _HALF_VIEW
-        distance = max((right[-1] + left[-1]) / side, (up[-1] + down[-1]) / room)
-        least = _NEAREST * float(np.linalg.norm(self._high - self._low)) or 1.0  # of a single point
-        distance = near + max(_MARGIN * (distance - near), least)
-        reach = _SHARES * _HALF_VIEW * distance
-        return (
-            _middle(right - self._aspect * reach, self._aspect * reach - left),
-            _middle(up - reach, _BELOW * reach - down),
-            distance,
-        )
+    def _best(self) -> _Sight:
+        """Of the sights that fill the view well, over all frames."""
+        if self._sight is None:
+            least = _NEAREST * float(np.linalg.norm(self._high - self._low)) or 1.0  # of a single point
+            first, *others = (_Sight(angles, self._aspect, self._seen, least) for angles in ((_AROUND, _UP), *_OTHERS))
+            best = max(sight.filled for sight in others)
+            better = next(sight for sight in others if sight.filled >= _AS_GOOD * best)
+            self._sight = better if best > _BETTER * first.filled else first
+        return self._sight
 
     def eye(self) -> rrb.EyeControls3D:
         """An orbiting eye that just sees all of it, and has room below."""
-        x, y, distance = self._camera()
-        middle = (self._ends[-2] - self._ends[-1]) / 2
-        eye, target = ((x, y, z) @ _AXES for z in (distance, middle))
+        sight = self._best()
+        x, y, distance = sight.place
+        eye, target = ((x, y, z) @ sight.axes for z in (distance, (sight.near + sight.far) / 2))
         return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=eye, look_target=target, eye_up=(0, 1, 0))
 
     def scale(self, strain_range: float, ends: tuple[float, float] = (0.0, 0.0)) -> tuple[rr.Mesh3D, rr.Points3D]:
@@ -101,14 +102,14 @@ class Extent:
         ends: the smallest and the largest strain of a spring; where the strip does not reach one it ends in a tip, with
         that figure.
         """
-        x, y, distance = self._camera()
-        near = self._ends[-2]
+        sight = self._best()
+        (x, y, distance), near = sight.place, sight.near
         half = _HALF_VIEW * (distance - near)
         width = _SCALE_WIDTH * half * min(1.0, self._aspect)
         across = [x - width + 2 * width * k / (LEVELS - 1) for k in range(LEVELS)]
         top = y + _SCALE_AT * half
         low = top - _SCALE_HEIGHT * half
-        edges = np.array([[at, height, near] for at in across for height in (low, top)]) @ _AXES
+        edges = np.array([[at, height, near] for at in across for height in (low, top)]) @ sight.axes
         first = 2 * np.arange(LEVELS - 1)[:, None, None]
         faces = (first + np.array([[0, 2, 1], [1, 2, 3]])).reshape(-1, 3)
         colours = np.repeat(palette()[:-1], 2, axis=0)
@@ -118,19 +119,73 @@ class Extent:
         for k, way, end in ((0, -1, ends[0]), (len(across) - 1, 1, ends[1])):
             if way * end > strain_range:
                 tip = [across[k] + way * 2 * (top - low), (low + top) / 2, near]
-                edges = np.vstack([edges, tip @ _AXES])
+                edges = np.vstack([edges, tip @ sight.axes])
                 faces = np.vstack([faces, [2 * k, 2 * k + 1, len(edges) - 1]])
                 colours = np.vstack([colours, colours[2 * k]])
                 marks.append([tip[0], top + _WORD * half, near])
                 words.append(f"to {percent(end, 2)}")
         strip = rr.Mesh3D(vertex_positions=edges, triangle_indices=faces, vertex_colors=colours)
         return strip, rr.Points3D(
-            np.array(marks) @ _AXES,
+            np.array(marks) @ sight.axes,
             labels=words,
             show_labels=True,
             radii=rr.Radius.ui_points([1.0] * 5 + [0.1] * (len(words) - 5)),
             colors=(255, 255, 255),
         )
+
+
+class _Sight:
+    """The points of some frames, seen from one direction.
+
+    axes: to the right, up and towards the camera; place: cx, cy and D; near, far: of the points towards the camera;
+    filled: the part of the view that a frame's points span, the geometric mean over the frames.
+    """
+
+    def __init__(
+        self, angles: tuple[float, float], aspect: float, frames: Sequence[NDArray[np.floating]], least: float
+    ) -> None:
+        around, up = np.radians(angles)
+        towards = np.array([np.sin(around) * np.cos(up), np.sin(up), np.cos(around) * np.cos(up)])
+        right = np.cross((0, 1, 0), towards) / np.linalg.norm(np.cross((0, 1, 0), towards))
+        self.axes = np.stack([right, np.cross(towards, right), towards])
+        seen = [p @ self.axes.T for p in frames]
+        points = np.concatenate(seen)
+        self.near, self.far = float(points[:, 2].max()), float(points[:, 2].min())
+        self.place = self._placed(points, aspect, least)
+        self.filled = float(np.exp(np.mean(np.log([max(self._part(p, aspect), _LEAST) for p in seen]))))
+
+    def _placed(self, points: NDArray[np.floating], aspect: float, least: float) -> tuple[float, float, float]:
+        x, y, z = points.T[:, None]
+        side, room = _SHARES[:, None] * aspect * _HALF_VIEW, _SHARES[:, None] * _HALF_VIEW
+        right, left, up, down = (
+            end.max(axis=1) for end in (x + side * z, side * z - x, y + room * z, _BELOW * room * z - y)
+        )
+        across, upright = 2 * aspect * _HALF_VIEW, (1 + _BELOW) * _HALF_VIEW
+        distance = max((right[-1] + left[-1]) / across, (up[-1] + down[-1]) / upright)
+        distance = self.near + max(_MARGIN * (distance - self.near), least)
+        reach = _SHARES * _HALF_VIEW * distance
+        return (
+            _middle(right - aspect * reach, aspect * reach - left),
+            _middle(up - reach, _BELOW * reach - down),
+            float(distance),
+        )
+
+    def _part(self, p: NDArray[np.floating], aspect: float) -> float:
+        x, y, distance = self.place
+        at: NDArray[np.float64] = (p[:, :2] - (x, y)) / (_HALF_VIEW * (distance - p[:, 2:])) / (aspect, 1)
+        across, upright = at.max(axis=0) - at.min(axis=0)
+        return float(across * upright) / 4
+
+
+def _outermost(p: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The points that are the last along some axis, spread evenly over all directions."""
+    if len(p) <= 2 * _SUPPORTS:
+        return p.copy()
+    turn = np.arange(_SUPPORTS)
+    up = (turn + 0.5) / _SUPPORTS  # of half a ball, in a spiral by the golden angle
+    out, around = np.sqrt(1 - up**2), turn * np.pi * (3 - np.sqrt(5))
+    along = p @ np.stack([out * np.cos(around), up, out * np.sin(around)]).astype(p.dtype)
+    return p[np.unique([along.argmax(axis=0), along.argmin(axis=0)])]
 
 
 def _middle(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:

@@ -36,6 +36,9 @@ _SHOWN = 3
 """How many of them are seen at once; the others are behind a tab."""
 
 
+_ABREAST = 4
+"""Scenes in a row at most; so many are higher than wide."""
+
 _STRAINED = ("/scene/mesh", "/scene/springs")
 _PAINTED = (
     ("Mesh3D:vertex_positions", "Mesh3D:vertex_colors"),
@@ -58,21 +61,23 @@ def side_by_side(out: Path, recordings: Mapping[str, Path], title: str, looks: M
     """
     file = PartialFile(out, f"springbench side by side {title}", title, title)
     try:
-        aspect = 1.0 if len(recordings) < 3 else 0.75
         with ExitStack() as opened:
             sources = {name: opened.enter_context(open_recording(path)) for name, path in recordings.items()}
             longest = max(float(network(source)["strain_range"][0]) for source in sources.values())
-            runs = [
-                _copy(file, _Run(name, k, source, aspect, longest), source, looks[name])
-                for k, (name, source) in enumerate(sources.items())
-            ]
+            box: Extent | None = None  # of all of them, so that all are seen alike
+            runs = list[_Run]()
+            for name, source in sources.items():
+                runs.append(_Run(name, len(runs), source, longest))
+                box = runs[-1].seen_in(source, box, 0.75 if len(sources) == _ABREAST else 1.0)
+            for run, source in zip(runs, sources.values(), strict=True):
+                _copy(file, run, source, looks[run.name], box)
         for frame in sorted(set[int]().union(*(run.curves for run in runs))):
             drawn = {run.name: run.curves[frame] for run in runs if frame in run.curves}
             colours = curves.colours(_colour(looks[name]) for name in drawn)
             curves.draw(file.stream, f"/curves/frame_{frame}", drawn, colours)
         document = rr.TextDocument(_table(title, runs), media_type=rr.MediaType.MARKDOWN)
         file.stream.log("/runs", document, static=True)
-        file.finish(_layout(runs))
+        file.finish(_layout(runs, box))
     finally:
         file.abandon()
 
@@ -80,7 +85,7 @@ def side_by_side(out: Path, recordings: Mapping[str, Path], title: str, looks: M
 class _Run:
     """One recording: where it went and what its views need to know."""
 
-    def __init__(self, name: str, k: int, source: Source, aspect: float, strain_range: float) -> None:
+    def __init__(self, name: str, k: int, source: Source, strain_range: float) -> None:
         fixed = network(source)
         self.strain_range, self._anew = strain_range, float(fixed["strain_range"][0]) != strain_range
         self._springs = fixed["springs"].reshape(-1, 2).astype(np.int64)
@@ -92,15 +97,18 @@ class _Run:
         self.properties: dict[str, Any] = properties(source)[1]
         self.triangles = len(triangles(source))
         self.entities: set[str] = set()
-        self.box: Extent | None = None
-        self.last = 0
+        self.last = self._vertices = 0
         self.curves = residuals(source)
+
+    def seen_in(self, source: Source, box: Extent | None, aspect: float) -> Extent | None:
+        """The box, widened to the recording's positions; aspect: of its view."""
         for frame, _, p in positions(source):
-            self.box = self.box or Extent(p, aspect)
-            self.box.add(p)
+            box = box or Extent(p, aspect)
+            box.add(p)
             self.last = max(self.last, frame)
             self._vertices = len(p)
             self.ends = widest(self.ends, self._strains(p)[0])
+        return box
 
     def _strains(self, p: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Of the springs and of the vertices."""
@@ -126,19 +134,18 @@ class _Run:
         return colours(strain, self.strain_range)
 
 
-def _copy(file: PartialFile, run: _Run, source: Source, look: Look) -> _Run:
+def _copy(file: PartialFile, run: _Run, source: Source, look: Look, box: Extent | None) -> None:
     for chunk in source.chunks(content="/**"):
         run.entities.add(chunk.entity_path)
         file.stream.send_chunks(run.coloured(chunk).with_entity_path(run.root + chunk.entity_path))
     for entity in run.entities & set(_QUANTITIES):
         lines = rr.SeriesLines(names=run.name, colors=_colour(look), widths=1.5)
         file.stream.log(run.root + entity, lines, static=True)
-    if run.box:
-        strip, numbers = run.box.scale(run.strain_range, run.ends)
+    if box:
+        strip, numbers = box.scale(run.strain_range, run.ends)
         file.stream.log(f"{run.root}/scene/scale", strip, static=True)
         file.stream.log(f"{run.root}/scene/scale/numbers", numbers, static=True)
     file.flush()
-    return run
 
 
 def residuals(source: Source) -> dict[int, list[float]]:
@@ -163,10 +170,10 @@ def _colour(look: Look) -> int:
     return int(on_dark(look.color)[1:] + "ff", 16)
 
 
-def _layout(runs: list[_Run]) -> rrb.Blueprint:
+def _layout(runs: list[_Run], box: Extent | None) -> rrb.Blueprint:
     entities = set[str]().union(*(run.entities for run in runs))
-    columns = min(len(runs), 4)
-    scenes = [scene_view(run.root, run.name, run.box, springs_visible=not run.triangles) for run in runs if run.box]
+    columns = min(len(runs), _ABREAST)
+    scenes = [scene_view(run.root, run.name, box, springs_visible=not run.triangles) for run in runs if box]
     known, last = [entity for entity in _QUANTITIES if entity in entities], max(run.last for run in runs)
     plots = [_plot(runs, entity, _QUANTITIES[entity], last, legend=entity == known[0]) for entity in known]
     frames = sorted(set[int]().union(*(run.curves for run in runs)))
