@@ -1,0 +1,63 @@
+"""How contact converges as its thickness shrinks and as its barrier stiffens: `python -m tests.contact_refinement`.
+
+A sheet of 1 m that is held at its corners sinks onto a ball; range and thickness are the same. What is told is how far
+vertices are from where half the thickness, or sixteen times the stiffness, has them, as the root of the mean of
+squares: the first is of order 1 (halved), the second of order 1/2 (a quarter), since a barrier rises by the third power
+of what is gone of its range.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from harness.scenes.effects.ether_drag import EtherDrag
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.self_contact import SelfContact
+from harness.scenes.effects.springs import Springs
+from harness.scenes.effects.surface_contact import SurfaceContact
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.obstacles import Sphere
+from harness.simulation.step import prepare, simulate
+from solvers.methods.newton import Newton
+from solvers.problem import Positions, StopRule
+from tests.scenes import scene
+
+THICKNESSES = tuple(0.04 / 2**k for k in range(6))
+STIFFNESSES = tuple(1e2 * 16**k for k in range(6))
+SIZE, FRAMES = 7, 20
+BALL = Sphere(center=(0.0, -0.36, 0.0), radius=0.3)
+
+
+def fallen(thickness: float, stiffness: float) -> Positions:
+    """Where the sheet is after 0.7 s, (n, 3) [m]."""
+    own = SelfContact(thickness=thickness, stiffness=stiffness)
+    ball = SurfaceContact(thickness=thickness, stiffness=stiffness, obstacles=(BALL,))
+    effects = Springs(stretch=100.0, shear=20.0), Gravity(), EtherDrag(rate=5.0), Pins(at=("corners",)), own, ball
+    made = scene(Grid(), *effects, size=SIZE)
+    rule = StopRule(200, 1e-7)
+    *_, last = simulate(made, prepare(made, Newton()), rule, first_guess="current", frames=FRAMES)
+    return last.positions
+
+
+def apart(found: list[Positions]) -> list[float]:
+    """How far each is from the next [m]."""
+    return [float(np.sqrt(np.mean(np.sum((b - a) ** 2, axis=1)))) for a, b in pairwise(found)]
+
+
+def main() -> None:
+    """Print both tables."""
+    for name, values, found in (
+        ("thickness [m]", THICKNESSES, [fallen(t, 100.0) for t in THICKNESSES]),
+        ("stiffness [N/m]", STIFFNESSES, [fallen(0.02, k) for k in STIFFNESSES]),
+    ):
+        far = apart(found)
+        print(f"{name:>16}  to the next [mm]  shrinks by")
+        for k, (value, one) in enumerate(zip(values, far, strict=False)):
+            print(f"{value:16.4g}  {1e3 * one:16.3f}  {far[k - 1] / one if k else np.nan:10.2f}")
+
+
+if __name__ == "__main__":
+    main()
