@@ -8,9 +8,24 @@ from numpy.typing import NDArray
 from harness.scenes.mesh.stack import Stack
 from solvers.contact.self_contact import SelfContact
 from solvers.contact.surface import Surface
-from solvers.problem import Positions
+from solvers.methods.anderson import Anderson
+from solvers.methods.chebyshev import Chebyshev
+from solvers.methods.lbfgs import Lbfgs
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.problem import Positions, Solver
+from solvers.registry import SOLVERS, load
 
 THICKNESS, RANGE = 0.02, 0.03
+
+TAKE_SURFACES: dict[str, Solver] = {
+    **{name: load(SOLVERS[name])() for name in ("newton", "newton-cg", "pncg", "lbfgs", "hybrid", "vbd", "sparse")},
+    **{name: load(SOLVERS[name])() for name in ("numba", "anderson", "chebyshev")},
+    "lbfgs float32": Lbfgs(precision="float32"),
+    "numba float32": CompiledLocalGlobal(precision="float32"),
+    "anderson float32": Anderson(precision="float32"),
+    "chebyshev float32": Chebyshev(precision="float32"),
+}
+"""The solvers that claim contact of surfaces, with the precisions of factors that they know."""
 
 
 def sides(triangles: NDArray[np.int64]) -> NDArray[np.int64]:

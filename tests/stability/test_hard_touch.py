@@ -12,29 +12,33 @@ from harness.simulation.observe import intersections
 from harness.simulation.step import prepare, simulate
 from solvers.contact.self_contact import PairContact
 from solvers.core.clearing import Blocked
-from solvers.methods.lbfgs import Lbfgs
-from solvers.problem import Solver, StopRule
-from solvers.registry import SOLVERS, load
+from solvers.problem import StopRule
+from tests.self_contacts import TAKE_SURFACES
 
 CASES = {
     path.stem: path for path in sorted((Path(__file__).resolve().parents[2] / "configs/hard-touch").glob("*.yaml"))
 }
-SOLVE: dict[str, Solver] = {name: load(SOLVERS[name])() for name in ("newton", "newton-cg", "pncg", "lbfgs", "hybrid")}
-SOLVE["lbfgs float32"] = Lbfgs(precision="float32")
-QUICK = {"edges-parallel", "vertex-on-face", "needles", "ropes-parallel"}
+SOLVE = TAKE_SURFACES
+QUICK = {"edges-parallel", "vertex-on-face", "needles"}
+QUICKLY = {"newton", "newton-cg", "pncg", "lbfgs", "lbfgs float32", "hybrid"}
 IMPOSSIBLE = {"slit-closes": "obstacles leave no room"}
-FEW = {"lbfgs": 4, "lbfgs float32": 4}
-"""Frames, where iterations are many."""
+MANY = {"newton", "newton-cg", "hybrid"}
+FEW = 4
+"""Frames of all other solvers, whose iterations are many."""
 
 
-@pytest.mark.parametrize("name", SOLVE)
 @pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=() if case in QUICK else pytest.mark.long, id=case) for case in CASES]
+    ("case", "name"),
+    [
+        pytest.param(case, name, marks=() if case in QUICK and name in QUICKLY else pytest.mark.long)
+        for case in CASES
+        for name in SOLVE
+    ],
 )
 def test_nothing_passes_through_anything(case: str, name: str):
     spec = load_scene(CASES[case])
     made, touched = build(spec, spec.default_size or 6), 0
-    rule, frames = StopRule(60, 1e-4), FEW.get(name, spec.frames)
+    rule, frames = StopRule(60, 1e-4), spec.frames if name in MANY or case in IMPOSSIBLE else FEW
     run = simulate(made, prepare(made, SOLVE[name]), rule, first_guess="current", frames=frames)
     if case in IMPOSSIBLE:
         with pytest.raises(Blocked, match=IMPOSSIBLE[case]):

@@ -12,15 +12,13 @@ from harness.scenes.bind import build
 from harness.simulation.observe import intersections
 from harness.simulation.step import prepare, simulate
 from solvers.contact.self_contact import PairContact
-from solvers.methods.lbfgs import Lbfgs
 from solvers.problem import Solver, StopRule
-from solvers.registry import SOLVERS, load
 from tests.knots import determinant
+from tests.self_contacts import TAKE_SURFACES
 
 SCENES = {path.stem: path for path in sorted((Path(__file__).resolve().parents[2] / "configs/touch").glob("*.yaml"))}
 SMALL = {"knot": 60, "net-on-block": 5}
-SOLVE: dict[str, Solver] = {name: load(SOLVERS[name])() for name in ("newton", "newton-cg", "pncg", "lbfgs", "hybrid")}
-SOLVE["lbfgs float32"] = Lbfgs(precision="float32")
+SOLVE = TAKE_SURFACES
 FRAMES = {"hybrid": 1000}
 """Sixty of all others."""
 
