@@ -10,6 +10,7 @@ import json
 import os
 import sys
 from copy import copy
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -93,8 +94,18 @@ def run(
     sweep = load_any(config, solvers=solver or (), sizes=size or (), **given.obj)
     folder = claimed(results / sweep.name, config)
     how: dict[str, Any] = {"again": again, "changed": changed, "positions": positions, "isolated": not here}
-    table = run_sweep(sweep.name, sweep.runs(), folder, display(err()), _say, at_once=workers, on=on, **how)
+    how |= {"at_once": workers, "on": on, "meanwhile": _load_what_tells}
+    table = run_sweep(sweep.name, sweep.runs(), folder, display(err()), _say, **how)
     raise typer.Exit(1 if _told(sweep, table, config, results, folder) else 0)
+
+
+def _load_what_tells() -> None:
+    """What `_told` needs, which takes as long to load as a picture to draw."""
+    from harness.base.machine_lock import beside
+
+    with beside(lambda said: None):
+        import_module("harness.report.learned")
+        import_module("harness.report.site")
 
 
 def _told(sweep: Sweep, table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:

@@ -59,20 +59,29 @@ class Workers:
         self._ready, self._fork = ready, fork
         self._worker: _Worker | None = None
 
-    def do(self, piece: Piece, tick: Tick, limits: Limits) -> Any:
-        """What the piece returns. Raises the SpringbenchError that it raises, and Lost where it gives no answer."""
-        going = self.doing(piece, tick, limits)
-        while True:
-            try:
-                wait([next(going)], _LOOK)
-            except StopIteration as done:
-                return done.value
-
-    def doing(self, piece: Piece, tick: Tick, limits: Limits) -> Going:
-        """Do a piece while others are done; see `do`. tick is told LOOK too, whenever this is asked to go on."""
+    def begin(self) -> None:
+        """Start a worker where there is none; it gets ready while this process does something else."""
         if self._worker is None or not self._worker.alive:
             self.end()
             self._worker = _Worker(self._ready, fork=self._fork)
+
+    def do(self, piece: Piece, tick: Tick, limits: Limits, meanwhile: Callable[[], object] = int) -> Any:
+        """What the piece returns. meanwhile: done here once the worker has it. Raises the SpringbenchError that the
+        piece raises, and Lost where it gives no answer."""
+        going = self.doing(piece, tick, limits)
+        while True:
+            try:
+                come = next(going)
+            except StopIteration as done:
+                return done.value
+            meanwhile()
+            meanwhile = int
+            wait([come], _LOOK)
+
+    def doing(self, piece: Piece, tick: Tick, limits: Limits) -> Going:
+        """Do a piece while others are done; see `do`. tick is told LOOK too, whenever this is asked to go on."""
+        self.begin()
+        assert self._worker
         try:
             answer = yield from self._worker.ask(piece, tick, limits)
         except BaseException:  # it was lost, or somebody wants to leave

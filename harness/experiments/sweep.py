@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING
 import pyarrow as pa
 
 from harness.base import holding, machine, rows
-from harness.base.errors import InputError, Mistake
+from harness.base.asides import is_step
+from harness.base.errors import InputError, Mistake, RunFailed
 from harness.base.holding import Claims
 from harness.base.progress import Display
+from harness.base.workers import Limits, Lost, Workers
 from harness.config.sweep import RunSpec
 from harness.experiments.core import do_all, do_together, require_threads, workers_at_once
 from harness.experiments.plan import NEEDED, Files, of_other_code, plan
@@ -23,6 +25,10 @@ from harness.experiments.run_unit import RunUnit
 
 if TYPE_CHECKING:
     from harness.experiments.cluster import Cluster
+
+
+_FEW = 100
+"""Up to so many runs the start of what draws counts, and their rows are not too long to hand over."""
 
 
 def _away(on: str, runs: Sequence[RunSpec], say: Callable[[str], None]) -> AbstractContextManager[Cluster]:
@@ -46,13 +52,15 @@ def run_sweep(
     isolated: bool = True,
     at_once: int | None = None,
     on: str | None = None,
+    meanwhile: Callable[[], object] = int,
 ) -> pa.Table:
     """Do what is missing of a sweep, all of it with `again` or `positions`, with `changed` also what was done by other
     code than today's, and return all its rows.
 
     say: prints a remark; positions: where to store the positions of the sweep's only run; isolated: whether runs are
     done in processes that may die, within their limits, or in this one; at_once: in how many, by the cores if left out;
-    on: where else to do them (`harness.experiments.cluster`). Raises InputError.
+    on: where else to do them (`harness.experiments.cluster`); meanwhile: done while another process draws. Raises
+    InputError, RunFailed where that process is lost.
     """
     if on and (positions or not isolated):
         raise InputError("--positions and --here are of this machine; leave --on out")
@@ -71,6 +79,12 @@ def run_sweep(
         )
         planned = plan(runs, folder, machines)
         todo = wanted(planned, "runs", say, again=again or positions is not None, changed=changed)
+        drawing: Workers | None = None
+        here = isolated and not away
+        if here and len(runs) <= _FEW and any(p.run.record and p.run.pictures for p in todo):
+            drawing = Workers(_ready_to_draw)
+            held.callback(drawing.end)
+            drawing.begin()
         if todo and not away:
             import_module("harness.experiments.run")  # here, for workers that are forks of this process
             if any(p.run.judge for p in todo):
@@ -81,14 +95,30 @@ def run_sweep(
             do_together(units, claims, partial(away.do_all, folder, display), say)
             planned = plan(runs, folder, machines)
         else:
-            here = partial(do_all, display=display, isolated=isolated, at_once=many)
-            do_together(units, claims, lambda some, another: here(some, another=another), say)
-        from harness.report.sweep import Pictured, draw_sweep  # takes a second, in which runs can be done already
+            do_here = partial(do_all, display=display, isolated=isolated, at_once=many)
+            do_together(units, claims, lambda some, another: do_here(some, another=another), say)
+        from harness.report.sweep import Pictured, draw_sweep
 
         table = rows.read((p.files.rows for p in planned), needed=NEEDED)
         pictured = [Pictured(p.run, p.files.recording, p.files.picture) for p in planned]
-        draw_sweep(name, pictured, folder, table, say, at_once=many, older=of_other_code(runs, table))
+        draw = partial(draw_sweep, name, pictured, folder, table, at_once=many, older=of_other_code(runs, table))
+        if drawing is None:
+            draw(say)
+            return table
+        try:
+            drawing.do(draw, lambda said: say(said) if is_step(said) else None, Limits(), meanwhile)
+        except Lost as lost:
+            raise RunFailed(
+                f"the process that draws {lost}; what was measured is kept, and the same command draws it"
+            ) from None
     return table
+
+
+def _ready_to_draw() -> None:
+    """In the process that draws a sweep of few runs: load what does while the runs are done, in a second or two."""
+    from harness.report.sweep import get_ready
+
+    get_ready()
 
 
 def failures(table: pa.Table) -> list[str]:

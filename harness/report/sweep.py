@@ -66,6 +66,19 @@ def draw_sweep(
     _draw_groups(groups, say, pictures=not missing)
 
 
+def get_ready() -> None:
+    """Load what draws, in this process, piece by piece and beside nothing that is timed."""
+    from harness.report import opengl
+
+    with beside(_silent):
+        opengl.begin()
+        import_module("harness.report.timing_plot")  # with Matplotlib
+        opengl.problem()
+    for name in ("harness.record.reader", "pyvista", "harness.report.run_picture"):
+        with beside(_silent):
+            import_module(name)
+
+
 def _loaded() -> str | None:
     """What draws is loaded, here, for processes that are forks of this one; returns why it cannot draw, if so."""
     from harness.report import opengl

@@ -158,3 +158,22 @@ def test_a_worker_stays_from_run_to_run(tmp_path: Path, monkeypatch: pytest.Monk
     workers = set(note.read_text().split())
     assert len(workers) == 1
     assert str(os.getpid()) not in workers
+
+
+def test_a_drawing_process_that_is_lost_fails_the_command_and_keeps_what_was_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from harness.report import sweep
+
+    monkeypatch.setattr(sweep, "get_ready", int)
+    monkeypatch.setattr(sweep, "draw_sweep", leave)  # where it draws: that process is a fork of this one
+    made = own(tmp_path, monkeypatch, options="frames: 1, rounds: 1, iterations: 5")
+    told = ran(made)
+    assert told.exit_code == 1
+    assert "the process that draws ended its process with exit code 3" in " ".join(told.output.split())
+    assert len([*(tmp_path / "r").rglob("*.parquet")]) == 2
+
+
+def leave(*_: Any, **__: Any) -> None:
+    """End the process."""
+    os._exit(3)
