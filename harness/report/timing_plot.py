@@ -113,7 +113,7 @@ def _scene(
     for (name, members), dash in zip(series.items(), _variants(series, looks), strict=True):
         look = looks[members[0].solver]
         ends += _draw_steps(step, name, members, look, dash, older)
-        _draw_prepare(prepare, members, look)
+        _draw_prepare(prepare, members, look, older)
     direct_labels(step, ends)
     _crosses(step, failed, looks)
     if not series:
@@ -198,21 +198,16 @@ def _draw_steps(
     return [(n[-1], middle[-1], words, look.color)]
 
 
-def _draw_prepare(ax: Axes, members: Sequence[RunTimes], look: Mark) -> None:
-    for field, dash, face in (("cold", (0, (2, 2)), PAGE), ("warm", "-", look.color)):
-        timed = sorted((run.vertices, getattr(run, field)) for run in members if getattr(run, field))
+def _draw_prepare(ax: Axes, members: Sequence[RunTimes], look: Mark, older: Collection[str]) -> None:
+    for field, dash, marker in (("cold", (0, (2, 2)), "_"), ("warm", "-", look.marker)):
+        known = [run for run in members if getattr(run, field)]
+        timed = sorted((run.vertices or 0, getattr(run, field), run.run_id in older) for run in known)
         if timed:
-            n, value = zip(*timed, strict=True)
-            ax.plot(
-                n,
-                value,
-                color=look.color,
-                linestyle=dash,
-                linewidth=1.3,
-                marker=look.marker,
-                markersize=5,
-                markerfacecolor=face,
-            )
+            n, value, hollow = (np.array(part) for part in zip(*timed, strict=True))
+            ax.plot(n, value, color=look.color, linestyle=dash, linewidth=1.3, marker=marker, markersize=5)
+            if hollow.any():
+                at, of = n[hollow], value[hollow]
+                ax.plot(at, of, marker=marker, ls="", mfc=PAGE, mec=look.color, markersize=5, zorder=4)
 
 
 def _crosses(ax: Axes, failed: Sequence[RunTimes], looks: Mapping[str, Mark]) -> None:

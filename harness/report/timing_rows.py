@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from math import log10
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -14,8 +15,12 @@ from harness.report.page import axes, count, quantity, shorten, text, ticks
 from harness.report.style import INK, MUTED, PAGE, Mark
 from harness.report.timing_table import RunTimes
 
-HEADINGS = "milliseconds a step", "milliseconds to prepare, once a run: filled warm, open cold"
+HEADINGS = "milliseconds a step", "milliseconds to prepare, once a run: marks warm, bars cold"
 """Of the two panels of a scene."""
+_SHORT = "ms a step", "ms to prepare"
+"""Where there is no room for these."""
+_TICK = 38.0
+"""Pixels of a number below an axis."""
 
 _ROW, _NAMES, _HEAD, _GAP, _LETTER = 42.0, 0.3, 96.0, 48.0, 8.2
 """Pixels of a row, part of the width for the solvers' names at most, pixels above, between panels, and of a letter."""
@@ -43,7 +48,7 @@ def draw_rows(
     tall = min(_ROW * len(here) + 14.0, height - _HEAD - 40.0)
     each = (width - start - _GAP) / 2.0
     panels = [axes(page, left + start + k * (each + _GAP), top + _HEAD, each, tall) for k in range(2)]
-    for k, words in enumerate(HEADINGS):
+    for k, words in enumerate(HEADINGS if each > 6.6 * max(map(len, HEADINGS)) else _SHORT):
         place = left + start + k * (each + _GAP)
         text(page, place, top + _HEAD - 18, shorten(words, int(each / 6.6)), size=9.5, color=MUTED)
     step, prepare = panels
@@ -57,23 +62,23 @@ def draw_rows(
             step.plot(0.02, row, "x", color=look.color, transform=step.get_yaxis_transform(), markersize=8, mew=2)
             where = step.get_yaxis_transform()
             step.text(0.05, row, run.status, color=look.color, transform=where, va="center", fontsize=9)
-        for value, fill in ((run.cold, PAGE), (run.warm, look.color)):
+        for value, marker, size in ((run.cold, "|", 13), (run.warm, look.marker, 7)):
             if value is not None:
-                prepare.plot(value, row, marker=look.marker, ls="", color=look.color, mfc=fill, mew=1.5, markersize=7)
+                prepare.plot(value, row, marker=marker, ls="", color=look.color, mfc=face, mew=1.5, markersize=size)
     labels = [shorten(names[run.run_id], int(start / _LETTER)) for run in here]
-    _scales(step, [v for run in here for v in (run.lower, run.upper) if v], labels)
-    _scales(prepare, [v for run in here for v in (run.cold, run.warm) if v], [""] * len(here))
+    _scales(step, [v for run in here for v in (run.lower, run.upper) if v], labels, each)
+    _scales(prepare, [v for run in here for v in (run.cold, run.warm) if v], [""] * len(here), each)
     return top + _HEAD + tall + 52.0
 
 
-def _scales(ax: Axes, values: Sequence[float], labels: Sequence[str]) -> None:
-    """Times by logarithms, over a decade at least; the rows' names at the left of the first panel."""
+def _scales(ax: Axes, values: Sequence[float], labels: Sequence[str], width: float) -> None:
+    """Times by logarithms, over a decade at least; the rows' names at the left of the first panel; width [pixels]."""
     low, high = (min(values), max(values)) if values else (0.1, 10.0)
-    reach = max((high / low) * 1.3, 10.0) ** 0.5
-    middle = (low * high) ** 0.5
+    reach = max((high / low) ** (1.0 + 40.0 / width) * 1.3, 10.0) ** 0.5
+    middle, named = (low * high) ** 0.5, 6.0 * log10(reach)
     ax.set_xscale("log")
     ax.set_xlim(middle / reach, middle * reach)
-    ax.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 2.0, 5.0), numticks=10))
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if named * _TICK < width else (1.0,), numticks=10))
     ax.xaxis.set_major_formatter(ticks(quantity))
     ax.xaxis.set_minor_locator(NullLocator())
     ax.set_ylim(len(labels) - 0.5, -0.5)

@@ -142,6 +142,7 @@ _NAMES = 12
 
 INTERRUPTED = "! the process was interrupted while steps were timed: its least time is nearest to the truth"
 APART = "~ local and global, timed alone, do not add up to an iteration within 15 %"
+OTHER = "† by other code than today's"
 """What the marks in the table mean."""
 SHARED = "timed beside others, up to {} at once, each on cores of its own: slower than alone by what they share"
 
@@ -179,7 +180,7 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
             _number(run.least, quantity),
             *(_number(value, quantity) + _apart(run, value) for value in (run.local, run.global_)),
             _number(run.iterations, quantity),
-            _ended(run) + ("[yellow] by other code[/]" if run.run_id in other_code else ""),
+            _ended(run) + ("[yellow]†[/]" if run.run_id in other_code else ""),
             _number(run.residual, "{:.1e}".format),
             *(
                 _number(strain, lambda strain: f"{100 * strain:.3g} %")
@@ -190,6 +191,7 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
     shared = [
         n for how, n in zip(*(table[c].to_pylist() for c in ("timing", "at_once")), strict=True) if how == "shared"
     ]
+    marks[OTHER] = any(run.run_id in other_code for run in found)
     marks[SHARED.format(max(shared, default=0))] = bool(shared)
     out.caption = "\n".join([*(words for words, there in marks.items() if there), *_methods(table), *foot(table)])
     longest = max(map(len, [*names.values(), *scenes]), default=0)
