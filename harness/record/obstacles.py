@@ -44,8 +44,12 @@ class Obstacles:
     def __init__(self, stream: rr.RecordingStream, obstacles: Sequence[AnySurface], rest: Array) -> None:
         self._stream = stream
         self._moving: list[tuple[str, KeyedMotion]] = []
+        self._deforming: list[tuple[str, Solid]] = []
         for k, one in enumerate(obstacles):
             entity = f"/scene/obstacles/{k}-{one.kind}"
+            if one.kind == "mesh" and one.frames:
+                self._deforming.append((entity, one))
+                continue
             stream.log(entity, _SHAPES[one.kind](one, rest), static=True)
             if one.motion:
                 self._moving.append((entity, one.motion))
@@ -55,6 +59,9 @@ class Obstacles:
         for entity, motion in self._moving:
             origin, *ends = motion.moved(np.concatenate([np.zeros((1, 3)), np.eye(3)]), time)
             self._stream.log(entity, rr.Transform3D(translation=origin, mat3x3=(np.array(ends) - origin).T))
+        for entity, one in self._deforming:
+            points, triangles = one.shape()
+            self._stream.log(entity, _faces(one.placed(points, time), triangles))
 
 
 def _sphere(one: Sphere, rest: Array) -> rr.Ellipsoids3D:
@@ -97,7 +104,10 @@ def _plane(one: Plane, rest: Array) -> rr.Mesh3D:
 
 def _mesh(one: Solid, rest: Array) -> rr.Mesh3D:
     """Every triangle with points of its own: edges stay sharp."""
-    points, triangles = one.shape()
+    return _faces(*one.shape())
+
+
+def _faces(points: Array, triangles: NDArray[np.int64]) -> rr.Mesh3D:
     corners = points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)

@@ -41,7 +41,9 @@ def seen(replay: Replay, frames: Iterable[int]) -> NDArray[np.float32]:
 def solid(obstacle: AnySurface, time: float, seen: NDArray[np.floating]) -> pv.PolyData | None:
     """The obstacle at a time [s]; of a plane the part below the points `seen` (q, 3) [m]; None for the level ground."""
     made = _MADE[obstacle.kind](obstacle, seen)
-    if made is not None and obstacle.motion is not None:
+    if obstacle.kind == "mesh" and made is not None:
+        made.points = obstacle.placed(np.asarray(made.points, np.float64), time)
+    elif made is not None and obstacle.motion is not None:
         made.points = obstacle.motion.moved(np.asarray(made.points, np.float64), time)
     return made
 

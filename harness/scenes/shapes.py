@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
@@ -17,7 +18,7 @@ from pydantic import (
     model_serializer,
 )
 
-from harness.base.errors import InputError
+from harness.base.errors import InputError, Mistake
 from harness.base.model import Model, Vector
 from harness.scenes.mesh.body import Body
 from harness.scenes.mesh.files import File
@@ -57,6 +58,41 @@ class Triangles(Model):
         return triangles
 
 
+class Frames(Model):
+    """Where the points of a mesh are in frames of equal length, in between on straight ways; before the first frame and
+    after the last one they rest."""
+
+    positions: Path | tuple[tuple[Vector, ...], ...]
+    """An .npz with `positions` (frames, points, 3) [m], as `springbench run --positions` writes it; or written out."""
+    rate: Metres = 60.0
+    """Frames a second."""
+    begin: float = Field(default=0.0, ge=0.0, le=1e9)
+    """When the first frame is [s]."""
+
+    @cached_property
+    def stored(self) -> Array:
+        """(frames, points, 3) [m]; raises InputError."""
+        if not isinstance(self.positions, Path):
+            found = np.array(self.positions)
+        else:
+            try:
+                with np.load(self.positions, allow_pickle=False) as file:
+                    found = np.asarray(file["positions"], np.float64)
+            except (OSError, ValueError, KeyError, EOFError) as error:
+                wanted = "wanted an .npz with `positions` (frames, points, 3)"
+                raise InputError(Mistake(f"cannot be read ({error}); {wanted}", self.positions)) from None
+        if found.ndim != 3 or found.shape[2] != 3 or not len(found) or not np.isfinite(found).all():
+            raise InputError(f"frames: came positions {found.shape}; wanted finite ones of shape (frames, points, 3)")
+        return found
+
+    def at(self, time: float) -> Array:
+        """Where the points are at a time [s], (points, 3) [m]."""
+        frame = min(max((time - self.begin) * self.rate, 0.0), len(self.stored) - 1.0)
+        k = min(int(frame), max(len(self.stored) - 2, 0))
+        one, part = self.stored[k], frame - k
+        return one if part == 0.0 else one + part * (self.stored[k + 1] - one)
+
+
 AnyShape = Annotated[
     Balloon | Block | Body | File | Grid | Skirt | Triangles,
     Field(discriminator="kind"),
@@ -77,23 +113,32 @@ class Solid(Model):
     """then shifted by this [m]."""
     motion: KeyedMotion | None = None
     """Key frames that take the obstacle along."""
+    frames: Frames | None = None
+    """Frames in which its points are elsewhere: it deforms, and goes along its key frames besides."""
 
     @field_validator("mesh")
     @classmethod
     def _beside(cls, mesh: Any, info: ValidationInfo) -> Any:
         """Names of files are relative to the config's folder."""
-        if not isinstance(mesh, File):
-            return mesh
-        path = Path(cast(Mapping[str, Any], info.context or {}).get("folder", ".")) / mesh.path
-        if not path.is_file():
-            raise ValueError(f"there is no file {path}")
-        return mesh.model_copy(update={"path": path})
+        return mesh.model_copy(update={"path": _beside(mesh.path, info)}) if isinstance(mesh, File) else mesh
+
+    @field_validator("frames")
+    @classmethod
+    def _beside_too(cls, frames: Frames | None, info: ValidationInfo) -> Frames | None:
+        if frames is None or not isinstance(frames.positions, Path):
+            return frames
+        return frames.model_copy(update={"positions": _beside(frames.positions, info)})
 
     @model_serializer(mode="wrap")
     def _written_out(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """A file counts by what it holds; what a recording declares has to be there when it is read."""
         told: dict[str, Any] = dump(self)
-        if isinstance(self.mesh, File):
+        if self.frames is None:
+            del told["frames"]
+        else:
+            moved = self.scale * self.frames.stored + np.array(self.offset)
+            told["frames"]["positions"] = moved.tolist()
+        if isinstance(self.mesh, File) or self.frames:
             points, triangles = self.shape()
             told |= {"scale": 1.0, "offset": (0.0, 0.0, 0.0)}
             told["mesh"] = {"kind": "triangles", "points": points.tolist(), "triangles": triangles.tolist()}
@@ -108,7 +153,26 @@ class Solid(Model):
             points, triangles = mesh.rest, mesh.triangles
         if not len(triangles):
             raise InputError("the mesh has no triangles, so there is nothing to meet")
+        if self.frames:
+            if len(points) != self.frames.stored.shape[1]:
+                came = f"{self.frames.stored.shape[1]:,} points for a mesh of {len(points):,}"
+                raise InputError(f"frames: came {came}; wanted as many")
+            points = self.frames.stored[0]
         return self.scale * points + np.array(self.offset), triangles
+
+    def placed(self, points: Positions, time: float) -> Positions:
+        """Where the points that `shape` tells are at a time [s], (o, 3) [m]."""
+        if self.frames:
+            points = self.scale * self.frames.at(time) + np.array(self.offset)
+        return points if self.motion is None else self.motion.moved(points, time)
+
+
+def _beside(name: Path, info: ValidationInfo) -> Path:
+    """A file by the config's folder."""
+    path = Path(cast(Mapping[str, Any], info.context or {}).get("folder", ".")) / name
+    if not path.is_file():
+        raise ValueError(f"there is no file {path}")
+    return path
 
 
 AnySurface = Annotated[Plane | Sphere | Capsule | Box | Solid, Field(discriminator="kind")]
@@ -117,6 +181,18 @@ AnySurface = Annotated[Plane | Sphere | Capsule | Box | Solid, Field(discriminat
 def from_json(text: str) -> tuple[AnySurface, ...]:
     """The obstacles that a recording declares. Raises ValueError."""
     return TypeAdapter(tuple[AnySurface, ...]).validate_json(text)
+
+
+def deforming(obstacle: AnySurface) -> bool:
+    """Whether it goes along stored frames."""
+    return isinstance(obstacle, Solid) and obstacle.frames is not None
+
+
+def placed(obstacle: AnySurface, points: Positions, time: float) -> Positions:
+    """Where points of its shape, as they were declared, are at a time [s], (o, 3) [m] both."""
+    if isinstance(obstacle, Solid):
+        return obstacle.placed(points, time)
+    return points if obstacle.motion is None else obstacle.motion.moved(points, time)
 
 
 def shape(obstacle: AnySurface, sag: float, around: Positions) -> Shape:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from harness.base.errors import InputError
-from harness.scenes.bind import Scene
+from harness.scenes.bind import Scene, build
 from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.self_contact import SelfContact
 from harness.scenes.effects.springs import Springs
@@ -21,7 +22,9 @@ from harness.scenes.mesh.surfaces import Balloon
 from harness.scenes.motion import Key, KeyedMotion
 from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
 from harness.scenes.shapes import Solid, Triangles, from_json, shape
+from harness.scenes.spec import SceneSpec
 from harness.simulation.observe import intersections
+from harness.simulation.opinion.second import second_opinion
 from harness.simulation.step import State, prepare, problem, simulate, start
 from solvers.contact.self_contact import ObstacleContact
 from solvers.core.clearing import Blocked
@@ -129,6 +132,46 @@ def test_an_obstacle_that_moves_pushes_the_sheet_and_never_passes_it(name, sidew
             energy.closed(step.positions) for energy in step.problem.energies if isinstance(energy, ObstacleContact)
         )
     assert highest > 0.1 or sideways
+
+
+def deforming(path: Path, rate: float) -> Solid:
+    """The ball grows taller and thinner from frame to frame, and rises."""
+    ball = Balloon(radius=0.3).build(4).rest
+    stored = [ball * (1 / s, s, 1 / s) + (0.0, 0.4 * (s - 1), 0.0) for s in 1 + 0.08 * np.arange(7)]
+    np.savez(path / "ball.npz", positions=np.array(stored))
+    frames = {"positions": str(path / "ball.npz"), "rate": rate}
+    return Solid.model_validate(BALL.model_dump() | {"mesh": {"kind": "balloon", "radius": 0.3}, "frames": frames})
+
+
+def test_an_obstacle_that_deforms_along_stored_frames_lifts_the_sheet(tmp_path):
+    one = deforming(tmp_path, 30.0)
+    made, highest = draped(one, friction=0.3, size=6), 0.0
+    for step in simulate(made, prepare(made, Newton()), RULE, first_guess="current", frames=8):
+        assert intersections(made, step.positions, made.time(step.index)) == 0
+        highest = float(step.positions[:, 1].max())
+    assert highest > 0.2
+    points, _ = one.shape()
+    for time, frame in ((0.0, 0), (0.1, 3), (9.0, 6)):
+        assert one.frames is not None
+        np.testing.assert_allclose(one.placed(points, time), one.frames.stored[frame] + one.offset, atol=1e-12)
+    (back,) = from_json(f"[{one.model_dump_json(exclude_none=True)}]")
+    assert isinstance(back, Solid)
+    np.testing.assert_allclose(back.placed(back.shape()[0], 0.15), one.placed(points, 0.15), atol=1e-12)
+
+
+def test_the_second_opinion_agrees_on_an_obstacle_that_deforms(tmp_path):
+    effect = SurfaceContact(thickness=0.01, friction=0.3, obstacles=(deforming(tmp_path, 3.0),))
+    given = {"mesh": Grid(), "mass": 1.0, "time_step": 1 / 30, "frames": 6, "path": Path("scene.yaml")}
+    spec = SceneSpec.model_validate(given | {"effects": (Springs(stretch=100.0), effect)})
+    assert second_opinion(spec, build(spec, 4), "implicit-euler") == "agrees"
+
+
+def test_frames_of_another_mesh_are_refused(tmp_path):
+    np.savez(tmp_path / "ball.npz", positions=np.zeros((2, 5, 3)))
+    frames = {"positions": str(tmp_path / "ball.npz")}
+    for given, words in ((frames, "came 5 points for a mesh of"), ({"positions": [[[0, 0, 0]]]}, "came 1 points")):
+        with pytest.raises(InputError, match=words):
+            draped(BALL.model_dump() | {"mesh": {"kind": "balloon"}, "frames": given})
 
 
 def test_what_is_squeezed_between_obstacles_is_said():

@@ -15,7 +15,7 @@ from harness.base.model import Model
 from harness.scenes.effects.base import Contribution, Pin
 from harness.scenes.intersections import Apart
 from harness.scenes.mesh.base import Mesh
-from harness.scenes.shapes import AnySurface, Shape, shape
+from harness.scenes.shapes import AnySurface, Shape, deforming, placed, shape
 from harness.scenes.touching import ENDS, outline, require_open, require_still, resisting, told
 from solvers.contact.obstacles import Against, Side
 from solvers.contact.self_contact import ObstacleContact
@@ -69,19 +69,23 @@ class SurfaceContact(Model):
         triangles = np.concatenate([first + faces for first, (_, faces) in zip(sizes, shapes, strict=False)])
         sides = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
         ends = np.unique(np.sort(sides, axis=1), axis=0)
-        motions = [one.motion for one in self.obstacles]
-        moving = any(motions)
+        moving = any(one.motion or deforming(one) for one in self.obstacles)
 
         @lru_cache(maxsize=2)  # a step's end is the start of the next one
         def moved(time: float) -> Positions:
-            parts = zip(shapes, motions, strict=True)
-            return np.concatenate([x if motion is None else motion.moved(x, time) for (x, _), motion in parts])
+            parts = zip(shapes, self.obstacles, strict=True)
+            return np.concatenate([placed(one, x, time) for (x, _), one in parts])
 
         def place(time: float) -> Positions:
             return moved(time) if moving else points
 
         def carry(begin: float, end: float, p: Positions) -> list[Positions]:
-            return [motion.moved(motion.back(p, begin), end) for motion in motions if motion is not None]
+            rigid = [one.motion for one in self.obstacles if one.motion is not None and not deforming(one)]
+            ways = [motion.moved(motion.back(p, begin), end) for motion in rigid]
+            for (x, _), one in zip(shapes, self.obstacles, strict=True):
+                if deforming(one):  # as it does on the whole
+                    ways.append(p + (placed(one, x, end) - placed(one, x, begin)).mean(axis=0))
+            return ways
 
         def energy(stiffness: NDArray[np.float64]) -> ObstacleContact:
             own, others = Side.of(mesh.rest, edges, faces), Side.of(points, ends, triangles, n)

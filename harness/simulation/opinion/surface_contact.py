@@ -29,17 +29,18 @@ def surface_contact(effect: Any, declared: Declared) -> Opinion:
 def against(effect: Any, declared: Declared) -> list[Against]:
     """The mesh with each obstacle."""
     shapes = effect.shapes(np.asarray(declared.mesh.rest, float))
-    return [Against(declared, one.motion, *shape) for one, shape in zip(effect.obstacles, shapes, strict=True)]
+    return [Against(declared, one, *shape) for one, shape in zip(effect.obstacles, shapes, strict=True)]
 
 
 class Against(Touching):
     """A mesh, and an obstacle's points (o, 3) [m], as declared, and triangles (f, 3), whose vertices follow the
     mesh's."""
 
-    def __init__(self, declared: Declared, motion: Any, points: Array, triangles: Indices) -> None:
+    def __init__(self, declared: Declared, one: Any, points: Array, triangles: Indices) -> None:
         super().__init__(declared)
         n = len(self.rest)
-        self._declared, self._motion, self._faces = wide(points), motion, triangles + n
+        self._declared, self._motion, self._faces = wide(points), one.motion, triangles + n
+        self._one, self._frames = one, getattr(one, "frames", None)
         sides = {tuple(sorted(pair)) for corners in triangles.tolist() for pair in combinations(corners, 2)}
         self._sides = n + np.array(sorted(sides), int)
         self._corners = n + np.unique(triangles)[:, None]
@@ -47,7 +48,14 @@ class Against(Touching):
 
     def obstacle(self, time: float) -> Wide:
         """Where the obstacle's points are at a time [s], (o, 3) [m]."""
-        return place(self._motion, time).there(self._declared)
+        points = self._declared
+        if self._frames:
+            x = np.asarray(self._frames.stored, float)
+            since = min(max((time - self._frames.begin) * self._frames.rate, 0.0), len(x) - 1.0)
+            low, high = int(np.floor(since)), int(np.ceil(since))
+            between = (1.0 - (since - low)) * x[low] + (since - low) * x[high]
+            points = wide(self._one.scale * between + np.array(self._one.offset))
+        return place(self._motion, time).there(points)
 
     def whole(self, x: Wide, time: float) -> Wide:
         """See Touching."""

@@ -1,0 +1,153 @@
+"""Contact by pairs beside ipctk, in turns on one thread: cloth folded into four layers that all touch.
+
+    python -m tests.bench.pairs [--sizes 64 128] [--rounds 5]
+
+Gaps are 4 mm at 64 vertices a side and go with the spacing; they are felt up to 5/4 of that. Told is how many times as
+long ipctk takes, by CPU times: in the middle, and the least and the most of the rounds. Both have the same pairs in
+range, to within those that either counts twice. ipctk comes with the extra `dev`.
+
+    value + gradient        with the pairs looked up anew; and with those that a solver's iteration still has
+    Hessian                 clamped, with the pairs given: blocks, and of ipctk the matrix
+    candidates + safe step  of a step that closes gaps: LBVH and additive CCD
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from statistics import median
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from harness.base.machine import describe, pinned_threads
+from harness.scenes.mesh.base import Mesh
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.touching import outline
+from solvers.contact.self_contact import SelfContact
+from solvers.contact.surface import Surface
+from solvers.problem import Positions
+
+GAP, LAYERS = 0.004, 4
+"""At 64 vertices a side [m]."""
+
+
+class Folded(NamedTuple):
+    """mesh: at rest; p (n, 3) [m]: folded; d (n, 3) [m]: a step; thickness, reach [m]."""
+
+    mesh: Mesh
+    p: Positions
+    d: Positions
+    thickness: float
+    reach: float
+
+
+def folded(size: int) -> Folded:
+    """Columns go to and fro, one layer above the other, vertex over vertex but for a little noise."""
+    mesh, rng = Grid(diagonals="one").build(size), np.random.default_rng(0)
+    gap, h, columns = GAP * 63 / (size - 1), 1 / (size - 1), -(-size // LAYERS)
+    layer, along = np.divmod(np.arange(size), columns)
+    x = np.where(layer % 2 == 0, along, columns - 1 - along) * h
+    rows = len(mesh.rest) // size
+    p = np.stack([np.tile(x, rows), np.tile(layer * gap, rows), mesh.rest[:, 2]], axis=1)
+    p += 0.02 * gap * rng.normal(size=p.shape)
+    return Folded(mesh, p, 0.3 * gap * rng.normal(size=p.shape), 0.25 * gap, gap)
+
+
+def ours(made: Folded) -> tuple[dict[str, Callable[[], object]], SelfContact]:
+    """What is timed, by name."""
+    mesh, p, d, thickness, reach = made
+    k = np.ones(len(p))
+    contact = SelfContact(Surface.of(mesh.rest, outline(mesh)[0], mesh.triangles, k, thickness, reach))
+
+    def slopes() -> float:
+        contact.add_gradient(p, np.zeros_like(p))
+        return contact.value(p)
+
+    def anew() -> float:
+        contact.kept.clear()
+        return slopes()
+
+    def step() -> float:
+        contact.kept.clear()
+        return contact.largest_step(p, d)
+
+    return {
+        "value + gradient": anew,
+        "the same, pairs known": slopes,
+        "Hessian": lambda: contact.blocks(p, 0.0),
+        "candidates + safe step": step,
+    }, contact
+
+
+def theirs(made: Folded) -> tuple[dict[str, Callable[[], object]], int]:
+    """The same by ipctk, and how many pairs it has in range."""
+    import ipctk
+
+    ipctk.set_num_threads(1)
+    of: Any = ipctk
+    mesh, p, d, thickness, reach = made
+    V, W = np.asfortranarray(p), np.asfortranarray(p + d)
+    surface = of.CollisionMesh(np.asfortranarray(mesh.rest), outline(mesh)[0].astype(np.int32), mesh.triangles)
+    potential = of.BarrierPotential(reach, 1.0)
+    known = of.NormalCollisions()
+    known.build(surface, V, reach, thickness, of.LBVH())
+
+    def slopes(found: Any) -> float:
+        potential.gradient(found, surface, V)
+        return potential(found, surface, V)
+
+    def anew() -> float:
+        found = of.NormalCollisions()
+        found.build(surface, V, reach, thickness, of.LBVH())
+        return slopes(found)
+
+    def step() -> float:
+        near = of.Candidates()
+        near.build(surface, V, W, 0.5 * thickness, of.LBVH())
+        return near.compute_collision_free_stepsize(surface, V, W, thickness, of.AdditiveCCD())
+
+    return {
+        "value + gradient": anew,
+        "the same, pairs known": lambda: slopes(known),
+        "Hessian": lambda: potential.hessian(known, surface, V, of.PSDProjectionMethod.CLAMP),
+        "candidates + safe step": step,
+    }, len(known)
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """CPU time of this process."""
+    begun = time.process_time()
+    work()
+    return time.process_time() - begun
+
+
+def main() -> None:
+    """Time and tell."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128])
+    parser.add_argument("--rounds", type=int, default=5)
+    asked, console = parser.parse_args(), Console()
+    with pinned_threads(1):
+        for size in asked.sizes:
+            made = folded(size)
+            (one, contact), (other, pairs) = ours(made), theirs(made)
+            table = Table("", "ipctk takes", "between", "ours [ms]", box=SIMPLE_HEAD)
+            for name, work in one.items():
+                for one_of in (work, other[name]):  # compiled, and in the caches
+                    one_of()
+                both = [(seconds(work), seconds(other[name])) for _ in range(asked.rounds)]
+                ratios = sorted(b / a for a, b in both)
+                ends = f"{ratios[0]:.2f} and {ratios[-1]:.2f}"
+                table.add_row(name, f"{median(ratios):.2f} times", ends, f"{1e3 * min(a for a, _ in both):.3g}")
+            in_range = len(contact.blocks(made.p).vertices)
+            table.title = f"{size} x {size}: {in_range:,} pairs in range, by ipctk {pairs:,}; {describe().cpu}"
+            console.print(table)
+
+
+if __name__ == "__main__":
+    main()
