@@ -24,6 +24,7 @@ from harness.report.solids import solids
 from harness.report.style import INK, PAGE, STRAIN_MAP
 
 Points = NDArray[np.floating]
+Dots = tuple[Points, str]
 _HALF_ANGLE = np.radians(12.0)  # of the camera's view, vertically: long enough a lens for calm perspective
 _MARGIN = 0.06  # of the view, left free at each side
 _TUBES = 20_000  # springs; beyond that they are drawn as lines
@@ -196,12 +197,7 @@ class Studio:
         self._plotter.close()
 
     def draw(
-        self,
-        replay: Replay,
-        frame: int,
-        view: View,
-        more: Sequence[pv.PolyData] = (),
-        dots: Sequence[tuple[Points, str]] = (),
+        self, replay: Replay, frame: int, view: View, more: Sequence[pv.PolyData] = (), dots: Sequence[Dots] = ()
     ) -> NDArray[np.uint8]:
         """A recorded frame as pixels (height, width, 3), or 4 without a background, with more solids than its
         obstacles, and with dots at points (q, 3) in a colour; it must be finite."""
