@@ -29,6 +29,7 @@ def show(
     from harness.config.load import load_any
     from harness.record.base import Replay
     from harness.record.obstacles import declared, listed
+    from harness.record.shading import STRAIN_RANGE
     from harness.report.shown import Choice, draw_scene
     from harness.scenes.bind import build
     from harness.scenes.selection import selections
@@ -57,7 +58,7 @@ def show(
         springs=made.springs.edges,
         rest_lengths=made.springs.rest_length,
         pinned=np.empty(0, np.int64),
-        strain_range=run.strain_range,
+        strain_range=run.strain_range or STRAIN_RANGE,
         scalars={},
         properties={
             **declared(listed(run.scene.effects)),
