@@ -125,8 +125,8 @@ MEASURING = (
     Mutation(
         "colours-inverted",
         "harness/record/shading.py",
-        "np.clip(strain / self._range, -1, 1)",
-        "np.clip(-strain / self._range, -1, 1)",
+        "np.clip(strain / end, -1, 1)",
+        "np.clip(-strain / end, -1, 1)",
         ("tests/unit/test_record_shading.py",),
         ("sparse", "other colours"),
     ),
