@@ -14,6 +14,7 @@ from harness.scenes.bind import build
 from harness.scenes.effects.self_contact import SelfContact
 from harness.scenes.effects.sewing import Sewing
 from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.stack import Stack
 from harness.scenes.selection import Selection
 from harness.scenes.spec import SceneSpec
 from harness.simulation.observe import intersections
@@ -22,15 +23,14 @@ from harness.simulation.step import prepare, simulate
 from solvers.energies.sewing import Sewing as Energy
 from solvers.problem import StopRule
 from solvers.registry import SOLVERS, load
-from tests.self_contacts import Two
 
 ROWS = tuple(Selection(indices=tuple(range(first, first + 5))) for first in (0, 25))
 SEWN = Sewing(first=ROWS[0], second=ROWS[1], stiffness=2e4, begin=0.02, end=0.2, gap=0.05)
 
 
 def spec(*effects) -> SceneSpec:
-    given: dict[str, Any] = {"mesh": Two(), "mass": 0.2, "time_step": 0.02, "frames": 20, "path": Path("scene.yaml")}
-    return SceneSpec(effects=(Springs(stretch=100.0), *effects), **given)
+    given: dict[str, Any] = {"mass": 0.2, "time_step": 0.02, "frames": 20, "path": Path("scene.yaml")}
+    return SceneSpec(mesh=Stack(apart=0.2), effects=(Springs(stretch=100.0), *effects), **given)
 
 
 def gaps(p: np.ndarray) -> np.ndarray:
