@@ -17,7 +17,7 @@ from rich.table import Table
 
 from harness.base.machine import pinned_threads
 from harness.config.load import load_scene
-from harness.experiments.ablation.prices import price
+from harness.experiments.ablation.prices import price, ready
 from solvers.problem import StopRule, Unsupported
 from solvers.registry import SOLVERS, load
 
@@ -67,7 +67,8 @@ def main() -> None:
             for solver in asked.solvers:
                 made = load(SOLVERS[solver])()
                 try:
-                    found = price(whole, asked.size, effect, made, STOP, frames=asked.frames, rounds=asked.rounds)
+                    both = ready(whole, asked.size, made, effect), ready(whole, asked.size, made)
+                    found = price(effect, *both, STOP, frames=asked.frames, rounds=asked.rounds)
                 except Unsupported:
                     cells.append("refused")
                     continue

@@ -5,7 +5,8 @@
 The plain scene has the effects that say that they are `plain`. Both scenes go step by step in turns, each to
 the tolerance that is asked for, so that a drift of the machine meets both alike. Rounds end once the price is known to
 CLOSE, or after as many as are allowed. A round that has taken ENOUGH ends with the next step that counts, and then
-LEAST rounds will do, so that the slowest solvers take minutes as well.
+LEAST rounds will do; where a single step takes that long, each further step of both scenes is a round. So the slowest
+solvers take minutes as well.
 
 No iteration reads the effect's own numbers sooner than a dot product does, nor multiplies and adds them up sooner than
 a product of matrices does: the longer one is the bound beside each price. Of an element that couples k vertices 12 k
@@ -30,7 +31,7 @@ from harness.scenes.spec import SceneSpec
 from harness.simulation.algebraic import Stop
 from harness.simulation.step import Step, prepare, simulate
 from solvers.energies.springs import Springs
-from solvers.problem import NotPositiveDefinite, ProjectiveEnergy, Solver, Unsupported
+from solvers.problem import NotPositiveDefinite, Prepared, ProjectiveEnergy, Solver, Unsupported
 
 ALL = "all"
 """The name of all effects together."""
@@ -43,6 +44,10 @@ ENOUGH = 2.0
 _READS = 20
 _SIDE = 256
 """Of matrices whose product tells how many flops a second there are at the most."""
+
+
+Ready = tuple[Scene, Prepared]
+"""A scene, and what a solver prepared for it."""
 
 
 class Price(NamedTuple):
@@ -105,38 +110,47 @@ def _plain(effect: Effect) -> bool:
 
 def prices(scene: SceneSpec, size: int, solver: Solver, stop: Stop, *, frames: int, rounds: int) -> Iterator[Price]:
     """The price of each effect by a solver; one that it refuses has none. frames: that count in a round."""
+    plain = None
     for effect in priced(scene):
         try:
-            yield price(scene, size, effect, solver, stop, frames=frames, rounds=rounds)
+            plain = plain or ready(scene, size, solver)
+            yield price(effect, ready(scene, size, solver, effect), plain, stop, frames=frames, rounds=rounds)
         except (InputError, NotPositiveDefinite, Unsupported) as error:
             yield Price(effect, refused=str(error))
 
 
-def price(scene: SceneSpec, size: int, effect: str, solver: Solver, stop: Stop, *, frames: int, rounds: int) -> Price:
-    """The price of one effect by one solver; raises InputError, NotPositiveDefinite and Unsupported."""
-    made = [build(only(scene, *kinds), size) for kinds in ((effect,), ())]
-    ready = [prepare(one, solver) for one in made]
+def ready(scene: SceneSpec, size: int, solver: Solver, *effects: str) -> Ready:
+    """The scene with these effects and the plain ones; raises InputError, NotPositiveDefinite and Unsupported."""
+    made = build(only(scene, *effects), size)
+    return made, prepare(made, solver)
+
+
+def price(effect: str, one: Ready, plain: Ready, stop: Stop, *, frames: int, rounds: int) -> Price:
+    """The price of an effect, from scenes with and without it. frames: that count in a round."""
     pairs: list[tuple[float, float]] = []
-    found = Interval(np.nan, np.nan, np.nan)
+    runs: list[_Run] = []
+    found, slow = Interval(np.nan, np.nan, np.nan), False
     while len(pairs) < rounds:
-        runs = [
-            _Run(iter(simulate(one, prepared, stop, first_guess="current", frames=WARM + frames)))
-            for one, prepared in zip(made, ready, strict=True)
-        ]
-        enough = False
+        if slow:
+            runs = [_Run(run.steps, spent=run.spent) for run in runs]
+        else:
+            all_frames = WARM + frames + rounds
+            runs = [_Run(iter(simulate(*it, stop, first_guess="current", frames=all_frames))) for it in (one, plain)]
+        enough = slow
         for k in range(WARM + frames):
             last = enough
-            for run in runs[:: 1 if len(pairs) % 2 else -1]:
+            for run in runs if len(pairs) % 2 else runs[::-1]:
                 run.step(counts=last or k >= WARM)
             enough = sum(run.spent for run in runs) > ENOUGH
             if last or (enough and k >= WARM):
+                slow = k < WARM
                 break
         pairs.append((runs[0].each, runs[1].each))
         found = ratio(*np.array(pairs).T)
         if len(pairs) >= LEAST and (enough or found.high - found.low <= CLOSE * found.middle):
             break
-    each, plain = np.array(pairs).min(axis=0)
-    return Price(effect, found, float(each), 1.0 + _least(made[0]) / plain, len(pairs))
+    each, without = np.array(pairs).min(axis=0)
+    return Price(effect, found, float(each), 1.0 + _least(one[0]) / without, len(pairs))
 
 
 def _least(scene: Scene) -> float:
