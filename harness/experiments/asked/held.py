@@ -7,7 +7,7 @@ solver and tolerance. Where none of them gets there within `LONGEST`, what they 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from math import inf, sqrt
 from time import thread_time
@@ -24,7 +24,6 @@ from harness.simulation.step import prepare, simulate
 from solvers.problem import NotPositiveDefinite, Positions, Solver, Unsupported
 from solvers.registry import EVERY, about, load
 
-ROUNDS = 3
 LONGEST = 20.0
 """Processor seconds that one simulation may take."""
 _SHORTENED = 40
@@ -38,13 +37,14 @@ Error = Callable[[Positions], float]
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What a goal is held against: its name, its error, its least processor seconds; bound: whether it does not keep to
-    the error, and would take longer."""
+    """What a goal is held against: its name, its error, its processor seconds; bound: whether it does not keep to the
+    error, and would take longer; again: does it once more, and returns the seconds."""
 
     name: str
     error: float
     seconds: float
     bound: bool = False
+    again: Callable[[], float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def _steps(one: OneGoal, asked: Asked, error: Error, say: Callable[[str], None])
         say(f"  held against {least.name}")
         return least
     say(f"  held against {best.name}")
-    return Held(best.name, best.error, min(_run(asked, error, again, inf).seconds for _ in range(ROUNDS)))
+    return replace(best, again=lambda: _run(asked, error, again, inf).seconds)
 
 
 def _choices(goal: Goal) -> list[tuple[str, str, float | None]]:
