@@ -46,10 +46,8 @@ class Forces(NamedTuple):
 
 
 @inner
-def pull(forces, p, out):
-    """Write M^-1 of all forces but drag [m/s^2] at p to `out`."""
-    for k in range(len(out)):
-        out[k] = 0.0
+def add_forces(forces, p, out):
+    """Add all forces but drag [N] at p to `out`, in rows of four."""
     add_descent(forces.bundles, 0, len(forces.bundles.start) - 1, p, forces.right, out, 0)
     for i in range(len(forces.held)):
         for k in range(4 * i, 4 * i + 3):
@@ -60,6 +58,14 @@ def pull(forces, p, out):
             f = w * (p[i + c] - p[j + c])
             out[i + c] -= f
             out[j + c] += f
+
+
+@inner
+def pull(forces, p, out):
+    """Write M^-1 of these forces [m/s^2] to `out`."""
+    for k in range(len(out)):
+        out[k] = 0.0
+    add_forces(forces, p, out)
     for k in range(len(out)):
         out[k] *= forces.inverse[k]
 
@@ -72,29 +78,43 @@ def carry(forces, part, p):
             p[4 * forces.pins[q] + c] = forces.end[q, c] + (1.0 - part) * (forces.begin[q, c] - forces.end[q, c])
 
 
+@inner
+def kick(inverse, kept, gained, first, second, h, p, v, force):
+    """A kick of v, a second one unless it is negative, and a drift of p for h [s]; the force [N] is used up."""
+    for i in range(len(p)):
+        a = force[i] * inverse[i]
+        force[i] = 0.0
+        w = kept[first, i] * v[i] + gained[first, i] * a
+        if second >= 0:
+            w = kept[second, i] * w + gained[second, i] * a
+        v[i] = w
+        p[i] += h * w
+
+
 @kernel
-def compose(forces, drifts, kept, gained, count, h, p, v, acceleration):
-    """`count` steps of h [s]: drift 0, kick 0, drift 1, ..., the last drift, of p and v, which take the result.
+def compose(forces, drifts, kept, gained, count, h, p, v, force):
+    """`count` steps of h [s]: drift 0, kick 0, drift 1, ..., the last drift, of p and v, which take the result. Where a
+    step neither ends nor begins with a drift, its last kick and the next step's first have one force.
 
     drifts (k + 1,): parts of h; kept and gained (k, rows): what is left of a velocity by a kick, and what it gains of
-    the acceleration [s], both exact for drag; acceleration: scratch.
+    the acceleration [s], both exact for drag; force: scratch, of zeros.
     """
-    known = False
+    last = len(kept) - 1
+    joined = drifts[0] == 0.0 and drifts[-1] == 0.0
     for step in range(count):
-        gone = 0.0
-        for k in range(len(drifts)):
-            if drifts[k] != 0.0:
-                gone += drifts[k]
-                for i in range(len(p)):
-                    p[i] += drifts[k] * h * v[i]
+        gone = drifts[0]
+        if drifts[0] != 0.0:
+            for i in range(len(p)):
+                p[i] += drifts[0] * h * v[i]
+            carry(forces, (step + gone) / count, p)
+        for k in range(1 if joined and step > 0 else 0, last + 1):
+            both = joined and k == last and step < count - 1
+            after = drifts[1] if both else drifts[k + 1]
+            add_forces(forces, p, force)
+            kick(forces.inverse, kept, gained, k, 0 if both else -1, after * h, p, v, force)
+            gone = 1 + after if both else gone + after
+            if after != 0.0:
                 carry(forces, (step + gone) / count, p)
-                known = False
-            if k < len(kept):
-                if not known:
-                    pull(forces, p, acceleration)
-                    known = True
-                for i in range(len(v)):
-                    v[i] = kept[k, i] * v[i] + gained[k, i] * acceleration[i]
 
 
 class Coefficients(NamedTuple):
