@@ -37,8 +37,8 @@ from solvers.integrators import INTEGRATORS
 ACROSS = 4
 """Panels in a row."""
 
-_PLAIN = 4.4
-"""The size of a mark."""
+_PLAIN, _OWN = 4.4, 7.0
+"""The size of a mark; of a method with steps of its own, which has no line that leads to it."""
 
 ERRORS = (0.1, 0.03, 0.01, 0.003, 0.001)
 """The errors at which the front is told in words."""
@@ -165,13 +165,13 @@ def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dic
         members.sort(key=lambda work: work.time_step)
         look, hollow = marked[label], [older(work) for work in members]
         x, y = [work.seconds for work in members], [work.error for work in members]
-        grown = max(_PLAIN, *sizes.values()) if members[0].own_steps else sizes[tolerance]
+        grown = max(_OWN, *sizes.values()) if members[0].own_steps else sizes[tolerance]
         line(ax, x, y, look, spaced=False, older=hollow, linewidth=0.9, markersize=grown * size(look))
     base = default(works)
     if base:
         ax.plot(base.seconds, base.error, "o", mfc="none", mec=INK, markersize=15, mew=1.6, zorder=6)
         ax.annotate(
-            "the default", (base.seconds, base.error), (2, 13), textcoords="offset points",
+            "the default", (base.seconds, base.error), (11, 4), textcoords="offset points",
             fontsize=9, ha="left", color=INK, bbox={"facecolor": PAGE, "alpha": 0.8, "edgecolor": "none", "pad": 0.8},
         )  # fmt: skip
 
