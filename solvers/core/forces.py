@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import ArpackError, eigsh
 
-from solvers import matrices
 from solvers.core.driver import Iterating
 from solvers.energies.quadratic import Quadratic, Viscous
 from solvers.energies.springs import Springs
@@ -29,10 +30,11 @@ def frequency(system: System) -> float:
     constant = [e for e in system.energies if isinstance(e, (Springs, Quadratic)) and not is_lagged(e)]
     if not len(free) or not constant:
         return 0.0
-    n = system.vertices
-    K = sum((e.stiffness_matrix(n) for e in constant), csr_array((n, n)))
-    slow = matrices.diagonal(1.0 / np.sqrt(system.mass[free]))
-    inner = csr_array(slow @ csr_array(csr_array(K[free])[:, free]) @ slow)
+    K = reduce(add, (e.stiffness_matrix(system.vertices) for e in constant))
+    inner = csr_array(K, copy=True) if len(free) == system.vertices else csr_array(csr_array(K[free])[:, free])
+    slow = 1.0 / np.sqrt(system.mass[free])
+    inner.data *= np.repeat(slow, np.diff(inner.indptr))
+    inner.data *= slow[inner.indices]
     rows = float(abs(inner).sum(axis=1).max(initial=0.0))  # Gershgorin
     if len(free) < 20 or not rows:
         most = float(np.linalg.eigvalsh(inner.toarray()).max(initial=0.0))
@@ -63,19 +65,19 @@ class ForceParts:
         """Raises Unsupported for what it does not know."""
         n = system.vertices
         springs = Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
-        drag, load, L = np.zeros(n), np.zeros((n, 3)), csr_array((n, n))
+        drag, load, forms = np.zeros(n), np.zeros((n, 3)), list[csr_array]()
         for energy in system.energies:
             if isinstance(energy, Viscous) and (np.diff(energy.A.indptr) == 1).all():
                 drag += energy.A.power(2).T @ energy.weight
             elif isinstance(energy, Quadratic) and not is_lagged(energy):
-                L = csr_array(L + energy.stiffness_matrix(n))
+                forms.append(energy.stiffness_matrix(n))
                 energy.add_projection(load, load)
             elif not isinstance(energy, Springs):
                 raise Unsupported(
                     f"{solver}: knows springs, bending and drag on vertices; the scene has {type(energy).__name__} "
                     "as well"
                 )
-        form = Form.of(L)
+        form = Form.of(csr_array(reduce(add, forms))) if forms else Form.none()
         part = np.where(system.unpinned, 0, -1)
         bundles, _ = Bundles.of(springs, np.arange(n), part, 1, n, n + 1)
         drag = np.divide(drag, system.mass, out=np.zeros(n), where=system.unpinned)

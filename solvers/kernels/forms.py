@@ -39,6 +39,11 @@ class Form(NamedTuple):
             np.where(abs(held) <= _ROUND_OFF * size, 0.0, held),
         )
 
+    @classmethod
+    def none(cls) -> Form:
+        """The form of no matrix."""
+        return cls(np.empty((0, 2), np.int64), np.empty(0), np.empty(0))
+
 
 @kernel
 def add_gradient(form, p, out):
