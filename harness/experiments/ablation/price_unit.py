@@ -65,6 +65,7 @@ def _row(found: Price) -> Row:
     row: Row = {"name": found.effect, "rounds": found.rounds}
     if found.refused:
         return row | {"status": "unsupported", "reason": found.refused}
+    row["max_iterations"] = found.iterations
     middle, low, high = found.price
     measured = {"price": middle, "price_low": low, "price_high": high, "price_bound": found.bound}
     return row | {"status": "ok", "seconds": found.seconds} | measured

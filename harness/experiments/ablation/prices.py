@@ -5,8 +5,8 @@
 The plain scene has the effects that say that they are `plain`. Both scenes go step by step in turns, each to
 the tolerance that is asked for, so that a drift of the machine meets both alike. Rounds end once the price is known to
 CLOSE, or after as many as are allowed. A round that has taken ENOUGH ends with the next step that counts, and then
-LEAST rounds will do; where a single step takes that long, each further step of both scenes is a round. So the slowest
-solvers take minutes as well.
+LEAST rounds will do; where a single step takes that long, fewer iterations a step are done. So the slowest solvers take
+minutes as well.
 
 No iteration reads the effect's own numbers sooner than a dot product does, nor multiplies and adds them up sooner than
 a product of matrices does: the longer one is the bound beside each price. Of an element that couples k vertices 12 k
@@ -16,7 +16,7 @@ flops count, those of A p and of A'f for three coordinates, and none of what hap
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter, thread_time
 from typing import Any, NamedTuple
 
@@ -52,13 +52,15 @@ Ready = tuple[Scene, Prepared]
 
 class Price(NamedTuple):
     """Of an effect: the ratio, and seconds of CPU time an iteration with the effect; bound: the least
-    ratio that the effect's own bytes and flops allow; refused: why there is none of these, in words."""
+    ratio that the effect's own bytes and flops allow; iterations: the limit of a step; refused: why there is none of
+    these, in words."""
 
     effect: str
     price: Interval = Interval(np.nan, np.nan, np.nan)
     seconds: float = np.nan
     bound: float = np.nan
     rounds: int = 0
+    iterations: int = 0
     refused: str = ""
 
 
@@ -113,7 +115,9 @@ def prices(scene: SceneSpec, size: int, solver: Solver, stop: Stop, *, frames: i
     plain = None
     for effect in priced(scene):
         try:
-            plain = plain or ready(scene, size, solver)
+            if plain is None:
+                plain = ready(scene, size, solver)
+                stop = _affordable(plain, stop)
             yield price(effect, ready(scene, size, solver, effect), plain, stop, frames=frames, rounds=rounds)
         except (InputError, NotPositiveDefinite, Unsupported) as error:
             yield Price(effect, refused=str(error))
@@ -128,29 +132,31 @@ def ready(scene: SceneSpec, size: int, solver: Solver, *effects: str) -> Ready:
 def price(effect: str, one: Ready, plain: Ready, stop: Stop, *, frames: int, rounds: int) -> Price:
     """The price of an effect, from scenes with and without it. frames: that count in a round."""
     pairs: list[tuple[float, float]] = []
-    runs: list[_Run] = []
-    found, slow = Interval(np.nan, np.nan, np.nan), False
+    found = Interval(np.nan, np.nan, np.nan)
     while len(pairs) < rounds:
-        if slow:
-            runs = [_Run(run.steps, spent=run.spent) for run in runs]
-        else:
-            all_frames = WARM + frames + rounds
-            runs = [_Run(iter(simulate(*it, stop, first_guess="current", frames=all_frames))) for it in (one, plain)]
-        enough = slow
+        runs = [_Run(iter(simulate(*it, stop, first_guess="current", frames=WARM + frames))) for it in (one, plain)]
+        enough = False
         for k in range(WARM + frames):
             last = enough
-            for run in runs if len(pairs) % 2 else runs[::-1]:
+            for run in runs[:: 1 if len(pairs) % 2 else -1]:
                 run.step(counts=last or k >= WARM)
             enough = sum(run.spent for run in runs) > ENOUGH
             if last or (enough and k >= WARM):
-                slow = k < WARM
                 break
         pairs.append((runs[0].each, runs[1].each))
         found = ratio(*np.array(pairs).T)
         if len(pairs) >= LEAST and (enough or found.high - found.low <= CLOSE * found.middle):
             break
     each, without = np.array(pairs).min(axis=0)
-    return Price(effect, found, float(each), 1.0 + _least(one[0]) / without, len(pairs))
+    return Price(effect, found, float(each), 1.0 + _least(one[0]) / without, len(pairs), stop.iterations)
+
+
+def _affordable(plain: Ready, stop: Stop) -> Stop:
+    """The rule; where a step takes longer than ENOUGH, with as many iterations as take a quarter of it."""
+    run = _Run(iter(simulate(*plain, stop, first_guess="current", frames=WARM)))
+    for k in range(WARM):  # what the first compiles does not count
+        run.step(counts=k == WARM - 1)
+    return replace(stop, iterations=max(1, int(ENOUGH / 4.0 / run.each))) if run.seconds > ENOUGH else stop
 
 
 def _least(scene: Scene) -> float:

@@ -191,8 +191,9 @@ class _Search:
 
     @staticmethod
     def _cost(one: Found, part: float) -> float:
-        """Processor seconds with a part of the error of a step."""
-        return one.path.processor * part ** (-1.0 / one.way.follower.order)
+        """Processor seconds with a part of the error of a step: it prepares once."""
+        stepping = min(one.path.seconds, one.path.processor)
+        return one.path.processor - stepping + stepping * part ** (-1.0 / one.way.follower.order)
 
     def _graded(self, one: Found, closer: Found) -> Found:
         p, q = one.path.positions, closer.path.positions
@@ -207,7 +208,11 @@ class _Search:
     def _promise(self, one: Found) -> float:
         """The processor seconds that a way would take to the error asked; where it is more exact than that, those that
         it took, for explicit steps may be as long as is stable already."""
-        return self._cost(one, min(1.0, AIM * self._error / one.estimated)) if one.estimated < inf else inf
+        return self._cost(one, min(1.0, self._aim(one) / one.estimated)) if one.estimated < inf else inf
+
+    def _aim(self, one: Found) -> float:
+        """The error that a setting is chosen for."""
+        return (_AIM_EVEN if one.way.follower.even else AIM) * self._error
 
     def _moved(self, one: Found, closer: Found) -> tuple[Found, str]:
         """The way at the setting that gives the error asked, and why it is far more exact, if it is."""
@@ -235,7 +240,7 @@ class _Search:
         """The setting to try after one that errs too much or too little: between both where they are known."""
         if best and above:
             return sqrt(best.setting * above.setting)
-        aim = (_AIM_EVEN if one.way.follower.even else AIM) * self._error
+        aim = self._aim(one)
         ratio = aim / max(one.estimated, 1e-3 * aim)
         return one.way.follower.changed(one.setting, min(30.0, max(1e-3, ratio)))
 
