@@ -81,24 +81,29 @@ def record(
     starts: int,
     planted: float = 0.0,
 ) -> None:
-    """Record so many seconds of turns of each request, in so many starts, beside what the condition says."""
+    """Record so many seconds of turns, of each request in its turn, in so many starts, beside what the condition says.
+    What was recorded so far is stored after each start."""
     found: list[dict[str, Any]] = []
+    sides = Side("the one", checkout, extra=planted), Side("the other", checkout)
     with competing(condition):
-        for request in requests:
-            for start in range(starts):
-                sides = Side("the one", checkout, extra=planted), Side("the other", checkout)
-                with started(sides, request, Options(seconds), lambda line: None) as (a, b):
-                    began = perf_counter()
-                    for order in orders():
+        for start in range(starts):
+            with ExitStack() as alive:
+                pairs = [
+                    alive.enter_context(started(sides, request, Options(seconds), lambda line: None))
+                    for request in requests
+                ]
+                until = perf_counter() + seconds / starts
+                for order in orders():
+                    for request, (a, b) in zip(requests, pairs, strict=True):
                         at = perf_counter()
                         calls = [{"A": a, "B": b}[who]() for who in order]
                         row = {"gate": request.title, "condition": condition, "start": start, "order": order}
                         row |= {f"call_{k}": call for k, call in enumerate(calls)}
-                        now = perf_counter()
-                        found.append(row | {"wall": now - at, "load": os.getloadavg()[0], "planted": planted})
-                        if now - began >= seconds / starts:
-                            break
-    rows.write(path, found, SCHEMA)
+                        took = perf_counter() - at
+                        found.append(row | {"wall": took, "load": os.getloadavg()[0], "planted": planted})
+                    if perf_counter() > until:
+                        break
+            rows.write(path, found, SCHEMA)
 
 
 @contextmanager
@@ -107,7 +112,7 @@ def competing(condition: str) -> Generator[None]:
     if condition not in CONDITIONS:
         raise InputError(f"--condition: came {condition}; wanted one of {', '.join(CONDITIONS)}")
     with ExitStack() as cleanup:
-        for core in range(os.cpu_count() or 1 if condition != "nothing" else 0):
+        for core in os.sched_getaffinity(0) if condition != "nothing" else ():
             process = get_context("spawn").Process(target=_compete, args=(condition == "bursty", core), daemon=True)
             process.start()
             cleanup.callback(process.join)

@@ -44,7 +44,7 @@ def record(
     samples: Annotated[Path, typer.Argument(help="Where to store the turns (.parquet).")],
     config: Config,
     condition: Condition = "nothing",
-    seconds: Annotated[float, typer.Option(help="For each run.")] = 1800.0,
+    seconds: Annotated[float, typer.Option(help="For all runs together, which take turns.")] = 1800.0,
     starts: Annotated[int, typer.Option(help="Pairs of processes for each run.")] = 10,
     sizes: Sizes = None,
     solvers: Solvers = None,
