@@ -15,13 +15,18 @@ from typing import Any, NamedTuple
 import pytest
 
 from harness.base import rows
-from tests.contracts.test_cluster_runs import SWEEP
 from tests.own_solvers import SCENE
 
 ROOT = Path(__file__).resolve().parents[2]
 RUNS, PATIENCE = 12, 240.0
 
 pytestmark = pytest.mark.long
+
+SWEEP = """
+scenes: [scene.yaml]
+solvers: [sparse]
+options: {frames: 4, rounds: 1, iterations: [5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16], record: false}
+"""
 
 FAR = """
 from pathlib import Path

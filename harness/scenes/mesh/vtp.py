@@ -27,8 +27,11 @@ _DECOMPRESS: dict[str, Callable[[bytes], bytes]] = {
     "vtkZLibDataCompressor": zlib.decompress,
     "vtkLZMADataCompressor": lzma.decompress,
 }
-_TYPES = {f"{sign}{bits}": f"{sign[0].lower()}{bits // 8}" for sign in ("Int", "UInt") for bits in (8, 16, 32, 64)}
-_TYPES |= {"Float32": "f4", "Float64": "f8"}
+_TYPES = {
+    "Float32": "f4",
+    "Float64": "f8",
+    **{f"{sign}{bits}": f"{sign[0].lower()}{bits // 8}" for sign in ("Int", "UInt") for bits in (8, 16, 32, 64)},
+}
 
 
 class Surface(NamedTuple):
