@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import tracemalloc
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -65,6 +66,7 @@ def _referents(one: object) -> Iterable[object]:
 def bound(*effects: Effect) -> tuple[Scene, Prepared]:
     pins = Pins(at=("top_corners",))
     made = scene(Grid(), Springs(stretch=300.0), Gravity(), pins, *effects, size=SIDE)
+    made = replace(made, halved=None)  # a recipe, which holds what the effects were described by
     return made, prepare(made, SparseLocalGlobal())
 
 

@@ -149,7 +149,7 @@ def test_a_new_solver_has_a_look_that_nobody_else_has():
     looks = marks()
     assert looks["mine"] not in [look for name, look in looks.items() if name != "mine"]
     assert looks["mine"].color not in {look.color for name, look in looks.items() if name != "mine"}
-    assert looks["mine"] == marks(["another", "and one more"])["mine"]
+    assert looks["mine"] == marks(["yours", "one more"])["mine"]
 
 
 def test_a_motion_calls_for_a_new_effect():
