@@ -26,14 +26,16 @@ def solver_class(run: RunSpec) -> Any:
 
 
 def parts(run: RunSpec) -> frozenset[Part]:
-    """What a run is put together from by name: the solver's file, the classes of the mesh and the effects, the file of
-    a judge's reference, and what keeps to an error. Neither solvers nor somebody's own code are imported."""
+    """What a run is put together from by name: the solver's file, the classes of the mesh and the effects, the files of
+    a judge's reference and of what guesses, and what keeps to an error. Neither solvers nor somebody's own code are
+    imported."""
     named = {"mesh": run.scene.mesh, **{f"effects[{i}]": effect for i, effect in enumerate(run.scene.effects)}}
     shipped = [type(part) for place, part in named.items() if place not in run.scene.own]
     solver = [] if isinstance(run.solver.name, Plugin) else [run.solver.name]
     judge = ["newton"] if run.judge else []
+    guess = ["hybrid"] if run.first_guess == "coarse" else []
     kept = [] if run.accuracy is None else [Path(source_of(TO_ERROR.partition(":")[0]) or _RUN)]
-    return frozenset([*map(_file_of, [*solver, *judge]), *kept, *shipped, *run.own()])
+    return frozenset([*map(_file_of, [*solver, *judge, *guess]), *kept, *shipped, *run.own()])
 
 
 def code(parts: frozenset[Part]) -> str:

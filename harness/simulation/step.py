@@ -14,8 +14,8 @@ from harness.simulation.coarser import Coarser
 from harness.simulation.stages import Guess, Stages, require_mass
 from solvers.core.clearing import begun_free
 from solvers.integrators import IMPLICIT_EULER, Integrator, Motion
-from solvers.methods.hybrid import Hybrid
 from solvers.problem import Positions, Prepared, Solution, Solver, Start, StepProblem, StopRule, System, Unsupported
+from solvers.registry import SOLVERS, load
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,6 +215,8 @@ FIRST_GUESSES: dict[str, Callable[[StepProblem], StepProblem]] = {
 
 COARSE = "coarse"
 """The first guess that is no function of the problem alone: it is where the coarser mesh goes."""
+COARSE_BY = "hybrid"
+"""What solves there; by name, so that runs which do not ask for it do not depend on its code."""
 
 _NEAR_ENOUGH = StopRule(100, 1e-2)
 """Of the solves on coarser meshes: what these err by, being coarse, is more."""
@@ -237,7 +239,7 @@ def _coarse(scene: Scene, state: State, stated: StepProblem) -> StepProblem:
             coarse = scene.halved()
         except InputError as error:
             raise Unsupported(f"first_guess: coarse needs the scene on a mesh of half the size: {error}") from error
-        level = _COARSER[scene] = Coarser.of(scene, coarse, prepare(coarse, Hybrid()))
+        level = _COARSER[scene] = Coarser.of(scene, coarse, prepare(coarse, load(SOLVERS[COARSE_BY])()))
     there = State(level.down(state.now), level.down(state.before) if state.before else None, state.index)
     below = problem(level.scene, there, COARSE if level.scene.halved else "current")
     found = level.prepared.solve(below, _NEAR_ENOUGH).positions

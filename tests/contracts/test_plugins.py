@@ -52,8 +52,8 @@ class Hum(Model):
         return Contribution(forces=steady(np.full_like(mesh.rest, self.force)))
 
 
-class Rope(Chain):
-    kind: Literal["rope"] = "rope"
+class Cord(Chain):
+    kind: Literal["cord"] = "cord"
 
 
 EULER = IMPLICIT_EULER
@@ -70,7 +70,7 @@ mine = somebodys:Mine
 [springbench.effects]
 hum = somebodys:Hum
 [springbench.meshes]
-rope = somebodys:Rope
+cord = somebodys:Cord
 [springbench.integrators]
 euler = somebodys:EULER
 [springbench.reports]
@@ -84,8 +84,8 @@ WHEEL = {
     f"{ABOUT}/entry_points.txt": ENTRIES,
 }
 """What a wheel holds: pip installs it without a build backend, and without a network."""
-NAMES = {"mesh": "Rope", "effect": "Hum", "solver": "Mine", "integrator": "EULER", "report": "tell"}
-INSTALLED = {"mesh": "rope", "effect": "hum", "solver": "mine", "integrator": "euler", "report": "tell"}
+NAMES = {"mesh": "Cord", "effect": "Hum", "solver": "Mine", "integrator": "EULER", "report": "tell"}
+INSTALLED = {"mesh": "cord", "effect": "hum", "solver": "mine", "integrator": "euler", "report": "tell"}
 WAYS = {
     "beside": {part: f"./mine.py:{name}" for part, name in NAMES.items()},
     "below": {part: f"./own/mine.py:{name}" for part, name in NAMES.items()},
