@@ -39,9 +39,11 @@ def named() -> frozenset[str]:
 
 
 def mark(items: list[pytest.Item]) -> None:
-    """Mark the items that are named."""
+    """Mark the items that are named; those that are long already are in neither run."""
     slow = named()
     for item in items:
+        if item.get_closest_marker("long"):
+            continue
         name = item.nodeid
         if name in slow or name.partition("::")[0] in slow or any(kind in name for kind in KINDS):
             item.add_marker(pytest.mark.slow)
