@@ -97,7 +97,7 @@ _MARKERS: tuple[Any, ...] = (
 # Okabe and Ito's palette, less its yellow and black, and five more: for families in the order of the registry.
 _FAMILIES = ("#0072b2", "#00a878", "#e69f00", "#d55e00", "#9a86e0", "#cc79a7", "#a8326e", "#858585", "#8a994c")
 _MEMBERS: tuple[tuple[float, Any], ...] = (
-    *((0.0, "-"), (-0.36, DASHED), (0.42, "-"), (0.2, DASH_DOTTED), (-0.18, (0, (1, 3)))),
+    *((0.0, "-"), (-0.36, DASHED), (0.42, "-"), (0.2, DASH_DOTTED), (-0.12, (0, (1, 3)))),
 )
 """How much lighter the members of a family are drawn, or darker where negative, and in which line style."""
 _MANY: tuple[tuple[float, Any], ...] = (
