@@ -5,8 +5,9 @@
     own_cores   as `beside`, on cores that nobody else has
 
 Whoever wants to be timed goes first, so that those who were timed look at what they found side by side and not each
-before the next is timed. The locks are files, which the system lets go of where a process dies; they are the same for
-all commands and workers of a machine: in the folder `SPRINGBENCH_LOCKS`, else in that for temporary files.
+before the next is timed. Who gets ready for it (`Turn`) counts among them, or two would take turns for ever, each
+getting ready while the other looks. The locks are files, which the system lets go of where a process dies; they are
+the same for all commands and workers of a machine: in the folder `SPRINGBENCH_LOCKS`, else in that for temporary files.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import fcntl
 import os
 import tempfile
 from collections.abc import Generator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 from time import sleep
 
@@ -41,6 +42,36 @@ def beside(tick: Tick) -> Generator[None]:
         yield
     finally:
         _let_go(used)
+
+
+class Turn:
+    """The turn of one that is timed alone: it gets ready, is timed (`alone`), and looks at what was found.
+
+    exclusive: else it is timed beside others (`own_cores`), and waits for nobody's turn.
+    """
+
+    def __init__(self, tick: Tick, *, exclusive: bool) -> None:
+        self._tick, self._exclusive = tick, exclusive
+        self._coming, self._looking = ExitStack(), ExitStack()
+
+    def __enter__(self) -> Turn:
+        if self._exclusive:
+            self._coming.enter_context(_held("wanted", fcntl.LOCK_SH, self._tick))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._coming.close()
+        self._looking.close()
+
+    def ready(self) -> AbstractContextManager[None]:
+        """Compute before it is timed."""
+        return _held("used", fcntl.LOCK_SH, self._tick) if self._exclusive else beside(self._tick)
+
+    def look(self) -> None:
+        """Compute beside others from now on: it was timed, or will not be."""
+        self._coming.close()
+        self._looking.close()
+        self._looking.enter_context(beside(self._tick))
 
 
 @contextmanager

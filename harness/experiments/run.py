@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from harness.base import machine, rows
 from harness.base.errors import InputError, RunFailed
 from harness.base.files import replacing
-from harness.base.machine_lock import alone, beside, own_cores
+from harness.base.machine_lock import Turn, alone, own_cores
 from harness.base.worker import Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.ability import of_this_machine
@@ -55,45 +55,45 @@ def execute(
     (frames, n, 3) [m], float64; at_once: how many runs may be timed at once. Returns the rows. Raises InputError, and
     CannotWrite without rows.
     """
-    with beside(tick):
-        shared = common(run) | {"code": code(parts(run)), "at_once": at_once}
-    shared |= of_this_machine(tick)
+    shared: dict[str, Any] = {"at_once": at_once, **of_this_machine(tick)}
     threads = machine.threads(run.threads)
-    with machine.pinned_threads(threads.number):
+    with machine.pinned_threads(threads.number), Turn(tick, exclusive=run.timing == "exclusive") as turn:
+        with turn.ready():
+            shared |= common(run) | {"code": code(parts(run))}
         try:
-            found = _passes(run, files, tick, positions)
+            found = _passes(run, files, tick, positions, turn)
         except InputError:
             raise
         except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
+            turn.look()
             found = [failure(error, sources.of_class(solver_class(run)))]
             for earlier in (files.recording, files.picture):  # of a time when it did not fail; they would hide this
                 earlier.unlink(missing_ok=True)
             if run.record and "frame" in found[0]:
-                with beside(tick):
-                    _record_until(run, files, found[0])
-    if threads.why:
-        for row in found:
-            row["choice"] = "; ".join(filter(None, [row.get("choice"), threads.why]))
-    result = [shared | row for row in found]
-    with beside(tick):
+                _record_until(run, files, found[0])
+        if threads.why:
+            for row in found:
+                row["choice"] = "; ".join(filter(None, [row.get("choice"), threads.why]))
+        result = [shared | row for row in found]
         content = rows.encoded(result)
     rows.store(files.rows, content)  # who waits for the disk computes nothing, and disturbs nobody who is timed
     return result
 
 
-def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
+def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None, turn: Turn) -> list[dict[str, Any]]:
+    """Its rows; the turn looks at what was found when they are there."""
     if run.accuracy is not None:
-        return _to_error(run, run.accuracy, files, tick, positions)
-    with beside(tick):
+        return _to_error(run, run.accuracy, files, tick, positions, turn)
+    with turn.ready():
         scene = build(run.scene, run.size, run.integrator)
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
     settings = _settings(run)
     with _timed(run, tick) as how:
         measured, told = _measured(scene, _solver(run), settings, tick)
-    with beside(tick):
-        by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
-        require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=isinstance(run.tolerance, float))
-        stands = _standing(run)
+    turn.look()
+    by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
+    require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=isinstance(run.tolerance, float))
+    stands = _standing(run)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
     facts |= {"choice": measured.prepared.choice} | stands | how
     return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
@@ -113,27 +113,27 @@ def _measured(scene: Scene, solver: Solver, settings: Settings, tick: Tick) -> t
     return measured, times.rows(measured)
 
 
-def _to_error(run: RunSpec, error: float, files: Files, tick: Tick, positions: Path | None) -> list[dict[str, Any]]:
+def _to_error(
+    run: RunSpec, error: float, files: Files, tick: Tick, positions: Path | None, turn: Turn
+) -> list[dict[str, Any]]:
     """The rows of a run whose solver keeps to an error of its end: integrator and steps are chosen first."""
     with _timed(run, tick) as how:
         found = load(TO_ERROR)(run, error, tick)
     told, seen, last = found.rows(), found.positions, dict[str, Any]()
-    with beside(tick):
-        if positions:
-            save_positions(positions, seen[1:])
-        if run.record:
-            chosen = {name: told[0][name] for name in ("status", "integrator", "estimated")}
-            recorder = _recorder(
-                run, files, found.scene, chosen | {"milliseconds_per_step": 1e3 * found.median}, seen[-1]
-            )
-            try:
-                for k, p in enumerate(seen):
-                    recorder.frame(Frame(k, found.scene.time(k), p, {}, float("nan"), 0))
-                recorder.close({})
-            finally:
-                recorder.abandon()
-            ends = run.frames, found.scene.time(run.frames), seen[-1]
-            last = {"recorded": require_last(files.recording, recorder.info, *ends)}
+    turn.look()
+    if positions:
+        save_positions(positions, seen[1:])
+    if run.record:
+        chosen = {name: told[0][name] for name in ("status", "integrator", "estimated")}
+        recorder = _recorder(run, files, found.scene, chosen | {"milliseconds_per_step": 1e3 * found.median}, seen[-1])
+        try:
+            for k, p in enumerate(seen):
+                recorder.frame(Frame(k, found.scene.time(k), p, {}, float("nan"), 0))
+            recorder.close({})
+        finally:
+            recorder.abandon()
+        ends = run.frames, found.scene.time(run.frames), seen[-1]
+        last = {"recorded": require_last(files.recording, recorder.info, *ends)}
     return [how | row | (last if row["frame"] == run.frames else {}) for row in told]
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from harness.base.asides import WAITING, begun, ended
 from harness.base.crew import Task, done_by
-from harness.base.machine_lock import alone, beside, own_cores
+from harness.base.machine_lock import Turn, alone, beside, own_cores
 from harness.base.workers import Limits, Tick
 
 SOON, PATIENCE = 0.1, 60.0
@@ -79,6 +79,30 @@ def test_who_would_be_timed_goes_before_who_would_not():
     timed.leave.set()
     assert untimed.inside.wait(PATIENCE)
     untimed.leave.set()
+
+
+def test_who_gets_ready_goes_before_who_was_timed_and_two_get_ready_side_by_side():
+    with Turn(quiet, exclusive=True) as mine, Turn(quiet, exclusive=True) as another:
+        looks = Other(beside)
+        assert looks.waits.wait(PATIENCE)
+        with mine.ready(), another.ready():
+            assert not looks.inside.wait(SOON)
+        with alone(quiet):
+            assert not looks.inside.is_set()
+    assert looks.inside.wait(PATIENCE)
+    looks.leave.set()
+
+
+def test_who_was_timed_looks_beside_others():
+    with Turn(quiet, exclusive=True) as mine:
+        mine.look()
+        mine.look()
+        with Turn(quiet, exclusive=False) as shared, shared.ready():
+            timed = Other(alone)
+            assert timed.waits.wait(PATIENCE)
+        assert not timed.inside.wait(SOON)
+    assert timed.inside.wait(PATIENCE)
+    timed.leave.set()
 
 
 def at_core(tick: Tick) -> tuple[list[int], set[int], float, float]:
