@@ -58,7 +58,7 @@ def serve(
     calls: Connection, ticks: Connection, said: Connection, dump: Connection, ready: Callable[[], object], parent: int
 ) -> None:
     """Do what comes through `calls` until that ends. ready: called first; parent: whose child this is."""
-    _tie(parent)
+    tie(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's affair, which ends this
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.dup2(said.fileno(), 2)
@@ -85,8 +85,8 @@ def serve(
             gc.freeze()  # compiled kernels leave 10^5 objects, which take longer to look through than a short run
 
 
-def _tie(parent: int) -> None:
-    """End when the parent does; and be the first to go where memory runs out."""
+def tie(parent: int) -> None:
+    """In a child: end when its parent does, and be the first to go where memory runs out."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PARENT_DIES, signal.SIGKILL)
         if os.getppid() != parent:

@@ -25,6 +25,7 @@ from scipy.stats import mannwhitneyu
 
 from harness.base import columns, rows
 from harness.base.errors import InputError
+from harness.base.worker import tie
 from harness.experiments.gates.abba import orders
 from harness.experiments.gates.against import Options, Request, started
 from harness.experiments.gates.pair import Side
@@ -113,15 +114,18 @@ def competing(condition: str) -> Generator[None]:
         raise InputError(f"--condition: came {condition}; wanted one of {', '.join(CONDITIONS)}")
     with ExitStack() as cleanup:
         for core in os.sched_getaffinity(0) if condition != "nothing" else ():
-            process = get_context("spawn").Process(target=_compete, args=(condition == "bursty", core), daemon=True)
+            process = get_context("spawn").Process(
+                target=_compete, args=(condition == "bursty", core, os.getpid()), daemon=True
+            )
             process.start()
             cleanup.callback(process.join)
             cleanup.callback(process.terminate)
         yield
 
 
-def _compete(bursts: bool, seed: int) -> None:
+def _compete(bursts: bool, seed: int, parent: int) -> None:
     """Go through 16 MB again and again; in bursts of half a second to three, with pauses of one to six."""
+    tie(parent)
     rng, memory = Random(seed), np.ones(2**21)
     while True:
         until = process_time() + (rng.uniform(0.5, 3.0) if bursts else 60.0)
