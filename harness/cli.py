@@ -30,6 +30,7 @@ from harness.experiments.gallery import gallery
 from harness.experiments.gates.command import gate
 from harness.experiments.gates.history_command import history
 from harness.experiments.gates.study_command import study
+from harness.experiments.repeat import repeat
 from harness.experiments.show import show
 from harness.experiments.speed.command import speed
 
@@ -179,6 +180,7 @@ def report(
 app.command(cls=taking("frames", "iterations", "tolerance", "rounds"))(ablate)
 app.command()(speed)
 app.command()(recommend)
+app.command()(repeat)
 app.command()(goals)
 app.command()(compact)
 app.command()(merge)

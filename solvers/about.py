@@ -27,7 +27,8 @@ class About:
     integrates a frame in substeps of its own, whatever the integrator of the run. first: whether it is the one of its
     family to take first. to_error: whether it is tried where an error is asked for: one with steps of its own chooses
     them by their error (`within`), others minimise what an integrator with an error states. even: whether its own steps
-    have one length instead, and can be had shorter (`refined`).
+    have one length instead, and can be had shorter (`refined`). package: the distribution that it is an interface to,
+    whose version its rows tell.
     """
 
     family: str
@@ -36,6 +37,7 @@ class About:
     first: bool = False
     to_error: bool = False
     even: bool = False
+    package: str = ""
 
 
 LIU_2013 = Reference(

@@ -41,6 +41,8 @@ SOLVERS = {
 OPTIONAL = {
     "eigen": "solvers.methods.eigen:EigenLocalGlobal",
     "cholmod": "solvers.methods.cholmod:CholmodLocalGlobal",
+    "mujoco": "solvers.engines.mujoco:Mujoco",
+    "pypbd": "solvers.engines.pypbd:PyPbd",
 }
 """Those that need what is not everywhere, and refuse with the reason where it is missing."""
 

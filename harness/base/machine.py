@@ -82,10 +82,10 @@ def _cores() -> int:
 
 
 @cache
-def versions() -> dict[str, str]:
-    """The versions of Python and of the libraries that compute, store and draw; absent ones are left out."""
+def versions(*more: str) -> dict[str, str]:
+    """The versions of Python, of the libraries that compute, store and draw, and of these; absent ones are left out."""
     found = {"python": platform.python_version()}
-    for name in _LIBRARIES:
+    for name in (*_LIBRARIES, *more):
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:

@@ -9,6 +9,14 @@ from typing import Any
 from solvers.registry import EVERY, about, load, minimises
 
 
+def packages(solver: str) -> tuple[str, ...]:
+    """The distributions of others that a solver by name is an interface to."""
+    if solver not in EVERY:
+        return ()
+    package = about(load(EVERY[solver]), solver).package
+    return (package,) if package else ()
+
+
 def stated(solver: str) -> dict[str, Any]:
     """The columns `family`, `reference`, `minimises` and `own_steps` of a solver by name; none of what is no solver."""
     if solver not in EVERY:

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from harness.base import machine
-from harness.base.stated import stated
+from harness.base.stated import packages, stated
 from harness.config.options import OPTIONS
 from harness.config.sweep import RunSpec
 
@@ -15,7 +15,12 @@ from harness.config.sweep import RunSpec
 def common(run: RunSpec) -> dict[str, Any]:
     """The columns that are the same in all rows of a run."""
     limits = {"time_limit": run.time_limit, "memory_limit": run.memory_limit, "timing": run.timing}
-    return {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep} | asked(run) | limits | provenance()
+    return (
+        {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep}
+        | asked(run)
+        | limits
+        | provenance(run.solver.name)
+    )
 
 
 def asked(run: RunSpec) -> dict[str, Any]:
@@ -38,8 +43,9 @@ def tolerance(stated: float | str | None) -> float | None:
     return 0.0 if isinstance(stated, str) else stated
 
 
-def provenance() -> dict[str, Any]:
-    """The columns that tell where, when and by which code something was measured."""
+def provenance(solver: str = "") -> dict[str, Any]:
+    """The columns that tell where, when and by which code something was measured; solver: of whose package the version
+    is told, if it is an interface to one."""
     here = machine.describe()
     return {
         "machine": here.id,
@@ -48,7 +54,7 @@ def provenance() -> dict[str, Any]:
         "cores": here.cores,
         "memory_gib": here.memory_gib,
         "system": here.system,
-        "versions": json.dumps(machine.versions(), sort_keys=True),
+        "versions": json.dumps(machine.versions(*packages(solver)), sort_keys=True),
         "commit": machine.commit(),
         "code": machine.code_hash(),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -70,6 +70,11 @@ LOZENGE: Any = ((-1, 0), (0, 0.5), (1, 0), (0, -0.5), (-1, 0))
 """A diamond that lies on its side."""
 ARROWHEAD: Any = ((0, 1), (0.9, -0.8), (0, -0.25), (-0.9, -0.8), (0, 1))
 """A triangle that points up, notched below."""
+BARS: tuple[Any, ...] = (
+    ((-0.9, 1), (0.9, 1), (0.9, 0.6), (0.2, 0.6), (0.9, -0.9), (-0.9, -0.9), (-0.2, 0.6), (-0.9, 0.6), (-0.9, 1)),
+    ((-0.9, -1), (0.9, -1), (0.9, -0.6), (0.2, -0.6), (0.9, 0.9), (-0.9, 0.9), (-0.2, -0.6), (-0.9, -0.6), (-0.9, -1)),
+)
+"""Triangles that point up and down to a bar."""
 _MARKERS: tuple[Any, ...] = (
     "s",
     "o",
@@ -92,10 +97,22 @@ _MARKERS: tuple[Any, ...] = (
     BOWTIE,
     LOZENGE,
     ARROWHEAD,
+    *BARS,
 )
 
-# Okabe and Ito's palette, less its yellow and black, and five more: for families in the order of the registry.
-_FAMILIES = ("#0072b2", "#00a878", "#e69f00", "#d55e00", "#9a86e0", "#cc79a7", "#a8326e", "#858585", "#8a994c")
+# Okabe and Ito's palette, less its yellow and black, and six more: for families in the order of the registry.
+_FAMILIES = (
+    "#0072b2",
+    "#00a878",
+    "#e69f00",
+    "#d55e00",
+    "#9a86e0",
+    "#cc79a7",
+    "#a8326e",
+    "#858585",
+    "#8a994c",
+    "#99634c",
+)
 _MEMBERS: tuple[tuple[float, Any], ...] = (
     *((0.0, "-"), (-0.36, DASHED), (0.42, "-"), (0.2, DASH_DOTTED), (-0.12, (0, (1, 3)))),
 )

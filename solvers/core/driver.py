@@ -144,6 +144,26 @@ class Iterative(ABC):
         return {}
 
 
+class Substeps(Iterating):
+    """The whole step in one substep, in two, and so on, each from the start; what nobody looks at is left out."""
+
+    def __init__(self, step: Callable[[StepProblem, int], tuple[Positions, Positions]], problem: StepProblem) -> None:
+        """step: positions [m] and velocity [m/s] after the step of a problem in so many substeps."""
+        self._step, self._problem, self._substeps = step, problem, 0
+        self.positions = problem.start.positions
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        self.iterate(loop.ONE)
+        return True
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating."""
+        self._substeps += limits.iterations
+        self.positions, self.velocity = self._step(self._problem, self._substeps)
+        return limits.iterations, float("nan"), loop.ITERATIONS
+
+
 def largest(problem: StepProblem) -> float:
     """The first guess's largest coordinate [m], exactly pinned vertices on their targets."""
     s, p = problem.system, problem.first_guess

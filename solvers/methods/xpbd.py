@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from solvers.about import About, Reference
 from solvers.core import colouring, vertex_terms
-from solvers.core.driver import Iterating, Iterative
+from solvers.core.driver import Iterating, Iterative, Substeps
 from solvers.core.prefactored import only_springs
 from solvers.kernels import xpbd as kernels
 from solvers.kernels.loop import ITERATIONS, ONE, Limits
@@ -131,7 +131,7 @@ class PreparedSmallSteps(Iterative):
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """See Iterative; from where the step starts."""
-        return _SmallSteps(self, problem)
+        return Substeps(self.step, problem)
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
         """Positions [m] and velocity [m/s] after the step in so many substeps."""
@@ -144,25 +144,6 @@ class PreparedSmallSteps(Iterative):
         force, before = problem.force.copy(), np.empty_like(p)
         kernels.substeps(self.constraints, ease, compliance, pinned, force, before, p, v, h, substeps)
         return p, v
-
-
-class _SmallSteps(Iterating):
-    """The whole step in one substep, in two, and so on, each from the start."""
-
-    def __init__(self, prepared: PreparedSmallSteps, problem: StepProblem) -> None:
-        self._prepared, self._problem, self._substeps = prepared, problem, 0
-        self.positions = problem.start.positions
-
-    def advance(self) -> bool:
-        """See Iterating."""
-        self.iterate(ONE)
-        return True
-
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating; substeps that nobody looks at are not taken."""
-        self._substeps += limits.iterations
-        self.positions, self.velocity = self._prepared.step(self._problem, self._substeps)
-        return limits.iterations, float("nan"), ITERATIONS
 
 
 def _prepared(system: System, held: NDArray[np.float64], solver: str) -> tuple[kernels.Constraints, str]:

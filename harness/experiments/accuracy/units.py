@@ -219,7 +219,7 @@ def _written(home: Home, spec: CurveSpec | WorkSpec, found: Sequence[Row]) -> st
         "parameters": json.dumps(dict(spec.solver.parameters), sort_keys=True),
         **stated(spec.solver.name),
         "threads": spec.how.threads,
-        **provenance(),
+        **provenance(spec.solver.name),
     }
     rows.write(home.rows(spec.label()), [shared | row for row in found], SCHEMA)
     bad = next((row for row in found if row["status"] != "ok"), None)

@@ -157,12 +157,14 @@ def _sizes(works: Iterable[WorkPoint]) -> dict[float | None, float]:
 
 
 def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dict[float | None, float]) -> None:
-    """Points of one integrator; those that differ in the time step alone are joined."""
-    chains: dict[tuple[str, float | None, int, str], list[WorkPoint]] = {}
+    """Points of one integrator; those that differ in the time step alone are joined, or in the substeps alone."""
+    chains: dict[tuple[str, float | None, float, str], list[WorkPoint]] = {}
+    divided = _divided(works)
     for work in works:
-        chains.setdefault((work.label, work.tolerance, work.iterations, work.first_guess), []).append(work)
+        differs = work.time_step if work.label in divided else work.iterations
+        chains.setdefault((work.label, work.tolerance, differs, work.first_guess), []).append(work)
     for (label, tolerance, *_), members in chains.items():
-        members.sort(key=lambda work: work.time_step)
+        members.sort(key=lambda work: (work.time_step, -work.iterations))
         look, hollow = marked[label], [older(work) for work in members]
         x, y = [work.seconds for work in members], [work.error for work in members]
         grown = max(_OWN, *sizes.values()) if members[0].own_steps else sizes[tolerance]
@@ -174,6 +176,15 @@ def _panel(ax: Axes, works: list[WorkPoint], marked: dict[str, Mark], sizes: dic
             "the default", (base.seconds, base.error), (11, 4), textcoords="offset points",
             fontsize=9, ha="left", color=INK, bbox={"facecolor": PAGE, "alpha": 0.8, "edgecolor": "none", "pad": 0.8},
         )  # fmt: skip
+
+
+def _divided(works: Iterable[WorkPoint]) -> set[str]:
+    """The methods with steps of their own that were tried with several numbers of them in a time step, by label."""
+    tried: dict[str, set[int]] = {}
+    for work in works:
+        if work.own_steps:
+            tried.setdefault(work.label, set()).add(work.iterations)
+    return {label for label, numbers in tried.items() if len(numbers) > 1}
 
 
 def _front(ax: Axes, works: list[WorkPoint]) -> None:
@@ -204,6 +215,8 @@ def _stop(tolerance: float | None) -> str:
 
 def _notes(works: Sequence[WorkPoint]) -> list[str]:
     words = ["Joined points differ in the time step alone: " + ", ".join(map(step_words, _steps(works)))]
+    if divided := sorted(_divided(works)):
+        words[0] += f"; those of {', '.join(divided)} in the substeps alone"
     if not all(work.minimises for work in works):
         words.append("† does not minimise the step's objective: its limit is not the integrator's own solution")
     words += [OLDER] if any(map(older, works)) else []

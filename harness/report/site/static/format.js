@@ -63,6 +63,7 @@ Object.assign(springbench, (() => {
     "star-square": ring(8, 0.55), "star-triangle-down": ring(3, 0.4, Math.PI),
     "triangle-ne": "M-5-5H5V5Z", "triangle-nw": "M5-5H-5V5Z", "triangle-se": "M-5 5H5V-5Z", "triangle-sw": "M5 5H-5V-5Z", hourglass: "M-5-6H5L-5 6H5Z", bowtie: "M-6-5L6 5V-5L-6 5Z", "diamond-wide": "M-7 0L0-4L7 0L0 4Z",
     arrow: "M0-6.5L5.5 5L0 1.5L-5.5 5Z",
+    "arrow-bar-up": "M-6-6.5H6V-4H1.3L6 6H-6L-1.3-4H-6Z", "arrow-bar-down": "M-6 6.5H6V4H1.3L6-6H-6L-1.3 4H-6Z",
   };
   function glyph(mark) {
     const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");

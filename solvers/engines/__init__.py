@@ -1,0 +1,1 @@
+"""Programs of others as solvers, each in a file of its own."""

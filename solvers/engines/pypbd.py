@@ -1,0 +1,158 @@
+"""PositionBasedDynamics, by its Python interface pyPBD: springs are its XPBD distance constraints.
+
+    lambda' = -(C + lambda / (k h^2)) / (1/m_i + 1/m_j + 1/(k h^2)),    C = |p_i - p_j| - r
+
+(Macklin, Mueller and Chentanez 2016), in the substeps h of its `TimeStepController`, each of some iterations over all
+constraints. Its documentation and examples meet stiff cloth by substeps rather than by iterations, after Macklin et al.
+2019: by default a time step of 5 ms has 5 substeps of one iteration each. Gravity is the only force that it has.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numba
+import numpy as np
+from threadpoolctl import ThreadpoolController  # pyright: ignore[reportMissingTypeStubs]
+
+from solvers.about import About, Reference
+from solvers.engines.base import Engine, Network, Package, evenly
+from solvers.problem import Positions, StepProblem, Unsupported
+
+_SCRIPT = """\
+import time
+import numpy as np
+import pypbd as pbd
+net = np.load("{name}.npz")  # the network, and where springbench's run of pyPBD ended
+sim, model, control = pbd.Simulation.getCurrent(), pbd.SimulationModel(), pbd.TimeStepController()
+model.init(), control.init(), pbd.TimeManager.getCurrent().setTimeStepSize({time_step!r})
+control.setValueUInt(pbd.TimeStepController.NUM_SUB_STEPS, {substeps})
+control.setValueUInt(pbd.TimeStepController.MAX_ITERATIONS, {iterations})
+control.setValueUInt(pbd.TimeStepController.MAX_ITERATIONS_V, 0)
+control.setValueInt(pbd.TimeStepController.VELOCITY_UPDATE_METHOD, pbd.TimeStepController.ENUM_VUPDATE_FIRST_ORDER)
+particles, held = model.getParticles(), set(net["pinned"].tolist())
+for i, (p, v, m) in enumerate(zip(net["positions"], net["velocities"], net["mass"])):
+    particles.addVertex(p), particles.setMass(i, 0.0 if i in held else m), particles.setVelocity(i, v)
+for (i, j), k, r in zip(net["ends"].tolist(), net["stiffness"], net["rest_length"]):
+    model.addDistanceConstraint_XPBD(i, j, k)
+    model.getConstraints()[-1].restLength = r
+began = time.perf_counter()
+for _ in range({frames}):
+    control.step(model)
+seconds, p = time.perf_counter() - began, np.array(particles.getVertices())
+print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of that run")
+"""
+
+
+@dataclass(frozen=True)
+class PyPbd(Engine):
+    """iterations: over all constraints, in each substep."""
+
+    name: ClassVar[str] = "pypbd"
+    package: ClassVar[Package] = Package("pypbd", "pyPBD", "pypbd")
+    about: ClassVar[About] = About(
+        "engine",
+        Reference(
+            "Bender, Jan and Müller, Matthias and Macklin, Miles",
+            2017,
+            "A survey on position based dynamics",
+            "10.2312/egt.20171034",
+        ),
+        own_steps=True,
+        package="pyPBD",
+    )
+
+    iterations: int = 1
+
+    def built(self, network: Network, library: Any) -> tuple[_Model, str]:
+        """See Engine."""
+        if not self.iterations >= 1:
+            raise Unsupported(f"pypbd: iterations came as {self.iterations}; wanted 1 or more")
+        made = _Model(library, network, self.iterations)
+        return made, f"{self.iterations} iterations a substep, in {made.precision}"
+
+    def script(self, name: str, network: Network, problem: StepProblem, substeps: int, frames: int) -> dict[str, str]:
+        """See Engine."""
+        _require_gravity(network, problem)
+        given = {"time_step": network.time_step, "substeps": substeps, "iterations": self.iterations, "frames": frames}
+        return {f"{name}.py": _SCRIPT.format(name=name, **given)}
+
+
+GRAVITY = (0.0, -9.81, 0.0)
+"""Its interface sets no other [m/s^2]."""
+
+
+def _require_gravity(network: Network, problem: StepProblem) -> None:
+    found = network.acceleration(problem.force)
+    if found is None or not np.allclose(found, GRAVITY, rtol=0.0, atol=1e-9):
+        came = "loads that differ from gravity" if found is None else f"an acceleration of {found} m/s²"
+        raise Unsupported(f"pypbd: has gravity of 9.81 m/s² along -y and no other force; the scene has {came}")
+
+
+def _pin_threads() -> None:
+    """Let its own OpenMP have as many threads as our kernels have."""
+    for pool in ThreadpoolController().select(internal_api="openmp").lib_controllers:
+        if "pypbd" in pool.filepath:
+            pool.set_num_threads(numba.get_num_threads())
+
+
+class _Model:
+    """A model and its state. Only what differs from the state that it ended at is set, vertex by vertex."""
+
+    def __init__(self, library: Any, network: Network, iterations: int) -> None:
+        self._library, self._network = library, network
+        _pin_threads()
+        library.Simulation.getCurrent()  # has gravity
+        self._model, self._control = library.SimulationModel(), library.TimeStepController()
+        self._model.init()
+        self._control.init()
+        self._particles = self._model.getParticles()
+        fixed = np.isin(np.arange(len(network.mass)), network.pinned)
+        for i, m in enumerate(np.where(fixed, 0.0, network.mass).tolist()):
+            self._particles.addVertex(np.zeros(3))
+            self._particles.setMass(i, m)
+        for (i, j), k in zip(network.lines.ends.tolist(), network.lines.stiffness.tolist(), strict=True):
+            self._model.addDistanceConstraint_XPBD(i, j, k)
+        constraints = self._model.getConstraints()
+        for e, r in enumerate(network.lines.rest_length.tolist()):
+            constraints[e].restLength = r
+        self._set(iterations, "MAX_ITERATIONS")
+        self._set(0, "MAX_ITERATIONS_V")  # there is nothing to project velocities to
+        control = library.TimeStepController
+        self._control.setValueInt(control.VELOCITY_UPDATE_METHOD, control.ENUM_VUPDATE_FIRST_ORDER)
+        self._velocity = np.zeros((len(network.mass), 3))
+        self.precision = f"float{8 * np.asarray(self._particles.getVertices()).itemsize}"
+
+    def _set(self, value: int, name: str) -> None:
+        self._control.setValueUInt(getattr(self._library.TimeStepController, name), value)
+
+    def _positions(self) -> Positions:
+        return np.array(self._particles.getVertices(), np.float64)
+
+    def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
+        """See Stepping. Raises Unsupported for other loads than its gravity."""
+        net, start, particles = self._network, problem.start, self._particles
+        _require_gravity(net, problem)
+        for i in np.flatnonzero((self._positions() != start.positions).any(axis=1)).tolist():
+            particles.setPosition(i, start.positions[i])
+        for i in np.flatnonzero((self._velocity != start.velocity).any(axis=1)).tolist():
+            particles.setVelocity(i, start.velocity[i])
+        begin, end = start.positions[net.pinned], problem.pin_targets
+        places = evenly(begin, end, substeps)
+        if places is None:
+            self._steps(net.time_step, substeps)
+        for place in places or ():
+            for i, x in zip(net.pinned.tolist(), place + (end - begin) / substeps, strict=True):
+                particles.setPosition(i, x)
+            self._steps(net.time_step / substeps, 1)
+        p = self._positions()
+        self._velocity = np.array([particles.getVelocity(i) for i in range(len(p))], np.float64)
+        v = self._velocity.copy()
+        p[net.pinned], v[net.pinned] = end, (end - begin) / net.time_step
+        return p, v
+
+    def _steps(self, time: float, substeps: int) -> None:
+        self._library.TimeManager.getCurrent().setTimeStepSize(time)
+        self._set(substeps, "NUM_SUB_STEPS")
+        self._control.step(self._model)

@@ -1,0 +1,98 @@
+"""Outside engines beside ours, by what no trajectory tells: what is left of the step's residual, drift and stability.
+
+    python -m tests.bench.engines [SCENE ...] [--size 9] [--frames 30] [--substeps 4 16 64 256]
+
+Scenes without drag: all energy that goes, or comes, is the method's. A cell is `residual / drift`. The residual is
+|Q^-1 grad g|_Q of implicit Euler's step problem at the answer, over its value at the step's start, the median over the
+frames: 0 for whoever minimises it. The drift is that of kinetic, elastic and gravitational energy, over the largest
+kinetic one. A dash: positions are not finite, or farther away than ten times the mesh's size.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from harness.base.machine import pinned_threads
+from harness.config.load import load_scene
+from harness.reference.frozen import bind
+from harness.reference.oracle import Oracle
+from harness.scenes.bind import Scene
+from harness.simulation.step import prepare, simulate, start
+from solvers.core.forces import frequency
+from solvers.problem import Positions, StopRule, Unsupported
+from solvers.registry import EVERY, load
+
+SCENES = [Path(__file__).parents[2] / "configs" / "scenes" / f"{name}.yaml" for name in ("curtain", "stiff-cloth-sway")]
+ENGINES: tuple[tuple[str, dict[str, Any]], ...] = (
+    *(("mujoco", {"integrator": one}) for one in ("implicitfast", "implicit", "Euler", "RK4")),
+    *(("pypbd", {"iterations": one}) for one in (1, 4, 16)),
+    ("xpbd-small-steps", {}),
+)
+OURS = (("velocity-verlet", "own", StopRule(1)), ("hybrid", "implicit-euler", StopRule(200, 1e-6)))
+FAR = 10.0
+
+
+def energy(scene: Scene, p: Positions, v: Positions) -> tuple[float, float]:
+    """All of it, and the kinetic part [J]."""
+    kinetic = 0.5 * float(scene.system.mass @ np.einsum("ij,ij->i", v, v))
+    return kinetic + scene.springs.value(p) - float(np.einsum("ij,ij->", scene.load, p)), kinetic
+
+
+def cell(scene: Scene, solver: Any, stop: StopRule, frames: int) -> str:
+    """Residual and drift."""
+    oracle, size, begun = Oracle(scene.system), scene.mesh.size or 1.0, start(scene).now
+    first, most = energy(scene, *begun)
+    last, left = first, list[float]()
+    try:
+        for step in simulate(scene, prepare(scene, solver), stop, first_guess="current", frames=frames):
+            p, v = step.state.now
+            if not np.isfinite(p).all() or np.abs(p - scene.mesh.rest).max() > FAR * size:
+                return "–"
+            left.append(oracle.stationarity(step.problem, p).reached)
+            last, kinetic = energy(scene, p, v)
+            most = max(most, kinetic)
+    except Unsupported as refused:
+        return str(refused).partition(":")[2].strip()
+    return f"{np.median(left):.1e} / {100 * (last - first) / most:+.2g} %"
+
+
+def rows(path: Path, size: int, frames: int, substeps: list[int]) -> Iterator[tuple[str, ...]]:
+    """Of one scene."""
+    scene = bind(load_scene(path), size, "own")
+    for name, parameters in ENGINES:
+        made = load(EVERY[name])(**parameters)
+        words = " ".join(map(str, (name, *parameters.values())))
+        yield words, *(cell(scene, made, StopRule(number), frames) for number in substeps)
+    for name, integrator, stop in OURS:
+        yield f"{name}, {integrator}", cell(bind(load_scene(path), size, integrator), load(EVERY[name])(), stop, frames)
+
+
+def main() -> None:
+    """Print a table a scene."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("scenes", nargs="*", type=Path, default=SCENES, metavar="SCENE")
+    parser.add_argument("--size", type=int, default=9)
+    parser.add_argument("--frames", type=int, default=30)
+    parser.add_argument("--substeps", type=int, nargs="+", default=[4, 16, 64, 256])
+    asked = parser.parse_args()
+    with pinned_threads(1):
+        for path in asked.scenes:
+            system = bind(load_scene(path), asked.size, "own").system
+            least = frequency(system) * system.time_step / 2.0
+            title = f"{path.stem} {asked.size}: omega h is 2 at {least:.3g} substeps"
+            table = Table("substeps", *map(str, asked.substeps), box=SIMPLE_HEAD, title=title)
+            for row in rows(path, asked.size, asked.frames, asked.substeps):
+                table.add_row(*row)
+            Console(width=140).print(table)
+
+
+if __name__ == "__main__":
+    main()

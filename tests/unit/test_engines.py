@@ -1,0 +1,217 @@
+"""Outside engines: the same network, their own steps; refusals by name, and scripts that repeat a point without us."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from harness.cli import app
+from harness.experiments.provenance import provenance
+from harness.scenes.bind import Scene, build
+from harness.scenes.effects.bending import Bending
+from harness.scenes.effects.dashpots import Dashpots
+from harness.scenes.effects.ether_drag import EtherDrag
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.spec import SceneSpec
+from harness.simulation.step import problem, start
+from solvers.engines import base
+from solvers.engines.base import Engine, PreparedEngine
+from solvers.methods.xpbd import XpbdSmallSteps
+from solvers.problem import Positions, StepProblem, StopRule, System, Unsupported
+from solvers.registry import OPTIONAL, about, load, minimises
+from tests.scenes import random_problem
+
+ENGINES = [name for name, target in OPTIONAL.items() if about(load(target), name).package]
+engines = pytest.mark.parametrize("name", ENGINES)
+
+CONFIG = """
+scenes: [net.yaml]
+solvers: [newton, {engine}]
+work: [{{size: 3, horizon: 0.1, integrator: own, iterations: 20}}]
+"""
+NET = """
+mesh: {kind: net, width: 2.0, height: 2.0}
+mass: 2.0
+time_step: 1/30
+frames: 3
+effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [corners]}]
+"""
+
+
+def made(*effects: Any, mesh: Any = None, size: int = 4, integrator: str = "own", **given: Any) -> Scene:
+    path = Path("scene.yaml")
+    spec = SceneSpec(mesh=mesh or Grid(), mass=1.0, time_step=1 / 30, frames=1, effects=effects, path=path, **given)
+    return build(spec, size, integrator)
+
+
+HANGING = Springs(stretch=300.0, shear=60.0), Gravity(), Pins.model_validate({"at": ["top_corners"]})
+
+
+def ready(name: str, system: System, **parameters: Any) -> PreparedEngine:
+    """The engine; where it is not installed it says which command does so, and there is nothing to try."""
+    engine: Engine = load(OPTIONAL[name])(**parameters)
+    try:
+        engine.package.load(name)
+    except Unsupported as error:
+        pytest.skip(str(error))
+    return engine.prepare(system)
+
+
+def falling(problem: StepProblem) -> StepProblem:
+    """The same with the weight of gravity for a load, and at rest."""
+    s = problem.system
+    begun = replace(problem.start, positions=problem.current, velocity=np.zeros_like(problem.current))
+    return replace(problem, force=s.mass[:, None] * np.array([0.0, -9.81, 0.0]), start=begun)
+
+
+@engines
+def test_where_it_is_not_installed_the_reason_is_the_command_that_does_so(name: str, monkeypatch: pytest.MonkeyPatch):
+    def none(module: str) -> None:
+        raise ModuleNotFoundError(f"No module named {module!r}")
+
+    monkeypatch.setattr(base, "import_module", none)
+    with pytest.raises(Unsupported, match=rf"^{name}: .*pip install -e '\.\[{name}\]'` in the checkout"):
+        load(OPTIONAL[name])().prepare(made(*HANGING).system)
+
+
+@engines
+def test_what_an_engine_cannot_express_it_refuses_by_name(name: str):
+    engine = load(OPTIONAL[name])()
+    assert not minimises(engine)
+    with pytest.raises(Unsupported, match=rf"^{name}: expresses springs.* the scene has \w*Bending\w* as well"):
+        engine.prepare(made(*HANGING, Bending(stiffness=1e-3)).system)
+    with pytest.raises(Unsupported, match=f"{name}: divides the step by itself"):
+        engine.prepare(made(*HANGING, integrator="bdf2").system)
+
+
+def test_drag_that_an_engine_does_not_have_is_refused():
+    with pytest.raises(Unsupported, match="pypbd: expresses springs; the scene has EtherDrag as well"):
+        load(OPTIONAL["pypbd"])().prepare(made(*HANGING, EtherDrag(rate=1.0)).system)
+
+
+def semi_implicit(scene: Scene, stated: StepProblem, substeps: int, damping: float) -> tuple[Positions, Positions]:
+    """v <- v + h M^-1 (f - grad E) on what is not pinned, p <- p + h v."""
+    s, h = scene.system, scene.system.time_step / substeps
+    p, v = stated.start.positions.copy(), np.where(s.unpinned[:, None], stated.start.velocity, 0.0)
+    for _ in range(substeps):
+        force = stated.force.copy()
+        for edge, r, k in zip(scene.springs.edges, scene.springs.rest_length, scene.springs.stiffness, strict=True):
+            i, j = edge
+            away = p[i] - p[j]
+            length = float(np.linalg.norm(away))
+            n = away / length
+            pull = (k * (length - r) + damping * n @ (v[i] - v[j])) * n
+            force[i] -= pull
+            force[j] += pull
+        v[s.unpinned] += h * force[s.unpinned] / s.mass[s.unpinned, None]
+        p[s.unpinned] += h * v[s.unpinned]
+    return p, v
+
+
+@pytest.mark.parametrize(("integrator", "damping"), [("Euler", 0.5), ("implicitfast", 0.0), ("implicit", 0.0)])
+def test_mujoco_steps_a_network_as_its_documentation_says(integrator: str, damping: float):
+    parts = Springs(rule="fixed", stretch=300.0), Dashpots(rule="fixed", stretch=damping), Gravity(), HANGING[2]
+    scene = made(*parts, size=3, velocity=(0.3, 0.0, -0.2))
+    stated = problem(scene, start(scene), "current")
+    wind = replace(stated, force=stated.force + np.random.default_rng(0).normal(size=stated.force.shape))
+    prepared = ready("mujoco", scene.system, integrator=integrator)
+    for one in stated, wind:
+        found = prepared.solve(one, StopRule(20))
+        p, v = semi_implicit(scene, one, 20, damping)
+        free = scene.system.unpinned
+        # Two ways to add the same terms, twenty times.
+        np.testing.assert_allclose(found.positions[free], p[free], rtol=0, atol=1e-12)
+        assert found.velocity is not None
+        np.testing.assert_allclose(found.velocity[free], v[free], rtol=0, atol=1e-10)
+
+
+def test_the_drag_that_mujoco_takes_is_that_of_the_scene():
+    scene = made(Gravity(), EtherDrag(rate=2.0), HANGING[2], size=3, velocity=(1.0, 0.0, 0.0))
+    found = ready("mujoco", scene.system).solve(problem(scene, start(scene), "current"), StopRule(400))
+    free = scene.system.unpinned
+    assert found.velocity is not None
+    # v' = g - c v; steps of 1/400 of a frame are of order 1.
+    np.testing.assert_allclose(found.velocity[free, 0], np.exp(-2.0 / 30), rtol=1e-4)
+
+
+@pytest.mark.parametrize("substeps", [1, 7])
+def test_pypbd_moves_one_spring_as_xpbd_in_small_steps_does(substeps: int):
+    pins = Pins.model_validate({"at": ["first"], "weight": "exact"})
+    scene = made(Springs(stretch=500.0), Gravity(), pins, mesh=Chain(), size=2)
+    stated = problem(scene, start(scene), "current")
+    found = ready("pypbd", scene.system).solve(stated, StopRule(substeps))
+    wanted = XpbdSmallSteps().prepare(scene.system).solve(stated, StopRule(substeps))
+    # It may compute in single precision.
+    np.testing.assert_allclose(found.positions, wanted.positions, rtol=0, atol=1e-6)
+
+
+@engines
+@pytest.mark.parametrize("weight", [1e10, "exact"])
+def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_number(name: str, weight: float | str):
+    pins = Pins.model_validate({"at": ["top_corners"], "weight": weight})
+    scene = made(*HANGING[:2], pins)
+    stated = problem(scene, start(scene), "current")
+    prepared = ready(name, scene.system)
+    kept = stated.start.positions.copy()
+    other = falling(random_problem(0))
+    elsewhere = ready(name, other.system)
+    alone = prepared.solve(stated, StopRule(5))
+    together = zip(prepared.iterates(stated), elsewhere.iterates(other), strict=False)
+    iterates = [p.copy() for p, _ in islice(together, 5)]
+    np.testing.assert_array_equal(alone.positions, iterates[-1])
+    np.testing.assert_array_equal(stated.start.positions, kept)
+    assert (alone.residual_of, alone.stopped, alone.iterations) == ("none", "iterations", 5)
+    assert np.isnan([alone.residual, alone.yardstick, prepared.residual_at(stated, kept)]).all()
+    # Pins that move are at their ends, whatever came before.
+    moved = replace(stated, pin_targets=stated.pin_targets + 0.01)
+    found = prepared.solve(moved, StopRule(4))
+    np.testing.assert_array_equal(found.positions[scene.system.pins.vertices], moved.pin_targets)
+    np.testing.assert_array_equal(prepared.solve(stated, StopRule(5)).positions, alone.positions)
+
+
+@engines
+def test_rows_tell_the_version_of_the_engine(name: str):
+    prepared = ready(name, made(*HANGING).system)
+    package = load(OPTIONAL[name]).about.package
+    version = json.loads(provenance(name)["versions"])[package]
+    assert f"{package} {version}," in prepared.choice
+    assert package not in json.loads(provenance("newton")["versions"])
+
+
+@engines
+def test_the_script_that_is_printed_ends_where_the_run_did(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    ready(name, made(*HANGING).system)
+    (tmp_path / "net.yaml").write_text(NET)
+    config = tmp_path / "config.yaml"
+    config.write_text(CONFIG.format(engine=name))
+    listed = CliRunner().invoke(app, ["repeat", str(config)])
+    (line,) = [line for line in listed.stdout.splitlines() if f"net-3-work-{name}" in line]
+    point = line.split()[0]
+    told = CliRunner().invoke(app, ["repeat", str(config), point[-6:], "-o", str(tmp_path)])
+    assert told.exit_code == 0, told.output
+    assert (tmp_path / f"{point}.py").read_text() in told.stdout
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    runpy.run_path(f"{point}.py")
+    assert " s; 0 m from the end of that run" in capsys.readouterr().out
+
+
+def test_a_point_of_none_or_of_several_is_a_mistake(tmp_path: Path):
+    (tmp_path / "net.yaml").write_text(NET)
+    (tmp_path / "config.yaml").write_text(CONFIG.format(engine="mujoco"))
+    told = CliRunner().invoke(app, ["repeat", str(tmp_path / "config.yaml"), "nothing"])
+    assert told.exit_code == 2
