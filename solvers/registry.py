@@ -36,6 +36,7 @@ SOLVERS = {
     "pncg": "solvers.methods.pncg:NonlinearCG",
     "admm": "solvers.methods.admm:Admm",
     "a-jacobi": "solvers.methods.a_jacobi:AggregatedJacobi",
+    "mgpbd": "solvers.methods.mgpbd:MultigridXpbd",
 }
 
 OPTIONAL = {

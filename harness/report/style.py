@@ -75,6 +75,8 @@ BARS: tuple[Any, ...] = (
     ((-0.9, -1), (0.9, -1), (0.9, -0.6), (0.2, -0.6), (0.9, 0.9), (-0.9, 0.9), (-0.2, -0.6), (-0.9, -0.6), (-0.9, -1)),
 )
 """Triangles that point up and down to a bar."""
+CHEVRON: Any = ((-1, -0.7), (0, 0.1), (1, -0.7), (1, 0), (0, 0.8), (-1, 0), (-1, -0.7))
+"""A broad stroke that is bent to point up."""
 _MARKERS: tuple[Any, ...] = (
     "s",
     "o",
@@ -98,6 +100,7 @@ _MARKERS: tuple[Any, ...] = (
     LOZENGE,
     ARROWHEAD,
     *BARS,
+    CHEVRON,
 )
 
 # Okabe and Ito's palette, less its yellow and black, and six more: for families in the order of the registry.
@@ -114,7 +117,7 @@ _FAMILIES = (
     "#99634c",
 )
 _MEMBERS: tuple[tuple[float, Any], ...] = (
-    *((0.0, "-"), (-0.36, DASHED), (0.42, "-"), (0.2, DASH_DOTTED), (-0.12, (0, (1, 3)))),
+    *((0.0, "-"), (-0.36, DASHED), (0.3, "-"), (0.2, DASH_DOTTED), (-0.12, (0, (1, 3)))),
 )
 """How much lighter the members of a family are drawn, or darker where negative, and in which line style."""
 _MANY: tuple[tuple[float, Any], ...] = (

@@ -147,7 +147,7 @@ def _coarsen(A: csr_array) -> tuple[Level, csr_array]:
         CompressedRows.of(P),
         CompressedRows.of(R),
         (1.0 / diagonal).astype(np.float32),
-        _chebyshev(largest),
+        chebyshev_weights(largest),
         *vectors,
     )
     return level, coarse
@@ -163,7 +163,7 @@ def largest_eigenvalue(A: csr_array, diagonal: NDArray[np.float64]) -> float:
     return min(bound, 1.1 * float(v @ (A @ v) / (v @ (diagonal * v))))
 
 
-def _chebyshev(largest: float) -> list[tuple[np.float32, np.float32]]:
+def chebyshev_weights(largest: float) -> list[tuple[np.float32, np.float32]]:
     """(keep, scale) of each step of the Chebyshev iteration for eigenvalues of _LOWEST to 1 times `largest`."""
     centre, half = 0.5 * (1.0 + _LOWEST) * largest, 0.5 * (1.0 - _LOWEST) * largest
     rho = half / centre

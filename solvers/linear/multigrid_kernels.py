@@ -205,3 +205,21 @@ def filtered(pointers, columns, values, strength):
                 out[e] = 0.0
         out[own] += lumped
     return out
+
+
+@kept()
+def gauss_seidel(pointers, columns, values, x, sweeps):
+    """So many sweeps of Gauss-Seidel's method for A x = 0 from x (n, q), which takes the result."""
+    n, count = x.shape
+    for _ in range(sweeps):
+        for i in range(n):
+            own, x[i] = 1.0, 0.0
+            for e in range(pointers[i], pointers[i + 1]):
+                j = columns[e]
+                if j == i:
+                    own = values[e]
+                    continue
+                for c in range(count):
+                    x[i, c] -= values[e] * x[j, c]
+            for c in range(count):
+                x[i, c] /= own

@@ -95,16 +95,16 @@ class PreparedXpbd(Iterative):
     choice: str
     facts: dict[str, float] = field(default_factory=dict)
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+    def begin(self, problem: StepProblem, guess: Positions) -> Passes:
         """See Iterative; from where the vertices would go without springs."""
-        return _Passes(self, vertex_terms.anchors(problem))
+        return Passes(self, vertex_terms.anchors(problem))
 
 
-class _Passes(Iterating):
-    """One pass over all springs after another."""
+class Passes(Iterating):
+    """One pass over all springs after another. tension: t of each (m,) [N], in the order of `constraints`."""
 
     def __init__(self, prepared: PreparedXpbd, p: Positions) -> None:
-        self._prepared, self._tension, self.positions = prepared, np.zeros_like(prepared.ease), p
+        self._prepared, self.tension, self.positions = prepared, np.zeros_like(prepared.ease), p
 
     def advance(self) -> bool:
         """See Iterating."""
@@ -114,7 +114,7 @@ class _Passes(Iterating):
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
         """See Iterating."""
         made = self._prepared
-        kernels.iterate(made.constraints, made.ease, made.compliance, self._tension, self.positions, limits.iterations)
+        kernels.iterate(made.constraints, made.ease, made.compliance, self.tension, self.positions, limits.iterations)
         return limits.iterations, float("nan"), ITERATIONS
 
 

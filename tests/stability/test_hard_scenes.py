@@ -39,7 +39,7 @@ REFUSED = {
     (case, method): "mass"
     for case in ("numbers-massless-vertices", "numbers-mostly-massless")
     for method in SOLVERS
-    if method == "xpbd" or load(SOLVERS[method]).about.own_steps
+    if method in ("xpbd", "mgpbd") or load(SOLVERS[method]).about.own_steps
 }
 REFUSED |= {(case, "velocity-verlet"): "substeps" for case in ("effects-air-drag-1e9", "effects-bending-1e12")}
 """Methods that move each vertex by its own mass cannot move one that has none; explicit ones would take all day."""

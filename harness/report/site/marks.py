@@ -9,6 +9,7 @@ from harness.report.style import (
     ARROWHEAD,
     BARS,
     BOWTIE,
+    CHEVRON,
     CORNERS,
     DASH_DOTTED,
     DASHED,
@@ -26,7 +27,7 @@ _SYMBOLS: dict[Any, str] = {
     STARS[0]: "star-diamond", STARS[1]: "hexagram", STARS[2]: "star-triangle-up", STARS[3]: "star-square",
     STARS[4]: "star-triangle-down", CORNERS[0]: "triangle-nw", CORNERS[1]: "triangle-ne", CORNERS[2]: "triangle-sw",
     CORNERS[3]: "triangle-se", HOURGLASS: "hourglass", BOWTIE: "bowtie", LOZENGE: "diamond-wide",
-    ARROWHEAD: "arrow", BARS[0]: "arrow-bar-up", BARS[1]: "arrow-bar-down",
+    ARROWHEAD: "arrow", BARS[0]: "arrow-bar-up", BARS[1]: "arrow-bar-down", CHEVRON: "arrow-wide",
 }  # fmt: skip
 _DASHES: dict[Any, str] = {"-": "solid", DASHED: "dash", DOTTED: "dot", DASH_DOTTED: "dashdot"}
 

@@ -64,6 +64,7 @@ Object.assign(springbench, (() => {
     "triangle-ne": "M-5-5H5V5Z", "triangle-nw": "M5-5H-5V5Z", "triangle-se": "M-5 5H5V-5Z", "triangle-sw": "M5 5H-5V-5Z", hourglass: "M-5-6H5L-5 6H5Z", bowtie: "M-6-5L6 5V-5L-6 5Z", "diamond-wide": "M-7 0L0-4L7 0L0 4Z",
     arrow: "M0-6.5L5.5 5L0 1.5L-5.5 5Z",
     "arrow-bar-up": "M-6-6.5H6V-4H1.3L6 6H-6L-1.3-4H-6Z", "arrow-bar-down": "M-6 6.5H6V4H1.3L6-6H-6L-1.3 4H-6Z",
+    "arrow-wide": "M-6.5 4.5L0-1L6.5 4.5V0L0-5.5L-6.5 0Z",
   };
   function glyph(mark) {
     const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");

@@ -1,0 +1,171 @@
+"""MGPBD: where it ends, how much sooner than XPBD, its multigrid, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins as PinsEffect
+from harness.scenes.effects.springs import Springs as SpringsEffect
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
+from harness.simulation.step import prepare, simulate
+from solvers.energies.springs import Springs
+from solvers.linear.near_kernel import Cycle, Prolongation, Solving, near_kernel, norm
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.methods.mgpbd import MultigridXpbd
+from solvers.methods.newton import Newton
+from solvers.methods.xpbd import Xpbd
+from solvers.problem import Pins, StepProblem, StopRule, System, Unsupported
+from tests.bench.duals import course, mgpbd, xpbd
+from tests.scenes import begun, cloth, first_problem, random_problem, scene
+from tests.unit.test_xpbd import Other, without_mass
+
+STIFF = first_problem(cloth(16, "exact", stretch=1e4))
+"""Nine hundred springs, which multigrid takes two levels for."""
+
+
+def solved(problem: StepProblem, iterations: int, solver: MultigridXpbd | Xpbd | None = None) -> np.ndarray:
+    return (solver or MultigridXpbd()).prepare(problem.system).solve(problem, StopRule(iterations)).positions
+
+
+def hanging(stretch: float, factor: float = 1.0) -> StepProblem:
+    pins = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
+    mesh = Chain(length=2.0, direction=(0.0, -1.0, 0.0))
+    problem = first_problem(scene(mesh, SpringsEffect(stretch=stretch), Gravity(), pins, size=10))
+    return replace(problem, system=replace(problem.system, factor=factor))
+
+
+def dual(problem: StepProblem, solver: MultigridXpbd | None = None):
+    """The matrix of the first iteration, its right-hand side, and how it is prolonged."""
+    made = (solver or MultigridXpbd()).prepare(problem.system)
+    run = made.begin(problem, problem.first_guess)
+    A = made.matrix(made.stretched(run.positions)[1])
+    return A, run.misfit, made.prolongation(A)
+
+
+def test_one_spring_ends_where_its_force_is_that_of_inertia():
+    """k (l - r) = m/dt^2 (y - l), for a mass that inertia leads to y below where its spring is held."""
+    k, r, m, dt, y = 500.0, 0.7, 0.3, 0.1, 1.2
+    rest = np.array([[0.0, 0.0, 0.0], [0.0, -r, 0.0]])
+    springs = Springs.at_rest(rest, np.array([[0, 1]]), np.array([k]))
+    system = System(np.full(2, m), dt, (springs,), Pins(np.array([0]), np.array([np.inf])))
+    target = np.array([[0.0, 0.0, 0.0], [0.0, -y, 0.0]])
+    start = begun(system, target, rest)
+    problem = StepProblem(system, target, np.zeros((2, 3)), rest[:1], rest, rest, start)
+    held = m / dt**2
+    wanted = (k * r + held * y) / (k + held)
+    np.testing.assert_allclose(solved(problem, 1), [[0.0, 0.0, 0.0], [0.0, -wanted, 0.0]], rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("stretch", [2.0, 2e3, 2e6])
+@pytest.mark.parametrize("factor", [1.0, 2.25], ids="c = {:g}".format)
+def test_springs_that_do_not_turn_reach_the_minimiser_of_the_step_at_once(stretch, factor):
+    problem = hanging(stretch, factor)
+    wanted = CompiledLocalGlobal().prepare(problem.system).solve(problem, StopRule(50_000, 1e-14)).positions
+    # The first iteration is exact but for round-off, which stiff springs multiply, and the second for less.
+    np.testing.assert_allclose(solved(problem, 2), wanted, rtol=0, atol=1e-12)
+
+
+def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_step():
+    apart = []
+    pins = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
+    for frames in (24, 48, 96):
+        made = scene(Chain(length=2.0), SpringsEffect(stretch=20.0), Gravity(), pins, size=10, time_step=0.2 / frames)
+        prepared = prepare(made, Newton())
+        *_, last = simulate(made, prepared, StopRule(100, 1e-12), first_guess="current", frames=frames)
+        apart.append(np.abs(solved(last.problem, 20) - last.solution.positions).max())
+    np.testing.assert_allclose([a / b for a, b in pairwise(apart)], 16.0, rtol=0.1)  # the next order
+
+
+@pytest.mark.parametrize("solver", [MultigridXpbd(), MultigridXpbd(components=0), MultigridXpbd(setup=2)])
+def test_tensions_end_as_what_their_springs_ask_for_and_xpbd_is_far_from_it(solver):
+    by_all, one_by_one = course(mgpbd(STIFF, solver), 30), course(xpbd(STIFF), 300)
+    assert by_all.misfits[-1] <= 1e-6
+    assert all(a > b for a, b in pairwise([1.0, *by_all.misfits]))
+    assert one_by_one.misfits[-1] >= 1e-2
+
+
+def test_a_free_cloth_keeps_its_momentum():
+    made = scene(Grid(), SpringsEffect(stretch=3e4), size=6)
+    problem = first_problem(made)
+    velocity = np.random.default_rng(0).normal(size=problem.current.shape)
+    moving = replace(problem.start, velocity=velocity)
+    problem = replace(problem, target=problem.current + made.system.time_step * velocity, start=moving)
+    after = moving.velocity_at(solved(problem, 5))
+    np.testing.assert_allclose(made.system.mass @ after, made.system.mass @ velocity, rtol=0, atol=1e-12)
+
+
+def test_springs_without_stiffness_and_loops_do_nothing():
+    problem = random_problem(3)
+    idle = Springs.at_rest(problem.current, np.array([[0, 5], [4, 4], [2, 9]]), np.array([0.0, 100.0, 0.0]))
+    with_, without = (replace(problem, system=replace(problem.system, energies=e)) for e in ((idle,), ()))
+    np.testing.assert_array_equal(solved(with_, 5), solved(without, 5))
+
+
+@pytest.mark.parametrize("smoothed", [False, True], ids=["unsmoothed", "smoothed"])
+def test_the_cycle_is_symmetric_and_positive_definite(smoothed):
+    A, _, prolongation = dual(STIFF, MultigridXpbd(smoothed=smoothed))
+    cycle = Cycle(A, prolongation)
+    assert cycle.sizes[0] > 400 >= cycle.sizes[-1]
+    r, s = np.random.default_rng(0).normal(size=(2, A.shape[0]))
+    zr, zs = cycle.apply(r), cycle.apply(s)
+    assert abs(s @ zr - r @ zs) <= 1e-10 * np.abs(r * zs).sum()
+    assert r @ zr > 0.0
+
+
+def test_prolongations_hold_the_near_kernel_and_are_orthonormal():
+    A, _, _ = dual(STIFF)
+    B = near_kernel(A, 6, 30)
+    P = Prolongation(A, B).levels[0]
+    gathered = np.diff(P.indptr) > 0
+    np.testing.assert_allclose((P.T @ P).toarray(), np.eye(P.shape[1]), rtol=0, atol=1e-12)
+    np.testing.assert_allclose((P @ (P.T @ B))[gathered], B[gathered], rtol=0, atol=1e-12)
+    assert gathered.mean() > 0.9
+
+
+def test_sweeps_leave_what_the_matrix_hardly_resists():
+    A, _, _ = dual(STIFF)
+    rough, smooth = near_kernel(A, 2, 0), near_kernel(A, 2, 30)
+    resisted = [np.einsum("ij,ij->j", B, A @ B) / np.einsum("ij,ij->j", B, B) for B in (rough, smooth)]
+    assert (resisted[1] <= 1e-2 * resisted[0]).all()
+
+
+def test_the_linear_solve_is_that_of_the_dual_system():
+    A, b, prolongation = dual(first_problem(cloth(16, "exact", stretch=100.0)))
+    solving = Solving(A, Cycle(A, prolongation), b, 1e-10)
+    assert solving.solve(400) < 400
+    np.testing.assert_allclose(A @ solving.x, b, rtol=0, atol=1e-9 * norm(b))
+
+
+@pytest.mark.parametrize(("components", "most"), [(0, 40), (6, 80)])
+def test_multigrid_makes_up_for_the_length_of_a_chain(components, most):
+    """Whose near-kernel is one tension for all; smoothing alone needs hundreds of iterations."""
+    pins = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
+    long = first_problem(scene(Chain(length=2.0), SpringsEffect(stretch=1e4), Gravity(), pins, size=1500))
+    A, b, prolongation = dual(long, MultigridXpbd(components=components))
+    assert Solving(A, Cycle(A, prolongation), b, 1e-6).solve(500) <= most
+    prolongation.levels.clear()
+    assert Solving(A, Cycle(A, prolongation), b, 1e-6).solve(500) > 5 * most
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        pytest.param(lambda s: replace(s, energies=(*s.energies, Other())), "mgpbd: .*Other", id="another energy"),
+        pytest.param(without_mass, r"mgpbd: .*1 of 12 have none and are not pinned \(3\)", id="no mass"),
+    ],
+)
+def test_what_it_cannot_do_is_said_before_any_work(change, told):
+    with pytest.raises(Unsupported, match=told):
+        MultigridXpbd().prepare(change(random_problem(0).system))
+
+
+@pytest.mark.parametrize(("settings", "told"), [({"components": -1}, "components"), ({"setup": 0}, "setup")])
+def test_settings_that_mean_nothing_are_refused(settings, told):
+    with pytest.raises(ValueError, match=f"{told}: should be at least"):
+        MultigridXpbd(**settings)
