@@ -115,7 +115,11 @@ def critical(n: int, alpha: float) -> int:
     return n // 2 + int(np.argmax(refused)) if refused[-1] else n + 1
 
 
-@lru_cache(maxsize=64)
 def _critical_up_to(n: int, alpha: float) -> NDArray[np.int64]:
     """`critical` of 1 to n turns."""
+    return _criticals(1 << n.bit_length(), alpha)[:n]  # so that a replay, which asks for many n, makes a few tables
+
+
+@lru_cache(maxsize=64)
+def _criticals(n: int, alpha: float) -> NDArray[np.int64]:
     return np.array([critical(turns, alpha) for turns in range(1, n + 1)], np.int64)
