@@ -88,6 +88,14 @@ def search(
     return None
 
 
+def lower(step: StepObjective, start: Point) -> Point:
+    """The lower one of a point and of free fall, where nothing is in the way there."""
+    fall = step.fall()
+    if step.bounded and step.reach(start.positions, fall - start.positions) < 1.0:
+        return start
+    return Point(fall, step.gradient(fall)) if step.rise(start.positions, fall)[0] < 0.0 else start
+
+
 def dot(a: Positions, b: Positions) -> float:
     """The scalar product of two fields, (n, 3)."""
     return float(np.einsum("ij,ij->", a, b))
@@ -140,7 +148,11 @@ class Metric:
 
 @dataclass(frozen=True, eq=False)
 class PreparedDescent(Iterative):
-    """A method, ready for a system."""
+    """A method, ready for a system.
+
+    Where something may not be passed through, it begins with free fall if that is lower. A gap that all but closes
+    makes a Hessian so stiff that the direction of a common motion keeps no digits for the gap, which bounds the step.
+    """
 
     objective: Objective
     metric: Metric
@@ -150,7 +162,8 @@ class PreparedDescent(Iterative):
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """See Iterative."""
-        return _Iterating(self, *self._begin(problem, guess))
+        step, start = self._begin(problem, guess)
+        return _Iterating(self, step, lower(step, start) if step.bounded else start)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """See Iterative."""

@@ -32,7 +32,7 @@ import numpy as np
 from solvers.about import About, Reference
 from solvers.core.acceleration import Accelerating
 from solvers.core.bounds import without_bounded
-from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
+from solvers.core.descent import Metric, Point, PreparedDescent, dot, lower, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import Hessian, StepObjective
 from solvers.kernels.line_search import falls
@@ -107,7 +107,7 @@ class HybridMethod:
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
         """The points after `start`; where a saddle was left, all begins anew."""
-        point = _lower(step, start)
+        point = start if step.bounded else lower(step, start)
         while not point.stalled:
             for following in () if step.touched or _nearly(step, point.positions) else self._approach(step, point):
                 if not _clear(step, point, following):
@@ -234,14 +234,6 @@ def _gain(step: StepObjective, before: Point, after: Point) -> float:
     """By how much the objective falls [J], 0 where it rises or round-off hides it."""
     rise, noise = step.rise(before.positions, after.positions)
     return -rise if -rise > noise else 0.0
-
-
-def _lower(step: StepObjective, start: Point) -> Point:
-    """The lower one of a point and of free fall."""
-    fall = step.fall()
-    if step.bounded and step.reach(start.positions, fall - start.positions) < 1.0:
-        return start
-    return Point(fall, step.gradient(fall)) if step.rise(start.positions, fall)[0] < 0.0 else start
 
 
 def _nearly(step: StepObjective, p: Positions) -> bool:
