@@ -52,6 +52,12 @@ def test_it_agrees_with_another_integrator_and_beside_self_contact():
     assert second_opinion(given, build(given, 3, "bdf2"), "bdf2") == "agrees"
 
 
+def test_it_agrees_where_an_obstacle_that_rubs_is_gone_in_a_step():
+    shot = KeyedMotion(keys=(Key(time=0.0), Key(time=0.1, offset=(5.0, 2.0, 0.0))))
+    given = spec(BALL.model_copy(update={"motion": shot}), Plane(point=(0, -1, 0)), friction=0.4)
+    assert second_opinion(given, build(given, 3), "implicit-euler") == "agrees"
+
+
 WRONG = r"disagrees: (objective \(gradient\), by \S+ of its size; )?effects\[1\] surface-contact"
 
 

@@ -1,7 +1,8 @@
 """Where opinions are compared: random motions and unknowns around a scene's start and its rest shape.
 
 They differ from those by 1e-3 to 0.5 of the spacing of the mesh, and move by as much in a step. Where there are
-obstacles the mesh is brought up to one, so that something touches.
+obstacles the mesh is brought up to one, so that something touches; no step starts where surfaces are closer than their
+thickness, for none may.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from harness.simulation.opinion.declared import Array, Declared
 from harness.simulation.opinion.derivatives import wide
 from harness.simulation.opinion.motion import place
 from harness.simulation.opinion.self_contact import gathered
-from harness.simulation.opinion.surface_contact import against, brought
+from harness.simulation.opinion.surface_contact import against, met
 from harness.simulation.step import State, start
 
 POINTS = 20
@@ -56,9 +57,10 @@ def points(scene: Scene, declared: Declared, frames: int) -> Iterator[SamplePoin
         if touching:
             effect, one = touching[k % len(touching)]
             p = _brought(effect, one, p, scene.time(index), rng)
-        if beside:  # where the obstacle is at the step's start, or at its end
-            effect, one = beside[k % len(beside)]
-            p = brought(effect, one, p, scene.mesh.spacing, scene.time(index) + dt * (k // 2 % 2), rng)
+        if beside:  # where the obstacle is at the step's start; of four points, it takes the mesh along at two
+            times = scene.time(index), scene.time(index) + dt
+            p, end = met(beside, k, p, scene.mesh.spacing, times, rng)
+            v = v + (k // 2 % 2) * (end - p) / dt
         before = p - dt * v + some * rng.normal(size=rest.shape), v + some / dt * rng.normal(size=rest.shape)
         shift = some * rng.normal(size=rest.shape)
         far = np.linalg.norm(shift, axis=1).max()

@@ -19,6 +19,8 @@ from harness.simulation.opinion.self_contact import Indices, Touching, barriers,
 
 _SOME = 200
 """Steps, none longer than the mesh's spacing."""
+_WAYS = 20
+"""That are tried, of which some lead into another obstacle."""
 
 
 def surface_contact(effect: Any, declared: Declared) -> Opinion:
@@ -70,14 +72,35 @@ class Against(Touching):
         """See Touching: what is at rest is not beside the obstacle."""
         return wide(np.full(len(rows), np.inf))
 
+    def clear(self, p: Array, time: float, apart: float) -> bool:
+        """Whether no pair is nearer than `apart` [m], the mesh at p (n, 3) [m], at a time [s]."""
+        return self.nearest(np.concatenate([p, np.asarray(self.obstacle(time), float)]), apart) >= apart
 
-def brought(effect: Any, one: Against, p: Array, spacing: float, time: float, rng: np.random.Generator) -> Array:
-    """Positions (n, 3) [m] as a whole outside of one of the obstacles, and so near to it that some pair is in range, at
-    a time [s]: from far away along a random way, each time by what is free. spacing [m]: of the mesh."""
+
+Rng = np.random.Generator
+Beside = tuple[Any, Against]
+"""An effect, and the mesh with one of its obstacles."""
+
+
+def met(all_: list[Beside], k: int, p: Array, spacing: float, times: tuple[float, float], rng: Rng) -> list[Array]:
+    """Positions (n, 3) [m] as a whole near to obstacle k, where it is at each of two times [s]; at the first one free
+    of all obstacles, as every step starts. spacing [m]: of the mesh."""
+    effect, one = all_[k % len(all_)]
+    found = list[Array]()
+    for _ in range(_WAYS):
+        way = rng.normal(size=3)
+        found = [brought(effect, one, p, spacing, time, way / np.linalg.norm(way), rng) for time in times]
+        if all(other.clear(found[0], times[0], its.thickness) for its, other in all_):
+            break
+    return found
+
+
+def brought(effect: Any, one: Against, p: Array, spacing: float, time: float, way: Array, rng: Rng) -> Array:
+    """Positions (n, 3) [m] as a whole outside of an obstacle, and so near to it that some pair is in range, at a time
+    [s]: from far away along a way (3,), each time by what is free. spacing [m]: of the mesh."""
     reach = effect.thickness if effect.range is None else effect.range
     there = np.asarray(one.obstacle(time), float)
-    way, middle = rng.normal(size=3), 0.5 * (there.max(axis=0) + there.min(axis=0))
-    way /= np.linalg.norm(way)
+    middle = 0.5 * (there.max(axis=0) + there.min(axis=0))
     at = p - p.mean(axis=0)
     out = float(((there - middle) @ way).max() - (at @ way).min()) + effect.thickness + reach  # a plane between them
     wanted = effect.thickness + reach * rng.uniform(0.3, 0.7)
