@@ -190,9 +190,9 @@ def _asv(new: Array, old: Array) -> bool:
 
 
 OTHERS: dict[str, Callable[[Array, Array], bool]] = {
-    "pytest-benchmark, min:5%": lambda new, old: float(new.min()) > 1.05 * float(old.min()),
-    "pytest-benchmark, mean:5%": lambda new, old: float(new.mean()) > 1.05 * float(old.mean()),
-    "asv continuous, 1.05": _asv,
+    "pytest-benchmark min:5%": lambda new, old: float(new.min()) > 1.05 * float(old.min()),
+    "pytest-benchmark mean:5%": lambda new, old: float(new.mean()) > 1.05 * float(old.mean()),
+    "asv continuous 1.05": _asv,
 }
 """Comparisons of two sessions that ran one after the other: whether the new one is called slower."""
 

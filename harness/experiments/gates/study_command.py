@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated
@@ -78,10 +80,12 @@ def live(
 
     checkout, requests = _asked(config, sizes, solvers)
     hold(found, checkout, requests, condition, Options(budget, limit), gates=gates, planted=planted, say=say)
-    table = Table("gate", "beside it", "load", "planted", "limit", "gates", "fails", "holds", "cannot tell", "median s")
-    for row in summary(found):
-        table.add_row(*row)
-    out().print(narrow(table, beside=2))
+    told = "beside it", "load", "planted", "limit", "gates", "fails", "holds", "cannot tell", "median s"
+    for gate, rows in groupby(sorted(summary(found), key=itemgetter(0)), key=itemgetter(0)):
+        table = Table(*told, title=gate)
+        for _, *cells in rows:
+            table.add_row(*cells)
+        out().print(narrow(table))
 
 
 @study.command()
@@ -98,16 +102,15 @@ def replay(
 
     if missing := [str(path) for path in samples if not path.is_file()]:
         raise InputError(f"{', '.join(missing)}: no such file; `springbench gate-study record` makes one")
-    table = Table(
-        "gate", "beside it", "load", "slower", "limit", "fails", "holds", "cannot tell", "median s", *of.OTHERS
-    )
+    told = "slower", "limit", "fails", "holds", "cannot tell", "median s", *of.OTHERS
     for (gate, condition), starts in of.read(samples).items():
+        load = f"{median(start.load for start in starts):.1f}"
+        table = Table(*told, title=f"{gate}\nbeside it: {condition}; load {load}")
         for slower, limit in CASES:
             room = max(budget, 300.0) if limit < 1.02 else budget
             found = of.replay(starts, slower, Rule(limit), room, replays)
             others = [of.replay_other(rule, starts, slower, room / 2, replays // 10) for rule in of.OTHERS.values()]
             parts = [f"{part:.2%}" for part in (found.fails, found.holds, found.undecided)]
-            load = f"{median(start.load for start in starts):.1f}"
-            cells = [gate, condition, load, f"{slower - 1:.0%}", f"{limit - 1:.0%}", *parts, f"{found.seconds:.1f}"]
+            cells = [f"{slower - 1:.0%}", f"{limit - 1:.0%}", *parts, f"{found.seconds:.1f}"]
             table.add_row(*cells, *(f"{part:.1%}" for part in others))
-    out().print(narrow(table, beside=2))
+        out().print(narrow(table))
