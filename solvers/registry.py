@@ -37,6 +37,7 @@ SOLVERS = {
     "admm": "solvers.methods.admm:Admm",
     "a-jacobi": "solvers.methods.a_jacobi:AggregatedJacobi",
     "mgpbd": "solvers.methods.mgpbd:MultigridXpbd",
+    "jgs2": "solvers.methods.jgs2:Jgs2",
 }
 
 OPTIONAL = {

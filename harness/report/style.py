@@ -77,6 +77,8 @@ BARS: tuple[Any, ...] = (
 """Triangles that point up and down to a bar."""
 CHEVRON: Any = ((-1, -0.7), (0, 0.1), (1, -0.7), (1, 0), (0, 0.8), (-1, 0), (-1, -0.7))
 """A broad stroke that is bent to point up."""
+SPEARHEAD: Any = ((1, 0), (-1, 0.5), (-1, -0.5), (1, 0))
+"""A slim triangle that points to the right."""
 _MARKERS: tuple[Any, ...] = (
     "s",
     "o",
@@ -101,6 +103,7 @@ _MARKERS: tuple[Any, ...] = (
     ARROWHEAD,
     *BARS,
     CHEVRON,
+    SPEARHEAD,
 )
 
 # Okabe and Ito's palette, less its yellow and black, and six more: for families in the order of the registry.
@@ -117,7 +120,7 @@ _FAMILIES = (
     "#99634c",
 )
 _MEMBERS: tuple[tuple[float, Any], ...] = (
-    *((0.0, "-"), (-0.36, DASHED), (0.3, "-"), (0.2, DASH_DOTTED), (-0.12, (0, (1, 3)))),
+    *((0.0, "-"), (-0.27, DASHED), (0.3, "-"), (0.2, DASH_DOTTED), (-0.12, (0, (1, 3)))),
 )
 """How much lighter the members of a family are drawn, or darker where negative, and in which line style."""
 _MANY: tuple[tuple[float, Any], ...] = (

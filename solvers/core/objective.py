@@ -207,6 +207,11 @@ class Hessian:
         pairs = [by.pairs(blocks) for blocks in self.pairs]
         return Filtered(keep, tension, curvature, pairs, by.looked, by.changed)
 
+    def convex(self) -> Matrix:
+        """The Hessian with its elements' negative eigenvalues clamped, until it is assembled again."""
+        clamped = self.filtered(Filtering())
+        return self._assembled(clamped.keep, 0.0, clamped.tension, clamped)
+
     def factorise_filtered(self, filtered: Filtered, shift: NDArray[np.float64] | float = 0.0) -> bool:
         """Whether what was filtered, and `shift` added to its diagonal [N/m], is positive definite; see `factorise`."""
         return self._factor.factorise(self._assembled(filtered.keep, shift, filtered.tension, filtered).values)

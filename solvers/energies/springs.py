@@ -54,6 +54,11 @@ class Springs(Edges):
         """The elastic energy [J] at p, shape (n, 3)."""
         return 0.5 * float(self.stiffness @ (self.lengths(p) - self.rest_length) ** 2)
 
+    def hessian_at_rest(self, lateral: float, n: int) -> scipy.sparse.csr_array:
+        """The Hessian [N/m], (3n, 3n), of the rest shape, did springs resist by `lateral` k across their length."""
+        across = np.where(self.rest_length == 0.0, 1.0, lateral)
+        return self._blocks(across, self.rest_direction, n)
+
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient A'K (A p - d) [N], shape (n, 3), to `out`."""
         v = self._along(p)

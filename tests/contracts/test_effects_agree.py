@@ -35,7 +35,7 @@ def takes(solver: str, scene: str) -> bool:
         return solver in CONTACT
     if solver in ALONG_EDGES:
         return scene in ALONG_EDGES[solver]
-    return solver in {*TAKE_ALL, "pncg"} or (solver in {*PROJECTIVE, "vbd", "a-jacobi"} and "gas" not in scene)
+    return solver in {*TAKE_ALL, "pncg"} or (solver in {*PROJECTIVE, "vbd", "a-jacobi", "jgs2"} and "gas" not in scene)
 
 
 @cache

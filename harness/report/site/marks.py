@@ -16,6 +16,7 @@ from harness.report.style import (
     DOTTED,
     HOURGLASS,
     LOZENGE,
+    SPEARHEAD,
     STARS,
     Mark,
 )
@@ -28,6 +29,7 @@ _SYMBOLS: dict[Any, str] = {
     STARS[4]: "star-triangle-down", CORNERS[0]: "triangle-nw", CORNERS[1]: "triangle-ne", CORNERS[2]: "triangle-sw",
     CORNERS[3]: "triangle-se", HOURGLASS: "hourglass", BOWTIE: "bowtie", LOZENGE: "diamond-wide",
     ARROWHEAD: "arrow", BARS[0]: "arrow-bar-up", BARS[1]: "arrow-bar-down", CHEVRON: "arrow-wide",
+    SPEARHEAD: "arrow-right",
 }  # fmt: skip
 _DASHES: dict[Any, str] = {"-": "solid", DASHED: "dash", DOTTED: "dot", DASH_DOTTED: "dashdot"}
 

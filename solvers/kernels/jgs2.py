@@ -1,0 +1,125 @@
+"""Each vertex's own step of JGS2, with all that answers to it (`solvers.methods.jgs2`), compiled.
+
+d_i = -R_i S^-1 sum over a of W_a' g_a,   S = sum over a, b of W_a' H_ab W_b,   W_a = R_a response_ia
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.compiling import inner, kernel
+
+
+class Patches(NamedTuple):
+    """Which free vertices answer to each, and how. start (f + 1,): where those of each begin; near (e,): these, itself
+    among them, ascending; response (e, 3, 3): their displacements for one of its own, which are no unit's."""
+
+    start: NDArray[np.int64]
+    near: NDArray[np.int64]
+    response: NDArray[np.float64]
+
+
+class PatchScratch(NamedTuple):
+    """place (f,): -1; turned: W of the largest patch; product, block, pull: of one vertex, (3, 3), (3, 3), (3,)."""
+
+    place: NDArray[np.int64]
+    turned: NDArray[np.float64]
+    product: NDArray[np.float64]
+    block: NDArray[np.float64]
+    pull: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, patches: Patches) -> PatchScratch:
+        """For these."""
+        most = int(np.diff(patches.start).max(initial=1))
+        return cls(
+            np.full(len(patches.start) - 1, -1),
+            np.zeros((most, 3, 3)),
+            np.zeros((3, 3)),
+            np.zeros((3, 3)),
+            np.zeros(3),
+        )
+
+
+@kernel
+def directions(patches, turn, pointers, columns, blocks, gradient, scratch, out):
+    """Write every free vertex's step d (f, 3) [m] to `out`.
+
+    turn (f, 3, 3): the rotation of each; pointers, columns, blocks: H, by rows, all its columns; gradient (f, 3) [N].
+    """
+    start, near, response = patches
+    place, turned, product, block, pull = scratch
+    for i in range(len(start) - 1):
+        first, count = start[i], start[i + 1] - start[i]
+        for k in range(count):
+            a = near[first + k]
+            place[a] = k
+            for r in range(3):
+                for c in range(3):
+                    turned[k, r, c] = (
+                        turn[a, r, 0] * response[first + k, 0, c]
+                        + turn[a, r, 1] * response[first + k, 1, c]
+                        + turn[a, r, 2] * response[first + k, 2, c]
+                    )
+        for r in range(3):
+            pull[r] = 0.0
+            for c in range(3):
+                block[r, c] = 0.0
+        for k in range(count):
+            a = near[first + k]
+            _times(turned, place, a, pointers, columns, blocks, product)
+            for r in range(3):
+                for c in range(3):
+                    pull[c] += turned[k, r, c] * gradient[a, r]
+                    for s in range(3):
+                        block[s, c] += turned[k, r, s] * product[r, c]
+        for k in range(count):
+            place[near[first + k]] = -1
+        _solve(block, pull)
+        for r in range(3):
+            out[i, r] = -(turn[i, r, 0] * pull[0] + turn[i, r, 1] * pull[1] + turn[i, r, 2] * pull[2])
+
+
+@inner
+def _times(turned, place, a, pointers, columns, blocks, product):
+    """Write H_aa W_a / 2 and the sum of H_ab W_b over b > a to `product`: half of a symmetric sum."""
+    for r in range(3):
+        for c in range(3):
+            product[r, c] = 0.0
+    for e in range(pointers[a], pointers[a + 1]):
+        b = columns[e]
+        k = place[b]
+        if b < a or k < 0:
+            continue
+        part = 0.5 if b == a else 1.0
+        for r in range(3):
+            h0, h1, h2 = part * blocks[e, r, 0], part * blocks[e, r, 1], part * blocks[e, r, 2]
+            for c in range(3):
+                product[r, c] += h0 * turned[k, 0, c] + h1 * turned[k, 1, c] + h2 * turned[k, 2, c]
+
+
+@inner
+def _solve(half, x):
+    """x becomes (half + half')^-1 x, or x over the trace where that is not positive definite."""
+    a, b, c = 2.0 * half[0, 0], half[0, 1] + half[1, 0], half[0, 2] + half[2, 0]
+    d, e, f = 2.0 * half[1, 1], half[1, 2] + half[2, 1], 2.0 * half[2, 2]
+    trace = a + d + f
+    least = 1e-14 * trace
+    if a > least:
+        l10, l20 = b / a, c / a
+        second, mixed = d - l10 * b, e - l10 * c
+        if second > least:
+            l21 = mixed / second
+            third = f - l20 * c - l21 * mixed
+            if third > least:
+                y1 = x[1] - l10 * x[0]
+                x[2] = (x[2] - l20 * x[0] - l21 * y1) / third
+                x[1] = y1 / second - l21 * x[2]
+                x[0] = x[0] / a - l10 * x[1] - l20 * x[2]
+                return
+    by = 1.0 / trace if trace > 0.0 else 0.0
+    for r in range(3):
+        x[r] *= by

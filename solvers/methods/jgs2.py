@@ -1,0 +1,243 @@
+"""JGS2: Jacobi's method, each vertex's step taken with all that answers to it (Lan et al. 2025).
+
+    p <- p + t d,     d_i = -(U_i' H U_i)^-1 U_i' grad g,     U_i = R W_i R_i'
+
+    W_i = X_i (E_i' X_i)^-1,     X_i = (H0 among P)^-1 E_i
+
+A vertex that lowers its own energy alone overshoots what is good for the mesh, or crawls. So it moves together with the
+vertices P within some rings of springs, along U_i: what they do, the others held, where i is displaced and they are in
+equilibrium. Were P the whole mesh and H0 the Hessian H, d would be Newton's step, for then U_i' H U_i is the Schur
+complement of i. H0 is that of the rest shape, so that W_i is made once; it is turned along by rotations R of the
+vertices, those nearest to how their springs have turned (polar decomposition). At rest springs do not resist what is
+across them; H0 gives them `lateral` of their stiffness there, as if they were stretched.
+
+The paper sums U'HU over elements that it samples (cubature); here the sum is that of all springs of P. Elements of H
+with negative eigenvalues are clamped, so that U'HU is positive definite. The length t is halved from 1 until the
+objective falls enough. Where d does not descend, the vertices go alone, P = {i}: these steps together always do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import reduce
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, eye_array, kron
+
+from solvers import matrices, memory
+from solvers.about import About, Reference
+from solvers.contact.touching import is_contact
+from solvers.core import vertex_terms
+from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
+from solvers.core.pattern import Matrix
+from solvers.energies.edges import directions
+from solvers.energies.springs import Springs
+from solvers.kernels import jgs2 as kernels
+from solvers.kernels.jgs2 import Patches, PatchScratch
+from solvers.linear.factors import DenseCholesky
+from solvers.problem import NotPositiveDefinite, Positions, ProjectiveEnergy, System, Unsupported
+
+_NEAR_NOTHING = 1e-10
+"""Of how springs have turned, what is added of no rotation: it decides where they do not, as along a line."""
+
+
+@dataclass(frozen=True)
+class Jgs2:
+    """Jacobi's method with precomputed responses. rings: of springs, how far from a vertex others answer to it, 0 for
+    Jacobi's method itself; lateral: of a spring's stiffness, what it resists across its length at rest, from 0 to 1.
+    """
+
+    minimises: ClassVar[bool] = True
+    descends: ClassVar[bool] = True
+    about: ClassVar[About] = About(
+        "vertex block descent",
+        Reference(
+            "Lan, Lei and Lu, Zixuan and Yuan, Chun and Xu, Weiwei and Su, Hao and Wang, Huamin and Jiang, Chenfanfu "
+            "and Yang, Yin",
+            2025,
+            "JGS2: Near second-order converging Jacobi/Gauss-Seidel for GPU elastodynamics",
+            "10.48550/arXiv.2506.06494",
+        ),
+    )
+
+    rings: int = 4
+    lateral: float = 0.03
+
+    def __post_init__(self) -> None:
+        """Raises ValueError."""
+        if self.rings < 0:
+            raise ValueError(f"rings: should not be negative, not {self.rings}")
+        if not 0.0 <= self.lateral <= 1.0:
+            raise ValueError(f"lateral: should be from 0 to 1, not {self.lateral}")
+
+    def prepare(self, system: System) -> PreparedDescent:
+        """Raises Unsupported for contact, for energies that are not projective, and where the responses do not fit in
+        memory; NotPositiveDefinite where nothing determines some positions."""
+        unknown = {type(e).__name__ for e in system.energies if is_contact(e) or not isinstance(e, ProjectiveEnergy)}
+        if unknown:
+            raise Unsupported(
+                f"jgs2: what answers to a vertex is computed once, from the rest shape, and that says nothing of "
+                f"{', '.join(sorted(unknown))}; take newton, lbfgs or hybrid"
+            )
+        metric, objective = Metric(system), Objective(system)
+        patches = answering(at_rest(system, objective.springs, self.lateral), objective.matrix.graph, self.rings)
+        mean = len(patches.near) / max(1, len(patches.start) - 1)
+        choice = (
+            f"on average {mean:.1f} vertices answer to one, in {memory.in_words(patches.response.nbytes)}; residuals "
+            f"by {metric.choice}{objective.interpreted}"
+        )
+        return PreparedDescent(objective, metric, _Method(metric, objective.springs, patches), choice, metric.facts)
+
+
+def at_rest(system: System, springs: Springs, lateral: float) -> csr_array:
+    """H0 [N/m] over the coordinates of free vertices, (3f, 3f); springs: all of the system's. What is projective beside
+    them counts as in Q."""
+    others = [e for e in system.energies if isinstance(e, ProjectiveEnergy) and not isinstance(e, Springs)]
+    held = vertex_terms.held(system)
+    held[np.isinf(held)] = 0.0
+    shares = reduce(lambda total, share: total + share, matrices.shares(system, others), matrices.diagonal(held))
+    whole = csr_array(kron(shares, eye_array(3))) + springs.hessian_at_rest(lateral, system.vertices)
+    free = (3 * system.free[:, None] + np.arange(3)).ravel()
+    return csr_array(csr_array(csr_array(whole)[free])[:, free])
+
+
+def answering(H: csr_array, graph: csr_array, rings: int) -> Patches:
+    """The responses W of all vertices: H (3f, 3f); graph (f, f): who is next to whom, itself included.
+
+    A vertex whose patch has no Cholesky factor goes alone. Raises Unsupported where they do not fit in memory.
+    """
+    f = len(graph.indptr) - 1
+    link = csr_array((np.ones(graph.nnz), graph.indices, graph.indptr), shape=(f, f))
+    reach = csr_array(eye_array(f))
+    for _ in range(rings):
+        wider = csr_array(reach @ link)
+        wider.data[:] = 1.0
+        if wider.nnz == reach.nnz:
+            break
+        reach = wider
+    reach.sort_indices()
+    needs, free = 72.0 * reach.nnz, memory.of_machine()
+    if needs > free:
+        raise Unsupported(
+            f"jgs2: the vertices within {rings} rings of each answer to it in {memory.in_words(needs)} of memory, "
+            f"where {memory.in_words(free)} may be taken; take fewer rings, or a coarser mesh"
+        )
+    start, near = np.asarray(reach.indptr, np.int64), np.asarray(reach.indices, np.int64)
+    response, known = np.zeros((len(near), 3, 3)), _Patch(H)
+    for i in range(f):
+        at = slice(start[i], start[i + 1])
+        response[at] = known.response(near[at], i)
+    return Patches(start, near, response)
+
+
+class _Patch:
+    """The factor of H among some vertices, kept for the next vertex that has the same ones."""
+
+    def __init__(self, H: csr_array) -> None:
+        self._H, self._near = H, np.empty(0, np.int64)
+        self._factor: DenseCholesky | None = None
+
+    def response(self, near: NDArray[np.int64], vertex: int) -> NDArray[np.float64]:
+        """W (k, 3, 3) of a vertex among those near it (k,)."""
+        if not np.array_equal(near, self._near):
+            self._near, self._factor = near, self._factorised(near)
+        own, alone = int(np.searchsorted(near, vertex)), np.zeros((len(near), 3, 3))
+        alone[own] = np.eye(3)
+        if self._factor is None:
+            return alone
+        X = np.empty((len(near), 3, 3))
+        self._factor.solve(alone.reshape(-1, 3), X.reshape(-1, 3))
+        W = X @ np.linalg.inv(X[own])
+        W[own] = np.eye(3)
+        return W if np.isfinite(W).all() else alone
+
+    def _factorised(self, near: NDArray[np.int64]) -> DenseCholesky | None:
+        rows = (3 * near[:, None] + np.arange(3)).ravel()
+        try:
+            return DenseCholesky(csr_array(csr_array(self._H[rows])[:, rows]).toarray())
+        except NotPositiveDefinite:
+            return None
+
+
+class _Turns:
+    """The rotations of free vertices. springs: all of the system's; those without a rest length tell nothing."""
+
+    def __init__(self, system: System, springs: Springs) -> None:
+        i, j = springs.edges.T
+        said = (springs.rest_length > 0.0) & (i != j)
+        self._edges, self._rest = springs.edges[said], springs.rest_direction[said]
+        k = springs.stiffness[said]
+        weight = k / k.max(initial=np.finfo(np.float64).tiny)
+        count, rows = len(k), self._edges.T.ravel()
+        shares = csr_array((np.tile(weight, 2), (rows, np.tile(np.arange(count), 2))), shape=(system.vertices, count))
+        self._shares = csr_array(shares[system.free])
+
+    def at(self, p: Positions) -> NDArray[np.float64]:
+        """R (f, 3, 3) at positions p (n, 3): the rotation nearest to the sum of nn0', n a spring's direction, n0 that
+        at rest."""
+        i, j = self._edges.T
+        _, unit = directions(p[i] - p[j], self._rest)
+        sums = (self._shares @ (unit[:, :, None] * self._rest[:, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
+        size = np.linalg.norm(sums, axis=(1, 2))[:, None, None]
+        left, _, right = np.linalg.svd(sums + np.where(size > 0.0, _NEAR_NOTHING * size, 1.0) * np.eye(3))
+        left[np.linalg.det(left @ right) < 0.0, :, 2] *= -1.0
+        return left @ right
+
+
+class _Method:
+    """The iteration for one system."""
+
+    def __init__(self, metric: Metric, springs: Springs, patches: Patches) -> None:
+        self._metric, self._turns, self._free = metric, _Turns(metric.system, springs), metric.system.free
+        f = len(self._free)
+        alone = Patches(np.arange(f + 1), np.arange(f), np.tile(np.eye(3), (f, 1, 1)))
+        ways = (patches, alone) if len(patches.near) > f else (alone,)
+        self._ways = [(way, PatchScratch.of(way)) for way in ways]
+
+    def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
+        """See `solvers.core.descent.Method`."""
+        point = start
+        while not point.stalled:
+            point = self._next(step, point) or point._replace(stalled=True)
+            yield point
+
+    def certifies(self, step: StepObjective, at: Point) -> bool:
+        """See `solvers.core.descent.Method`; clamped elements tell no saddle from a minimum."""
+        return True
+
+    def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
+        """The gradient, the Hessian, the rotations, and the vertices' steps."""
+        hessian, turns = step.hessian(at.positions).convex(), self._turns.at(at.positions)
+        return {
+            "gradient": lambda: step.gradient(at.positions),
+            "hessian": lambda: step.hessian(at.positions).convex(),
+            "rotations": lambda: self._turns.at(at.positions),
+            "steps": lambda: self._direction(hessian, turns, at, *self._ways[0]),
+        }
+
+    def _next(self, step: StepObjective, at: Point) -> Point | None:
+        """The point after `at`, None where round-off lets nothing descend."""
+        hessian, turns = step.hessian(at.positions).convex(), self._turns.at(at.positions)
+        for way in self._ways:
+            direction = self._direction(hessian, turns, at, *way)
+            if -dot(at.gradient, direction) > self._metric.round_off(at.positions):
+                found = search(step, at, direction)
+                if found is not None:
+                    return found
+        return None
+
+    def _direction(
+        self, hessian: Matrix, turns: NDArray[np.float64], at: Point, patches: Patches, scratch: PatchScratch
+    ) -> Positions:
+        """The steps of all vertices (n, 3), zero where they are not free."""
+        graph, free = hessian.graph, self._free
+        steps, out = np.empty((len(free), 3)), np.zeros_like(at.positions)
+        pointers, columns = np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int64)
+        kernels.directions(patches, turns, pointers, columns, hessian.values, at.gradient[free], scratch, steps)
+        out[free] = steps
+        return out

@@ -1,0 +1,113 @@
+"""JGS2: what a vertex's step is, what rings are for, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs as SpringsEffect
+from harness.scenes.mesh.solids import Block
+from solvers import memory
+from solvers.energies.springs import Springs
+from solvers.kernels.jgs2 import PatchScratch, directions
+from solvers.methods.jgs2 import Jgs2, answering
+from solvers.methods.newton import Newton
+from solvers.problem import Positions, StepProblem, StopRule, Unsupported
+from tests.effects import SCENES, stepped
+from tests.scenes import cloth, first_problem, scene
+
+HANGING = first_problem(cloth(8, "exact", stretch=1000.0))
+PINS = Pins.model_validate({"at": ["left"], "weight": "exact"})
+BEAM = first_problem(
+    scene(Block(height=0.4, depth=0.4), SpringsEffect(stretch=1e5), Gravity(), PINS, size=5, mass=50.0)
+)
+
+
+def chain(vertices: int) -> csr_array:
+    """Which vertices of a chain are next to which, themselves included."""
+    return csr_array(np.eye(vertices, k=-1) + np.eye(vertices) + np.eye(vertices, k=1))
+
+
+def positive_definite(graph: csr_array, seed: int) -> np.ndarray:
+    """A matrix of 3 x 3 blocks where the graph has entries."""
+    blocks = np.random.default_rng(seed).normal(size=(*graph.shape, 3, 3)) * graph.toarray()[:, :, None, None]
+    half = blocks.transpose(0, 2, 1, 3).reshape(3 * graph.shape[0], -1)
+    return half + half.T + 40.0 * np.eye(len(half))
+
+
+def rotations(count: int) -> np.ndarray:
+    q, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(count, 3, 3)))
+    return q * np.linalg.det(q)[:, None, None]
+
+
+@pytest.mark.parametrize("rings", [0, 1, 3])
+def test_a_vertex_takes_the_best_step_along_its_turned_response(rings):
+    graph, f = chain(6), 6
+    H, now, R = positive_definite(graph, 3), positive_definite(graph, 4), rotations(f)
+    patches, g, out = answering(csr_array(H), graph, rings), np.random.default_rng(2).normal(size=18), np.empty((f, 3))
+    blocks = now.reshape(f, 3, f, 3).transpose(0, 2, 1, 3)[graph.toarray() > 0.0]
+    pointers, columns = graph.indptr.astype(np.int64), graph.indices.astype(np.int64)
+    directions(patches, R, pointers, columns, blocks, g.reshape(f, 3), PatchScratch.of(patches), out)
+    turn = np.zeros((18, 18))
+    for i in range(f):
+        turn[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = R[i]
+    for i in range(f):
+        near = [3 * a + c for a in range(max(0, i - rings), min(f, i + rings + 1)) for c in range(3)]
+        own = slice(3 * i, 3 * i + 3)
+        X = np.zeros((18, 3))
+        X[near] = np.linalg.solve(H[np.ix_(near, near)], np.eye(18)[near, own])
+        U = turn @ X @ np.linalg.inv(X[own]) @ R[i].T
+        np.testing.assert_allclose(out[i], -np.linalg.solve(U.T @ now @ U, U.T @ g), rtol=1e-10, atol=1e-13)
+
+
+def test_what_answers_from_the_whole_mesh_to_a_quadratic_objective_is_newtons_step():
+    springs = Springs.joined([e for e in HANGING.system.energies if isinstance(e, Springs)])
+    soft = replace(springs, rest_length=np.zeros(len(springs.edges)))
+    problem = replace(HANGING, system=replace(HANGING.system, energies=(soft,)))
+    wanted = Newton().prepare(problem.system).solve(problem, StopRule(5, 1e-12)).positions
+    np.testing.assert_allclose(first(Jgs2(rings=8), problem), wanted, rtol=0, atol=1e-10)
+
+
+def first(solver: Jgs2, problem: StepProblem) -> Positions:
+    return next(islice(solver.prepare(problem.system).iterates(problem), 1)).copy()
+
+
+def test_responses_turn_with_the_mesh():
+    R = rotations(1)[0]
+    fields = ("target", "force", "pin_targets", "first_guess", "current")
+    turned = replace(HANGING, **{name: getattr(HANGING, name) @ R.T for name in fields})
+    # Half of the digits: how springs have turned is told by a sum that is singular across the cloth.
+    np.testing.assert_allclose(first(Jgs2(), turned), first(Jgs2(), HANGING) @ R.T, rtol=0, atol=1e-8)
+
+
+def test_on_a_solid_at_small_displacements_it_converges_as_newtons_method_does():
+    none, two, whole = (
+        Jgs2(rings, 0.001).prepare(BEAM.system).solve(BEAM, StopRule(5000, 1e-3)).iterations for rings in (0, 2, 8)
+    )
+    newton = Newton().prepare(BEAM.system).solve(BEAM, StopRule(50, 1e-3)).iterations
+    assert none > 10 * two
+    assert whole <= newton + 2
+
+
+@pytest.mark.parametrize(("scene", "name"), [("contact", "Contact"), ("gas", "Gas")], ids=lambda x: x)
+def test_what_the_rest_shape_does_not_tell_is_refused_by_name(scene, name):
+    with pytest.raises(Unsupported, match=f"jgs2: .*{name}"):
+        Jgs2().prepare(stepped(SCENES[scene]()).system)
+
+
+def test_responses_that_do_not_fit_in_memory_are_refused_beforehand(monkeypatch):
+    monkeypatch.setattr(memory, "of_machine", lambda: 5e4)
+    with pytest.raises(Unsupported, match=r"within 4 rings .* KiB of memory.*take fewer rings"):
+        answering(csr_array(np.eye(300)), chain(100), 4)
+
+
+@pytest.mark.parametrize(("given", "words"), [({"rings": -1}, "rings"), ({"lateral": 1.5}, "lateral")], ids=str)
+def test_settings_without_meaning_are_refused(given, words):
+    with pytest.raises(ValueError, match=f"{words}: should"):
+        Jgs2(**given)
