@@ -45,7 +45,7 @@ SLOW = ("dense", "sparse", "numba", "chebyshev", "admm", "a-jacobi")
 """Take as many iterations as k dt^2/m; `test_properties` holds each of their iterates to the same."""
 SOFT = {"vbd": 0.0, "jgs2": 0.0}
 """Powers of ten of the stiffness number up to which a method converges in time: one vertex at a time is slow, and what
-answers to it at rest does so otherwise in networks as far out of shape as these."""
+answers to it at rest says little in networks as far out of shape as these."""
 
 converging = pytest.mark.parametrize("name", [name for name in MINIMISERS if name not in SLOW])
 EXAMPLES = examples(10)
