@@ -20,6 +20,8 @@ Indices = NDArray[np.int64]
 _BITS = 10
 _DEPTH = 128
 """Of a stack: twice the levels of any tree that memory holds."""
+_ROOM = 32
+"""For pairs of each primitive; where more are found, all are looked for again. Four layers that touch have some 20."""
 
 
 class Tree(NamedTuple):
@@ -65,7 +67,7 @@ def found(corners: Indices, tree: Tree, p: Positions, q: Positions, reach: float
     p to q, by their numbers, (k, 2); same: see `look`."""
     boxes = np.empty((2 * len(tree.leaves), 6))
     refit(tree, p, q, reach, boxes)
-    room, stack, box = 8 * len(corners) + 64, np.empty(_DEPTH, np.int64), np.empty(6)
+    room, stack, box = _ROOM * len(corners) + 64, np.empty(_DEPTH, np.int64), np.empty(6)
     while True:
         out = np.empty((room, 2), np.int64)
         count = look(corners, tree, boxes, p, q, same, stack, box, out)

@@ -49,7 +49,8 @@ class Surfaces(Protocol):
         ...
 
     def on_way(self, p: Positions, q: Positions, reach: float) -> Pairs:
-        """Pairs that may come nearer than `reach` [m] on the straight way from p to q, (n, 3) [m] both."""
+        """Pairs that may come nearer than `reach` [m] on the straight way from p to q, (n, 3) [m] both; with what they
+        press with or without."""
         ...
 
 

@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 _LESS = 1.0 - 1e-12
 """Of a proportion: round-off at rest is no force."""
 
+_NOTHING = np.empty(0)
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -50,7 +52,7 @@ class Surface:
         trees = Tree.of(rest, edges), Tree.of(rest, triangles)
         bare = cls(points, *trees, lengths, np.array(stiffness), thickness, reach, none)
         found, first = boxes.near(points, bare._trees, rest, rest, thickness + reach)
-        apart = distances(bare._pairs(found, first), rest)
+        apart = distances(bare._bare(found, first), rest)
         close = apart < thickness + reach
         keys, share = bare._keys(found, first)[close], _LESS * apart[close] / (thickness + reach)
         order = np.argsort(keys)
@@ -64,29 +66,37 @@ class Surface:
     def within(self, p: Positions, reach: float) -> Pairs:
         """Pairs that are nearer than `reach` [m] at p (n, 3) [m]."""
         found, first = boxes.near(self.points, self._trees, p, p, reach)
-        close = distances(self._pairs(found, first), p) < reach
-        return self._pairs(found[close], int(close[:first].sum()))
+        bare = self._bare(found, first)
+        close = distances(bare, p) < reach
+        found, vertices = found[close], bare.vertices[close]
+        first = int(close[:first].sum())
+        two, parallel = found[first:].T, np.zeros(len(found))
+        parallel[first:] = MOLLIFIED * (self.length[two[0]] * self.length[two[1]]) ** 2
+        stiffness = self.stiffness[vertices].mean(axis=1)
+        return Pairs(vertices, first, self._scale(found, first), stiffness, parallel, self.thickness, self.reach)
 
     def on_way(self, p: Positions, q: Positions, reach: float) -> Pairs:
-        """Pairs that may come nearer than `reach` [m] on the straight way from p to q, (n, 3) [m] both."""
-        return self._pairs(*boxes.near(self.points, self._trees, p, q, reach))
+        """Pairs that may come nearer than `reach` [m] on the straight way from p to q, (n, 3) [m] both; without what
+        they press with."""
+        found, first = boxes.near(self.points, self._trees, p, q, reach)
+        return self._bare(found, first)._replace(scale=self._scale(found, first))
 
-    def _pairs(self, found: Indices, first: int) -> Pairs:
-        """Pairs by their numbers (k, 2), the first ones of points and triangles."""
+    def _bare(self, found: Indices, first: int) -> Pairs:
+        """Pairs by their numbers (k, 2), the first ones of points and triangles; no more than where they are."""
         one, two = found[:first].T, found[first:].T
-        edges = self.edges.corners
         vertices = np.empty((len(found), 4), np.int64)
         vertices[:first, 0], vertices[:first, 1:] = self.points[one[0]], self.triangles.corners[one[1]]
-        vertices[first:, :2], vertices[first:, 2:] = edges[two[0]], edges[two[1]]
-        parallel = np.zeros(len(found))
-        parallel[first:] = MOLLIFIED * (self.length[two[0]] * self.length[two[1]]) ** 2
-        scale, (keys, share) = np.ones(len(found)), self.near
-        if len(keys) and len(found):
-            wanted = self._keys(found, first)
-            at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-            scale = np.where(keys[at] == wanted, share[at], 1.0)
-        stiffness = self.stiffness[vertices].mean(axis=1)
-        return Pairs(vertices, first, scale, stiffness, parallel, self.thickness, self.reach)
+        vertices[first:, :2], vertices[first:, 2:] = self.edges.corners[two[0]], self.edges.corners[two[1]]
+        return Pairs(vertices, first, _NOTHING, _NOTHING, _NOTHING, self.thickness, self.reach)
+
+    def _scale(self, found: Indices, first: int) -> Array:
+        """The proportion (k,) in which pairs keep thickness and range."""
+        keys, share = self.near
+        if not (len(keys) and len(found)):
+            return np.ones(len(found))
+        wanted = self._keys(found, first)
+        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        return np.where(keys[at] == wanted, share[at], 1.0)
 
     def _keys(self, found: Indices, first: int) -> Indices:
         """A number of each pair."""
