@@ -141,6 +141,7 @@ class _Patch:
     def __init__(self, H: csr_array) -> None:
         self._H, self._near = H, np.empty(0, np.int64)
         self._factor: DenseCholesky | None = None
+        self._inverse = np.empty((0, 0))
 
     def response(self, near: NDArray[np.int64], vertex: int) -> NDArray[np.float64]:
         """W (k, 3, 3) of a vertex among those near it (k,)."""
@@ -150,11 +151,22 @@ class _Patch:
         alone[own] = np.eye(3)
         if self._factor is None:
             return alone
-        X = np.empty((len(near), 3, 3))
-        self._factor.solve(alone.reshape(-1, 3), X.reshape(-1, 3))
+        X = self._columns(self._factor, own).reshape(-1, 3, 3)
         W = X @ np.linalg.inv(X[own])
         W[own] = np.eye(3)
         return W if np.isfinite(W).all() else alone
+
+    def _columns(self, factor: DenseCholesky, own: int) -> NDArray[np.float64]:
+        """Those of the inverse that belong to vertex `own` of the patch, (3k, 3)."""
+        rows, columns = 3 * len(self._near), slice(3 * own, 3 * own + 3)
+        if rows < self._H.shape[0]:
+            out = np.empty((rows, 3))
+            factor.solve(np.eye(rows, 3, -3 * own), out)
+            return out
+        if len(self._inverse) < rows:  # of the whole mesh, which all vertices share: all at once is sooner
+            self._inverse = np.empty((rows, rows))
+            factor.solve(np.eye(rows), self._inverse)
+        return self._inverse[:, columns]
 
     def _factorised(self, near: NDArray[np.int64]) -> DenseCholesky | None:
         rows = (3 * near[:, None] + np.arange(3)).ravel()
