@@ -1,0 +1,245 @@
+"""A step of four layers that all touch, by our solvers beside a Newton-IPC with ipctk, in turns on one thread.
+
+    python -m tests.bench.newton_ipc [--size 64] [--rounds 3]
+
+A cloth folded into four layers (`tests.bench.pairs`), at rest as folded, is thrown at 0.1 m/s onto its lowest layer,
+which is held: one step of 1/30 s, to a residual |Q^-1 grad g|_Q of a thousandth of that at its start. Told is how many
+times as long Newton-IPC takes, by CPU times, in the middle, and the least and the most of the rounds; how long our step
+is in steps of the same solver without contact; and of what Newton-IPC's time is made.
+
+Newton-IPC is that of Li et al. 2020 (algorithm 1): the Hessian of springs and of the barrier clamped element by
+element and factorised, steps no longer than additive CCD lets them be, halved until the objective falls, pairs looked
+up anew at each point. Pairs, values, derivatives and CCD are ipctk's; inertia, springs, the matrix of 3 x 3 blocks, its
+factor, the line search and the residual are ours, the same for both. ipctk's barrier is one of squared distances; in
+the middle of the range it pushes as ours does. What both prepare once, and compile, is not timed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import replace
+from statistics import median
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from scipy.sparse import csr_array
+
+from harness.base.machine import describe, pinned_threads
+from harness.scenes.touching import outline
+from solvers.contact.self_contact import SelfContact
+from solvers.contact.surface import Surface
+from solvers.core.bounds import without_bounded
+from solvers.core.descent import Metric, Point, search
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
+from solvers.energies.springs import Springs
+from solvers.problem import Energy, Pins, Positions, Start, StepProblem, StopRule, System
+from solvers.registry import SOLVERS, load
+from tests.bench.pairs import Folded, folded, seconds
+
+OURS = ("hybrid", "newton", "lbfgs")
+TOLERANCE, MOST = 1e-3, 500
+STRETCH, MASS, TIME_STEP, FAST = 1000.0, 0.3, 1 / 30, 0.1
+"""[N/m], [kg], [s], [m/s]."""
+STIFFNESS = 0.1
+"""Of the barriers [N/m], soft enough for layers to be pressed well into their range."""
+
+
+def stated(made: Folded, contact: Energy) -> StepProblem:
+    """The step. Vertices of the lowest layer are held exactly."""
+    mesh, p = made.mesh, made.p
+    springs = Springs.at_rest(p, mesh.springs, np.full(len(mesh.springs), STRETCH))
+    lowest = np.flatnonzero(p[:, 1] < 0.5 * made.reach)
+    pins = Pins(lowest, np.full(len(lowest), np.inf))
+    system = System(MASS * mesh.shares, TIME_STEP, (springs, contact), pins)
+    force, velocity = np.zeros_like(p), np.zeros_like(p)
+    force[:, 1], velocity[:, 1] = -9.81 * system.mass, -FAST
+    velocity[lowest] = 0.0
+    start = Start(p, velocity, 0.0, p, system.rate, TIME_STEP)
+    return StepProblem(system, p + TIME_STEP * velocity, force, p[lowest], p, p, start)
+
+
+class Blocks(NamedTuple):
+    """A matrix by its blocks, as an objective takes those of pairs (`solvers.core.bounds.PairBlocks`). vertices (b, 2):
+    the row and the column of each; values (b, 3, 3) [N/m]."""
+
+    vertices: NDArray[np.int64]
+    values: NDArray[np.float64]
+
+    def add(self, places: NDArray[np.int64], values: NDArray[np.float64]) -> None:
+        """Add them to blocks, at places (b, 4) of a row and a column with each of both; -1 where one is held."""
+        free = places[:, 1] >= 0
+        values[places[free, 1]] += self.values[free]
+
+
+class Found(NamedTuple):
+    """What ipctk says at p: its collisions, their energy [J] and gradient (n, 3) [N]."""
+
+    p: Positions
+    collisions: Any
+    value: float
+    gradient: Positions
+
+
+class Ipctk:
+    """ipctk's barrier, as an energy that no step passes through. What it found at the last two points it keeps.
+
+    spent: CPU time [s] by what it went into.
+    """
+
+    def __init__(self, made: Folded, stiffness: float) -> None:
+        """stiffness: of our barrier [N/m], the force of which this one has in the middle of the range."""
+        import ipctk
+
+        of: Any = ipctk
+        of.set_num_threads(1)
+        self._of, self._thickness, self._reach = of, made.thickness, made.reach
+        edges, triangles = outline(made.mesh)[0].astype(np.int32), made.mesh.triangles
+        self._surface = of.CollisionMesh(np.asfortranarray(made.mesh.rest), edges, triangles)
+        t, r = made.thickness, made.reach
+        middle, most = (t + 0.5 * r) ** 2 - t**2, (2.0 * t + r) * r
+        slope = (most - middle) * (2.0 * np.log(middle / most) - most / middle + 1.0) * 2.0 * (t + 0.5 * r)
+        self._potential = of.BarrierPotential(r, -stiffness * r * (0.5 + np.log(2.0)) / slope)
+        self._known: list[Found] = []
+        self._bent: tuple[Positions, Blocks] | None = None
+        self.spent = defaultdict[str, float](float)
+
+    def _timed(self, name: str, work: Callable[[], Any]) -> Any:
+        begun = time.process_time()
+        out = work()
+        self.spent[name] += time.process_time() - begun
+        return out
+
+    def _at(self, p: Positions) -> Found:
+        for found in self._known:
+            if np.array_equal(found.p, p):
+                return found
+        V, collisions = np.asfortranarray(p), self._of.NormalCollisions()
+        args = (self._surface, V, self._reach, self._thickness, self._of.LBVH())
+        self._timed("pairs", lambda: collisions.build(*args))
+        value, gradient = self._timed("value and gradient", lambda: self._slopes(collisions, V))
+        found = Found(p.copy(), collisions, value, gradient.reshape(-1, 3))
+        self._known = [*self._known[-1:], found]
+        return found
+
+    def _slopes(self, collisions: Any, V: Any) -> tuple[float, Any]:
+        return self._potential(collisions, self._surface, V), self._potential.gradient(collisions, self._surface, V)
+
+    def value(self, p: Positions) -> float:
+        """See Energy."""
+        return self._at(p).value
+
+    def add_gradient(self, p: Positions, out: Positions) -> None:
+        """See Energy."""
+        out += self._at(p).gradient
+
+    def hessian(self, p: Positions) -> csr_array:
+        """See Energy; clamped."""
+        of, V = self._of, np.asfortranarray(p)
+        args = (self._at(p).collisions, self._surface, V, of.PSDProjectionMethod.CLAMP)
+        H = self._timed("Hessian", lambda: self._potential.hessian(*args))
+        return csr_array((H.data, H.indices, H.indptr), shape=H.shape)  # it is symmetric
+
+    def blocks(self, p: Positions, keep: float = 0.0) -> Blocks:
+        """The clamped Hessian."""
+        if self._bent is None or not np.array_equal(self._bent[0], p):
+            H: Any = self.hessian(p).tobsr((3, 3))
+            rows = np.repeat(np.arange(len(p)), np.diff(H.indptr))
+            self._bent = p.copy(), Blocks(np.column_stack([rows, H.indices]).astype(np.int64), H.data)
+        return self._bent[1]
+
+    def largest_step(self, p: Positions, direction: Positions) -> float:
+        """See `solvers.core.bounds.Bounded`."""
+        V, W = np.asfortranarray(p), np.asfortranarray(p + direction)
+        return self._timed("CCD", lambda: self._safe(V, W))
+
+    def _safe(self, V: Any, W: Any) -> float:
+        near = self._of.Candidates()
+        near.build(self._surface, V, W, 0.5 * self._thickness, self._of.LBVH())
+        return near.compute_collision_free_stepsize(self._surface, V, W, self._thickness, self._of.AdditiveCCD())
+
+
+Solved = tuple[Positions, int]
+"""Where a solve ended (n, 3) [m], and after how many iterations."""
+
+
+def newton_ipc(problem: StepProblem) -> tuple[Callable[[], Solved], Ipctk]:
+    """A solve by Newton-IPC, whose tolerance holds where it ends, and the barrier."""
+    metric, whole = Metric(problem.system), Objective(problem.system)
+    (barrier,) = (energy for energy in problem.system.energies if isinstance(energy, Ipctk))
+
+    def solve() -> Solved:
+        step, p = StepObjective(whole, problem), problem.first_guess
+        at, count = Point(p, step.gradient(p)), 0
+        limit = TOLERANCE * metric.residual(at.gradient)
+        while metric.residual(at.gradient) > limit:
+            hessian = step.hessian(at.positions)
+            found = search(step, at, -hessian.solve(at.gradient)) if hessian.factorise(0.0) else None
+            if found is None or count == MOST:
+                raise RuntimeError(f"Newton-IPC has not converged in {count} iterations")
+            at, count = found, count + 1
+        return at.positions, count
+
+    return solve, barrier
+
+
+def ours(problem: StepProblem, name: str) -> Callable[[], Solved | None]:
+    """A solve by one of our solvers; None where it does not converge."""
+    prepared = load(SOLVERS[name])().prepare(problem.system)
+
+    def solve() -> Solved | None:
+        found = prepared.solve(problem, StopRule(MOST, TOLERANCE))
+        return (found.positions, found.iterations) if found.stopped == "tolerance" else None
+
+    return solve
+
+
+def main() -> None:
+    """Time and tell."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--rounds", type=int, default=3)
+    asked, console = parser.parse_args(), Console(highlight=False)
+    with pinned_threads(1):
+        made = folded(asked.size)
+        mesh, k = made.mesh, np.full(len(made.p), STIFFNESS)
+        surface = Surface.of(mesh.rest, outline(mesh)[0], mesh.triangles, k, made.thickness, made.reach)
+        problem = stated(made, SelfContact(surface))
+        bare = replace(problem, system=without_bounded(problem.system))
+        newton, barrier = newton_ipc(stated(made, Ipctk(made, STIFFNESS)))
+        works = {name: (ours(problem, name), ours(bare, name)) for name in OURS}
+        # All is done once, and so compiled and in the caches.
+        there, count = newton()
+        ends = {name: (touching(), free())[0] for name, (touching, free) in works.items()}
+        barrier.spent.clear()
+        rounds = [
+            (seconds(newton), {name: [seconds(work) for work in both] for name, both in works.items() if ends[name]})
+            for _ in range(asked.rounds)
+        ]
+    title = f"{asked.size} x {asked.size}: Newton-IPC in {count} iterations; {describe().cpu}"
+    columns = ("", "iterations", "Newton-IPC takes", "between", "steps without contact", "ranges from its end")
+    table = Table(*columns, title=title, box=SIMPLE_HEAD)
+    for name, end in ends.items():
+        if end is None:
+            table.add_row(name, f"not in {MOST}")
+            continue
+        ratios = sorted(theirs / took[name][0] for theirs, took in rounds)
+        longer = median(took[name][0] / took[name][1] for _, took in rounds)
+        away = np.linalg.norm(end[0] - there, axis=1).max() / made.reach
+        between = f"{ratios[0]:.2f} and {ratios[-1]:.2f}"
+        table.add_row(name, f"{end[1]}", f"{median(ratios):.2f} times", between, f"{longer:.1f}", f"{away:.2g}")
+    total = sum(theirs for theirs, _ in rounds)
+    parts = sorted(((spent / total, name) for name, spent in barrier.spent.items()), reverse=True)
+    console.print(table)
+    console.print(f"Of Newton-IPC's time: {', '.join(f'{name} {part:.0%}' for part, name in parts)}; the rest is ours.")
+
+
+if __name__ == "__main__":
+    main()
