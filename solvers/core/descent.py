@@ -96,6 +96,11 @@ def lower(step: StepObjective, start: Point) -> Point:
     return Point(fall, step.gradient(fall)) if step.rise(start.positions, fall)[0] < 0.0 else start
 
 
+def near(step: StepObjective, p: Positions) -> bool:
+    """Whether something is in range at p that a step may not pass through."""
+    return any(energy.value(p) > 0.0 for energy in step.bounded)
+
+
 def dot(a: Positions, b: Positions) -> float:
     """The scalar product of two fields, (n, 3)."""
     return float(np.einsum("ij,ij->", a, b))
@@ -150,8 +155,9 @@ class Metric:
 class PreparedDescent(Iterative):
     """A method, ready for a system.
 
-    Where something may not be passed through, it begins with free fall if that is lower. A gap that all but closes
-    makes a Hessian so stiff that the direction of a common motion keeps no digits for the gap, which bounds the step.
+    Where something is in range that may not be passed through, it begins with free fall if that is lower. A gap that
+    all but closes makes a Hessian so stiff that the direction of a common motion keeps no digits for the gap, which
+    bounds the step.
     """
 
     objective: Objective
@@ -163,7 +169,7 @@ class PreparedDescent(Iterative):
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """See Iterative."""
         step, start = self._begin(problem, guess)
-        return _Iterating(self, step, lower(step, start) if step.bounded else start)
+        return _Iterating(self, step, lower(step, start) if near(step, start.positions) else start)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """See Iterative."""

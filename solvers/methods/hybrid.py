@@ -32,7 +32,7 @@ import numpy as np
 from solvers.about import About, Reference
 from solvers.core.acceleration import Accelerating
 from solvers.core.bounds import without_bounded
-from solvers.core.descent import Metric, Point, PreparedDescent, dot, lower, search
+from solvers.core.descent import Metric, Point, PreparedDescent, dot, lower, near, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import Hessian, StepObjective
 from solvers.kernels.line_search import falls
@@ -107,9 +107,9 @@ class HybridMethod:
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
         """The points after `start`; where a saddle was left, all begins anew."""
-        point = start if step.bounded else lower(step, start)
+        point = lower(step, start)
         while not point.stalled:
-            for following in () if step.touched or _nearly(step, point.positions) else self._approach(step, point):
+            for following in () if step.touched or near(step, point.positions) else self._approach(step, point):
                 if not _clear(step, point, following):
                     break
                 point = following
@@ -236,17 +236,12 @@ def _gain(step: StepObjective, before: Point, after: Point) -> float:
     return -rise if -rise > noise else 0.0
 
 
-def _nearly(step: StepObjective, p: Positions) -> bool:
-    """Whether something is in range at p that a step may not pass through."""
-    return any(energy.value(p) > 0.0 for energy in step.bounded)
-
-
 def _clear(step: StepObjective, before: Point, after: Point) -> bool:
     """Whether the way between two points is free, and nothing is in range at its end."""
     if not step.bounded:
         return True
     way = after.positions - before.positions
-    return step.reach(before.positions, way) == 1.0 and not _nearly(step, after.positions)
+    return step.reach(before.positions, way) == 1.0 and not near(step, after.positions)
 
 
 def _reached(run: Accelerating) -> Point:
