@@ -82,6 +82,7 @@ class _Model:
 
     def __init__(self, library: Any, model: Any, network: Network) -> None:
         self._library, self._model, self._data, self._network = library, model, library.MjData(model), network
+        library.set_mju_user_warning(_unheard)  # it would write a file here
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
         """See Stepping."""
@@ -103,6 +104,10 @@ class _Model:
         p[net.free], v[net.free] = data.qpos.reshape(-1, 3), data.qvel.reshape(-1, 3)
         p[net.pinned], v[net.pinned] = end, (end - begin) / net.time_step
         return p, v
+
+
+def _unheard(warning: str) -> None:
+    """Positions tell whoever asks that a simulation is unstable."""
 
 
 def mjcf(network: Network, integrator: str, problem: StepProblem | None = None, substeps: int = 1) -> str:

@@ -140,19 +140,28 @@ class _Model:
             particles.setVelocity(i, start.velocity[i])
         begin, end = start.positions[net.pinned], problem.pin_targets
         places = evenly(begin, end, substeps)
+        h = net.time_step / substeps
         if places is None:
-            self._steps(net.time_step, substeps)
-        for place in places or ():
-            for i, x in zip(net.pinned.tolist(), place + (end - begin) / substeps, strict=True):
-                particles.setPosition(i, x)
-            self._steps(net.time_step / substeps, 1)
+            self._steps(h, substeps - 1)
+            before = self._positions()
+            self._steps(h, 1)
+        else:
+            before = start.positions
+            for place in places:
+                before = self._positions()
+                for i, x in zip(net.pinned.tolist(), place + (end - begin) / substeps, strict=True):
+                    particles.setPosition(i, x)
+                self._steps(h, 1)
         p = self._positions()
-        self._velocity = np.array([particles.getVelocity(i) for i in range(len(p))], np.float64)
-        v = self._velocity.copy()
+        v = (1.0 / h) * (p - before)  # as it has them itself, to the last bit; to ask for them takes a call a vertex
+        v[net.pinned] = 0.0
+        self._velocity = v.copy()
         p[net.pinned], v[net.pinned] = end, (end - begin) / net.time_step
         return p, v
 
-    def _steps(self, time: float, substeps: int) -> None:
-        self._library.TimeManager.getCurrent().setTimeStepSize(time)
-        self._set(substeps, "NUM_SUB_STEPS")
-        self._control.step(self._model)
+    def _steps(self, h: float, number: int) -> None:
+        """So many substeps of h [s]."""
+        if number:
+            self._library.TimeManager.getCurrent().setTimeStepSize(h * number)
+            self._set(number, "NUM_SUB_STEPS")
+            self._control.step(self._model)
