@@ -86,7 +86,7 @@ GRAVITY = (0.0, -9.81, 0.0)
 def _require_gravity(network: Network, problem: StepProblem) -> None:
     found = network.acceleration(problem.force)
     if found is None or not np.allclose(found, GRAVITY, rtol=0.0, atol=1e-9):
-        came = "loads that differ from gravity" if found is None else f"an acceleration of {found} m/s²"
+        came = "loads of another kind" if found is None else f"({', '.join(f'{x:g}' for x in found)}) m/s²"
         raise Unsupported(f"pypbd: has gravity of 9.81 m/s² along -y and no other force; the scene has {came}")
 
 

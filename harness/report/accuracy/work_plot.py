@@ -40,6 +40,9 @@ ACROSS = 4
 _PLAIN, _OWN = 4.4, 7.0
 """The size of a mark; of a method with steps of its own, which has no line that leads to it."""
 
+_WILD = 1e3
+"""Errors beyond it are those of motions that exploded, finite as they may be: they are above the panel."""
+
 ERRORS = (0.1, 0.03, 0.01, 0.003, 0.001)
 """The errors at which the front is told in words."""
 
@@ -121,7 +124,8 @@ def _draw(stem: Path, mesh: str, works: list[WorkPoint], marked: dict[str, Mark]
     integrators = [*(name for name in INTEGRATORS if name in there), *sorted(there - set(INTEGRATORS))]
     known = [work for work in works if _known(work)]
     sizes = _sizes(works)
-    across, down = limits([w.seconds for w in known], margin=1.6), limits([w.error for w in known], margin=1.6)
+    across = limits([w.seconds for w in known], margin=1.6)
+    down = limits([w.error for w in known if w.error < _WILD] or [w.error for w in known], margin=1.6)
     facts = [f"{quantity(works[0].horizon)} s simulated", "time stepping and solver together", *machine]
     if any(work.truth == "self-converged" for work in works):
         facts.insert(1, "by a self-converged reference")
@@ -215,8 +219,11 @@ def _stop(tolerance: float | None) -> str:
 
 def _notes(works: Sequence[WorkPoint]) -> list[str]:
     words = ["Joined points differ in the time step alone: " + ", ".join(map(step_words, _steps(works)))]
-    if divided := sorted(_divided(works)):
-        words[0] += f"; those of {', '.join(divided)} in the substeps alone"
+    divided = _divided(works)
+    if solvers := sorted({work.solver for work in works if work.label in divided}):
+        words[0] += f"; those of {', '.join(solvers)} in the substeps alone"
+    if any(_known(work) and work.error >= _WILD for work in works):
+        words.append("What leaves a panel at its top exploded")
     if not all(work.minimises for work in works):
         words.append("† does not minimise the step's objective: its limit is not the integrator's own solution")
     words += [OLDER] if any(map(older, works)) else []
