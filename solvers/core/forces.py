@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import ArpackError, eigsh
 
 from solvers.core.driver import Iterating
-from solvers.energies.quadratic import Quadratic, Viscous
+from solvers.energies.quadratic import Quadratic, drag_of_vertices
 from solvers.energies.springs import Springs
 from solvers.kernels.forms import Form
 from solvers.kernels.loop import ITERATIONS, Limits
@@ -67,8 +67,8 @@ class ForceParts:
         springs = Springs.joined([energy for energy in system.energies if isinstance(energy, Springs)])
         drag, load, forms = np.zeros(n), np.zeros((n, 3)), list[csr_array]()
         for energy in system.energies:
-            if isinstance(energy, Viscous) and (np.diff(energy.A.indptr) == 1).all():
-                drag += energy.A.power(2).T @ energy.weight
+            if (c := drag_of_vertices(energy)) is not None:
+                drag += c
             elif isinstance(energy, Quadratic) and not is_lagged(energy):
                 forms.append(energy.stiffness_matrix(n))
                 energy.add_projection(load, load)

@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from solvers.matrices import diagonal, without_zeros
-from solvers.problem import Positions, Start
+from solvers.problem import Energy, Positions, Start
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +83,13 @@ class Viscous(Quadratic):
     def begin_step(self, start: Start) -> Viscous:
         """The energy of a step."""
         return replace(self, weight=start.rate * self.weight, d=self.A @ start.origin)
+
+
+def drag_of_vertices(energy: Energy) -> NDArray[np.float64] | None:
+    """The coefficients c (n,) [N s/m] of an energy that damps each vertex by itself, None of any other."""
+    if isinstance(energy, Viscous) and (np.diff(energy.A.indptr) == 1).all():
+        return energy.A.power(2).T @ energy.weight
+    return None
 
 
 class AirDrag(Viscous):

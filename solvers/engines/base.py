@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from solvers.core import vertex_terms
 from solvers.core.driver import Iterating, Iterative, Substeps
 from solvers.energies.dashpots import Dashpots
-from solvers.energies.quadratic import Viscous
+from solvers.energies.quadratic import drag_of_vertices
 from solvers.energies.springs import Springs
-from solvers.problem import Energy, Positions, ResidualOf, StepProblem, System, Unsupported
+from solvers.problem import Positions, ResidualOf, StepProblem, System, Unsupported
 
 _SAME = 1e-12
 """Of the largest acceleration: what the division of weights by masses may round."""
@@ -93,9 +93,8 @@ class Network:
             elif damps and isinstance(energy, Dashpots):
                 c = energy.stiffness
                 lines.append(Lines(energy.edges, 0.0 * c, 0.0 * c, c))
-            elif damps and _of_vertices(energy):
-                assert isinstance(energy, Viscous)
-                drag += energy.A.power(2).T @ energy.weight
+            elif damps and (of_vertices := drag_of_vertices(energy)) is not None:
+                drag += of_vertices
             else:
                 others.add(type(energy).__name__)
         if others:
@@ -116,11 +115,6 @@ class Network:
         start, lines = problem.start, self.lines._asdict()
         begun = {"positions": start.positions, "velocities": start.velocity, "force": problem.force}
         return {"mass": self.mass, "free": self.free, "pinned": self.pinned, "drag": self.drag, **lines, **begun}
-
-
-def _of_vertices(energy: Energy) -> bool:
-    """Whether it damps vertices, each by itself."""
-    return isinstance(energy, Viscous) and bool((np.diff(energy.A.indptr) == 1).all())
 
 
 def _joined(parts: list[Lines], unpinned: NDArray[np.bool_]) -> Lines:

@@ -27,7 +27,7 @@ from solvers.core.driver import Iterating, Iterative
 from solvers.core.fixed_objective import Objective
 from solvers.core.forces import Whole
 from solvers.core.objective import StepObjective
-from solvers.energies.quadratic import Viscous
+from solvers.energies.quadratic import drag_of_vertices
 from solvers.methods.rosenbrock_tables import RODAS, ROS2, ROS3P, Rosenbrock
 from solvers.problem import (
     NotPositiveDefinite,
@@ -70,8 +70,8 @@ class _Linear:
         vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), self.name)
         drag, kept = np.zeros(system.vertices), list[Any]()
         for energy in system.energies:
-            if isinstance(energy, Viscous) and (np.diff(energy.A.indptr) == 1).all():
-                drag += energy.A.power(2).T @ energy.weight
+            if (c := drag_of_vertices(energy)) is not None:
+                drag += c
             elif is_lagged(energy) or is_bounded(energy):
                 raise Unsupported(
                     f"{self.name}: needs the exact derivatives of all forces, and knows energies of the positions "
