@@ -7,7 +7,7 @@ from random import Random
 
 import pytest
 
-from harness.experiments.gates.abba import ORDERS, Result, Turn, confirmed, orders, race
+from harness.experiments.gates.abba import ORDERS, Racers, Renewing, Result, Turn, confirmed, orders, race
 from harness.experiments.gates.sequential import RatioInterval, Rule, Verdict
 
 RULE = Rule(1.03)
@@ -23,7 +23,7 @@ def clock(seconds: float) -> Callable[[], float]:
 )
 def test_a_race_ends_when_it_knows(ratio: float, answer: Verdict):
     # The third ratio is the limit itself: neither above nor below, so that only the budget ends it.
-    found = race(clock(ratio), clock(1.0), RULE, budget=60.0 if answer is not Verdict.UNDECIDED else 0.05)
+    found = race(Racers(clock(ratio), clock(1.0)), RULE, budget=60.0 if answer is not Verdict.UNDECIDED else 0.05)
     assert found.answer is answer
     if answer is not Verdict.UNDECIDED:
         assert len(found.turns) == 16  # the fewest that can decide at an error of 0.1 %
@@ -41,14 +41,36 @@ def test_a_steady_drift_cancels_in_each_turn():
         assert Turn(order, (1.0, 1.1, 1.2, 1.3)).log_ratio == pytest.approx(0.0, abs=1e-15)
 
 
+def test_work_is_made_anew_between_turns_in_half_of_the_time_at_most(monkeypatch: pytest.MonkeyPatch):
+    now, renewed = [0.0], list[float]()
+
+    def renew() -> None:
+        renewed.append(now[0])
+        now[0] += 3.0
+
+    monkeypatch.setattr("harness.experiments.gates.abba.perf_counter", lambda: now[0])
+    renewing = Renewing(renew)
+    for _ in range(9):
+        now[0] += 1.0  # a turn
+        renewing.after(1.0)
+    assert renewed == [1.0, 6.0, 12.0, 18.0]  # after the first turn, and then when turns took as long as all before
+
+
+def test_a_race_makes_the_work_of_both_anew_until_it_knows():
+    renewed = list[None]()
+    found = race(Racers(clock(1.0), clock(1.0), lambda: renewed.append(None)), RULE, budget=60.0)
+    assert (found.answer, len(found.turns)) == (Verdict.HOLDS, 16)
+    assert 1 <= len(renewed) <= 15
+
+
 def pairs(*ratios: float) -> tuple[Callable[..., object], list[float]]:
     """Starts of programs whose ratios of times are these, one start after the other; what has been started."""
     left, started = iter(ratios), []
 
     @contextmanager
-    def start() -> Iterator[tuple[Callable[[], float], Callable[[], float]]]:
+    def start() -> Iterator[Racers]:
         started.append(next(left))
-        yield clock(started[-1]), clock(1.0)
+        yield Racers(clock(started[-1]), clock(1.0))
 
     return start, started
 

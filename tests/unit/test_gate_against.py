@@ -2,13 +2,15 @@
 
 import re
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.experiments.gates import revisions
+from harness.experiments.gates import revisions, worker
 from harness.experiments.gates.against import Request, exit_code, started
 from harness.experiments.gates.pair import Side, changes, workers
 from harness.experiments.gates.sequential import Verdict
@@ -181,6 +183,22 @@ def test_a_run_of_a_scene_is_held_with_its_exact_facts_and_each_revision_has_its
     assert held[0].facts["iterations"] == 40
     assert held[0].facts["nnz_factor"] > 16
     assert abs(held[0].answer - held[1].answer).max() > 1e-6
+
+
+def test_work_that_is_renewed_is_made_again_before_it_is_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made, done = list[int](), list[int]()
+
+    def candidate() -> Callable[[], float]:
+        made.append(number := len(made))
+        return lambda: done.append(number) or 0.0
+
+    monkeypatch.setattr(worker, "_gates", lambda: {"mine": SimpleNamespace(candidate=candidate, clock="cpu")})
+    held = worker.Worker()
+    monkeypatch.setattr(held, "_pin", lambda threads: None)
+    held.gate("mine", str(tmp_path / "answer.npy"))
+    held.renew()
+    held.time(2, "cpu")
+    assert (made, done) == ([0, 1], [0, 1, 1])
 
 
 def test_a_worker_that_dies_is_told_with_its_last_words(tmp_path: Path):

@@ -1,8 +1,10 @@
 """Two programs take turns, A B B A or B A A B by a coin, until the sequential test knows or the budget ends.
 
-A test sees what differs between two running programs, and two processes of the same code differ a little all their
-lives, by where their memory happens to lie (Mytkowicz et al. 2009). A slowdown is therefore believed only when a second
-pair, started anew, is found to be slower too.
+A test sees what differs between two running programs, and two of the same code differ a little, by where their memory
+happens to lie (Mytkowicz et al. 2009). So the work of both is made anew between turns, elsewhere in memory, as often as
+takes no longer than the turns do (after Curtsinger and Berger 2013): what places do is noise then, which the coin
+evens out. What a process keeps all its life is left: a slowdown is believed only when a second pair, started anew, is
+found to be slower too.
 """
 
 from __future__ import annotations
@@ -29,6 +31,32 @@ seven other programs on two cores turns of 10 and of 40 ms spread alike, and fiv
 Clock = Literal["cpu", "wall"]
 Timed = Callable[[], float]
 """Does the work once; how long it took [s], by whatever clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class Racers:
+    """Two programs, warm. renew: makes the work of both anew, elsewhere in memory, and warms it; None where that cannot
+    be done."""
+
+    a: Timed
+    b: Timed
+    renew: Callable[[], None] | None = None
+
+
+@dataclass(slots=True)
+class Renewing:
+    """Renews racers' work after turns, in half of the time at most, whatever it takes."""
+
+    renew: Callable[[], None] | None
+    _earned: float = 0.0
+
+    def after(self, seconds: float) -> None:
+        """After a turn of so many seconds."""
+        self._earned += seconds
+        if self.renew and self._earned >= 0.0:
+            began = perf_counter()
+            self.renew()
+            self._earned -= perf_counter() - began
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,33 +111,39 @@ class Result:
         return f"load {self.load:.0f}" if self.load >= 1 else "no load"
 
 
-def race(a: Timed, b: Timed, rule: Rule, *, budget: float = BUDGET, coin: Random | None = None) -> Result:
-    """Time `a` against `b`, both warm, until the rule answers or `budget` seconds have gone.
+def race(racers: Racers, rule: Rule, *, budget: float = BUDGET, coin: Random | None = None) -> Result:
+    """Time both, warm, until the rule answers or `budget` seconds have gone.
 
     coin: what decides the orders; the system's own where none is given, which nothing on the machine can follow.
     """
-    game = playing(b, rule, budget=budget, coin=coin)
+    game = playing(racers.b, rule, budget=budget, coin=coin, renew=racers.renew)
     next(game)
     while True:
         try:
-            game.send(a())
+            game.send(racers.a())
         except StopIteration as done:
             return done.value
 
 
 def playing(
-    b: Timed, rule: Rule, *, budget: float = BUDGET, coin: Random | None = None
+    b: Timed,
+    rule: Rule,
+    *,
+    budget: float = BUDGET,
+    coin: Random | None = None,
+    renew: Callable[[], None] | None = None,
 ) -> Generator[None, float, Result]:
     """The same for a caller that times A itself: each time this yields it wants the seconds of one call of A."""
-    began, turns = perf_counter(), list[Turn]()
+    began, turns, renewing = perf_counter(), list[Turn](), Renewing(renew)
     for order in orders(coin):
-        seconds = list[float]()
+        at, seconds = perf_counter(), list[float]()
         for who in order:
             seconds.append((yield) if who == "A" else b())
         turns.append(Turn(order, tuple(seconds)))
-        answer, elapsed = rule.judge([t.log_ratio for t in turns]), perf_counter() - began
-        if answer is not Verdict.UNDECIDED or elapsed >= budget:
-            return result(rule, turns, elapsed)
+        answer, now = rule.judge([t.log_ratio for t in turns]), perf_counter()
+        if answer is not Verdict.UNDECIDED or now - began >= budget:
+            return result(rule, turns, now - began)
+        renewing.after(now - at)
     raise AssertionError("orders do not end")
 
 
@@ -126,19 +160,17 @@ def result(rule: Rule, turns: list[Turn], elapsed: float) -> Result:
     return Result(rule.judge(x), rule, interval(x, rule.alpha), tuple(turns), elapsed, os.getloadavg()[0])
 
 
-def confirmed(
-    start: Callable[[], AbstractContextManager[tuple[Timed, Timed]]], rule: Rule, *, budget: float = BUDGET
-) -> Result:
+def confirmed(start: Callable[[], AbstractContextManager[Racers]], rule: Rule, *, budget: float = BUDGET) -> Result:
     """A race between programs that `start` starts; one that fails is repeated with programs started anew.
 
     Where the second race finds otherwise nothing is decided. The budget is that of both together.
     """
-    with start() as (a, b):
-        first = race(a, b, rule, budget=budget)
+    with start() as racers:
+        first = race(racers, rule, budget=budget)
     if first.answer is not Verdict.FAILS:
         return first
-    with start() as (a, b):
-        second = race(a, b, rule, budget=max(budget - first.elapsed, 0.0))
+    with start() as racers:
+        second = race(racers, rule, budget=max(budget - first.elapsed, 0.0))
     answer = Verdict.FAILS if second.answer is Verdict.FAILS else Verdict.UNDECIDED
     both, elapsed = (*first.turns, *second.turns), first.elapsed + second.elapsed
     # Each race's interval has its own error; the wider ends hold what both say.

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from functools import partial
 from math import ceil
 from pathlib import Path
+from random import sample
 from typing import Any
 
 from harness.base.errors import InputError
-from harness.experiments.gates.abba import CALL, Result, Timed, confirmed
+from harness.experiments.gates.abba import CALL, Racers, Result, confirmed
 from harness.experiments.gates.agreement import difference
 from harness.experiments.gates.pair import HeldWork, RevisionProcess, Side, changes, workers
 from harness.experiments.gates.sequential import ALPHA, Rule, Verdict
@@ -92,7 +93,7 @@ def exit_code(answers: Sequence[Verdict]) -> int:
 @contextmanager
 def started(
     sides: tuple[Side, Side], request: Request, options: Options, say: Callable[[str], None]
-) -> Generator[tuple[Timed, Timed]]:
+) -> Generator[Racers]:
     """Both revisions in processes of their own, warm, with the same answer."""
     with workers(*sides) as alive:
         held = _held(alive, request, 1)
@@ -109,7 +110,7 @@ def started(
             say(f"{request.title}: {change}")
         calls = max(1, ceil(CALL / max(once, 1e-6)))
         a, b = (partial(worker.seconds, calls, clock) for worker in alive)
-        yield a, b
+        yield Racers(a, b, partial(_renew, alive))
 
 
 def _held(alive: Sequence[RevisionProcess], request: Request, frames: int) -> list[HeldWork]:
@@ -121,6 +122,15 @@ def _held(alive: Sequence[RevisionProcess], request: Request, frames: int) -> li
             more = {"config": str(worker.side.own(request.config)), "frames": frames, "extra": worker.side.extra}
         held.append(worker.hold(request.do, **request.arguments, **more))
     return held
+
+
+def _renew(alive: Sequence[RevisionProcess]) -> None:
+    """Both make their work anew and do it once, in an order that a coin decides: the last to work is the warmest."""
+    chance = sample(alive, len(alive))
+    for worker in chance:
+        worker.renew()
+    for worker in chance:
+        worker.seconds(1, "cpu")
 
 
 def _instructions(worker: RevisionProcess) -> dict[str, int]:

@@ -21,7 +21,7 @@ from harness.base.machine import pinned_threads
 from harness.base.model import Model
 from harness.base.yaml import read_yaml
 from harness.config.options import Iterations, Tolerance
-from harness.experiments.gates.abba import Clock, Result, Timed, confirmed
+from harness.experiments.gates.abba import Clock, Racers, Result, confirmed
 from harness.experiments.gates.agreement import AGREEMENT, difference
 from harness.experiments.gates.scenes import calls_of, pair, timed
 from harness.experiments.gates.sequential import ALPHA, Rule
@@ -98,7 +98,7 @@ def run_table(path: Path, budget: float, say: Callable[[str], None], alpha: floa
 
 
 @contextmanager
-def _started(document: Document, i: int, gate: Gate) -> Generator[tuple[Timed, Timed]]:
+def _started(document: Document, i: int, gate: Gate) -> Generator[Racers]:
     """Both solvers prepared anew, warm, with the same answer."""
     options = {key: getattr(gate, key) for key in ("iterations", "tolerance", "integrator", "frames")}
     with pinned_threads(1):
@@ -118,7 +118,7 @@ def _started(document: Document, i: int, gate: Gate) -> Generator[tuple[Timed, T
             document.report(f"the answers differ, so nothing was timed: {said}", ("gates", i))
             raise document.error()
         calls = calls_of(candidate, yardstick)
-        yield timed(candidate, calls, gate.clock), timed(yardstick, calls, gate.clock)
+        yield Racers(timed(candidate, calls, gate.clock), timed(yardstick, calls, gate.clock))
 
 
 def _placed(mistake: Mistake, path: Path, line: int | None, i: int) -> Mistake:

@@ -100,6 +100,10 @@ class RevisionProcess:
         """The seconds that so many calls of the work take, together."""
         return self.ask("time", calls=calls, clock=clock)["seconds"]
 
+    def renew(self) -> None:
+        """Make the work that it holds anew, elsewhere in memory."""
+        self.ask("renew")
+
     def close(self) -> None:
         """End the process."""
         process = self._process

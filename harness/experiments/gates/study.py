@@ -26,7 +26,7 @@ from scipy.stats import mannwhitneyu
 from harness.base import columns, rows
 from harness.base.errors import InputError
 from harness.base.worker import tie
-from harness.experiments.gates.abba import orders
+from harness.experiments.gates.abba import Renewing, orders
 from harness.experiments.gates.against import Options, Request, started
 from harness.experiments.gates.pair import Side
 from harness.experiments.gates.sequential import Rule, Verdict
@@ -37,7 +37,7 @@ COLUMNS = (
     columns.Column("start", pa.int64(), "", "which pair of processes, from 0"),
     columns.Column("order", pa.string(), "", "ABBA or BAAB"),
     *(columns.Column(f"call_{k}", pa.float64(), "s", f"time of the turn's call {k}") for k in range(4)),
-    columns.Column("wall", pa.float64(), "s", "wall time of the whole turn"),
+    columns.Column("wall", pa.float64(), "s", "wall time of the whole turn, and of making the work anew after it"),
     columns.Column("load", pa.float64(), "", "load average over a minute"),
     columns.Column("planted", pa.float64(), "", "extra work of A, as a part of its iterations"),
 )
@@ -93,11 +93,13 @@ def record(
                     alive.enter_context(started(sides, request, Options(seconds), lambda line: None))
                     for request in requests
                 ]
+                renewing = [Renewing(racers.renew) for racers in pairs]
                 until = perf_counter() + seconds / starts
                 for order in orders():
-                    for request, (a, b) in zip(requests, pairs, strict=True):
+                    for request, racers, renewed in zip(requests, pairs, renewing, strict=True):
                         at = perf_counter()
-                        calls = [{"A": a, "B": b}[who]() for who in order]
+                        calls = [{"A": racers.a, "B": racers.b}[who]() for who in order]
+                        renewed.after(perf_counter() - at)
                         row = {"gate": request.title, "condition": condition, "start": start, "order": order}
                         row |= {f"call_{k}": call for k, call in enumerate(calls)}
                         took = perf_counter() - at

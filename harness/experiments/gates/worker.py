@@ -8,6 +8,7 @@ standard error. It imports from the tree alone: what is timed is all the revisio
     {"do": "gates"}                                           -> {"gates": ["numba-against-sparse-64", ...]}
     {"do": "gate", "name": "...", "positions": "..."}         -> {"facts": {...}, "clock": "cpu"}
     {"do": "time", "calls": n, "clock": "cpu"}                -> {"seconds": s}, all calls together
+    {"do": "renew"}                                           -> {}, the same work, made anew elsewhere in memory
     {"do": "instructions"}                                    -> {"instructions": n}, null where they are hidden
 """
 
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import sys
 import time
 import traceback
@@ -26,12 +28,17 @@ from typing import Any
 
 CLOCKS = {"cpu": time.process_time, "wall": time.perf_counter}
 
+ROOM = 2**20
+"""Bytes, at most, that move what is made anew."""
+
 
 class Worker:
     """What is held between two requests."""
 
     def __init__(self) -> None:
+        self._make: Callable[[], Callable[[], Any]] | None = None
         self._work: Callable[[], Any] | None = None
+        self._room = bytearray()
         self._threads = ExitStack()
 
     def runs(self, config: str, asked: dict[str, Any]) -> dict[str, Any]:
@@ -45,40 +52,12 @@ class Worker:
 
         extra: so much more work than the run asks for, as a part of its iterations: a planted slowdown.
         """
-        from harness.scenes.bind import build
-        from harness.simulation.step import prepare, simulate
-        from solvers.problem import StopRule
-        from solvers.registry import SOLVERS, load
-
         run = _sweep(config, asked)[index]
         threads = 1 if run.threads == "auto" else run.threads  # idle cores now are not idle cores later
         self._pin(threads)
-        scene = build(run.scene, run.size, run.integrator)
-        prepared = prepare(scene, load(SOLVERS[run.solver.name])(**run.solver.parameters))
         frames = min(frames, run.frames)
-        if isinstance(run.tolerance, str):  # `auto`, which older revisions do not know
-            from harness.simulation.algebraic import stop_rule
-
-            stop: Any = stop_rule(run.iterations, run.tolerance)
-        else:
-            stop = StopRule(run.iterations, run.tolerance)
-        done: list[int] = []
-
-        def work() -> Any:
-            done.clear()
-            step = None
-            for step in simulate(scene, prepared, stop, first_guess=run.first_guess, frames=frames):
-                done.append(_iterations(step))
-            assert step is not None
-            if extra:
-                prepared.solve(step.problem, StopRule(max(1, round(extra * sum(done)))))
-            return step.positions
-
-        counts = {name: int(value) for name, value in prepared.facts.items()}
-        return self._held(work, positions, counts, lambda: {"iterations": sum(done), "steps": frames}) | {
-            "clock": "cpu" if threads == 1 else "wall",
-            "frames": frames,
-        }
+        steps = self._held(lambda: _Steps(run, frames, extra), positions)
+        return {"facts": steps.facts(), "clock": "cpu" if threads == 1 else "wall", "frames": frames}
 
     def gates(self) -> dict[str, Any]:
         """The names of the tree's own gates."""
@@ -88,7 +67,15 @@ class Worker:
         """Hold the candidate of one of the tree's own gates."""
         self._pin(1)
         gate = _gates()[name]
-        return self._held(gate.candidate(), positions, {}, dict) | {"clock": gate.clock}
+        self._held(gate.candidate, positions)
+        return {"facts": {}, "clock": gate.clock}
+
+    def renew(self) -> dict[str, Any]:
+        """Make the work anew, while the old still takes its place, behind so much room as chance will have it."""
+        assert self._make is not None
+        self._room = bytearray(random.randrange(ROOM))
+        self._work = self._make()
+        return {}
 
     def time(self, calls: int, clock: str) -> dict[str, Any]:
         """The seconds of so many calls."""
@@ -109,20 +96,61 @@ class Worker:
         place.loader.exec_module(counter)
         return {"instructions": counter.count(self._work)}
 
-    def _held(
-        self, work: Callable[[], Any], positions: str, counts: dict[str, int], after: Callable[[], dict[str, int]]
-    ) -> dict[str, Any]:
+    def _held(self, make: Callable[[], Any], positions: str) -> Any:
+        """The work, done once; its answer is in a file."""
         import numpy as np
 
-        self._work = work
+        work = make()
+        self._make, self._work = make, work
         np.save(positions, np.asarray(work(), float))
-        return {"facts": counts | after()}
+        return work
 
     def _pin(self, threads: int) -> None:
         from harness.base import machine
 
         self._threads.close()
         self._threads.enter_context(machine.pinned_threads(threads))
+
+
+class _Steps:
+    """The first steps of a run, as often as it is called."""
+
+    def __init__(self, run: Any, frames: int, extra: float) -> None:
+        from harness.scenes.bind import build
+        from harness.simulation.step import prepare
+        from solvers.registry import SOLVERS, load
+
+        self._run, self._frames, self._extra, self._iterations = run, frames, extra, 0
+        self._scene = build(run.scene, run.size, run.integrator)
+        self._prepared = prepare(self._scene, load(SOLVERS[run.solver.name])(**run.solver.parameters))
+        self._stop = _stop(run)
+
+    def __call__(self) -> Any:
+        from harness.simulation.step import simulate
+        from solvers.problem import StopRule
+
+        self._iterations, step, first_guess = 0, None, self._run.first_guess
+        for step in simulate(self._scene, self._prepared, self._stop, first_guess=first_guess, frames=self._frames):
+            self._iterations += _iterations(step)
+        assert step is not None
+        if self._extra:
+            self._prepared.solve(step.problem, StopRule(max(1, round(self._extra * self._iterations))))
+        return step.positions
+
+    def facts(self) -> dict[str, int]:
+        """What the solver counts, and what the last call did."""
+        counts = {name: int(value) for name, value in self._prepared.facts.items()}
+        return counts | {"iterations": self._iterations, "steps": self._frames}
+
+
+def _stop(run: Any) -> Any:
+    from solvers.problem import StopRule
+
+    if isinstance(run.tolerance, str):  # `auto`, which older revisions do not know
+        from harness.simulation.algebraic import stop_rule
+
+        return stop_rule(run.iterations, run.tolerance)
+    return StopRule(run.iterations, run.tolerance)
 
 
 def _sweep(config: str, asked: dict[str, Any]) -> list[Any]:
