@@ -35,6 +35,10 @@ SCENES = [Path(__file__).parents[2] / "configs" / "scenes" / f"{name}.yaml" for 
 ENGINES: tuple[tuple[str, dict[str, Any]], ...] = (
     *(("mujoco", {"integrator": one}) for one in ("implicitfast", "implicit", "Euler", "RK4")),
     *(("pypbd", {"iterations": one}) for one in (1, 4, 16)),
+    ("newton-physics", {"method": "vbd", "iterations": 10}),
+    ("newton-physics", {"method": "vbd", "iterations": 10, "colours": "newton"}),
+    ("newton-physics", {"method": "xpbd", "iterations": 1}),
+    ("newton-physics", {"method": "semi-implicit"}),
     ("xpbd-small-steps", {}),
 )
 OURS = (("velocity-verlet", "own", StopRule(1)), ("hybrid", "implicit-euler", StopRule(200, 1e-6)))

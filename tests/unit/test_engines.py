@@ -30,7 +30,7 @@ from solvers.engines import base
 from solvers.engines.base import Engine, PreparedEngine
 from solvers.methods.xpbd import XpbdSmallSteps
 from solvers.problem import Positions, StepProblem, StopRule, System, Unsupported
-from solvers.registry import OPTIONAL, about, load, minimises
+from solvers.registry import OPTIONAL, SOLVERS, about, load, minimises
 from tests.scenes import random_problem
 
 ENGINES = [name for name, target in OPTIONAL.items() if about(load(target), name).package]
@@ -82,8 +82,10 @@ def test_where_it_is_not_installed_the_reason_is_the_command_that_does_so(name: 
         raise ModuleNotFoundError(f"No module named {module!r}")
 
     monkeypatch.setattr(base, "import_module", none)
-    with pytest.raises(Unsupported, match=rf"^{name}: .*pip install -e '\.\[{name}\]'` in the checkout"):
-        load(OPTIONAL[name])().prepare(made(*HANGING).system)
+    engine = load(OPTIONAL[name])()
+    wanted = rf"^{name}: .*pip install -e '\.\[{engine.package.extra}\]'` in the checkout"
+    with pytest.raises(Unsupported, match=wanted):
+        engine.prepare(made(*HANGING).system)
 
 
 @engines
@@ -155,6 +157,40 @@ def test_pypbd_moves_one_spring_as_xpbd_in_small_steps_does(substeps: int):
     wanted = XpbdSmallSteps().prepare(scene.system).solve(stated, StopRule(substeps))
     # It may compute in single precision.
     np.testing.assert_allclose(found.positions, wanted.positions, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "substeps", "wanted"),
+    [
+        ({"method": "vbd", "iterations": 300}, 1, "converged"),
+        ({"method": "semi-implicit"}, 20, "semi-implicit"),
+        ({"method": "xpbd", "iterations": 1}, 7, "xpbd"),
+    ],
+)
+def test_newton_physics_steps_springs_as_its_methods_say(parameters: dict[str, Any], substeps: int, wanted: str):
+    pins = Pins.model_validate({"at": ["first"], "weight": "exact"})
+    size, velocity = (2 if wanted == "xpbd" else 4), (0.3, 0.1, -0.2)  # its XPBD moves along all springs at once
+    effects = Springs(stretch=500.0), Gravity(), pins
+    scene = made(*effects, mesh=Chain(), size=size, velocity=velocity)
+    stated = problem(scene, start(scene), "current")
+    found = ready("newton-physics", scene.system, **parameters).solve(stated, StopRule(substeps)).positions
+    if wanted == "semi-implicit":
+        should = semi_implicit(scene, stated, substeps, damping=0.0)[0]
+    elif wanted == "xpbd":
+        should = XpbdSmallSteps().prepare(scene.system).solve(stated, StopRule(substeps)).positions
+    else:
+        same = made(*effects, mesh=Chain(), size=size, velocity=velocity, integrator="implicit-euler")
+        step = problem(same, start(same), "current")
+        should = load(SOLVERS["newton"])().prepare(same.system).solve(step, StopRule(100, 1e-12)).positions
+    assert np.abs(found - stated.current).max() > 100 * 2e-6
+    np.testing.assert_allclose(found, should, rtol=0, atol=2e-6)  # float32
+
+
+def test_all_of_a_net_is_one_colour_to_newton_physics_which_sees_no_springs():
+    ready("newton-physics", made(*HANGING).system)
+    for colours, told in (("newton", "1 colours"), ("springs", "4 colours")):
+        prepared = ready("newton-physics", made(*HANGING).system, colours=colours)
+        assert told in prepared.choice
 
 
 @engines

@@ -1,0 +1,175 @@
+"""Newton (Warp): springs of its particles, stepped by three of its solvers on the CPU, in float32.
+
+- `vbd`, vertex block descent (Chen et al. 2024), and `xpbd`: implicit Euler in substeps, of some iterations each.
+  Newton's `ModelBuilder.color` sees triangles, tetrahedra and bending edges, and no springs: a net of springs is one
+  colour to it, whose vertices all move at once, which diverges where springs are stiff. So colours of the springs' own
+  are set by `set_coloring`, unless `colours` asks for Newton's.
+- XPBD there moves along all springs at once, with no relaxation, and forgets multipliers between iterations: what it
+  tends to is C = 0 and not the springs' stiffness (issue 2933 of newton-physics/newton), so one iteration a substep is
+  the one that means XPBD.
+- `semi-implicit`: v <- v + h M^-1 f(p), p <- p + h v.
+
+Its documentation meets stiff springs by more substeps ("Tuning VBD"; its example of a hanging cloth takes 10 of a frame
+of 1/60 s, of 10 iterations each, by VBD and XPBD and 32 explicit ones). Kernels are compiled while a run is prepared,
+a minute at first, and kept in Warp's cache. Style3D, its fourth solver of cloth, has no springs but triangles.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.about import About, Reference
+from solvers.core.colouring import of_vertices
+from solvers.engines.base import Engine, Network, Package, PreparedEngine, evenly
+from solvers.problem import Positions, StepProblem, System, Unsupported
+
+Method = Literal["vbd", "xpbd", "semi-implicit"]
+Colours = Literal["springs", "newton"]
+
+_SCRIPT = """\
+import time
+import newton
+import numpy as np
+net = np.load("{name}.npz")  # the network, and where springbench's run of Newton ended
+builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+held = set(net["pinned"].tolist())
+for i, (p, v, m) in enumerate(zip(net["positions"], net["velocities"], net["mass"])):
+    builder.add_particle(p, 0.0 * v if i in held else v, 0.0 if i in held else m, radius=0.0)
+for (i, j), k in zip(net["ends"].tolist(), net["stiffness"]):
+    builder.add_spring(i, j, k, 0.0, control=0.0)
+builder.spring_rest_length = net["rest_length"].tolist()
+{colouring}model = builder.finalize(device="cpu")
+solver, now, then = newton.solvers.{solver}, model.state(), model.state()
+began = time.perf_counter()  # the first step compiles
+for _ in range({steps}):
+    now.particle_f.assign(net["force"].astype(np.float32))
+    solver.step(now, then, None, None, {h!r})
+    now, then = then, now
+seconds, p = time.perf_counter() - began, now.particle_q.numpy()
+print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of that run")
+"""
+
+
+@dataclass(frozen=True)
+class NewtonPhysics(Engine):
+    """method: one of Newton's solvers. iterations: in each substep; an explicit method has none. colours: whose
+    vertices move at the same time by `vbd`."""
+
+    name: ClassVar[str] = "newton-physics"
+    package: ClassVar[Package] = Package("newton", "newton", "newton")
+    about: ClassVar[About] = About(
+        "engine",
+        Reference("{Newton Contributors}", 2025, "Newton: an open-source, GPU-accelerated physics simulation engine"),
+        own_steps=True,
+        package="newton",
+    )
+
+    method: Method = "vbd"
+    iterations: int = 10
+    colours: Colours = "springs"
+
+    def prepare(self, system: System) -> PreparedEngine:
+        """See Engine."""
+        with suppress(ImportError):  # which is told where Newton is asked for
+            import_module("warp").config.quiet = True
+        return super().prepare(system)
+
+    def built(self, network: Network, library: Any) -> tuple[_Model, str]:
+        """See Engine."""
+        if not self.iterations >= 1:
+            raise Unsupported(f"newton-physics: iterations came as {self.iterations}; wanted 1 or more")
+        builder = library.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        fixed = np.isin(np.arange(len(network.mass)), network.pinned)
+        for m in np.where(fixed, 0.0, network.mass).tolist():
+            builder.add_particle((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), m, radius=0.0)  # without radius, no contact
+        for (i, j), k in zip(network.lines.ends.tolist(), network.lines.stiffness.tolist(), strict=True):
+            builder.add_spring(i, j, k, 0.0, control=0.0)
+        builder.spring_rest_length = network.lines.rest_length.tolist()
+        told = "explicit"
+        if self.method != "semi-implicit":
+            told = f"{self.iterations} iterations a substep"
+        if self.method == "vbd":
+            told += f", {self._colour(builder, network)} colours"
+        model = builder.finalize(device="cpu")
+        solver, explicit = self._solver(library.solvers, model), self.method == "semi-implicit"
+        made = _Model(import_module("warp"), model, solver, network, explicit=explicit)
+        return made, f"{self.method}, {told}, in float32 on the CPU, on one thread"
+
+    def _colour(self, builder: Any, network: Network) -> int:
+        """Set the colours; how many there are."""
+        if self.colours == "newton":
+            builder.color()
+        else:
+            found = of_vertices(network.lines.ends, len(network.mass))
+            builder.set_coloring(np.split(found.order, found.start[1:-1]))
+        return len(builder.particle_color_groups)
+
+    def _solver(self, solvers: Any, model: Any) -> Any:
+        if self.method == "semi-implicit":
+            return solvers.SolverSemiImplicit(model)
+        return {"vbd": solvers.SolverVBD, "xpbd": solvers.SolverXPBD}[self.method](model, iterations=self.iterations)
+
+    def script(self, name: str, network: Network, problem: StepProblem, substeps: int, frames: int) -> dict[str, str]:
+        """See Engine."""
+        made = {
+            "vbd": f"SolverVBD(model, iterations={self.iterations})",
+            "xpbd": f"SolverXPBD(model, iterations={self.iterations})",
+            "semi-implicit": "SolverSemiImplicit(model)",
+        }
+        colouring = ""
+        if self.method == "vbd" and self.colours == "newton":
+            colouring = "builder.color()\n"
+        elif self.method == "vbd":
+            found = of_vertices(network.lines.ends, len(network.mass))
+            groups = [group.tolist() for group in np.split(found.order, found.start[1:-1])]
+            colouring = f"builder.set_coloring({groups})  # no two of a colour share a spring\n"
+        text = _SCRIPT.format(
+            name=name,
+            colouring=colouring,
+            solver=made[self.method],
+            steps=substeps * frames,
+            h=network.time_step / substeps,
+        )
+        return {f"{name}.py": text}
+
+
+class _Model:
+    """A model, its solver and two states that take turns. On the CPU its arrays are seen in place."""
+
+    def __init__(self, warp: Any, model: Any, solver: Any, network: Network, *, explicit: bool) -> None:
+        self._warp, self._solver, self._network, self._explicit = warp, solver, network, explicit
+        self._now, self._then = model.state(), model.state()
+        self._load = warp.zeros_like(self._now.particle_f)
+        solver.step(self._now, self._then, None, None, network.time_step)  # compiles; each step sets its own state
+
+    def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
+        """See Stepping."""
+        net, start, h = self._network, problem.start, self._network.time_step / substeps
+        _set(self._now.particle_q, start.positions)
+        _set(self._now.particle_qd, start.velocity)
+        for state in (self._now, self._then):
+            state.particle_qd.numpy()[net.pinned] = 0.0  # a particle without mass would go on with what it has
+        _set(self._load, problem.force)
+        begin, end = start.positions[net.pinned], problem.pin_targets
+        places = evenly(begin, end, substeps)
+        ahead = 0.0 if self._explicit else (end - begin) / substeps  # implicit steps have pins where they will be
+        for k in range(substeps):
+            if places is not None:
+                self._now.particle_q.numpy()[net.pinned] = places[k] + ahead
+            self._warp.copy(self._now.particle_f, self._load)  # an explicit step adds the springs' forces to it
+            self._solver.step(self._now, self._then, None, None, h)
+            self._now, self._then = self._then, self._now
+        p, v = (np.array(array.numpy(), np.float64) for array in (self._now.particle_q, self._now.particle_qd))
+        p[net.pinned], v[net.pinned] = end, (end - begin) / net.time_step
+        return p, v
+
+
+def _set(array: Any, values: NDArray[np.float64]) -> None:
+    """Write values (n, 3) to an array of Warp's."""
+    array.numpy()[:] = values
