@@ -45,6 +45,7 @@ OPTIONAL = {
     "cholmod": "solvers.methods.cholmod:CholmodLocalGlobal",
     "mujoco": "solvers.engines.mujoco:Mujoco",
     "pypbd": "solvers.engines.pypbd:PyPbd",
+    "taichi": "solvers.engines.taichi_newton:TaichiNewton",
     "newton-physics": "solvers.engines.newton_physics:NewtonPhysics",
 }
 """Those that need what is not everywhere, and refuse with the reason where it is missing."""

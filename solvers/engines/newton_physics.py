@@ -77,7 +77,8 @@ class NewtonPhysics(Engine):
     def prepare(self, system: System) -> PreparedEngine:
         """See Engine."""
         with suppress(ImportError):  # which is told where Newton is asked for
-            import_module("warp").config.quiet = True
+            warp = import_module("warp")
+            warp.config.log_level = warp.LOG_ERROR  # it tells of devices and of each module that it compiles
         return super().prepare(system)
 
     def built(self, network: Network, library: Any) -> tuple[_Model, str]:

@@ -39,6 +39,7 @@ ENGINES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("newton-physics", {"method": "vbd", "iterations": 10, "colours": "newton"}),
     ("newton-physics", {"method": "xpbd", "iterations": 1}),
     ("newton-physics", {"method": "semi-implicit"}),
+    *(("taichi", {"iterations": one}) for one in (1, 4)),
     ("xpbd-small-steps", {}),
 )
 OURS = (("velocity-verlet", "own", StopRule(1)), ("hybrid", "implicit-euler", StopRule(200, 1e-6)))

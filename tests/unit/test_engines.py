@@ -186,6 +186,22 @@ def test_newton_physics_steps_springs_as_its_methods_say(parameters: dict[str, A
     np.testing.assert_allclose(found, should, rtol=0, atol=2e-6)  # float32
 
 
+def test_the_program_in_taichi_minimises_the_step_and_one_iteration_is_the_linearised_step():
+    effects = HANGING[:2], Pins.model_validate({"at": ["top_corners"], "weight": "exact"})
+    scene = made(*effects[0], effects[1], velocity=(0.3, 0.1, -0.2))
+    stated = problem(scene, start(scene), "current")
+    found = ready("taichi", scene.system, iterations=30, tolerance=1e-9).solve(stated, StopRule(1)).positions
+    same = made(*effects[0], effects[1], velocity=(0.3, 0.1, -0.2), integrator="implicit-euler")
+    should = (
+        load(SOLVERS["newton"])()
+        .prepare(same.system)
+        .solve(problem(same, start(same), "current"), StopRule(100, 1e-12))
+    )
+    np.testing.assert_allclose(found, should.positions, rtol=0, atol=1e-9)
+    once = ready("taichi", scene.system, iterations=1).solve(stated, StopRule(1)).positions
+    assert 1e-6 < np.abs(once - should.positions).max() < 0.3 * np.abs(should.positions - stated.current).max()
+
+
 def test_all_of_a_net_is_one_colour_to_newton_physics_which_sees_no_springs():
     ready("newton-physics", made(*HANGING).system)
     for colours, told in (("newton", "1 colours"), ("springs", "4 colours")):

@@ -1,0 +1,121 @@
+"""Taichi: implicit Euler by Newton's method with conjugate gradients, in substeps; see `taichi_program`.
+
+Taichi is a language, and has no solver of nets: the program is ours, in the manner of its own examples. Its kernels are
+compiled while a run is prepared, for one core; Taichi keeps them in its cache.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+from solvers.about import About, Reference
+from solvers.engines import taichi_program
+from solvers.engines.base import Engine, Network, Package, PreparedEngine, evenly
+from solvers.problem import Positions, StepProblem, System, Unsupported
+
+_SCRIPT = """\
+
+
+import time
+
+import taichi as ti
+
+net = np.load("{name}.npz")  # the network, and where springbench's run ended
+ti.init(arch=ti.cpu, cpu_max_num_threads=1, default_fp=ti.f64)
+arrays = (net[key] for key in ("mass", "pinned", "ends", "stiffness", "rest_length"))
+made = program(ti, *arrays, {tolerance!r})
+made.h[None], made.newton[None] = {h!r}, {newton}
+for field, key in ((made.x, "positions"), (made.v, "velocities"), (made.load, "force")):
+    field.from_numpy(net[key])
+began = time.perf_counter()  # the first step compiles
+for _ in range({steps}):
+    made.step()
+seconds, p = time.perf_counter() - began, made.x.to_numpy()
+print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of that run")
+"""
+
+
+@dataclass(frozen=True)
+class TaichiNewton(Engine):
+    """iterations: of Newton's method in each substep; one is Baraff and Witkin's linearised step. tolerance: of
+    conjugate gradients, relative to the gradient."""
+
+    name: ClassVar[str] = "taichi"
+    package: ClassVar[Package] = Package("taichi", "taichi", "taichi")
+    about: ClassVar[About] = About(
+        "engine",
+        Reference(
+            "Hu, Yuanming and Li, Tzu-Mao and Anderson, Luke and Ragan-Kelley, Jonathan and Durand, Frédo",
+            2019,
+            "Taichi: a language for high-performance computation on spatially sparse data structures",
+            "10.1145/3355089.3356506",
+        ),
+        own_steps=True,
+        package="taichi",
+    )
+
+    iterations: int = 1
+    tolerance: float = 1e-6
+
+    def prepare(self, system: System) -> PreparedEngine:
+        """See Engine."""
+        os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+        return super().prepare(system)
+
+    def built(self, network: Network, library: Any) -> tuple[_Model, str]:
+        """See Engine."""
+        if not self.iterations >= 1:
+            raise Unsupported(f"taichi: iterations came as {self.iterations}; wanted 1 or more")
+        if not 0.0 < self.tolerance < 1.0:
+            raise Unsupported(
+                f"taichi: tolerance came as {self.tolerance}; wanted a part of the gradient, such as 1e-6"
+            )
+        made = _Model(library, network, self.iterations, self.tolerance)
+        return made, f"{self.iterations} iterations of Newton's method a substep, in float64, on one thread"
+
+    def script(self, name: str, network: Network, problem: StepProblem, substeps: int, frames: int) -> dict[str, str]:
+        """See Engine."""
+        given = {"tolerance": self.tolerance, "newton": self.iterations, "steps": substeps * frames}
+        driver = _SCRIPT.format(name=name, h=network.time_step / substeps, **given)
+        return {f"{name}.py": Path(taichi_program.__file__).read_text(encoding="utf-8") + driver}
+
+
+@cache
+def _begin(library: Any) -> None:
+    """Taichi is begun once a process: again, it would forget all that there is."""
+    library.init(arch=library.cpu, cpu_max_num_threads=1, default_fp=library.f64, log_level=library.WARN)
+
+
+class _Model:
+    """The program of a network."""
+
+    def __init__(self, library: Any, network: Network, iterations: int, tolerance: float) -> None:
+        _begin(library)
+        lines = network.lines
+        arrays = network.mass, network.pinned, lines.ends, lines.stiffness, lines.rest_length
+        self._network, self._made = network, taichi_program.program(library, *arrays, tolerance)
+        self._made.h[None], self._made.newton[None] = network.time_step, 0
+        self._made.step()  # compiles
+        self._made.newton[None] = iterations
+
+    def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
+        """See Stepping."""
+        net, made, start = self._network, self._made, problem.start
+        for field, values in ((made.x, start.positions), (made.v, start.velocity), (made.load, problem.force)):
+            field.from_numpy(values)
+        made.h[None] = net.time_step / substeps
+        begin, end = start.positions[net.pinned], problem.pin_targets
+        places = evenly(begin, end, substeps)
+        for k in range(substeps):
+            if places is not None:
+                p = made.x.to_numpy()
+                p[net.pinned] = places[k] + (end - begin) / substeps
+                made.x.from_numpy(p)
+            made.step()
+        p, v = made.x.to_numpy(), made.v.to_numpy()
+        p[net.pinned], v[net.pinned] = end, (end - begin) / net.time_step
+        return p, v
