@@ -18,8 +18,10 @@ from harness.scenes.mesh.grid import Grid
 from harness.simulation.step import prepare, simulate
 from solvers.energies.springs import Springs
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.methods.vbd import VertexBlockDescent
 from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
 from solvers.problem import Pins, StepProblem, StopRule, System, Unsupported
+from tests.bench.primal_dual import MOST, hanging, iterations
 from tests.scenes import SCENES, cloth, first_problem, random_problem, scene
 
 G, DT = 9.81, 1 / 30
@@ -234,3 +236,16 @@ def test_nothing_but_pins_needs_no_springs():
     np.testing.assert_allclose(
         solved(Xpbd(), problem, 2)[[0, 2]], (problem.target + DT**2 * problem.force)[[0, 2]], rtol=1e-15
     )
+
+
+def test_stiff_springs_hold_primal_methods_up_and_heavy_ends_dual_ones():
+    # Macklin, Erleben and Mueller 2020.
+    plain, stiffer = hanging(1e3), hanging(1e3, stiffer=100.0)
+    light, heavier = hanging(1e5), hanging(1e5, heavier=100.0)
+    primal, dual = VertexBlockDescent(spectral_radius=0.0), Xpbd()
+    found = {solver: [iterations(solver, of) for of in (plain, stiffer, light, heavier)] for solver in (primal, dual)}
+    (a, b, c, d), (e, f, g, h) = ([k or MOST for k in found[solver]] for solver in (primal, dual))
+    assert b > 20 * a
+    assert d < c
+    assert f < 3 * e
+    assert h > 3 * g

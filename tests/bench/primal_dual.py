@@ -1,0 +1,93 @@
+"""Primal and dual descent beside each other, by ratios of stiffness and of mass (Macklin, Erleben and Mueller 2020).
+
+    python -m tests.bench.primal_dual
+
+A chain of 17 vertices that hangs straight, its first step: every second spring of 1,000 N/m is so many times as
+stiff, or the last vertex of a chain of 100,000 N/m is so many times as heavy. Primal methods change positions vertex
+by vertex: `vbd`, Gauss and Seidel's way, with and without its acceleration, and Jacobi's (`jgs2`, `rings: 0`). Dual
+ones change the tensions of springs: `xpbd`, Gauss and Seidel's way. A cell is how many iterations it takes until
+every vertex is within a thousandth of the step's way of where it ends; a dash: not within 100,000. The line stays
+straight, so what XPBD tends to is the minimum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from harness.base.machine import pinned_threads
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from solvers.energies import springs
+from solvers.methods.jgs2 import Jgs2
+from solvers.methods.newton import Newton
+from solvers.methods.vbd import VertexBlockDescent
+from solvers.methods.xpbd import Xpbd
+from solvers.problem import Solver, StepProblem, StopRule
+from tests.scenes import first_problem, scene
+
+RATIOS = (1.0, 10.0, 100.0, 1e3, 1e4)
+METHODS: dict[str, Solver] = {
+    "primal, Jacobi: jgs2, rings: 0": Jgs2(rings=0),
+    "primal, Gauss-Seidel: vbd, spectral_radius: 0": VertexBlockDescent(spectral_radius=0.0),
+    "primal, accelerated: vbd": VertexBlockDescent(),
+    "dual, Gauss-Seidel: xpbd": Xpbd(),
+}
+LEVEL, MOST = 1e-3, 100_000
+"""Where the step should end over its way, and iterations at most."""
+
+
+def hanging(stiffness: float, stiffer: float = 1.0, heavier: float = 1.0) -> StepProblem:
+    """The chain's first step. stiffness: of springs [N/m]; stiffer: every second one; heavier: the last vertex."""
+    pins = Pins.model_validate({"at": ["first"], "weight": "exact"})
+    down = Chain(direction=(0.0, -1.0, 0.0))
+    stated = first_problem(scene(down, Springs(rule="fixed", stretch=stiffness), Gravity(), pins, size=17, mass=1.0))
+    mass = stated.system.mass.copy()
+    mass[-1] *= heavier
+    (found,) = stated.system.energies
+    assert isinstance(found, springs.Springs)
+    k = np.where(np.arange(len(found.edges)) % 2, stiffer, 1.0) * found.stiffness
+    energies = (replace(found, stiffness=k),)
+    force = stated.force * (mass / stated.system.mass)[:, None]
+    return replace(stated, system=replace(stated.system, mass=mass, energies=energies), force=force)
+
+
+def iterations(solver: Solver, stated: StepProblem) -> int | None:
+    """How many until all vertices are as near to the minimum as is asked."""
+    end = Newton().prepare(stated.system).solve(stated, StopRule(200, 1e-12)).positions
+    way = float(np.abs(end - stated.current).max())
+    for k, p in enumerate(islice(solver.prepare(stated.system).iterates(stated), MOST), 1):
+        if np.abs(p - end).max() <= LEVEL * way:
+            return k
+    return None
+
+
+def row(name: str, problems: Iterator[StepProblem]) -> list[str]:
+    """Of a method."""
+    found = (iterations(METHODS[name], stated) for stated in problems)
+    return [name, *("–" if k is None else f"{k:,}" for k in found)]
+
+
+def main() -> None:
+    """Print both tables."""
+    columns = tuple(f"{ratio:,.0f}" for ratio in RATIOS)
+    with pinned_threads(1):
+        stiffer, heavier = Table("stiffer springs, by", *columns), Table("a heavier end, by", *columns)
+        for name in METHODS:
+            stiffer.add_row(*row(name, (hanging(1e3, stiffer=ratio) for ratio in RATIOS)))
+            heavier.add_row(*row(name, (hanging(1e5, heavier=ratio) for ratio in RATIOS)))
+        for table in stiffer, heavier:
+            table.box = SIMPLE_HEAD
+            Console(width=120).print(table)
+
+
+if __name__ == "__main__":
+    main()
