@@ -41,19 +41,21 @@ def test_a_steady_drift_cancels_in_each_turn():
         assert Turn(order, (1.0, 1.1, 1.2, 1.3)).log_ratio == pytest.approx(0.0, abs=1e-15)
 
 
-def test_work_is_made_anew_between_turns_in_half_of_the_time_at_most(monkeypatch: pytest.MonkeyPatch):
-    now, renewed = [0.0], list[float]()
+def test_work_is_made_anew_between_turns_in_its_share_of_the_time(monkeypatch: pytest.MonkeyPatch):
+    now, turns, renewed = [0.0], list[None](), list[int]()
 
     def renew() -> None:
-        renewed.append(now[0])
-        now[0] += 3.0
+        renewed.append(len(turns))
+        now[0] += 1.0
 
     monkeypatch.setattr("harness.experiments.gates.abba.perf_counter", lambda: now[0])
+    monkeypatch.setattr("harness.experiments.gates.abba.SHARE", 0.2)
     renewing = Renewing(renew)
-    for _ in range(9):
-        now[0] += 1.0  # a turn
+    for _ in range(12):
+        turns.append(None)
+        now[0] += 1.0
         renewing.after(1.0)
-    assert renewed == [1.0, 6.0, 12.0, 18.0]  # after the first turn, and then when turns took as long as all before
+    assert renewed == [1, 4, 8, 12]  # after the first turn, and then after every fourth: a fifth of the time
 
 
 def test_a_race_makes_the_work_of_both_anew_until_it_knows():

@@ -1,10 +1,10 @@
 """Two programs take turns, A B B A or B A A B by a coin, until the sequential test knows or the budget ends.
 
 A test sees what differs between two running programs, and two of the same code differ a little, by where their memory
-happens to lie (Mytkowicz et al. 2009). So the work of both is made anew between turns, elsewhere in memory, as often as
-takes no longer than the turns do (after Curtsinger and Berger 2013): what places do is noise then, which the coin
-evens out. What a process keeps all its life is left: a slowdown is believed only when a second pair, started anew, is
-found to be slower too.
+happens to lie (Mytkowicz et al. 2009). So the work of both is made anew between turns, elsewhere in memory, in an
+eighth of the time (after Curtsinger and Berger 2013): what places do is noise then, of which there are many draws.
+What a process keeps all its life is left: a slowdown is believed only when a second pair, started anew, is found to
+be slower too. Chance is ruled out by the first pair alone, so that the second needs fewer turns.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from random import Random, SystemRandom
 from time import perf_counter
 from typing import Literal
@@ -21,8 +21,15 @@ from harness.experiments.gates.sequential import RatioInterval, Rule, Verdict, i
 
 ORDERS = ("ABBA", "BAAB")
 
-BUDGET = 120.0
+BUDGET = 240.0
 """Seconds that a gate may take until it says that it cannot tell."""
+
+SHARE = 0.125
+"""Of the time, what making work anew may take. Places make turns differ by 1 to 2 %, other programs by 3 to 7 %: some
+twenty places are as good as hundreds, and turns are what is needed."""
+
+CONFIRMS = 0.05
+"""The error of the race that confirms a first one: both must be wrong for an alarm to be."""
 
 CALL = 0.01
 """Seconds of work that a call should hold: a clock's overhead is nothing then. Longer calls are not steadier: with
@@ -45,14 +52,14 @@ class Racers:
 
 @dataclass(slots=True)
 class Renewing:
-    """Renews racers' work after turns, in half of the time at most, whatever it takes."""
+    """Renews racers' work after turns, in its share of the time, however long it takes."""
 
     renew: Callable[[], None] | None
     _earned: float = 0.0
 
     def after(self, seconds: float) -> None:
         """After a turn of so many seconds."""
-        self._earned += seconds
+        self._earned += SHARE / (1.0 - SHARE) * seconds
         if self.renew and self._earned >= 0.0:
             began = perf_counter()
             self.renew()
@@ -163,14 +170,16 @@ def result(rule: Rule, turns: list[Turn], elapsed: float) -> Result:
 def confirmed(start: Callable[[], AbstractContextManager[Racers]], rule: Rule, *, budget: float = BUDGET) -> Result:
     """A race between programs that `start` starts; one that fails is repeated with programs started anew.
 
-    Where the second race finds otherwise nothing is decided. The budget is that of both together.
+    The second has a larger error of its own (CONFIRMS); where it finds otherwise nothing is decided. The budget is that
+    of both together.
     """
     with start() as racers:
         first = race(racers, rule, budget=budget)
     if first.answer is not Verdict.FAILS:
         return first
     with start() as racers:
-        second = race(racers, rule, budget=max(budget - first.elapsed, 0.0))
+        again = replace(rule, alpha=max(rule.alpha, CONFIRMS))
+        second = race(racers, again, budget=max(budget - first.elapsed, 0.0))
     answer = Verdict.FAILS if second.answer is Verdict.FAILS else Verdict.UNDECIDED
     both, elapsed = (*first.turns, *second.turns), first.elapsed + second.elapsed
     # Each race's interval has its own error; the wider ends hold what both say.

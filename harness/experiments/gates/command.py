@@ -18,7 +18,7 @@ def gate(
     ] = None,
     against: Annotated[str | None, typer.Option(help="A git revision to be no slower than.")] = None,
     name: Annotated[str, typer.Option("-k", help="With --against: the tree's own gates whose name holds this.")] = "",
-    budget: Annotated[float | None, typer.Option(help="Seconds that a gate may take; 120 if left out.")] = None,
+    budget: Annotated[float | None, typer.Option(help="Seconds that a gate may take; 240 if left out.")] = None,
     limit: Annotated[float | None, typer.Option(help="Ratio of times that counts as slower; 1.03 if left out.")] = None,
     clock: Annotated[str | None, typer.Option(help="cpu or wall; what suits the work if left out.")] = None,
     yardstick: Annotated[

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from random import Random
@@ -26,7 +26,7 @@ from scipy.stats import mannwhitneyu
 from harness.base import columns, rows
 from harness.base.errors import InputError
 from harness.base.worker import tie
-from harness.experiments.gates.abba import Renewing, orders
+from harness.experiments.gates.abba import CONFIRMS, Renewing, orders
 from harness.experiments.gates.against import Options, Request, started
 from harness.experiments.gates.pair import Side
 from harness.experiments.gates.sequential import Rule, Verdict
@@ -162,7 +162,7 @@ def replay(starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
     for _ in range(replays):
         answer, spent = _race(rng, starts, slower, rule, budget)
         if answer is Verdict.FAILS:  # which is believed when it comes twice
-            again, more = _race(rng, starts, slower, rule, budget - spent)
+            again, more = _race(rng, starts, slower, replace(rule, alpha=CONFIRMS), budget - spent)
             answer, spent = (Verdict.FAILS if again is Verdict.FAILS else Verdict.UNDECIDED), spent + more
         answers.append(answer)
         seconds.append(spent)

@@ -67,7 +67,7 @@ def live(
     gates: Annotated[int, typer.Option(help="How many gates are held of each run.")] = 100,
     condition: Condition = "nothing",
     limit: Annotated[float, typer.Option(help="The ratio of times from which on something counts as slower.")] = 1.03,
-    budget: Annotated[float, typer.Option(help="Seconds of a gate.")] = 120.0,
+    budget: Annotated[float, typer.Option(help="Seconds of a gate.")] = 240.0,
     sizes: Sizes = None,
     solvers: Solvers = None,
     planted: Planted = 0.0,
@@ -92,7 +92,7 @@ def live(
 def replay(
     samples: Annotated[list[Path], typer.Argument(help="Recorded turns (.parquet).")],
     replays: Annotated[int, typer.Option(help="Comparisons of each kind.")] = 10_000,
-    budget: Annotated[float, typer.Option(help="Seconds of a gate; 300 for slowdowns of 2 %.")] = 120.0,
+    budget: Annotated[float, typer.Option(help="Seconds of a gate; 300 for slowdowns of 2 %.")] = 240.0,
 ) -> None:
     """Print how often gates would have failed, held and not known, beside what others would have said."""
     from rich.table import Table
