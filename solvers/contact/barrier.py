@@ -52,6 +52,13 @@ def law(x):
 
 
 @inner
+def _pushing(gap):
+    """The gap over the range that a pair pushes by: a closed one as if a millionth were left; below 1e-154 b''
+    overflows."""
+    return max(gap, 1e-100) if gap > 0.0 else 1e-6
+
+
+@inner
 def _gap(pairs, e, p):
     """(d - t)/r of pair e."""
     d = distance(p, pairs.vertices[e], e >= pairs.points)
@@ -100,7 +107,7 @@ def add_gradient(pairs, p, out):
         gap = (d / pairs.scale[e] - pairs.thickness) / pairs.reach
         if not gap < 1.0:
             continue
-        b, first, _ = law(max(gap, 1e-6))
+        b, first, _ = law(_pushing(gap))
         r, m = pairs.scale[e] * pairs.reach, 1.0
         f, f1 = pairs.stiffness[e] * r * r * b, pairs.stiffness[e] * r * first
         if pairs.parallel[e] > 0.0:
@@ -153,7 +160,7 @@ def press(pairs, which, p, weights, ways, force):
         gap, m = _gap(pairs, e, p), 1.0
         if pairs.parallel[e] > 0.0:
             m = mollifier(crossed(p, x).c, pairs.parallel[e])[0]
-        force[k] = -m * pairs.stiffness[e] * pairs.scale[e] * pairs.reach * law(max(gap, 1e-6))[1]
+        force[k] = -m * pairs.stiffness[e] * pairs.scale[e] * pairs.reach * law(_pushing(gap))[1]
 
 
 @kernel
@@ -178,7 +185,7 @@ def _curve(pairs, e, p, keep, work, H):
     n, c, g, dc, first, second = work[0], work[1], work[2], work[3], work[4], work[5]
     n[0], n[1], n[2] = z0 / d, z1 / d, z2 / d
     c[0], c[1], c[2], c[3] = c0, c1, c2, c3
-    b, b1, b2 = law(max(gap, 1e-6))
+    b, b1, b2 = law(_pushing(gap))
     r, m, m1, m2 = pairs.scale[e] * pairs.reach, 1.0, 0.0, 0.0
     f, f1, f2 = pairs.stiffness[e] * r * r * b, pairs.stiffness[e] * r * b1, pairs.stiffness[e] * b2
     if pairs.parallel[e] > 0.0:

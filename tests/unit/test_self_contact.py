@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from harness.scenes.intersections import crossings
-from solvers.contact.barrier import Pairs, distances
+from solvers.contact.barrier import Pairs, add_gradient, distances
 from solvers.contact.self_contact import SelfContact
 from solvers.contact.surface import Surface
 from tests.self_contacts import RANGE, THICKNESS, sides, touching, way
@@ -187,6 +187,19 @@ def test_pairs_that_are_near_at_rest_keep_their_distance_in_proportion():
 def _shrunk(by: float):
     _, p, _ = touching(noise=0.0)
     return (p * (by, 1.0, by),)
+
+
+@pytest.mark.parametrize("gap", [1e-2, 1e-5, 1e-7, 1e-9])
+def test_forces_are_the_slope_of_the_value_down_to_gaps_of_round_off(gap: float):
+    p = np.array([[0.2, THICKNESS + gap * RANGE, 0.2], [0, 0, 0], [0, 0, 1], [1, 0, 0]], float)
+    out, x = np.zeros_like(p), (p[0, 1] - THICKNESS) / RANGE
+    add_gradient(pair(False), p, out)
+    slope = (1 - x) * (2 * np.log(x) - (1 - x) / x)
+    assert out[0, 1] == pytest.approx(RANGE * slope, rel=1e-6)
+    closed = p - [[0, 2 * gap * RANGE, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]]
+    out[:] = 0.0
+    add_gradient(pair(False), closed, out)
+    assert -2e6 * RANGE < out[0, 1] < 0.0  # finite, and apart
 
 
 def test_values_are_infinite_where_a_gap_is_closed():
