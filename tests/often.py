@@ -9,8 +9,12 @@ import pytest
 
 
 def often(cases: Iterable[Any], kept: Sequence[Any]) -> list[Any]:
-    """The cases, all but the kept ones marked as long. Raises ValueError for one that is kept and is no case."""
+    """The cases, tuples of several parameters among them, all but the kept ones marked as long.
+
+    Raises ValueError for one that is kept and is no case.
+    """
     cases = list(cases)
     if unknown := [case for case in kept if case not in cases]:
         raise ValueError(f"no such cases: {unknown}")
-    return [case if case in kept else pytest.param(case, marks=pytest.mark.long) for case in cases]
+    values = [(case, case if isinstance(case, tuple) else (case,)) for case in cases]
+    return [pytest.param(*of, marks=() if case in kept else pytest.mark.long) for case, of in values]
