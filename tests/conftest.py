@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
 import tempfile
+from typing import Any
 
 import pytest
+import typer.testing
 from hypothesis import settings
 
 import harness  # noqa: F401  sets what Numba and OpenMP read when they load
@@ -15,6 +18,10 @@ from tests import slow
 # What commands time in tests waits for no other's.
 _LOCKS = tempfile.TemporaryDirectory(prefix="springbench-locks-")
 os.environ["SPRINGBENCH_LOCKS"] = _LOCKS.name
+
+# Of an app, all whose commands hundreds of tests invoke, Typer's runner makes Click's anew each time, in 40 ms.
+_RUNNER: Any = typer.testing
+_RUNNER._get_command = functools.cache(_RUNNER._get_command)
 
 # derandomize: the same examples in every run; no deadline: a slow machine fails no test.
 settings.register_profile("suite", derandomize=True, deadline=None, max_examples=40, database=None)
