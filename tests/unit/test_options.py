@@ -99,7 +99,7 @@ def test_an_error_asked_beside_stated_steps_is_one_run_and_has_no_part_in_the_ot
 
 def test_a_sweep_keeps_to_an_error_and_its_rows_say_what_it_took(folder: Path) -> None:
     (folder / "cloth.yaml").write_text(f"{CLOTH}  - {{kind: gravity}}\n  - {{kind: pins, at: [top_corners]}}\n")
-    (folder / "sweep.yaml").write_text(SWEEP.format("dormand-prince-8, xpbd", "accuracy: 1e-3"))
+    (folder / "sweep.yaml").write_text(SWEEP.format("dormand-prince-8, xpbd", "accuracy: 1e-3, pictures: false"))
     done = CliRunner().invoke(app, ["run", str(folder / "sweep.yaml"), "--here", "--results", str(folder / "results")])
     assert done.exit_code == 1, done.output
     assert "xpbd: tells no error of its steps" in done.output
