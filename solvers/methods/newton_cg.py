@@ -5,9 +5,8 @@
 For springs Q majorises H, so that the eigenvalues of Q^-1 H are at most 1. Conjugate gradients end where they meet
 negative curvature, with what they have: from the first direction of all that is -Q^-1 g, a local-global iteration.
 
-Contact is far stiffer than Q, on a few vertices. There P = S Q S takes the place of Q, with S_i = (I + W_i/Q_ii)^(1/2)
-of the blocks W_i that it adds to H: on these vertices P is Q + W but for what couples them, and it is Q on all others.
-An iteration settles friction, and may be several steps, as that of Newton's method.
+What else may precondition it, and what takes the place of Q where something is touched, `solvers.core.preconditioning`
+tells. An iteration settles friction, and may be several steps, as that of Newton's method.
 """
 
 from __future__ import annotations
@@ -17,13 +16,12 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from solvers.about import About, Reference
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import Hessian, StepObjective
-from solvers.energies.elements import add_blocks
+from solvers.core.preconditioning import Preconditioner, Preconditioning, Scaled, preconditioning
 from solvers.kernels import conjugate
 from solvers.linear.inverse import Inverse
 from solvers.linear.krylov import CURVED, Iteration
@@ -44,7 +42,10 @@ _MOST = 1000
 
 @dataclass(frozen=True)
 class NewtonCG:
-    """Newton's method without a factor of the Hessian: it needs the memory of local-global."""
+    """Newton's method without a factor of the Hessian: it needs the memory of local-global.
+
+    preconditioner: of conjugate gradients; `solvers.core.preconditioning` tells them.
+    """
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
@@ -58,85 +59,31 @@ class NewtonCG:
         ),
     )
 
+    preconditioner: Preconditioning = "factor"
+
     def prepare(self, system: System) -> PreparedDescent:
-        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
+        """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere, and for
+        blocks of energies without elements."""
         metric = Metric(system)
         objective = Objective(system)
-        choice = metric.choice + objective.interpreted
-        return PreparedDescent(objective, metric, TruncatedNewton(metric, objective), choice, metric.facts)
-
-
-Preconditioner = Callable[[Positions], Positions]
-"""Gradients [N] to displacements [m], both (n, 3)."""
-
-
-class Scaled:
-    """(S Q S)^-1 with S_i = (I + W_i/Q_ii)^(1/2) for some vertices, I for all others.
-
-    shrunk: these vertices (c,), and S_i^-1 (c, 3, 3)."""
-
-    def __init__(self, metric: Metric, vertices: NDArray[np.int64], blocks: NDArray[np.float64]) -> None:
-        """blocks: W (c, 3, 3) [N/m] of vertices (c,), positive semidefinite."""
-        self._metric, system = metric, metric.system
-        resists = np.full(system.vertices, np.inf)
-        resists[system.free] = metric.diagonal
-        size, axes = np.linalg.eigh(blocks)
-        shrunk = (1.0 + np.maximum(0.0, size) / resists[vertices, None]) ** -0.5
-        self.shrunk = vertices, (axes * shrunk[:, None, :]) @ axes.transpose(0, 2, 1)
-
-    def __call__(self, b: Positions) -> Positions:
-        """(S Q S)^-1 b, (n, 3)."""
-        scaled = b.copy()
-        self._shrink(scaled)
-        x = self._metric.solve(scaled)
-        self._shrink(x)
-        return x
-
-    def _shrink(self, x: Positions) -> None:
-        vertices, root = self.shrunk
-        x[vertices] = np.einsum("vij,vj->vi", root, x[vertices])
-
-
-def preconditioned(metric: Metric, step: StepObjective, p: Positions) -> tuple[Hessian, Preconditioner]:
-    """The Hessian at p (n, 3), and what preconditions it there: Q^-1, or (S Q S)^-1 where something is touched."""
-    hessian = step.hessian(p)
-    beyond = step.touched or any(len(blocks.vertices) for blocks in hessian.pairs)
-    return hessian, Scaled(metric, *_beyond(step, hessian, len(p))) if beyond else metric.solve
-
-
-def _beyond(step: StepObjective, hessian: Hessian, n: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """What elements that are in no Q add to the blocks of n vertices: which (c,), and the blocks (c, 3, 3) [N/m]."""
-    blocks, acted = np.zeros((n, 3, 3)), np.zeros(n, np.bool_)
-    for one, curvature in zip(step.stated, hessian.curvature, strict=True):
-        if not one.projective:
-            k = one.elements.vertices.shape[1]
-            places = np.full((len(curvature), k * k), -1)
-            places[:, :: k + 1] = one.elements.vertices
-            add_blocks(one.elements, places, curvature, blocks)
-            acted[one.elements.vertices] = True
-    for pairs in hessian.pairs:
-        k = pairs.vertices.shape[1]
-        places = np.full((len(pairs.vertices), k * k), -1)
-        places[:, :: k + 1] = pairs.vertices
-        pairs.add(places, blocks)
-        acted[pairs.vertices] = True
-    acted &= blocks.any(axis=(1, 2))
-    return np.flatnonzero(acted), blocks[acted]
+        method = TruncatedNewton(metric, objective, self.preconditioner)
+        return PreparedDescent(objective, metric, method, metric.choice + objective.interpreted, metric.facts)
 
 
 class TruncatedNewton:
     """The iteration for one system. compiled: its conjugate gradients in one kernel, None where that cannot be."""
 
-    def __init__(self, metric: Metric, objective: Objective) -> None:
-        self._metric = metric
-        self.compiled = _Compiled(objective, factor) if (factor := _known(metric)) else None
+    def __init__(self, metric: Metric, objective: Objective, by: Preconditioning = "factor") -> None:
+        self._metric, self._at = metric, preconditioning(by, metric, objective, "newton-cg")
+        factor = _known(metric) if by == "factor" else None
+        self.compiled = _Compiled(objective, factor) if factor else None
         self._settling = settling_for(metric)
 
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
         """The points after `start`."""
         loose = _TOUCHED if step.touched else _LOOSE
         point, eta = self._settling.start(step, start) if self._settling and step.touched else start, loose
-        hessian, solve = preconditioned(self._metric, step, point.positions)
+        hessian, solve = self._at(step, point.positions)
         descent = solve(point.gradient)
         while not point.stalled:
             found = None
@@ -146,7 +93,7 @@ class TruncatedNewton:
             if found is None:
                 yield point._replace(stalled=True)
                 return
-            hessian, solve = preconditioned(self._metric, step, found.positions)
+            hessian, solve = self._at(step, found.positions)
             before, descent = dot(point.gradient, descent), solve(found.gradient)
             # The safeguard of Eisenstat and Walker: eta falls no faster than its own square.
             following = 0.9 * dot(found.gradient, descent) / before
@@ -160,7 +107,7 @@ class TruncatedNewton:
             return search(step, at, direction)
 
         def following(point: Point) -> Positions:
-            hessian, solve = preconditioned(self._metric, step, point.positions)
+            hessian, solve = self._at(step, point.positions)
             return self._direction(step, hessian, solve, point, solve(point.gradient), eta)
 
         return self._settling.search(step, at, direction, following)
@@ -170,12 +117,12 @@ class TruncatedNewton:
         return True
 
     def phases(self, step: StepObjective, at: Point) -> dict[str, Callable[[], object]]:
-        """The gradient, a product with the Hessian, and a solve with Q."""
-        hessian = step.hessian(at.positions)
+        """The gradient, a product with the Hessian, and what preconditions it."""
+        hessian, solve = self._at(step, at.positions)
         return {
             "gradient": lambda: step.gradient(at.positions),
             "product": lambda: hessian.multiply(at.gradient),
-            "solve": lambda: self._metric.solve(at.gradient),
+            "solve": lambda: solve(at.gradient),
         }
 
     def _direction(

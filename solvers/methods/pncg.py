@@ -7,7 +7,7 @@ who precondition by the Hessian's diagonal, as there is no Q in interior-point e
 
 H d is a product, element by element. Where d does not descend, or the model curves downwards along it, d is -z again: a
 local-global iteration. A step that brings too little is halved, and none passes through what is bounded. Where surfaces
-touch, P = S Q S takes the place of Q (`solvers.methods.newton_cg.Scaled`). Contact of single vertices it refuses: that
+touch, P = S Q S takes the place of Q (`solvers.core.preconditioning`). Contact of single vertices it refuses: that
 begins at once and grips within a hundred-millionth of a metre, so that a quadratic model holds for no step along d,
 and sheets that landed took 340 to 2,600 iterations where L-BFGS took 23 to 135.
 """
@@ -26,13 +26,16 @@ from solvers.core.descent import Metric, Point, dot, search
 from solvers.core.driver import Iterating, Iterative, largest
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
-from solvers.methods.newton_cg import preconditioned
+from solvers.core.preconditioning import At, Preconditioning, preconditioning
 from solvers.problem import Positions, StepProblem, System, Unsupported
 
 
 @dataclass(frozen=True)
 class NonlinearCG:
-    """Preconditioned nonlinear conjugate gradients: takes all energies, with the memory of local-global."""
+    """Preconditioned nonlinear conjugate gradients: takes all energies, with the memory of local-global.
+
+    preconditioner: `solvers.core.preconditioning` tells them.
+    """
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
@@ -46,16 +49,19 @@ class NonlinearCG:
         ),
     )
 
+    preconditioner: Preconditioning = "factor"
+
     def prepare(self, system: System) -> PreparedPncg:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported for contact of single
-        vertices and where Q fits nowhere."""
+        vertices, where Q fits nowhere, and for blocks of energies without elements."""
         if without_contact(system) is not system:
             raise Unsupported(
                 "pncg: no quadratic model holds along a direction where single vertices begin to press and grip "
                 "(Contact); take lbfgs or newton, or state surface-contact"
             )
         metric, objective = Metric(system), Objective(system)
-        return PreparedPncg(metric, objective, metric.choice + objective.interpreted, metric.facts)
+        at = preconditioning(self.preconditioner, metric, objective, "pncg")
+        return PreparedPncg(metric, objective, at, metric.choice + objective.interpreted, metric.facts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,41 +70,42 @@ class PreparedPncg(Iterative):
 
     metric: Metric
     objective: Objective
+    at: At
     choice: str
     facts: dict[str, float]
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """See Iterative."""
-        return _Iterating(self.metric, StepObjective(self.objective, problem), guess)
+        return _Iterating(self.metric, self.at, StepObjective(self.objective, problem), guess)
 
     def scale(self, problem: StepProblem) -> float:
         """See Iterative."""
         return largest(problem) * self.metric.trace**0.5
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """The gradient, a product with the Hessian, and a solve with Q, at the first guess."""
+        """The gradient, a product with the Hessian, and what preconditions it, at the first guess."""
         step = StepObjective(self.objective, problem)
         p = step.placed(problem.first_guess)
-        hessian, gradient = step.hessian(p), step.gradient(p)
+        (hessian, solve), gradient = self.at(step, p), step.gradient(p)
         return {
             "gradient": lambda: step.gradient(p),
             "product": lambda: hessian.multiply(gradient),
-            "solve": lambda: self.metric.solve(gradient),
+            "solve": lambda: solve(gradient),
         }
 
 
 class _Iterating(Iterating):
     """From point to point, with the direction that led to the last one."""
 
-    def __init__(self, metric: Metric, step: StepObjective, guess: Positions) -> None:
-        self._metric, self._step = metric, step
+    def __init__(self, metric: Metric, preconditioned: At, step: StepObjective, guess: Positions) -> None:
+        self._metric, self._preconditioned, self._step = metric, preconditioned, step
         p = step.placed(guess)
         self._came, self._beta = np.zeros_like(p), 0.0
         self._arrive(Point(p, step.gradient(p)))
 
     def _arrive(self, at: Point) -> None:
         self._at, self.positions = at, at.positions
-        self._hessian, self._solve = preconditioned(self._metric, self._step, at.positions)
+        self._hessian, self._solve = self._preconditioned(self._step, at.positions)
         self._z = self._solve(at.gradient)
 
     def advance(self) -> bool:

@@ -1,0 +1,140 @@
+"""A multilevel additive Schwarz preconditioner: dense inverses of small patches (Wu, Wang and Wang 2022).
+
+    S = sum over levels l of P_l diag(B_l^-1) P_l'        B_l: the diagonal blocks, PATCH nodes each, of P_l'A P_l
+
+A is of 3 x 3 blocks. The nodes of level 0 are its rows of them, in an order in which neighbours make patches. A patch
+of one level moves as one and is a node of the next, so that node i of a level is part of node i // PATCH of the next
+one, and no lists are needed. S is symmetric, and positive definite where A is; it costs products with dense matrices.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from solvers.compiling import kernel
+from solvers.problem import Positions
+
+PATCH = 32
+"""Nodes of a patch: as many as threads of a device go together."""
+
+
+class Patches:
+    """Where in patches the blocks of a matrix lie. order (f,): its rows, in patches."""
+
+    def __init__(self, graph: csr_array, order: NDArray[np.int64]) -> None:
+        """graph (f, f): the pattern of blocks."""
+        self.order, n, entries = order, len(order), graph.nnz
+        place = np.empty(n, np.int64)
+        place[order] = np.arange(n)
+        i, j = place[np.repeat(np.arange(n), np.diff(graph.indptr))], place[graph.indices]
+        self._levels = list[tuple[int, csr_array]]()
+        while True:
+            inside = np.flatnonzero(i // PATCH == j // PATCH)
+            at, patches = i[inside] * PATCH + j[inside] % PATCH, -(-n // PATCH)
+            ones = np.ones(len(inside))
+            self._levels.append((n, csr_array((ones, (at, inside)), shape=(patches * PATCH**2, entries))))
+            if n <= PATCH:
+                break
+            i, j, n = i // PATCH, j // PATCH, patches
+
+    def inverted(self, blocks: NDArray[np.float64]) -> Schwarz:
+        """S of the matrix with these blocks (b, 3, 3), positive definite."""
+        inverses = list[NDArray[np.float64]]()
+        for n, places in self._levels:
+            dense = (places @ blocks.reshape(-1, 9)).reshape(-1, PATCH, PATCH, 3, 3)
+            dense = dense.transpose(0, 1, 3, 2, 4).reshape(-1, 3 * PATCH, 3 * PATCH)
+            spare = np.arange(3 * n, len(dense) * 3 * PATCH)
+            at = spare // (3 * PATCH), spare % (3 * PATCH), spare % (3 * PATCH)
+            dense[at] = 1.0
+            found = np.linalg.inv(dense)
+            found[at] = 0.0
+            inverses.append(0.5 * (found + found.transpose(0, 2, 1)))
+        return Schwarz(self.order, inverses)
+
+
+class Schwarz:
+    """S. inverses: of each level, (patches, 3 PATCH, 3 PATCH), zero beyond its last node."""
+
+    def __init__(self, order: NDArray[np.int64], inverses: list[NDArray[np.float64]]) -> None:
+        self._order, self.inverses = order, inverses
+
+    def solve(self, b: Positions) -> Positions:
+        """S b, (f, 3)."""
+        n, r = len(b), b[self._order]
+        x, out = np.zeros_like(r), np.empty_like(r)
+        for level, inverses in enumerate(self.inverses):
+            padded = np.zeros((len(inverses) * PATCH, 3))
+            padded[: len(r)] = r
+            moved = inverses @ padded.reshape(-1, 3 * PATCH, 1)
+            x += np.repeat(moved.reshape(-1, 3), PATCH**level, axis=0)[:n]
+            r = padded.reshape(-1, PATCH, 3).sum(axis=1)
+        out[self._order] = x
+        return out
+
+
+def ordered(Q: csr_array) -> NDArray[np.int64]:
+    """The vertices (f,), such that each PATCH of them that follow each other are neighbours, and so are each PATCH of
+    such patches, and so on."""
+    orders, graph = list[NDArray[np.int64]](), csr_array(Q)
+    while (n := len(graph.indptr) - 1) > PATCH:
+        order = np.empty(n, np.int64)
+        grow(np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int64), order, *np.zeros((3, n), int))
+        orders.append(order)
+        of = np.empty(n, np.int64)
+        of[order] = np.arange(n) // PATCH
+        P = _merging(of)
+        graph = csr_array(P.T @ abs(graph) @ P)
+    whole = np.arange(len(graph.indptr) - 1)
+    for order in reversed(orders):
+        at = PATCH * whole[:, None] + np.arange(PATCH)
+        whole = order[at[at < len(order)]]
+    return whole
+
+
+def _merging(of: NDArray[np.int64]) -> csr_array:
+    """P (n, N) that moves each node as the one `of` (n,) that it is part of."""
+    return csr_array((np.ones(len(of)), (np.arange(len(of)), of)))
+
+
+@kernel
+def grow(pointers, neighbours, order, state, queue, border):
+    """Write an order (n,) of the nodes of a graph in which patches grow outwards from where others ended.
+
+    state, queue, border (n,): scratch, zero at first. state: 0 for a node that is not reached, 1 in the queue of this
+    patch, 2 at the border of one before, 3 in the order.
+    """
+    n, done, first, left, right = len(order), 0, 0, 0, 0
+    while done < n:
+        head, tail, most = 0, 0, min(n, done + PATCH)
+        while done < most:
+            if head == tail:
+                seed = -1
+                while left < right and seed < 0:
+                    if state[border[left]] == 2:
+                        seed = border[left]
+                    left += 1
+                while seed < 0:
+                    if state[first] != 3:
+                        seed = first
+                    first += 1
+                head, tail = 0, 1
+                queue[0], state[seed] = seed, 1
+            v = queue[head]
+            head += 1
+            state[v] = 3
+            order[done] = v
+            done += 1
+            for e in range(pointers[v], pointers[v + 1]):
+                w = neighbours[e]
+                if state[w] == 0 or state[w] == 2:
+                    state[w] = 1
+                    queue[tail] = w
+                    tail += 1
+        for k in range(head, tail):
+            v = queue[k]
+            state[v] = 2
+            if right < n:
+                border[right] = v
+                right += 1

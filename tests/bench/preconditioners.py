@@ -1,0 +1,70 @@
+"""What conjugate gradients are preconditioned by: iterations, and products with the Hessian, of each preconditioner.
+
+    python -m tests.bench.preconditioners [SCENE ...]
+
+Scenes of `configs/hessians`, three steps each, to residuals of 1e-6, by `newton-cg` and `pncg`. A cell is iterations,
+and of `newton-cg` the products with the Hessian that these took, which are what a step costs but for the
+preconditioner. What did not get there in all steps is marked by >. All are exact counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import get_args
+from unittest.mock import patch
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from harness.base.machine import pinned_threads
+from harness.config.load import load_scene
+from harness.scenes.bind import build
+from harness.simulation.step import prepare, simulate
+from solvers.core.objective import Hessian
+from solvers.core.preconditioning import Preconditioning
+from solvers.methods import newton_cg
+from solvers.methods.newton_cg import NewtonCG
+from solvers.methods.pncg import NonlinearCG
+from solvers.problem import Positions, Solver, StopRule
+
+FOLDER = Path(__file__).parents[2] / "configs" / "hessians"
+SCENES = tuple(FOLDER / f"{name}-pressed-0.yaml" for name in ("block", "cloth-100", "cloth-1e4"))
+STOP = StopRule(5000, 1e-6)
+NAMES: tuple[Preconditioning, ...] = get_args(Preconditioning)
+
+
+def told(path: Path, solver: Solver) -> str:
+    """The cell of a scene and a solver."""
+    spec = load_scene(path)
+    made = build(spec, spec.default_size or 0)
+    products, multiply = [0], Hessian.multiply
+
+    def counting(self: Hessian, x: Positions) -> Positions:
+        products[0] += 1
+        return multiply(self, x)
+
+    iterations, ended = 0, True
+    with patch.object(Hessian, "multiply", counting), patch.object(newton_cg, "_known", lambda metric: None):
+        for step in simulate(made, prepare(made, solver), STOP, first_guess="current", frames=spec.frames):
+            iterations += step.solution.iterations
+            ended &= step.solution.stopped != "iterations"
+    took = f"{'' if ended else '>'}{iterations}"
+    return took if isinstance(solver, NonlinearCG) else f"{took}, {products[0]}"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("scenes", nargs="*", type=Path, default=SCENES, metavar="SCENE")
+    table = Table("scene", "solver", *NAMES, box=SIMPLE_HEAD)
+    with pinned_threads(1):
+        for path in parser.parse_args().scenes:
+            for name, solver in (("newton-cg", NewtonCG), ("pncg", NonlinearCG)):
+                table.add_row(path.stem, name, *(told(path, solver(preconditioner=by)) for by in NAMES))
+    Console(width=120).print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,207 @@
+"""Preconditioners of conjugate gradients: what each is, that it leads to the same minima, and which takes longer."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.sparse import bsr_array, csr_array
+
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.simulation.step import prepare, simulate
+from solvers.core.descent import Metric, PreparedDescent
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import Hessian, StepObjective
+from solvers.core.preconditioning import Preconditioning, diagonal_blocks
+from solvers.core.saddles import certified
+from solvers.linear.schwarz import PATCH, Patches, Schwarz, ordered
+from solvers.methods.newton import Newton
+from solvers.methods.newton_cg import NewtonCG
+from solvers.methods.pncg import NonlinearCG
+from solvers.problem import Positions, StepProblem, StopRule, Unsupported
+from tests.effects import SCENES, stepped
+from tests.scenes import cloth, first_problem, scene
+from tests.unit.test_surface_contact import BALL, contact, draped, intersections
+
+OTHERS: list[Preconditioning] = [name for name in get_args(Preconditioning) if name != "factor"]
+others = pytest.mark.parametrize("name", OTHERS)
+METHODS = {"newton-cg": NewtonCG, "pncg": NonlinearCG}
+
+
+def made(size: int, stretch: float = 300.0) -> tuple[csr_array, Schwarz, NDArray[np.int64], NDArray[np.float64]]:
+    """The clamped Hessian (3f, 3f) of a cloth that was disturbed, its S, the order, and its diagonal blocks."""
+    stated = first_problem(cloth(size, "exact", stretch))
+    step = StepObjective(Objective(stated.system), stated)
+    p = step.placed(stated.current + 0.1 / size * np.random.default_rng(0).normal(size=stated.current.shape))
+    matrix = step.hessian(p).convex()
+    order = ordered(matrix.graph)
+    bsr = bsr_array((matrix.values, matrix.graph.indices, matrix.graph.indptr))
+    blocks = matrix.values[matrix.places.diagonal[stated.system.free]]
+    return csr_array(bsr), Patches(matrix.graph, order).inverted(matrix.values), order, blocks
+
+
+def by_levels(A: csr_array, order: NDArray[np.int64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The sum over levels of P B^-1 P' b, (3f, k), by its formula."""
+    f = len(order)
+    nodes, out = np.argsort(order), np.zeros_like(b)
+    while True:
+        of = (3 * nodes[:, None] + np.arange(3)).ravel()
+        P = csr_array((np.ones(3 * f), (np.arange(3 * f), of)))
+        M, r = csr_array(P.T @ csr_array(A @ P)).toarray(), np.asarray(P.T @ b)
+        moved = np.zeros_like(r)
+        for first in range(0, len(M), 3 * PATCH):
+            some = slice(first, first + 3 * PATCH)
+            moved[some] = np.linalg.solve(M[some, some], r[some])
+        out += P @ moved
+        if len(M) <= 3 * PATCH:
+            return out
+        nodes = nodes // PATCH
+
+
+@pytest.mark.parametrize(("size", "levels"), [(4, 1), (12, 2), (33, 3)])
+def test_schwarz_is_the_sum_of_its_levels(size, levels):
+    A, S, order, _ = made(size)
+    assert len(S.inverses) == levels
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(order)))
+    b = np.random.default_rng(1).normal(size=(len(order), 3))
+    wanted = by_levels(A, order, b.reshape(-1, 1)).reshape(-1, 3)
+    np.testing.assert_allclose(S.solve(b), wanted, rtol=0, atol=1e-10 * np.abs(wanted).max())
+
+
+def whole(S: Schwarz, f: int) -> NDArray[np.float64]:
+    """S as a dense matrix (3f, 3f)."""
+    return np.column_stack([S.solve(unit.reshape(-1, 3)).ravel() for unit in np.eye(3 * f)])
+
+
+def condition(A: NDArray[np.float64], S: NDArray[np.float64]) -> float:
+    """Of S A, whose eigenvalues are those of L'S L, A = L L'."""
+    L = np.linalg.cholesky(A)
+    size = np.linalg.eigvalsh(L.T @ S @ L)
+    return float(size[-1] / size[0])
+
+
+def test_schwarz_is_symmetric_positive_definite_and_better_than_blocks_on_stiff_cloth():
+    A, S, order, blocks = made(12, 1e5)
+    found, dense = whole(S, len(order)), A.toarray()
+    np.testing.assert_allclose(found, found.T, rtol=0, atol=1e-12 * np.abs(found).max())
+    assert np.linalg.eigvalsh(found).min() > 0.0
+    jacobi = block_diag(*np.linalg.inv(blocks))
+    assert condition(dense, found) < 0.5 * condition(dense, jacobi)
+
+
+def test_patches_are_of_neighbours():
+    """Most of a cloth's neighbours are in the same patch, whatever parts it has, and all vertices are in one."""
+    graph = metric(33).inner
+    for some in (graph, csr_array(block_diag(graph.toarray(), np.eye(70), graph.toarray()[:40, :40]))):
+        order, ends = ordered(some), some.tocoo()
+        np.testing.assert_array_equal(np.sort(order), np.arange(len(order)))
+        place = np.argsort(order) // PATCH
+        apart = ends.row != ends.col
+        assert (place[ends.row] == place[ends.col])[apart].mean() > 0.6
+
+
+def metric(size: int) -> Metric:
+    return Metric(first_problem(cloth(size, "exact")).system)
+
+
+def given(scene: str) -> StepProblem:
+    return stepped(SCENES[scene]())
+
+
+@pytest.mark.parametrize("scene", [s for s in SCENES if "gas" not in s])
+def test_diagonal_blocks_are_those_of_the_clamped_matrix(scene):
+    stated = given(scene)
+    step = StepObjective(Objective(stated.system), stated)
+    p = step.placed(stated.current)
+    hessian = step.hessian(p)
+    matrix = hessian.convex()
+    wanted = matrix.values[matrix.places.diagonal[stated.system.free]]
+    np.testing.assert_allclose(diagonal_blocks(step, hessian, p), wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
+
+
+@others
+@pytest.mark.parametrize("method", METHODS)
+def test_the_minimum_is_that_of_newtons_method(method, name):
+    stated = given("all that are projective")
+    wanted = Newton().prepare(stated.system).solve(stated, StopRule(200)).positions
+    solution = METHODS[method](preconditioner=name).prepare(stated.system).solve(stated, StopRule(3000, 1e-9))
+    assert solution.stopped != "iterations"
+    np.testing.assert_allclose(solution.positions, wanted, rtol=0, atol=1e-7)
+
+
+@others
+def test_what_lies_on_a_floor_is_at_a_minimum(name):
+    """Which of them, friction leaves to the way there."""
+    stated = given("contact")
+    p = NewtonCG(preconditioner=name).prepare(stated.system).solve(stated, StopRule(500, 1e-9)).positions
+    assert np.abs(stated.gradient(p)).max() <= 1e-6 * np.abs(stated.gradient(stated.current)).max()
+    step = StepObjective(Objective(stated.system), stated)
+    assert certified(step, step.placed(p))
+
+
+@pytest.mark.parametrize(("method", "name"), [*(("newton-cg", name) for name in OTHERS), ("pncg", "block-jacobi")])
+def test_a_sheet_that_lies_on_a_ball_is_held_by_it(method, name):
+    made = draped(BALL, size=6)
+    rule, ends = StopRule(2000, 1e-8), list[Positions]()
+    for solver in (Newton(), METHODS[method](preconditioner=name)):
+        *_, last = simulate(made, prepare(made, solver), rule, first_guess="current", frames=9)
+        assert intersections(made, last.positions, made.time(last.index)) == 0
+        assert last.solution.stopped != "iterations"
+        ends.append(last.positions)
+    assert contact(made).blocks(ends[0]).vertices.size
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-6)
+
+
+def products(prepared: PreparedDescent, stated: StepProblem, monkeypatch: pytest.MonkeyPatch) -> int:
+    """With the Hessian, in a solve to 1e-6."""
+    count, multiply = [0], Hessian.multiply
+
+    def counting(self: Hessian, x: Positions) -> Positions:
+        count[0] += 1
+        return multiply(self, x)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Hessian, "multiply", counting)
+        assert prepared.solve(stated, StopRule(500, 1e-6)).stopped == "tolerance"
+    return count[0]
+
+
+def test_schwarz_takes_fewer_iterations_of_conjugate_gradients_than_blocks_on_stiff_cloth(monkeypatch):
+    stated = first_problem(cloth(24, "exact", 1e5))
+    found: dict[str, int] = {}
+    for name in OTHERS:
+        prepared = NewtonCG(preconditioner=name).prepare(stated.system)
+        assert isinstance(prepared, PreparedDescent)
+        found[name] = products(prepared, stated, monkeypatch)
+    assert found["schwarz"] < 0.5 * found["block-jacobi"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@others
+def test_energies_without_elements_are_refused_by_name(method, name):
+    stated = given("gas")
+    with pytest.raises(Unsupported, match=f"{method}, preconditioner: {name}.*Gas.*take preconditioner: factor"):
+        METHODS[method](preconditioner=name).prepare(stated.system)
+
+
+def test_nothing_is_solved_for_where_all_is_held():
+    stated = first_problem(scene(Chain(), Springs(stretch=1.0), Pins(at=("ends",), weight="exact"), size=2))
+    for name in OTHERS:
+        solution = NewtonCG(preconditioner=name).prepare(stated.system).solve(stated, StopRule(3))
+        np.testing.assert_array_equal(solution.positions, stated.current)
+
+
+def test_blocks_take_the_memory_of_local_global():
+    """Nothing looks for the structure of a Hessian's factor."""
+    stated = first_problem(cloth(6, "exact"))
+    prepared = NewtonCG(preconditioner="block-jacobi").prepare(stated.system)
+    assert isinstance(prepared, PreparedDescent)
+    prepared.solve(stated, StopRule(2))
+    for phase in prepared.phases(stated).values():
+        phase()
+    assert "matrix" not in vars(prepared.objective)
