@@ -23,6 +23,7 @@ from harness.base.blame import where
 from harness.base.child import data, limit
 from harness.base.console import write_plainly
 from harness.base.errors import SpringbenchError
+from solvers.device import broken
 
 Tick = Callable[[str], None]
 Piece = Callable[[Tick], Any]
@@ -47,7 +48,8 @@ class Limits(NamedTuple):
 
 
 class PieceOutcome(NamedTuple):
-    """What a piece returned, or its error, or in words how it left; clean: whether it left nothing behind."""
+    """What a piece returned, or its error, or in words how it left; clean: whether it left nothing behind, a
+    broken device among it."""
 
     value: Any
     error: SpringbenchError | str = ""
@@ -102,11 +104,11 @@ def _answer(piece: Piece, limits: Limits, tick: Tick) -> PieceOutcome:
     try:
         value: Any = piece(tick)
     except SpringbenchError as error:
-        return PieceOutcome(None, error)
+        return PieceOutcome(None, error, clean=not broken())
     except BaseException as error:  # SystemExit and GeneratorExit too: whoever called is not to leave
         said = " ".join(str(error).split())[:300]
         why = f"raised {type(error).__name__}{f': {said}' if said else ''} ({where(error, ())})"
-        return PieceOutcome(None, why, clean=isinstance(error, Exception))
+        return PieceOutcome(None, why, clean=isinstance(error, Exception) and not broken())
     finally:
         limit(resource.RLIMIT_DATA, resource.RLIM_INFINITY)
-    return PieceOutcome(value, clean=threading.active_count() <= before)
+    return PieceOutcome(value, clean=threading.active_count() <= before and not broken())

@@ -63,7 +63,7 @@ def _solver(document: Document, entry: str | dict[str, Any], at: Key) -> SolverS
         document.report(str(error), at)
     if own:
         return SolverSpec(name, asked)  # as `list` has them
-    found: dict[str, Any] = parameters.model_dump(mode="json")
+    found: dict[str, Any] = _stated(solver, parameters)
     if kept is not None:
         _keep(kept, found)
     return SolverSpec(name, found)
@@ -76,6 +76,13 @@ def parameters_model(name: str, solver: type) -> type[Model]:
         f.name: (hints[f.name], ... if f.default is MISSING else f.default) for f in fields(solver)
     }
     return create_model(name, __base__=Model, __doc__=solver.__doc__, **given)
+
+
+def _stated(solver: type, parameters: Model) -> dict[str, Any]:
+    """What rows and hashes tell of parameters: all but what the solver leaves unstated where it is as usual."""
+    unstated: frozenset[str] = getattr(solver, "unstated", frozenset())
+    usual = {name for name in unstated if getattr(parameters, name, None) == getattr(solver, name, None)}
+    return parameters.model_dump(mode="json", exclude=usual)
 
 
 def _kept_file(name: str) -> Path:

@@ -41,7 +41,7 @@ from harness.simulation.clock import measured_again
 from harness.simulation.measure import Measured, Settings, digest, measure
 from harness.simulation.observe import observe, require_numbers
 from harness.simulation.step import prepare
-from solvers import sources
+from solvers import device, sources
 from solvers.problem import Positions, Solver
 from solvers.registry import SOLVERS, load, minimises
 
@@ -95,7 +95,7 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None, turn
     require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=isinstance(run.tolerance, float))
     stands = _standing(run)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
-    facts |= {"choice": measured.prepared.choice} | stands | how
+    facts |= {"choice": measured.prepared.choice} | device.told(measured.prepared) | stands | how
     return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
 
 

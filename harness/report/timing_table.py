@@ -99,13 +99,20 @@ def _stated(run: RunTimes) -> dict[str, Any]:
 def labels(found: Sequence[RunTimes]) -> dict[str, str]:
     """By run id, the solver's name and those of its settings in which the solver's runs of the scene differ; and the
     machine where there are several, so that no line in a plot and no row stands for two."""
-    settings = {run.run_id: _stated(run) | json.loads(run.parameters or "{}") for run in found}
+    parameters: dict[str, dict[str, Any]] = {run.run_id: json.loads(run.parameters or "{}") for run in found}
+    settings = {run.run_id: _stated(run) | parameters[run.run_id] for run in found}
     places = machine_names((run.machine, run.node) for run in found)
     on = {run.run_id: places.get((run.machine, run.node), "unknown") for run in found if len(places) > 1}
     values: dict[tuple[str, str, str], set[str]] = defaultdict(set)
+    stated: dict[tuple[str, str], set[str]] = defaultdict(set)
     for run in found:
+        stated[run.scene, run.solver] |= parameters[run.run_id].keys()
         for key, value in settings[run.run_id].items():
             values[run.scene, run.solver, key].add(str(value))
+    for run in found:  # what some state and others leave out, for they have it as usual
+        own = parameters[run.run_id]
+        for key in stated[run.scene, run.solver] - own.keys() if own else ():
+            values[run.scene, run.solver, key].add("")
     return {
         run.run_id: ", ".join(
             [run.solver]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from time import perf_counter
 
@@ -21,6 +21,7 @@ from harness.scenes.bind import Scene
 from harness.simulation.algebraic import Stop
 from harness.simulation.clock import Clock, Watch, working
 from harness.simulation.contract import Contract
+from harness.simulation.replayed import Replayed, is_remote
 from harness.simulation.step import Step, prepare, simulate, start
 from solvers.problem import Positions, Prepared, Solver
 
@@ -50,13 +51,15 @@ class StepFailed(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """One measured time: phase, frame (None where it has none), round, wall seconds of each of so many calls."""
+    """One measured time: phase, frame (None where it has none), round, wall seconds of each of so many calls;
+    device: of a step on a device, its times there by events, as columns."""
 
     phase: str
     frame: int | None
     round: int
     seconds: float
     calls: int = 1
+    device: dict[str, float] = field(default_factory=dict[str, float])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +109,10 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
         timings.append(Timing("prepare", None, round, seconds))
     assert prepared is not None
 
+    replayed = Replayed(prepared) if is_remote(prepared) else None
     for step in steps(scene, contract.checked(prepared), settings):
+        if replayed:
+            replayed.keep(step)
         phases = working(prepared, step.problem)
         for phase, call in phases.items():
             with watch(phase):
@@ -126,8 +132,9 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
     final = start(scene).now.positions
     for round in range(settings.rounds):
         clock = Clock(watch("step", round))
-        for step in steps(scene, prepared, settings, clock):
-            timings.append(Timing("step", step.index, round, clock.seconds))
+        for step in steps(scene, replayed.again() if replayed else prepared, settings, clock):
+            told = replayed.told() if replayed else {}
+            timings.append(Timing("step", step.index, round, clock.seconds, device=told))
             final = step.positions
             tick("timed pass")
     return Measured(prepared, timings, watches, final)

@@ -101,7 +101,7 @@ def prepare(scene: Scene, solver: Solver) -> Prepared:
     if history and alternate:
         raise Unsupported("the integrator's formula holds for steps of one length, and the scene alternates two")
     prepared, other = solver.prepare(scene.system), alternate.system if alternate else _first(scene)
-    return _Turns(prepared, solver.prepare(other), other.rate) if history or alternate else prepared
+    return Turns(prepared, solver.prepare(other), other.rate) if history or alternate else prepared
 
 
 def simulate(
@@ -144,7 +144,7 @@ def _stages(scene: Scene, state: State) -> Stages:
     return Stages(of, _filtered(of, state.now), state.acceleration, scene.time(state.index))
 
 
-class _Turns:
+class Turns:
     """Prepared for two systems of one scene, which differ in their rate."""
 
     def __init__(self, usual: Prepared, other: Prepared, rate: float) -> None:
@@ -152,20 +152,21 @@ class _Turns:
         self.usual, self._other, self._rate = usual, other, rate
         self.choice, self.facts = usual.choice, usual.facts
 
-    def _of(self, problem: StepProblem) -> Prepared:
+    def of(self, problem: StepProblem) -> Prepared:
+        """The one that the problem is for."""
         return self._other if problem.system.rate == self._rate else self.usual
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        return self._of(problem).iterates(problem)
+        return self.of(problem).iterates(problem)
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        return self._of(problem).solve(problem, stop)
+        return self.of(problem).solve(problem, stop)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        return self._of(problem).residual_at(problem, p)
+        return self.of(problem).residual_at(problem, p)
 
     def phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        return self._of(problem).phases(problem)
+        return self.of(problem).phases(problem)
 
 
 def _filtered(scene: Scene, motion: Motion) -> Motion:

@@ -25,6 +25,7 @@ def rows(measured: Measured) -> list[dict[str, Any]]:
     for (phase, _), timings in groups.items():
         told: list[dict[str, Any]] = [
             {"phase": phase, "frame": t.frame, "round": t.round, "seconds": t.seconds, "adds_up": adds_up.get(phase)}
+            | t.device
             for t in timings
         ]
         watch = measured.watches[phase, measured.pass_of(timings[0])]

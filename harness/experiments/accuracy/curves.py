@@ -25,6 +25,7 @@ from harness.experiments.accuracy.scales import round_off
 from harness.reference.curvature import Curvature, curvature
 from harness.reference.oracle import Oracle
 from harness.simulation.clock import Watch, measured_again
+from solvers.device import Remote
 from solvers.problem import Positions, Prepared, StepProblem
 
 STATIONARY, GAP = 1e-10, 1e-9
@@ -176,16 +177,22 @@ def _timed(
 ) -> tuple[NDArray[np.float64], bool]:
     """Wall seconds (count + 1,) from the start to the first guess (0), and to each iterate; whether interrupted."""
     stamps, watch = np.zeros(count + 1), Watch(numba.get_num_threads())
-    p = problem.first_guess
+    p, copied = problem.first_guess, None
     gc.disable()  # a collection in the middle would be counted as the solver's
     try:
         with watch:
             began = perf_counter()
-            for number, following in enumerate(islice(prepared.iterates(problem), count), start=1):
-                stamps[number] = perf_counter()
-                p = following
+            if isinstance(prepared, Remote):
+                for number, copy in enumerate(islice(prepared.uncopied(problem), count), start=1):
+                    stamps[number] = perf_counter()
+                    copied = copy
+            else:
+                for number, following in enumerate(islice(prepared.iterates(problem), count), start=1):
+                    stamps[number] = perf_counter()
+                    p = following
     finally:
         gc.enable()
+    p = copied() if copied else p
     if not np.array_equal(p, expected, equal_nan=True):
         raise RunFailed("a timed pass ended at other positions than the graded one")
     stamps[1:] -= began

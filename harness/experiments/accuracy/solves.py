@@ -23,6 +23,7 @@ from harness.reference.oracle import Oracle
 from harness.reference.store import Store
 from harness.scenes.bind import Scene
 from harness.simulation.step import FIRST_GUESSES
+from solvers import device
 from solvers.problem import Positions, Prepared, Solver, System
 from solvers.registry import EVERY, load
 
@@ -137,6 +138,7 @@ def curve_rows(spec: CurveSpec, graded: GradedStep, folder: Path, tick: Callable
     try:
         with machine.pinned_threads(spec.how.threads):
             prepared, row = _prepared(solver, graded, spec.how.rounds)
+            shared |= device.told(prepared)
             found = [shared | row]
             for first_guess in spec.first_guesses:
                 found += [shared | row for row in _curve(spec, prepared, graded, first_guess, folder)]

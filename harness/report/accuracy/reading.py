@@ -177,9 +177,13 @@ def _labels(rows: Sequence[_Row]) -> _Label:
     def settings(row: _Row) -> _Row:
         return {**json.loads(row["parameters"] or "{}"), "threads": row["threads"]}
 
+    stated: dict[str, set[str]] = defaultdict(set)
     for row in rows:
-        for key, value in settings(row).items():
-            values[row["solver"], key].add(str(value))
+        stated[row["solver"]] |= settings(row).keys()
+    for row in rows:
+        own = settings(row)
+        for key in stated[row["solver"]]:  # some state what others leave out, for they have it as usual
+            values[row["solver"], key].add(str(own.get(key)))
 
     def label(row: _Row) -> str:
         told = [f"{key} {value}" for key, value in settings(row).items() if len(values[row["solver"], key]) > 1]

@@ -1,0 +1,146 @@
+"""The device: whether there is one, what it is, how much it has left, and what becomes of its errors.
+
+`NUMBA_ENABLE_CUDASIM=1` in the environment, before Numba is imported, takes Numba's simulator for a device. It runs the
+same kernels thread by thread in Python, without one; rows then say so.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from solvers.device import broken
+from solvers.memory import in_words
+from solvers.problem import Unsupported
+
+INSTALL = "`.venv/bin/pip install -e '.[cuda]'` in the checkout installs what it needs beside NVIDIA's driver"
+
+_PACKAGES = ("numba-cuda", "cuda-bindings", "cuda-core", "cuda-toolkit", "nvidia-ml-py", "nvmath-python")
+_SIMULATED = "Numba's simulator, no device"
+_DRIVERS = ("cudadrv", "cuda.bindings", "cuda.core")
+"""What errors of a driver come from, as parts of the names of modules."""
+
+
+class DeviceFailed(RuntimeError):
+    """The device gave up: no memory is left, a kernel failed, or the device is lost."""
+
+
+def simulated() -> bool:
+    """Whether the simulator stands for a device."""
+    config = import_module("numba.core.config")
+    return bool(config.ENABLE_CUDASIM)
+
+
+def ready(solver: str) -> Any:
+    """The module `numba.cuda` with a device. Raises Unsupported with the reason where there is none."""
+    if simulated():
+        return import_module("numba.cuda")
+    if broken():
+        raise Unsupported(f"{solver}: this process has lost its device; start it anew")
+    try:
+        version("numba-cuda")
+    except PackageNotFoundError as error:
+        raise Unsupported(f"{solver}: `device: cuda` needs numba-cuda, which is not installed; {INSTALL}") from error
+    try:
+        cuda = import_module("numba.cuda")
+        cuda.current_context()
+    except Exception as error:  # without a driver, without a device, with one that another holds: each has its own
+        why = " ".join(str(error).split()).rstrip(":. ")
+        raise Unsupported(f"{solver}: there is no CUDA device ({why}); {INSTALL}") from error
+    return cuda
+
+
+def require_memory(solver: str, needed: float) -> None:
+    """Raise Unsupported where the device has not so many bytes left."""
+    if simulated():
+        return
+    left, _ = import_module("numba.cuda").current_context().get_memory_info()
+    if needed > left:
+        raise Unsupported(f"{solver}: needs {in_words(needed)} on the device, which has {in_words(left)} left")
+
+
+def told() -> dict[str, Any]:
+    """The columns of rows that tell of the device: its name, its memory, its driver, versions, and its state now."""
+    versions = json.dumps(dict(_versions()), sort_keys=True)
+    if simulated():
+        return {"device": _SIMULATED, "device_versions": versions}
+    cuda = import_module("numba.cuda")
+    device = cuda.get_current_device()
+    name = device.name.decode() if isinstance(device.name, bytes) else str(device.name)
+    capability = ".".join(map(str, device.compute_capability))
+    _, memory = cuda.current_context().get_memory_info()
+    columns = {
+        "device": f"{name}, compute capability {capability}, {device.MULTIPROCESSOR_COUNT} multiprocessors",
+        "device_memory_gib": round(memory / 2**30, 1),
+        "device_versions": versions,
+    }
+    return columns | _state(device)
+
+
+def _versions() -> Generator[tuple[str, str]]:
+    for package in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            yield package, version(package)
+
+
+def _state(device: Any) -> dict[str, Any]:
+    """The driver, clocks and power, as NVIDIA's management library tells them; else that it does not."""
+    try:
+        nvml = import_module("pynvml")
+        nvml.nvmlInit()
+    except Exception as error:  # the library or its driver is missing
+        return {"device_state": f"not known: {type(error).__name__}: {error}"}
+    try:
+        handle = _handle(nvml, device)
+        asked = {
+            "sm_clock_mhz": lambda: nvml.nvmlDeviceGetClockInfo(handle, nvml.NVML_CLOCK_SM),
+            "memory_clock_mhz": lambda: nvml.nvmlDeviceGetClockInfo(handle, nvml.NVML_CLOCK_MEM),
+            "most_sm_clock_mhz": lambda: nvml.nvmlDeviceGetMaxClockInfo(handle, nvml.NVML_CLOCK_SM),
+            "power_w": lambda: nvml.nvmlDeviceGetPowerUsage(handle) / 1000,
+            "power_limit_w": lambda: nvml.nvmlDeviceGetEnforcedPowerLimit(handle) / 1000,
+            "performance_state": lambda: nvml.nvmlDeviceGetPerformanceState(handle),
+            "temperature_c": lambda: nvml.nvmlDeviceGetTemperature(handle, nvml.NVML_TEMPERATURE_GPU),
+            "busy_percent": lambda: nvml.nvmlDeviceGetUtilizationRates(handle).gpu,
+        }
+        state: dict[str, Any] = {}
+        for name, ask in asked.items():
+            try:
+                state[name] = ask()
+            except nvml.NVMLError as error:  # not every device tells everything
+                state[name] = str(error)
+        driver = nvml.nvmlSystemGetDriverVersion()
+        driver = driver.decode() if isinstance(driver, bytes) else str(driver)
+        return {"device_driver": driver, "device_state": json.dumps(state)}
+    except nvml.NVMLError as error:
+        return {"device_state": f"not known: {error}"}
+    finally:
+        nvml.nvmlShutdown()
+
+
+def _handle(nvml: Any, device: Any) -> Any:
+    """The library's own handle of the device; by its identity, for the two may number devices differently."""
+    uuid = str(getattr(device, "uuid", ""))
+    if uuid:
+        return nvml.nvmlDeviceGetHandleByUUID(uuid if uuid.startswith("GPU-") else f"GPU-{uuid}")
+    return nvml.nvmlDeviceGetHandleByIndex(device.id)
+
+
+@contextmanager
+def guarded() -> Generator[None]:
+    """Turn errors of the driver into DeviceFailed; after one other than a lack of memory this process cannot go on with
+    its device, and does not try to."""
+    try:
+        yield
+    except Exception as error:
+        origin = type(error).__module__
+        if not any(part in origin for part in _DRIVERS):
+            raise
+        text = " ".join(str(error).split())
+        if "MEMORY" in text.upper() and "ILLEGAL" not in text.upper():
+            raise DeviceFailed(f"the device has no memory left: {text}") from error
+        broken(text)
+        raise DeviceFailed(f"the device failed: {text}") from error

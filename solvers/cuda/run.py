@@ -1,0 +1,176 @@
+"""What solves on a device share: one stream, events, and copies that are made only where somebody asks.
+
+    begin: upload | launch, launch, ... | positions: download                       all in one stream, in their order
+
+A kernel is launched and not waited for. `positions` copies when it is asked for; a residual is asked for after each
+EVERY iterations where one may end a solve. Iterates depend on neither.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.core.driver import Iterating, Iterative
+from solvers.cuda import device
+from solvers.cuda.target import cuda
+from solvers.kernels.loop import EACH, ITERATIONS, LAST, Limits, verdict
+from solvers.problem import Positions, Solution, StepProblem, StopRule
+
+EVERY = 8
+"""Iterations from one residual to the next."""
+
+THREADS = 8 if device.simulated() else 128
+"""In a block; the simulator's take a thread of the processor each."""
+
+
+def blocks(threads: int) -> int:
+    """How many blocks so many threads take; one at least."""
+    return max(1, -(-threads // THREADS))
+
+
+class Stream:
+    """A stream with the arrays that are brought to it, and a clock on it. Device arrays live as long as this does."""
+
+    def __init__(self) -> None:
+        self.queue: Any = cuda.stream()
+
+    def upload(self, array: NDArray[Any], dtype: Any = None) -> Any:
+        """A copy of a host's array on the device."""
+        return cuda.to_device(np.ascontiguousarray(array, dtype), stream=self.queue)
+
+    def put(self, array: NDArray[Any], there: Any) -> None:
+        """Copy a host's array to one of the device of the same shape and type."""
+        there.copy_to_device(np.ascontiguousarray(array, there.dtype), stream=self.queue)
+
+    def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
+        """Zeros on the device."""
+        return self.upload(np.zeros(shape, dtype))
+
+    def download(self, there: Any) -> NDArray[Any]:
+        """A copy of a device's array; waits for all that was launched."""
+        out = there.copy_to_host(stream=self.queue)
+        self.wait()
+        return out
+
+    def wait(self) -> None:
+        """Until all that was launched is done."""
+        self.queue.synchronize()
+
+    def mark(self) -> Any:
+        """An event here and now on the stream."""
+        event = cuda.event()
+        event.record(self.queue)
+        return event
+
+
+class DeviceIterating(Iterating):
+    """A solve on a device. A method uploads in its `__init__`, between `super().__init__` and `self.uploaded()`."""
+
+    def __init__(self, stream: Stream) -> None:
+        self.stream = stream
+        self._began = self._up = self._asked = self._down = stream.mark()
+        self._copy: Positions | None = None
+        self._done = 0
+
+    def uploaded(self) -> None:
+        """All that the solve needs is on its way."""
+        self._up = self.stream.mark()
+
+    @abstractmethod
+    def sweep(self, count: int) -> None:
+        """Launch so many iterations, and wait for nothing."""
+
+    @abstractmethod
+    def fetch(self) -> Positions:
+        """A copy of where it is, (n, 3) [m]."""
+
+    def gauge(self, p: Positions) -> float:
+        """The residual [J^(1/2)] at positions, which are where it is; nan of a method that does not minimise."""
+        return float("nan")
+
+    @property
+    def positions(self) -> Positions:  # pyright: ignore[reportIncompatibleVariableOverride] a copy, when asked for
+        """A copy of where it is (n, 3) [m]; the same one until the next iteration."""
+        if self._copy is None:
+            with device.guarded():
+                self._asked = self.stream.mark()
+                self._copy = self.fetch()
+                self._down = self.stream.mark()
+        return self._copy
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        self.launch(1)
+        return True
+
+    def launch(self, count: int) -> None:
+        """So many iterations, and forget the copy."""
+        with device.guarded():
+            self.sweep(count)
+        self._copy, self._done = None, self._done + count
+
+    def residual(self) -> float:
+        """See Iterating."""
+        return self.gauge(self.positions)
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating; a residual after each EVERY iterations where it may end them."""
+        count, found, ended = 0, float("nan"), ITERATIONS
+        while count < limits.iterations and ended == ITERATIONS:
+            some = limits.iterations - count
+            some = min(EVERY - self._done % EVERY, some) if limits.wanted == EACH else some
+            self.launch(some)
+            count += some
+            if limits.wanted == EACH:
+                found = self.residual()
+                ended = verdict(found, limits)
+        if limits.wanted == LAST or (limits.wanted == EACH and count == 0):
+            found = self.residual()
+        return count, found, ended
+
+    def seconds(self) -> dict[str, float]:
+        """Up to the last copy of positions, by events on the stream [s]: of kernels, and of transfers; none of the
+        simulator, which has no events."""
+        if device.simulated():
+            return {}
+        self._down.synchronize()
+        transfers = self._began.elapsed_time(self._up) + self._asked.elapsed_time(self._down)  # in milliseconds
+        return {"kernel_seconds": 1e-3 * self._up.elapsed_time(self._asked), "transfer_seconds": 1e-3 * transfers}
+
+
+class DeviceIterative(Iterative):
+    """A method that is ready on a device, with `columns` for its rows."""
+
+    columns: dict[str, Any]
+
+    @abstractmethod
+    def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
+        """See Iterative."""
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """See Iterative."""
+        with device.guarded():
+            return super().solve(problem, stop)
+
+    def uncopied(self, problem: StepProblem) -> Iterator[Callable[[], Positions]]:
+        """The iterates of `iterates`, each done when it is yielded and copied only where it is called."""
+        with device.guarded():
+            run = self.begin(problem, problem.first_guess)
+            while True:
+                run.launch(1)
+                run.stream.wait()
+                yield lambda: run.positions
+
+    def replay(self, problem: StepProblem, iterations: int) -> tuple[Solution, dict[str, float]]:
+        """See Remote."""
+        with device.guarded():
+            run = self.begin(problem, problem.first_guess)
+            run.launch(iterations)
+            p, nan = run.positions, float("nan")
+            found = Solution(p, iterations, nan, nan, "iterations", run.velocity, self.residual_of)
+            return found, run.seconds()
