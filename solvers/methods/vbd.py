@@ -8,6 +8,7 @@ acts on single vertices, and a projective energy of elements (strain limits, das
 vertex belongs to. The paper skips the line search. Here a step that would raise the energy gives way to that of
 the majorant (held_i + sum of k) I, which cannot: so no sweep raises the objective. What has no such majorant, because
 it is no projective energy, is refused.
+With `device: cuda` the same iterates come from `solvers.cuda.vbd`.
 Vertices go by colour: none is joined by a spring, a form or an element to another of its colour.
 
 Sweeps are accelerated by Chebyshev's semi-iteration with the spectral radius rho (Wang 2015),
@@ -29,16 +30,17 @@ from numpy.typing import NDArray
 
 from solvers.about import About, Reference
 from solvers.contact.touching import ContactEnergy, touching, without_contact
-from solvers.core import colouring, vertex_terms
+from solvers.core import vertex_terms
 from solvers.core.bounds import is_bounded, without_bounded
 from solvers.core.driver import Iterating, Iterative, largest
 from solvers.core.parts import Parts, split
+from solvers.core.vertex_blocks import VertexBlocks
 from solvers.core.vertex_elements import Beside
+from solvers.device import Precise
 from solvers.kernels import vbd as kernels
 from solvers.kernels.accelerate_springs import Shares
 from solvers.kernels.half_spaces import HalfSpaces
 from solvers.kernels.loop import EACH, ITERATIONS, LAST, Limits
-from solvers.kernels.springs import Bundles
 from solvers.memory import aligned
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.problem import Positions, StepProblem, System, Unsupported
@@ -55,7 +57,7 @@ _FAR = 1e100
 
 
 @dataclass(frozen=True)
-class VertexBlockDescent:
+class VertexBlockDescent(Precise):
     """Vertex block descent over springs, quadratic forms, elements of projective energies, and contact.
 
     spectral_radius: rho of the acceleration, at least 0 and less than 1; 0 does not accelerate.
@@ -77,11 +79,16 @@ class VertexBlockDescent:
 
     def __post_init__(self) -> None:
         """Raises ValueError."""
+        super().__post_init__()
         if not 0.0 <= self.spectral_radius < 1.0:
             raise ValueError(f"spectral_radius: should be at least 0 and less than 1, not {self.spectral_radius}")
 
-    def prepare(self, system: System) -> PreparedVertexBlockDescent:
+    def prepare(self, system: System) -> Iterative:
         """Raises Unsupported for other energies, NotPositiveDefinite."""
+        if self.device == "cuda":
+            from solvers.cuda.device import ready  # for those who ask for it
+
+            ready("vbd")
         bare, n = without_bounded(without_contact(system)), system.vertices
         parts, beside = split(bare), Beside.of(system)
         unknown = {*parts.unknown} - {type(energy).__name__ for energy in beside.energies}
@@ -91,33 +98,28 @@ class VertexBlockDescent:
                 "neighbours its vertices are nor a bound of the second derivatives: a vertex's step needs both, to go "
                 "while its neighbours rest and to fall back on what cannot rise"
             )
-        measure = cast("Idle", CompiledLocalGlobal().prepare(system))
-        coloured = colouring.of_vertices(np.concatenate([parts.whole.edges, beside.pairs()]), n)
-        colour = np.empty(n, np.int64)
-        colour[coloured.order] = np.repeat(np.arange(coloured.colours), np.diff(coloured.start))
-        pinned = system.pins.vertices[system.pins.exact]
-        order = coloured.order[~np.isin(coloured.order, pinned)]
-        row = np.empty(n, np.int64)
-        row[order], row[pinned] = np.arange(len(order)), np.arange(len(order), n)
-        colour[pinned] = -1
-        bundles, _ = Bundles.of(parts.whole, row, colour, coloured.colours, n, n + 1)
-        held, majorant = np.zeros(n + 2), np.ones(n + 2)
-        held[: len(order)] = majorant[: len(order)] = (vertex_terms.held(system) + parts.held)[order]
-        majorant[: len(order)] += beside.diagonal()[order]
-        ends = np.repeat(bundles.own.reshape(-1, LANES), np.diff(bundles.start), axis=0)
-        np.add.at(majorant, ends.ravel() // 4, bundles.each()[1])
-        shares = Shares.of(bundles, held, row[pinned])
+        made = VertexBlocks.of(system, parts, beside)
+
+        def measure() -> Idle:
+            return cast("Idle", CompiledLocalGlobal().prepare(system))
+
+        if self.device == "cuda":
+            from solvers.cuda.vbd import prepare  # for those who ask for it
+
+            return prepare(system, parts, made, self.spectral_radius, self.real, measure)
+        gauge = measure()
+        shares = Shares.of(made.bundles, made.held, made.row[system.pins.vertices[system.pins.exact]])
         return PreparedVertexBlockDescent(
             system,
             parts,
-            beside.among(row, n + 2),
+            beside.among(made.row, n + 2),
             self.spectral_radius,
-            kernels.Blocks(bundles, shares, len(order), bundles.in_lanes(majorant)),
-            row,
-            held,
-            majorant[row],
-            measure,
-            f"vertices in {coloured.colours} colours; for the residual alone {measure.choice}",
+            kernels.Blocks(made.bundles, shares, made.free, made.bundles.in_lanes(made.majorant)),
+            made.row,
+            made.held,
+            made.majorant[made.row],
+            gauge,
+            f"vertices in {made.colours} colours; for the residual alone {gauge.choice}",
         )
 
 

@@ -1,0 +1,256 @@
+"""Vertex block descent on a device: the Newton step of each vertex of a colour, and Chebyshev's extrapolation.
+
+A colour is one launch, a vertex one thread: no two of a colour are neighbours, so that a thread writes one row that
+nobody else reads in this launch. Sums are those of blocks, in their order, and then of one block in a tree: the bits
+are the same each time. What to extrapolate by is decided on the device, in `control`, which nobody waits for:
+
+    OMEGA of the last iteration, KNOWN the objective there (nan where it is not known), WEIGHT of this iteration's
+    extrapolation, TAKEN whether it was taken, ASKED whether the objective before it is needed
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import float64
+
+from solvers.cuda import springs
+from solvers.cuda.run import THREADS
+from solvers.cuda.target import cuda
+from solvers.kernels.springs import TINY_SQUARED
+from solvers.vectors.springs import LANES
+
+OMEGA, KNOWN, WEIGHT, TAKEN, ASKED = range(5)
+CONTROLS = 5
+_ROUND_OFF = {np.float32: 1e-6, np.float64: 1e-14}
+"""Pivots up to this share of the diagonal's sum are round-off, of some ten springs."""
+
+
+class Kernels(NamedTuple):
+    """Kernels in one type of numbers."""
+
+    sweep: Any
+    extrapolate: Any
+    level: Any
+    decide: Any
+    finish: Any
+    rebase: Any
+
+
+@cache
+def kernels(real: Any) -> Kernels:
+    """Those of a type."""
+    zero, half, one = real(0.0), real(0.5), real(1.0)
+    least = real(_ROUND_OFF[real])
+    change, unit_exact = springs.kernels(real).change, springs.kernels(np.float64).unit
+    tiny = TINY_SQUARED
+
+    @cuda.jit
+    def sweep(
+        begin, end, own, start, neighbour, kind, weights, spring, direction, arrows,
+        nobody, far, held, majorant, force, u, before,
+    ):  # fmt: skip
+        """Move the vertices of a colour, lanes `begin` to `end`, each to a lower energy; `before` keeps where it was.
+
+        held, majorant (lanes,) [N/m]; force (3, lanes) [N]: minus the gradient at the reference.
+        """
+        t = begin + cuda.grid(1)
+        if t >= end or own[t] == nobody:
+            return
+        i, b, lane = own[t], t // LANES, t % LANES
+        first, last = start[b], start[b + 1]
+        u0, u1, u2, h = u[i, 0], u[i, 1], u[i, 2], held[t]
+        before[i, 0], before[i, 1], before[i, 2] = u0, u1, u2
+        f0, f1, f2 = force[0, t] - h * u0, force[1, t] - h * u1, force[2, t] - h * u2
+        b00, b01, b02, b11, b12, b22 = h, zero, zero, h, zero, h
+        lengthless = False
+        for entry in range(first, last):
+            e = LANES * entry + lane
+            j = neighbour[e]
+            if j == far:
+                continue
+            d0, d1, d2 = arrows[0, e], arrows[1, e], arrows[2, e]
+            w0, w1, w2 = u0 - u[j, 0], u1 - u[j, 1], u2 - u[j, 2]
+            pull, k = weights[kind[entry] + lane], weights[kind[entry] + LANES + lane]
+            c0, c1, c2, length, without = change(d0, d1, d2, w0, w1, w2, pull, k, spring[e], direction)
+            f0, f1, f2 = f0 + c0, f1 + c1, f2 + c2
+            if without:
+                lengthless = True
+                continue
+            inward = pull / length
+            tension = inward - k
+            # A spring whose k is negative is a form's, has no rest length and is never compressed.
+            lateral = zero if tension > zero and inward > zero else -tension
+            axial = (k - lateral) / (length * length)
+            v0, v1, v2 = d0 + w0, d1 + w1, d2 + w2
+            a0, a1 = axial * v0, axial * v1
+            b00, b01, b02 = b00 + a0 * v0 + lateral, b01 + a0 * v1, b02 + a0 * v2
+            b11, b12, b22 = b11 + a1 * v1 + lateral, b12 + a1 * v2, b22 + axial * v2 * v2 + lateral
+        scale = one / majorant[t]
+        s0, s1, s2 = scale * f0, scale * f1, scale * f2
+        l1, l2 = b01 / b00, b02 / b00
+        second = b11 - l1 * b01
+        below = b12 - l2 * b01
+        l3 = below / second
+        third = b22 - l2 * b02 - l3 * below
+        bound = least * (b00 + b11 + b22)
+        # Where a spring has no length there is no Hessian: the majorant's step takes it apart.
+        if not lengthless and b00 > bound and second > bound and third > bound:
+            y1 = f1 - l1 * f0
+            x2 = (f2 - l2 * f0 - l3 * y1) / third
+            x1 = y1 / second - l3 * x2
+            x0 = f0 / b00 - l1 * x1 - l2 * x2
+            moved = x0 * x0 + x1 * x1 + x2 * x2
+            rise = half * h * moved - (f0 * x0 + f1 * x1 + f2 * x2)
+            for entry in range(first, last):
+                e = LANES * entry + lane
+                j = neighbour[e]
+                if j == far:
+                    continue
+                pull, k = weights[kind[entry] + lane], weights[kind[entry] + LANES + lane]
+                v0 = arrows[0, e] + (u0 - u[j, 0])
+                v1 = arrows[1, e] + (u1 - u[j, 1])
+                v2 = arrows[2, e] + (u2 - u[j, 2])
+                was = real(math.sqrt(v0 * v0 + v1 * v1 + v2 * v2))
+                m0, m1, m2 = v0 + x0, v1 + x1, v2 + x2
+                both = was + real(math.sqrt(m0 * m0 + m1 * m1 + m2 * m2))
+                longer = ((v0 + m0) * x0 + (v1 + m1) * x1 + (v2 + m2) * x2) / both
+                along = (v0 * x0 + v1 * x1 + v2 * x2) / was
+                rise += half * k * moved - pull * (moved - along * longer) / both
+            if rise <= zero:
+                s0, s1, s2 = x0, x1, x2
+        u[i, 0], u[i, 1], u[i, 2] = u0 + s0, u1 + s1, u2 + s2
+
+    @cuda.jit
+    def extrapolate(u, older, control):
+        """`older`, the iterate before the last one, to w (u - older) + older."""
+        i = cuda.grid(1)
+        w = real(control[WEIGHT])
+        if i < len(u) and w > one:
+            for c in range(3):
+                older[i, c] += w * (u[i, c] - older[i, c])
+
+    @cuda.jit
+    def level(
+        own, start, neighbour, kind, weights, spring, direction, arrows,
+        nobody, far, free, held, force, u, asked, control, sums,
+    ):  # fmt: skip
+        """Write the objective at the reference and u, less that at the reference, to `sums`, a number a block [J].
+
+        In float64, from u and arrows as they are: what is decided by it is no matter of round-off.
+        free: so many rows, from the first one on, may move; asked: what of `control` must be positive (ASKED), or more
+        than one (WEIGHT).
+        """
+        kept = cuda.shared.array(THREADS, float64)
+        t, inside = cuda.grid(1), cuda.threadIdx.x
+        if asked == ASKED and not control[ASKED] > 0.0:
+            return
+        if asked == WEIGHT and not control[WEIGHT] > 1.0:
+            return
+        total = float64(0.0)
+        if t < len(own) and own[t] != nobody:
+            i, b, lane = own[t], t // LANES, t % LANES
+            u0, u1, u2 = float64(u[i, 0]), float64(u[i, 1]), float64(u[i, 2])
+            energy = 0.5 * held[t] * (u0 * u0 + u1 * u1 + u2 * u2)
+            energy -= force[0, t] * u0 + force[1, t] * u1 + force[2, t] * u2
+            for entry in range(start[b], start[b + 1]):
+                e = LANES * entry + lane
+                j = neighbour[e]
+                if j == far:
+                    continue
+                d0, d1, d2 = float64(arrows[0, e]), float64(arrows[1, e]), float64(arrows[2, e])
+                w0, w1, w2 = u0 - u[j, 0], u1 - u[j, 1], u2 - u[j, 2]
+                pull, k = weights[kind[entry] + lane], weights[kind[entry] + LANES + lane]
+                v0, v1, v2 = d0 + w0, d1 + w1, d2 + w2
+                begin, end = d0 * d0 + d1 * d1 + d2 * d2, v0 * v0 + v1 * v1 + v2 * v2
+                was, length, moved = math.sqrt(begin), math.sqrt(end), w0 * w0 + w1 * w1 + w2 * w2
+                a0, a1, a2 = unit_exact(d0, d1, d2, begin, spring[e], direction)
+                along = a0 * w0 + a1 * w1 + a2 * w2
+                if begin <= tiny or end <= tiny:
+                    turned = length - was - along
+                else:
+                    longer = ((d0 + v0) * w0 + (d1 + v1) * w1 + (d2 + v2) * w2) / (was + length)
+                    turned = (moved - along * longer) / (was + length)
+                share = 0.5 if j < free else 1.0  # the other end adds the other half, if it is anybody's
+                energy += share * (0.5 * k * moved - pull * turned)
+            total = energy
+        kept[inside] = total
+        cuda.syncthreads()
+        span = THREADS // 2
+        while span > 0:
+            if inside < span:
+                kept[inside] += kept[inside + span]
+            cuda.syncthreads()
+            span //= 2
+        if inside == 0:
+            sums[cuda.blockIdx.x] = kept[0]
+
+    @cuda.jit
+    def decide(radius, at_before, at_new, control):
+        """One block: whether an extrapolation is taken, and what the next one's weight is.
+
+        radius: rho; at_before, at_new: the sums of `level` where they were asked for.
+        """
+        kept = cuda.shared.array((2, THREADS), float64)
+        inside = cuda.threadIdx.x
+        before, new = float64(0.0), float64(0.0)
+        w = control[WEIGHT]
+        if w > 1.0:
+            for k in range(inside, len(at_new), THREADS):
+                new += at_new[k]
+            if control[ASKED] > 0.0:
+                for k in range(inside, len(at_before), THREADS):
+                    before += at_before[k]
+        kept[0, inside], kept[1, inside] = before, new
+        cuda.syncthreads()
+        span = THREADS // 2
+        while span > 0:
+            if inside < span:
+                kept[0, inside] += kept[0, inside + span]
+                kept[1, inside] += kept[1, inside + span]
+            cuda.syncthreads()
+            span //= 2
+        if inside == 0:
+            omega, known, taken = w, control[KNOWN], 0.0
+            if w > 1.0:
+                if control[ASKED] > 0.0:
+                    known = kept[0, 0]
+                if kept[1, 0] <= known:
+                    known, taken = kept[1, 0], 1.0
+                else:
+                    omega, known = 0.0, math.nan
+            following = 1.0
+            if omega > 1.0:
+                following = 4.0 / (4.0 - radius * radius * omega)
+            elif omega == 1.0:
+                following = 2.0 / (2.0 - radius * radius)
+            control[OMEGA], control[KNOWN], control[WEIGHT], control[TAKEN] = omega, known, following, taken
+            control[ASKED] = 1.0 if following > 1.0 and math.isnan(known) else 0.0
+
+    @cuda.jit
+    def finish(u, before, older, control):
+        """Take the extrapolation, if it is; and remember where the iteration began."""
+        i = cuda.grid(1)
+        taken = control[TAKEN] > 0.0
+        if i < len(u):
+            for c in range(3):
+                if taken:
+                    u[i, c] = older[i, c]
+                older[i, c] = before[i, c]
+
+    @cuda.jit
+    def rebase(x, u, older, control):
+        """The displacement into the reference: there the objective is known to be 0, if it was known."""
+        i = cuda.grid(1)
+        if i == 0 and not math.isnan(control[KNOWN]):
+            control[KNOWN] = 0.0
+        if i < len(x):
+            for c in range(3):
+                x[i, c] += float64(u[i, c])
+                older[i, c] -= u[i, c]
+                u[i, c] = zero
+
+    return Kernels(sweep, extrapolate, level, decide, finish, rebase)

@@ -1,0 +1,103 @@
+"""Runs on a device: what rows tell, that timed steps copy no more than they must, and what becomes of its failures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from harness.base import rows
+from harness.cli import app
+from harness.config.load import load_any
+from harness.experiments.plan import Files
+from solvers import device as where
+from solvers.cuda import device, run, vbd
+from tests.scenes import CLOTH_FILE
+
+SWEEP = """
+scenes: [cloth.yaml]
+sizes: [3]
+solvers: [{name: vbd, device: cuda, spectral_radius: 0}, {name: vbd, spectral_radius: 0}]
+options: {iterations: 40, tolerance: 1.0e-3, rounds: 2, frames: 2, threads: 1, pictures: false}
+"""
+
+
+def ran(folder: Path) -> tuple[Result, list[list[dict[str, Any]]]]:
+    """What the command says, and the rows of each run; in this process."""
+    (folder / "cloth.yaml").write_text(CLOTH_FILE)
+    sweep = folder / "sweep.yaml"
+    sweep.write_text(SWEEP)
+    told = CliRunner().invoke(app, ["run", str(sweep), "--results", str(folder / "r"), "--here"])
+    found = [rows.read([Files.of(run, folder / "r" / "sweep").rows]).to_pylist() for run in load_any(sweep).runs()]
+    return told, found
+
+
+def test_rows_tell_of_the_device_and_timed_steps_ask_for_no_residual(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, launched = list[float](), list[int]()
+    gauge, launch = vbd.PreparedVertexBlockDescent.residual_at, run.DeviceIterating.launch
+
+    def counted(self: Any, problem: Any, p: Any) -> float:
+        asked.append(gauge(self, problem, p))
+        return asked[-1]
+
+    def seen(self: Any, count: int) -> None:
+        launched.append(count)
+        launch(self, count)
+
+    monkeypatch.setattr(vbd.PreparedVertexBlockDescent, "residual_at", counted)
+    monkeypatch.setattr(run.DeviceIterating, "launch", seen)
+    told, (here, there) = ran(tmp_path)
+    assert told.exit_code == 0, told.output
+    assert {row["device"] for row in here} == {device.told()["device"]}
+    assert {row["device"] for row in there} == {None}
+    assert all(row["sweep_bytes"] > 0 for row in here)
+    steps = [row for row in here if row["phase"] == "step"]
+    assert {row["stopped"] for row in steps} == {"tolerance"}
+    counts = {row["frame"]: row["iterations"] for row in steps}
+    # Passes that look go in pieces of at most EVERY; both rounds go all the way at once.
+    for count in counts.values():
+        assert count % run.EVERY == 0
+    if max(counts.values()) > run.EVERY:
+        assert launched.count(max(counts.values())) >= 2
+    assert "vbd, device cuda" in " ".join(told.output.split())
+
+
+class OutOfMemory(Exception):
+    """As the driver raises it."""
+
+
+class Lost(Exception):
+    """As the driver raises it."""
+
+
+for kind in (OutOfMemory, Lost):
+    kind.__module__ = "numba.cuda.cudadrv.driver"
+
+
+@pytest.mark.parametrize(
+    ("error", "said", "lost"),
+    [
+        (OutOfMemory("CUDA_ERROR_OUT_OF_MEMORY"), "the device has no memory left: CUDA_ERROR_OUT_OF_MEMORY", False),
+        (Lost("CUDA_ERROR_ILLEGAL_ADDRESS"), "the device failed: CUDA_ERROR_ILLEGAL_ADDRESS", True),
+    ],
+    ids=["memory", "lost"],
+)
+def test_a_device_that_fails_is_a_row_and_the_sweep_goes_on(
+    error: Exception, said: str, lost: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(where, "_BROKEN", [])
+
+    def fails(self: Any, array: Any) -> Any:
+        raise error
+
+    monkeypatch.setattr(run.Stream, "download", fails)
+    told, (here, there) = ran(tmp_path)
+    assert told.exit_code == 1
+    assert [row["status"] for row in here] == ["failed"]
+    assert said in here[0]["reason"]
+    assert {row["status"] for row in there} == {"ok"}
+    assert where.broken() is lost
