@@ -22,12 +22,13 @@ from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import Hessian, StepObjective
 from solvers.core.preconditioning import Preconditioner, Preconditioning, Scaled, preconditioning
+from solvers.device import Precise
 from solvers.kernels import conjugate
 from solvers.linear.inverse import Inverse
 from solvers.linear.krylov import CURVED, Iteration
 from solvers.linear.supernodal import Supernodal
 from solvers.methods.newton import settling_for
-from solvers.problem import Positions, System
+from solvers.problem import Positions, Prepared, System
 
 _LOOSE, _TIGHT = 0.5, 1e-10
 """The bounds of eta."""
@@ -41,11 +42,13 @@ _MOST = 1000
 
 
 @dataclass(frozen=True)
-class NewtonCG:
+class NewtonCG(Precise):
     """Newton's method without a factor of the Hessian: it needs the memory of local-global.
 
-    preconditioner: of conjugate gradients; `solvers.core.preconditioning` tells them.
+    preconditioner: of conjugate gradients; `solvers.core.preconditioning` tells them. A device knows block-jacobi.
     """
+
+    unstated: ClassVar[frozenset[str]] = Precise.unstated | {"preconditioner"}
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
@@ -61,9 +64,16 @@ class NewtonCG:
 
     preconditioner: Preconditioning = "factor"
 
-    def prepare(self, system: System) -> PreparedDescent:
+    def prepare(self, system: System) -> Prepared:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere, and for
         blocks of energies without elements."""
+        if self.device == "cuda":
+            from solvers.cuda.device import ready  # for those who ask for it
+
+            ready("newton-cg")
+            from solvers.cuda.newton_cg import prepare
+
+            return prepare(system, self.preconditioner, self.real, (_LOOSE, _TIGHT), _MOST)
         metric = Metric(system)
         objective = Objective(system)
         method = TruncatedNewton(metric, objective, self.preconditioner)

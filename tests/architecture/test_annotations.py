@@ -19,8 +19,10 @@ KERNELS = {
     "inner_in_parallel",
     "part",
     "register_jitable",
+    "cuda.jit",
 }
-"""What a compiled function is decorated with: ours, and Numba's for what is compiled within its caller."""
+"""What a compiled function is decorated with: ours, Numba's for what is compiled within its caller, and its own for a
+device."""
 GENERATES = {"typingctx", "context"}
 """The first parameter of an intrinsic, and of the function that generates its code; Numba gives both."""
 
@@ -41,7 +43,7 @@ def unannotated(tree: ast.AST) -> Iterator[str]:
 def compiled(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
     decorators = (d.func if isinstance(d, ast.Call) else d for d in function.decorator_list)
     first = next((a.arg for a in function.args.args), "")
-    return first in GENERATES or any(isinstance(d, ast.Name) and d.id in KERNELS for d in decorators)
+    return first in GENERATES or any(ast.unparse(d) in KERNELS for d in decorators)
 
 
 @pytest.mark.parametrize("folder", ["harness", "solvers"])

@@ -1,0 +1,218 @@
+"""What descents on a device share: where they are, the objective's changes, and a line search.
+
+Positions and gradients are float64, directions `real`: p + t d keeps the positions' digits, and the next gradient tells
+what a direction missed. The host reads a few numbers: those of a trial, once each.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.core.descent import Metric
+from solvers.core.driver import largest
+from solvers.core.preconditioning import LEAST, Preconditioning
+from solvers.cuda import device, objective_kernels, sums
+from solvers.cuda.network import Edges, Network, require_known
+from solvers.cuda.preconditioning import Jacobi
+from solvers.cuda.run import EVERY, DeviceIterating, DeviceIterative, Stream
+from solvers.cuda.target import cuda
+from solvers.kernels.line_search import falls
+from solvers.kernels.loop import EACH, ITERATIONS, LAST, STALLED, Limits, verdict
+from solvers.linear.schwarz import ordered
+from solvers.problem import Positions, StepProblem, System, Unsupported
+
+_HALVINGS = 60
+"""A step so often halved has no digit left."""
+
+_SUMS = 8
+"""At a time."""
+
+Real = type[np.float32] | type[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Base:
+    """A system on the device. metric: of residuals, on the host; hold, least: h and what blocks get beside it (f,)."""
+
+    metric: Metric
+    network: Network
+    stream: Stream
+    edges: Edges
+    hold: Any
+    least: Any
+    real: Real
+
+    @classmethod
+    def of(cls, solver: str, system: System, preconditioner: Preconditioning, real: Real) -> Base:
+        """Raises Unsupported for what kernels do not know and for what the device has no room for, and
+        NotPositiveDefinite."""
+        if preconditioner != "block-jacobi":
+            raise Unsupported(
+                f"{solver}, device: cuda: knows preconditioner: block-jacobi, not {preconditioner}; take that, or "
+                "device: cpu"
+            )
+        require_known(solver, system)
+        metric = Metric(system)
+        order = ordered(metric.inner)
+        network = Network.of(solver, system, order)
+        size = np.dtype(real).itemsize
+        vectors = 3.0 * network.free * (6 * 8 + 8 * size) + 6.0 * size * network.free
+        device.require_memory(solver, network.bytes + vectors + 4.0 * size * len(network.entries.other))
+        with device.guarded():
+            stream = Stream()
+            hold = stream.upload(network.hold[: network.free])
+            least = stream.upload(LEAST * metric.diagonal[order])
+            return cls(metric, network, stream, network.upload(stream), hold, least, real)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedDescent(DeviceIterative):
+    """A method that is ready. columns: of the device; solving: begins a solve."""
+
+    base: Base
+    columns: dict[str, Any]
+    choice: str
+    solving: Callable[[Base, StepProblem, Positions], Descending]
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """Exact counts of what was built."""
+        return self.base.metric.facts
+
+    def begin(self, problem: StepProblem, guess: Positions) -> Descending:
+        """See Iterative."""
+        with device.guarded():
+            return self.solving(self.base, problem, guess)
+
+    def scale(self, problem: StepProblem) -> float:
+        """See Iterative."""
+        return largest(problem) * self.base.metric.trace**0.5
+
+
+class Descending(DeviceIterating):
+    """From point to point. p, q (n, 3): where it is and a trial, in rows; g: the gradient at p (f, 3); z: what the
+    preconditioner makes of -g; numbers: the last sums."""
+
+    def __init__(self, base: Base, problem: StepProblem, guess: Positions) -> None:
+        super().__init__(base.stream)
+        self.base, stream, network, rows = base, base.stream, base.network, base.network.free
+        placed = network.placed(guess, problem)
+        self.edges, self.given = network.begun(stream, base.edges, problem), network.given(stream, problem)
+        self.p, self.q = stream.upload(placed), stream.upload(placed)
+        self.floor = base.metric.round_off(placed)
+        self.uploaded()
+        self.kernels, self.preconditioner = objective_kernels.kernels(base.real), Jacobi(stream, rows, base.real)
+        self.linear = stream.zeros((4, len(network.entries.other)), base.real)
+        self.g, self.z, self.d, self.h = (stream.zeros((rows, 3), t) for t in (np.float64, *(base.real,) * 3))
+        self.partials, self.sums = sums.partials(_SUMS), stream.zeros(_SUMS, np.float64)
+        self.idle = stream.zeros(1, np.float64)
+        self.launch_over, self.stalled = (sums.blocks(rows), sums.THREADS, stream.queue), False
+        self.over_all = sums.blocks(max(rows, len(network.ends))), sums.THREADS, stream.queue
+        self.moves = 0
+
+    @abstractmethod
+    def one(self) -> bool:
+        """An iteration; False where nothing descends."""
+
+    def sweep(self, count: int) -> None:
+        """See DeviceIterating; each iteration waits for the numbers of its trial."""
+        for _ in range(count):
+            if self.stalled or not self.one():
+                self.stalled = True
+                return
+            self.moves += 1
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        self.launch(1)
+        return not self.stalled
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating; a residual after each EVERY iterations where it may end them."""
+        first, found, ended = self.moves, float("nan"), ITERATIONS
+        while self.moves - first < limits.iterations and ended == ITERATIONS:
+            left = limits.iterations - (self.moves - first)
+            self.launch(min(EVERY - self.moves % EVERY, left) if limits.wanted == EACH else left)
+            if limits.wanted == EACH:
+                found = self.residual()
+                ended = verdict(found, limits)
+            if ended == ITERATIONS and self.stalled:
+                ended = STALLED
+        if limits.wanted == LAST or (limits.wanted == EACH and self.moves == first):
+            found = self.residual()
+        return self.moves - first, found, ended
+
+    def fetch(self) -> Positions:
+        """See DeviceIterating."""
+        return self.base.network.fetched(self.stream.download(self.p))
+
+    def residual(self) -> float:
+        """See Iterating; on the host, of the device's gradient."""
+        with device.guarded():
+            return self.base.metric.residual(self.base.network.fetched(self.stream.download(self.g)))
+
+    def look(self) -> None:
+        """The gradient at p."""
+        objective_kernels.gradient[self.launch_over](self.edges, self.given, self.p, self.g)
+
+    def linearise(self) -> None:
+        """The Hessian at p, and z of the gradient there."""
+        base, preconditioner = self.base, self.preconditioner
+        self.kernels.linearise[self.launch_over](
+            self.edges, base.hold, base.least, self.p, self.linear, preconditioner.blocks
+        )
+        negated[self.launch_over](self.g, preconditioner.r)
+        preconditioner.apply(self.z, 0, self.partials, self.idle)
+
+    def collected(self, count: int, terms: int) -> NDArray[np.float64]:
+        """The first sums, of so many terms; waits for them."""
+        sums.collect[1, sums.THREADS, self.stream.queue](count, self.partials, sums.blocks(terms), self.sums)
+        return self.stream.download(self.sums)[:count]
+
+    def search(self, direction: Any, first: float = 1.0) -> bool:
+        """Go to the first point at `first`, first/2, ... of a direction (f, 3) that descends enough; whether any
+        does."""
+        t, slope = first, float("nan")
+        for _ in range(_HALVINGS):
+            slope, rise = self._tried(direction, t)
+            if not slope < 0.0:
+                return False
+            if falls(rise, t, slope, 0.0):
+                self.p, self.q = self.q, self.p
+                return True
+            t *= 0.5
+        return False
+
+    def _tried(self, direction: Any, t: float) -> tuple[float, float]:
+        trial[self.over_all](self.p, direction, t, self.q, self.g, 0, self.partials)
+        objective_kernels.rise[self.over_all](self.edges, self.given, self.p, self.q, 1, self.partials)
+        slope, rise = self.collected(2, max(self.base.network.free, len(self.base.network.ends)))
+        return float(slope), float(rise)
+
+
+@cuda.jit
+def negated(x, out):
+    """Write -x (f, 3) to `out`, rounded."""
+    i = cuda.grid(1)
+    while i < out.shape[0]:
+        out[i, 0], out[i, 1], out[i, 2] = -x[i, 0], -x[i, 1], -x[i, 2]
+        i += cuda.gridsize(1)
+
+
+@cuda.jit
+def trial(p, d, t, q, g, which, partials):
+    """Write p + t d to the first rows of q, and keep the first stage of g'd."""
+    total, i = 0.0, cuda.grid(1)
+    while i < d.shape[0]:
+        for c in range(3):
+            step = np.float64(d[i, c])
+            q[i, c] = p[i, c] + t * step
+            total += g[i, c] * step
+        i += cuda.gridsize(1)
+    sums.keep(total, which, partials)

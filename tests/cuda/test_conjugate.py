@@ -1,0 +1,91 @@
+"""Conjugate gradients on a device, linear and nonlinear: the processor's iterates, in both precisions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import islice
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from solvers.cuda import sums
+from solvers.cuda.device import simulated
+from solvers.cuda.target import cuda
+from solvers.energies.springs import Springs
+from solvers.methods.newton_cg import NewtonCG
+from solvers.methods.pncg import NonlinearCG
+from solvers.problem import Positions, StepProblem, StopRule, Unsupported
+from tests.effects import BEND, DASHPOTS, DRAG, LIMITS, stepped
+from tests.effects import SCENES as EFFECTS
+from tests.effects import cloth as cloth_with
+from tests.scenes import SCENES, cloth, first_problem, random_problem
+
+METHODS: dict[str, Callable[..., Any]] = {"newton-cg": NewtonCG, "pncg": NonlinearCG}
+methods = pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
+
+PROBLEMS: dict[str, Callable[[], StepProblem]] = {
+    "chain": lambda: first_problem(SCENES["chain"](1e10)),
+    "cloth": lambda: first_problem(cloth(4, "exact")),
+    "bending, dashpots and drag": lambda: stepped(cloth_with(BEND, DASHPOTS, DRAG)),
+    "random": lambda: random_problem(0, weights=(1e4, np.inf, 1e2)),
+}
+PRECISIONS: tuple[Literal["float64", "float32"], ...] = ("float64", "float32")
+
+
+def spacing(problem: StepProblem) -> float:
+    """The mean length of springs at rest [m]."""
+    return float(np.mean(Springs.joined([e for e in problem.energies if isinstance(e, Springs)]).rest_length))
+
+
+def iterates(solver: Any, problem: StepProblem, count: int) -> list[Positions]:
+    return [p.copy() for p in islice(solver.prepare(problem.system).iterates(problem), count)]
+
+
+@methods
+@pytest.mark.parametrize("make", PROBLEMS.values(), ids=list(PROBLEMS))
+def test_iterates_are_those_of_the_processor(make: Callable[[], StepProblem], method: Callable[..., Any]) -> None:
+    problem = make()
+    wanted = iterates(method(preconditioner="block-jacobi"), problem, 3)
+    for precision, close in zip(PRECISIONS, (1e-10, 1e-5 * spacing(problem)), strict=True):
+        solver = method(preconditioner="block-jacobi", device="cuda", precision=precision)
+        np.testing.assert_allclose(iterates(solver, problem, 3), wanted, rtol=0, atol=close, err_msg=precision)
+
+
+@methods
+def test_it_ends_where_the_processor_does(method: Callable[..., Any]) -> None:
+    """Kernels in float32, and a minimum in float64."""
+    problem, rule = first_problem(cloth(3, "exact")), StopRule(200, 1e-8)
+    there = method(preconditioner="block-jacobi", device="cuda").prepare(problem.system).solve(problem, rule)
+    here = method(preconditioner="block-jacobi").prepare(problem.system).solve(problem, rule)
+    assert there.stopped == "tolerance"
+    np.testing.assert_allclose(there.positions, here.positions, rtol=0, atol=1e-7)
+
+
+@methods
+@pytest.mark.parametrize(
+    ("make", "preconditioner", "named"),
+    [
+        (lambda: stepped(cloth_with(LIMITS)), "block-jacobi", "StrainLimits"),
+        (lambda: stepped(EFFECTS["contact"]()), "block-jacobi", "ContactEnergy|Contact"),
+        (lambda: stepped(EFFECTS["gas"]()), "block-jacobi", "Gas"),
+        (lambda: first_problem(cloth(3, "exact")), "factor", "knows preconditioner: block-jacobi, not factor"),
+        (lambda: first_problem(cloth(3, "exact")), "schwarz", "knows preconditioner: block-jacobi, not schwarz"),
+    ],
+    ids=["strain limits", "contact", "gas", "factor", "schwarz"],
+)
+def test_what_it_does_not_know_it_refuses_by_name(
+    make: Callable[[], StepProblem], preconditioner: str, named: str, method: Callable[..., Any]
+) -> None:
+    with pytest.raises(Unsupported, match=f"device: cuda: .*({named})"):
+        method(preconditioner=preconditioner, device="cuda").prepare(make().system)
+
+
+def test_sums_of_blocks_are_added_by_a_tree(monkeypatch: pytest.MonkeyPatch) -> None:
+    if simulated():
+        monkeypatch.setattr(sums, "THREADS", 8)
+    count = 3 * sums.THREADS + 1
+    terms = np.random.default_rng(0).normal(size=(2, count))
+    given, out = cuda.to_device(terms), cuda.to_device(np.zeros(2))
+    sums.collect[1, sums.THREADS](2, given, count, out)
+    np.testing.assert_allclose(out.copy_to_host(), terms.sum(axis=1), rtol=1e-12)
