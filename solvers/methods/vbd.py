@@ -43,7 +43,7 @@ from solvers.kernels.half_spaces import HalfSpaces
 from solvers.kernels.loop import EACH, ITERATIONS, LAST, Limits
 from solvers.memory import aligned
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.problem import Positions, StepProblem, System, Unsupported
+from solvers.problem import Positions, Prepared, StepProblem, System, Unsupported
 from solvers.vectors.springs import LANES
 from solvers.vectors.vbd import NUMBERS
 
@@ -83,7 +83,7 @@ class VertexBlockDescent(Precise):
         if not 0.0 <= self.spectral_radius < 1.0:
             raise ValueError(f"spectral_radius: should be at least 0 and less than 1, not {self.spectral_radius}")
 
-    def prepare(self, system: System) -> Iterative:
+    def prepare(self, system: System) -> Prepared:
         """Raises Unsupported for other energies, NotPositiveDefinite."""
         if self.device == "cuda":
             from solvers.cuda.device import ready  # for those who ask for it

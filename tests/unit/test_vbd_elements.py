@@ -13,7 +13,7 @@ from solvers.compiling import kernel
 from solvers.core.vertex_elements import Beside
 from solvers.kernels.stencils import Kind, Vertices
 from solvers.methods.newton import Newton
-from solvers.methods.vbd import VertexBlockDescent
+from solvers.methods.vbd import PreparedVertexBlockDescent, VertexBlockDescent
 from solvers.problem import StopRule, Unsupported
 from tests.effects import BEND, DASHPOTS, FLOOR, LIMITS, RAYLEIGH, SCENES, cloth, stepped
 
@@ -89,6 +89,7 @@ def test_vertices_of_one_element_have_different_colours():
     ]  # fmt: skip
     apart = replace(system, energies=(*(e for e in system.energies if e not in beside.energies), *far))
     made = VertexBlockDescent().prepare(apart)
+    assert isinstance(made, PreparedVertexBlockDescent)
     bundle = {int(place) // 4: k // 8 for k, place in enumerate(made.blocks.bundles.own)}
     assert all(bundle[int(made.row[i])] != bundle[int(made.row[j])] for i, j in ((0, 35), (5, 30)))
 
