@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from hashlib import sha256
 from typing import Any, NamedTuple
@@ -77,8 +77,12 @@ BARS: tuple[Any, ...] = (
 """Triangles that point up and down to a bar."""
 CHEVRON: Any = ((-1, -0.7), (0, 0.1), (1, -0.7), (1, 0), (0, 0.8), (-1, 0), (-1, -0.7))
 """A broad stroke that is bent to point up."""
-SPEARHEAD: Any = ((1, 0), (-1, 0.5), (-1, -0.5), (1, 0))
-"""A slim triangle that points to the right."""
+SPEARHEADS: tuple[Any, ...] = (
+    ((1, 0), (-1, 0.5), (-1, -0.5), (1, 0)),
+    ((-1, 0), (1, 0.5), (1, -0.5), (-1, 0)),
+    ((0, -1), (0.5, 1), (-0.5, 1), (0, -1)),
+)
+"""Slim triangles that point to the right, to the left and down."""
 _MARKERS: tuple[Any, ...] = (
     "s",
     "o",
@@ -103,7 +107,7 @@ _MARKERS: tuple[Any, ...] = (
     ARROWHEAD,
     *BARS,
     CHEVRON,
-    SPEARHEAD,
+    *SPEARHEADS,
 )
 
 # Okabe and Ito's palette, less its yellow and black, and six more: for families in the order of the registry.
@@ -127,7 +131,7 @@ _MANY: tuple[tuple[float, Any], ...] = (
     *((0.0, "-"), (-0.3, DOTTED), (0.3, (0, (10, 3))), (-0.48, (0, (3, 1, 1, 1, 1, 1)))),
     *((0.15, (0, (8, 2, 2, 2, 2, 2))), (-0.16, (0, (1, 3))), (0.42, (0, (12, 2, 1, 2)))),
 )
-"""The same for a family of more than four, in line styles that no other has."""
+"""The same for a family of more than five, or of engines alone, in line styles that others hardly have."""
 _VARIANTS: tuple[Any, ...] = (*_DASHES, *(dash for _, dash in _MANY[2:]))
 """The line styles of what differs from a solver in its settings alone."""
 _STRANGERS = (
@@ -164,9 +168,17 @@ def _shipped(names: tuple[str, ...]) -> dict[str, Mark]:
     return {
         name: Mark(shade(color, by), markers[name], dash)
         for color, members in zip(_FAMILIES, families.values(), strict=False)
-        for name, (by, dash) in zip(members, _MEMBERS if len(members) <= len(_MEMBERS) else _MANY, strict=False)
+        for name, (by, dash) in zip(members, _members(members), strict=False)
         if name in markers
     }
+
+
+def _members(family: Sequence[str]) -> Sequence[tuple[float, Any]]:
+    """The shades and line styles of a family's members; engines' solid light brown would be others' green
+    to some, and their darkest brown is black."""
+    if not set(family) & SOLVERS.keys():
+        return *_MANY[:3], *_MANY[4:]
+    return _MANY if len(family) > len(_MEMBERS) else _MEMBERS
 
 
 def shade(color: str, by: float) -> str:

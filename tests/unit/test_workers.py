@@ -5,10 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from functools import partial
-from time import sleep
 from typing import NamedTuple
 
-import psutil
 import pytest
 
 from harness.base.errors import InputError, Mistake
@@ -76,8 +74,7 @@ def test_a_worker_is_another_process_and_stays(workers: Workers):
 def test_a_worker_that_died_in_between_is_replaced(workers: Workers):
     first = workers.do(does.name, quiet, NONE)
     os.kill(first, 9)
-    while psutil.Process(first).status() != psutil.STATUS_ZOMBIE:
-        sleep(0.001)
+    os.waitid(os.P_PID, first, os.WEXITED | os.WNOWAIT)  # its last thread has gone, and nobody was told yet
     assert workers.do(does.name, quiet, NONE) != first
 
 

@@ -16,7 +16,7 @@ from harness.report.style import (
     DOTTED,
     HOURGLASS,
     LOZENGE,
-    SPEARHEAD,
+    SPEARHEADS,
     STARS,
     Mark,
 )
@@ -29,7 +29,7 @@ _SYMBOLS: dict[Any, str] = {
     STARS[4]: "star-triangle-down", CORNERS[0]: "triangle-nw", CORNERS[1]: "triangle-ne", CORNERS[2]: "triangle-sw",
     CORNERS[3]: "triangle-se", HOURGLASS: "hourglass", BOWTIE: "bowtie", LOZENGE: "diamond-wide",
     ARROWHEAD: "arrow", BARS[0]: "arrow-bar-up", BARS[1]: "arrow-bar-down", CHEVRON: "arrow-wide",
-    SPEARHEAD: "arrow-right",
+    SPEARHEADS[0]: "arrow-right", SPEARHEADS[1]: "arrow-left", SPEARHEADS[2]: "arrow-down",
 }  # fmt: skip
 _DASHES: dict[Any, str] = {"-": "solid", DASHED: "dash", DOTTED: "dot", DASH_DOTTED: "dashdot"}
 
