@@ -93,6 +93,22 @@ def test_a_slowdown_is_believed_when_a_second_start_has_it_too(ratios: tuple[flo
     assert (found.interval.low, found.interval.high) == (pytest.approx(min(ratios)), pytest.approx(max(ratios)))
 
 
+def test_programs_are_started_anew_as_long_as_a_race_lasts(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("harness.experiments.gates.abba.PAIR", 0.0)  # a start for each turn
+    start, started = pairs(*[1.0] * 16)
+    found = confirmed(start, RULE, budget=60.0)  # type: ignore[arg-type]
+    assert (found.answer, found.starts, len(found.turns), len(started)) == (Verdict.HOLDS, 16, 16, 16)
+
+
+def test_pairs_that_differ_all_their_lives_decide_nothing_together(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("harness.experiments.gates.abba.PAIR", 0.0)
+    start, _ = pairs(*[1.05, 1.0] * 10_000)
+    found = confirmed(start, RULE, budget=0.05)  # type: ignore[arg-type]
+    assert found.answer is Verdict.UNDECIDED
+    assert found.starts == len(found.turns) > 16
+    assert found.elapsed == pytest.approx(0.05, abs=0.05)
+
+
 @pytest.mark.parametrize(
     ("answer", "limit", "interval", "said"),
     [

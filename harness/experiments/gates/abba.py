@@ -3,16 +3,18 @@
 A test sees what differs between two running programs, and two of the same code differ a little, by where their memory
 happens to lie (Mytkowicz et al. 2009). So the work of both is made anew between turns, elsewhere in memory, in an
 eighth of the time (after Curtsinger and Berger 2013): what places do is noise then, of which there are many draws.
-What a process keeps all its life is left: a slowdown is believed only when a second pair, started anew, is found to
-be slower too. Chance is ruled out by the first pair alone, so that the second needs fewer turns.
+What a process keeps all its life, such as where its compiled code lies, is noise likewise: both programs are started
+anew every PAIR seconds. A slowdown is believed only when a second race, by programs started anew, finds it too. Chance
+is ruled out by the first race alone, so that the second needs fewer turns.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from itertools import count
 from random import Random, SystemRandom
 from time import perf_counter
 from typing import Literal
@@ -27,6 +29,10 @@ BUDGET = 240.0
 SHARE = 0.125
 """Of the time, what making work anew may take. Places make turns differ by 1 to 2 %, other programs by 3 to 7 %: some
 twenty places are as good as hundreds, and turns are what is needed."""
+
+PAIR = 30.0
+"""Seconds of racing after which both programs are started anew: what differs between two processes of the same code all
+their lives, up to 1 %, is then drawn again. Most races end earlier, and a start takes two or three seconds."""
 
 CONFIRMS = 0.05
 """The error of the race that confirms a first one: both must be wrong for an alarm to be."""
@@ -48,6 +54,10 @@ class Racers:
     a: Timed
     b: Timed
     renew: Callable[[], None] | None = None
+
+
+Start = Callable[[], AbstractContextManager[Racers]]
+"""Starts both programs, which end with the block."""
 
 
 @dataclass(slots=True)
@@ -85,8 +95,8 @@ class Turn:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What came of a gate. elapsed: seconds that it took; load: the machine's load average at its end; starts: how many
-    pairs of programs were started, the second to confirm what the first found."""
+    """What came of a gate. elapsed: seconds that its turns took; load: the machine's load average at its end; starts:
+    how many pairs of programs were started, one every PAIR seconds and others to confirm what the first race found."""
 
     answer: Verdict
     rule: Rule
@@ -118,12 +128,15 @@ class Result:
         return f"load {self.load:.0f}" if self.load >= 1 else "no load"
 
 
-def race(racers: Racers, rule: Rule, *, budget: float = BUDGET, coin: Random | None = None) -> Result:
+def race(
+    racers: Racers, rule: Rule, *, budget: float = BUDGET, coin: Random | None = None, before: Sequence[Turn] = ()
+) -> Result:
     """Time both, warm, until the rule answers or `budget` seconds have gone.
 
-    coin: what decides the orders; the system's own where none is given, which nothing on the machine can follow.
+    coin: what decides the orders; the system's own where none is given, which nothing on the machine can follow;
+    before: turns that others of the same programs took already, and that count.
     """
-    game = playing(racers.b, rule, budget=budget, coin=coin, renew=racers.renew)
+    game = playing(racers.b, rule, budget=budget, coin=coin, renew=racers.renew, before=before)
     next(game)
     while True:
         try:
@@ -139,9 +152,10 @@ def playing(
     budget: float = BUDGET,
     coin: Random | None = None,
     renew: Callable[[], None] | None = None,
+    before: Sequence[Turn] = (),
 ) -> Generator[None, float, Result]:
     """The same for a caller that times A itself: each time this yields it wants the seconds of one call of A."""
-    began, turns, renewing = perf_counter(), list[Turn](), Renewing(renew)
+    began, turns, renewing = perf_counter(), list(before), Renewing(renew)
     for order in orders(coin):
         at, seconds = perf_counter(), list[float]()
         for who in order:
@@ -167,25 +181,34 @@ def result(rule: Rule, turns: list[Turn], elapsed: float) -> Result:
     return Result(rule.judge(x), rule, interval(x, rule.alpha), tuple(turns), elapsed, os.getloadavg()[0])
 
 
-def confirmed(start: Callable[[], AbstractContextManager[Racers]], rule: Rule, *, budget: float = BUDGET) -> Result:
-    """A race between programs that `start` starts; one that fails is repeated with programs started anew.
+def confirmed(start: Start, rule: Rule, *, budget: float = BUDGET) -> Result:
+    """A race between programs that `start` starts, anew every PAIR seconds; one that fails is repeated with others.
 
     The second has a larger error of its own (CONFIRMS); where it finds otherwise nothing is decided. The budget is that
-    of both together.
+    of both races together, without what it takes to start programs.
     """
-    with start() as racers:
-        first = race(racers, rule, budget=budget)
+    first = _raced(start, rule, budget)
     if first.answer is not Verdict.FAILS:
         return first
-    with start() as racers:
-        again = replace(rule, alpha=max(rule.alpha, CONFIRMS))
-        second = race(racers, again, budget=max(budget - first.elapsed, 0.0))
+    second = _raced(start, replace(rule, alpha=max(rule.alpha, CONFIRMS)), max(budget - first.elapsed, 0.0))
     answer = Verdict.FAILS if second.answer is Verdict.FAILS else Verdict.UNDECIDED
     both, elapsed = (*first.turns, *second.turns), first.elapsed + second.elapsed
     # Each race's interval has its own error; the wider ends hold what both say.
     low, high = (f(getattr(r.interval, end) for r in (first, second)) for f, end in ((min, "low"), (max, "high")))
     found = RatioInterval(interval([t.log_ratio for t in both], rule.alpha).ratio, low, high)
-    return Result(answer, rule, found, both, elapsed, second.load, starts=2)
+    return Result(answer, rule, found, both, elapsed, second.load, first.starts + second.starts)
+
+
+def _raced(start: Start, rule: Rule, budget: float) -> Result:
+    """One race, of pairs that are started one after the other, whose turns count together."""
+    elapsed, turns = 0.0, tuple[Turn, ...]()
+    for starts in count(1):
+        with start() as racers:
+            found = race(racers, rule, budget=min(PAIR, budget - elapsed), before=turns)
+        elapsed, turns = elapsed + found.elapsed, found.turns
+        if found.answer is not Verdict.UNDECIDED or elapsed >= budget:
+            return replace(found, elapsed=elapsed, starts=starts)
+    raise AssertionError("count does not end")
 
 
 def _percent(ratio: float) -> str:

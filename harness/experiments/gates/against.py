@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from math import ceil
 from pathlib import Path
 from random import sample
@@ -78,8 +78,9 @@ def run_gates(
     """Race this checkout, the first side, against the revision; each result is told as it comes. Raises InputError."""
     rule = Rule(options.limit, options.alpha / len(requests))
     found: list[tuple[Request, Result]] = []
+    told = cache(say)  # what differs is found at each start, and told once
     for request in requests:
-        result = confirmed(partial(started, sides, request, options, say), rule, budget=options.budget)
+        result = confirmed(partial(started, sides, request, options, told), rule, budget=options.budget)
         say(f"{request.title}: {result}")
         found.append((request, result))
     return found

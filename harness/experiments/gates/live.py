@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -48,10 +48,11 @@ def hold(
     found = rows.read([path], SCHEMA).to_pylist() if path.exists() else []
     sides = Side("the one", checkout, extra=planted), Side("the other", checkout)
     rule = Rule(options.limit, options.alpha)
+    told = cache(say)  # what differs is found at each start, and told once
     with competing(condition):
         for number in range(gates):
             for request in requests:
-                result = confirmed(partial(started, sides, request, options, say), rule, budget=options.budget)
+                result = confirmed(partial(started, sides, request, options, told), rule, budget=options.budget)
                 say(f"{number + 1} of {gates}, {request.title}: {result}")
                 held = {"gate": request.title, "condition": condition, "planted": planted, "limit": options.limit}
                 held |= {"answer": result.answer.name.lower(), "ratio": result.interval.ratio}

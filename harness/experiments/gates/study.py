@@ -2,8 +2,8 @@
 
 A record holds the four times of each turn of two processes of the same code, start after start. A replay draws
 stretches of successive turns, so that bursts stay bursts, strings them together to as many turns as a budget has room
-for, makes the candidate's times so much longer as is asked, and lets the rule look after every turn; what fails it
-repeats on another start's turns, as a gate does.
+for, makes the candidate's times so much longer as is asked, and lets the rule look after every turn. Every PAIR seconds
+it goes on with another start's turns, and what fails it repeats with others, as a gate does.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from scipy.stats import mannwhitneyu
 from harness.base import columns, rows
 from harness.base.errors import InputError
 from harness.base.worker import tie
-from harness.experiments.gates.abba import CONFIRMS, Renewing, orders
+from harness.experiments.gates.abba import CONFIRMS, PAIR, Renewing, orders
 from harness.experiments.gates.against import Options, Request, started
 from harness.experiments.gates.pair import Side
 from harness.experiments.gates.sequential import Rule, Verdict
@@ -83,11 +83,12 @@ def record(
     planted: float = 0.0,
 ) -> None:
     """Record so many seconds of turns, of each request in its turn, in so many starts, beside what the condition says.
-    What was recorded so far is stored after each start."""
-    found: list[dict[str, Any]] = []
+    What was recorded so far is stored after each start, and what the file holds already is kept: starts count on."""
+    found = rows.read([path], SCHEMA).to_pylist() if path.exists() else []
+    first = max((row["start"] for row in found), default=-1) + 1
     sides = Side("the one", checkout, extra=planted), Side("the other", checkout)
     with competing(condition):
-        for start in range(starts):
+        for start in range(first, first + starts):
             with ExitStack() as alive:
                 pairs = [
                     alive.enter_context(started(sides, request, Options(seconds), lambda line: None))
@@ -173,11 +174,16 @@ def replay(starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
 def _race(
     rng: np.random.Generator, starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
 ) -> tuple[Verdict, float]:
-    """The answer on some start's turns, and the seconds that it took."""
-    start = starts[int(rng.integers(len(starts)))]
-    turns = _stretches(rng, len(start.log_ratios), max(1, int(budget / start.wall)))
-    answer, used = rule.first(np.log(slower) + start.log_ratios[turns])
-    return answer, used * start.wall
+    """The answer on the turns of some starts, one every PAIR seconds, and the seconds that it took."""
+    drawn, walls, left = list[Array](), list[Array](), budget
+    while left > 0.0 or not drawn:
+        start = starts[int(rng.integers(len(starts)))]
+        turns = _stretches(rng, len(start.log_ratios), max(1, int(min(PAIR, left) / start.wall)))
+        drawn.append(start.log_ratios[turns])
+        walls.append(np.full(len(turns), start.wall))
+        left -= PAIR
+    answer, used = rule.first(np.log(slower) + np.concatenate(drawn))
+    return answer, float(np.concatenate(walls)[:used].sum())
 
 
 def _stretches(rng: np.random.Generator, length: int, turns: int) -> NDArray[np.int64]:

@@ -43,7 +43,7 @@ def _asked(config: Path, sizes: list[int] | None, solvers: list[str] | None) -> 
 
 @study.command()
 def record(
-    samples: Annotated[Path, typer.Argument(help="Where to store the turns (.parquet).")],
+    samples: Annotated[Path, typer.Argument(help="Where to store the turns (.parquet); those there are kept.")],
     config: Config,
     condition: Condition = "nothing",
     seconds: Annotated[float, typer.Option(help="For all runs together, which take turns.")] = 1800.0,
