@@ -1,0 +1,73 @@
+"""How often our own gates are wrong while other programs keep the machine busy: each is held so many times.
+
+    python -m tests.bench.under_load [--times 50] [--condition busy] [--budget 10] [GATE ...]
+
+A program on each core goes through memory beside them, always (`busy`) or in bursts (`bursty`); `nothing` leaves the
+load to others. The work of both sides is prepared anew for each race. None may fail: what they compare lies below
+their limits by more than a load moves ratios by.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from statistics import median
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from harness.base.machine import pinned_threads
+from harness.experiments.gates.abba import Racers, Result, race
+from harness.experiments.gates.agreement import difference
+from harness.experiments.gates.scenes import calls_of, timed
+from harness.experiments.gates.sequential import Rule, Verdict
+from harness.experiments.gates.study import competing
+from tests.bench.contact import CONTACT
+from tests.bench.gates import GATES, THREADS, Gate
+
+NAMED = {gate.name: gate for gate in (*GATES, *CONTACT)}
+ASKED = ("harness-against-bare-solver-64", "numba-against-sparse-64", "idle-contact-against-none-64")
+
+
+def held(gate: Gate, budget: float) -> Result:
+    """One race of a gate, as `race` of the plugin for pytest has it."""
+    candidate, yardstick = gate.candidate(), gate.yardstick()
+    assert gate.tolerance is not None, f"{gate.name}: has no answers to compare"
+    if said := difference(candidate(), yardstick(), gate.tolerance):
+        raise AssertionError(f"{gate.name}: {said}")
+    calls = calls_of(candidate, yardstick)
+    a, b = (timed(work, calls, gate.clock) for work in (candidate, yardstick))
+    return race(Racers(a, b), Rule(gate.limit, gate.error), budget=budget)
+
+
+def main() -> None:
+    """Print a row for each gate."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("gates", nargs="*", metavar="GATE", help=f"of {', '.join(NAMED)}")
+    parser.add_argument("--times", type=int, default=50)
+    parser.add_argument("--condition", default="busy")
+    parser.add_argument("--budget", type=float, default=10.0)
+    asked = parser.parse_args()
+    if unknown := sorted({*asked.gates} - NAMED.keys()):
+        parser.error(f"{', '.join(unknown)}: no such gate; there are {', '.join(NAMED)}")
+    console = Console(width=120)
+    found: dict[str, list[Result]] = {name: [] for name in asked.gates or ASKED}
+    with pinned_threads(THREADS), competing(asked.condition):
+        for number in range(asked.times):
+            for name, results in found.items():
+                results.append(held(NAMED[name], asked.budget))
+                console.print(f"{number + 1} of {asked.times}, {name}: {results[-1]}", style="dim")
+    table = Table("gate", "limit", "fails", "holds", "cannot tell", "ratio", "median s", "load", box=SIMPLE_HEAD)
+    for name, results in found.items():
+        answers = Counter(result.answer for result in results)
+        counts = (str(answers[verdict]) for verdict in (Verdict.FAILS, Verdict.HOLDS, Verdict.UNDECIDED))
+        ratio, seconds, load = (
+            median(values) for values in zip(*((r.interval.ratio, r.elapsed, r.load) for r in results), strict=True)
+        )
+        table.add_row(name, f"{NAMED[name].limit}", *counts, f"{ratio:.3f}", f"{seconds:.1f}", f"{load:.1f}")
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()
