@@ -20,6 +20,7 @@ from solvers.methods.newton import Newton
 from solvers.problem import Positions, Solution, StepProblem, StopRule
 
 HARD = Path(__file__).resolve().parents[2] / "configs" / "hard"
+SCENES = HARD.with_name("scenes")
 
 
 def case(name: str) -> tuple[Scene, StepProblem]:
@@ -96,6 +97,20 @@ def test_of_large_systems_conjugate_gradients_give_nearly_the_same_and_never_mor
     exact = Oracle(made.system).residual(stated, stated.current)
     monkeypatch.setattr(oracle_module, "LARGEST", 0)
     assert 0.9 * exact <= Oracle(made.system).residual(stated, stated.current) <= exact * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(("scene", "size"), [("hanging-cloth", 45), ("flag-in-wind", 55)])
+def test_conjugate_gradients_give_four_digits_over_levels_of_multigrid(
+    scene: str, size: int, monkeypatch: pytest.MonkeyPatch
+):
+    made = build(load_scene(SCENES / f"{scene}.yaml"), size)
+    stated, far = problem(made, start(made), "current"), made.mesh.rest**3
+    exact = [Oracle(made.system).residual(stated, p) for p in (stated.current, far)]
+    monkeypatch.setattr(oracle_module, "LARGEST", 0)
+    oracle = Oracle(made.system)
+    found = [oracle.residual(stated, p) for p in (stated.current, far)]
+    assert len(oracle._multigrid.sizes) > 1, "a mesh of 2,000 vertices is coarsened"  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(found, exact, rtol=1e-5)  # a pin of 1e8 times what the springs pull costs some digits
 
 
 def test_what_overflows_is_not_stationary():
