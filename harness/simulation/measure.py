@@ -102,6 +102,7 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
 
     prepared = None
     for round in range(settings.rounds + 1):
+        prepared = None  # what it holds is free again before the next one takes as much
         with watch("prepare"):
             began = perf_counter()
             prepared = prepare(scene, solver)
