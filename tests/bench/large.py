@@ -1,0 +1,96 @@
+"""What large meshes take: processor time, memory, and what is left by the oracle, of the runs of a sweep, once each.
+
+    python -m tests.bench.large [CONFIG] [--only WORDS]
+
+CONFIG is `configs/growth-large.yaml` if left out; WORDS are of a run's scene, size, solver and first guess, in this
+order, as in "flag-in-wind 122". Each run has a process of its own, whose peak of memory is told, oracle included.
+Preparing and steps are timed apart, steps from the first on, after one iteration that warms up; a step's time is the
+mean over frames. `left` is the largest |Q^-1 grad g|_Q over the frames, relative to that at the frame's current
+positions, and `growth` the power of the vertices that a step's processor time grows with from the same solver's
+smallest mesh on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+from concurrent.futures import ProcessPoolExecutor
+from math import log
+from multiprocessing import get_context
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import NamedTuple
+
+from harness.base.machine import pinned_threads
+from harness.config.load import load_sweep
+from harness.config.sweep import RunSpec
+from harness.reference.oracle import Oracle
+from harness.scenes.bind import build
+from harness.simulation.algebraic import stop_rule
+from harness.simulation.step import prepare, problem, simulate, start
+from solvers.problem import StopRule
+from solvers.registry import SOLVERS, load
+
+GROWTH = Path(__file__).parents[2] / "configs" / "growth-large.yaml"
+
+
+class Took(NamedTuple):
+    """Of a run: vertices; processor seconds of preparing and of a step, wall seconds of a step; iterations of a step;
+    what is left; the peak of memory [GiB]."""
+
+    vertices: int
+    prepare: float
+    step: float
+    wall: float
+    iterations: float
+    left: float
+    peak: float
+
+
+def took(run: RunSpec) -> Took:
+    """Do a run, and look at each of its steps when the clocks stand."""
+    with pinned_threads(1):
+        scene = build(run.scene, run.size, run.integrator)
+        stop = stop_rule(run.iterations, run.tolerance)
+        assert isinstance(stop, StopRule), "a tolerance by the step's own error has no yardstick to be relative to"
+        began = process_time()
+        prepared = prepare(scene, load(SOLVERS[str(run.solver.name)])(**run.solver.parameters))
+        ready = process_time() - began
+        first = problem(scene, start(scene), run.first_guess)
+        prepared.solve(first, StopRule(1, stop.tolerance))
+        oracle, step, wall, iterations, left = Oracle(scene.system), 0.0, 0.0, 0, 0.0
+        steps = simulate(scene, prepared, stop, first_guess=run.first_guess, frames=run.frames)
+        for _ in range(run.frames):
+            began, then = process_time(), perf_counter()
+            done = next(steps)
+            step, wall = step + process_time() - began, wall + perf_counter() - then
+            iterations += done.iterations
+            stated = done.problem
+            left = max(left, oracle.residual(stated, done.solution.positions) / oracle.yardstick(stated))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    frames = run.frames
+    return Took(len(scene.mesh.rest), ready, step / frames, wall / frames, iterations / frames, left, peak)
+
+
+def main() -> None:
+    """Print a line for each run when it is done."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("config", nargs="?", type=Path, default=GROWTH, metavar="CONFIG")
+    parser.add_argument("--only", default="", metavar="WORDS")
+    asked = parser.parse_args()
+    smallest: dict[tuple[str, str, str], Took] = {}
+    print("run | vertices | prepare s | step s | wall s | iterations | left | peak GiB | growth")
+    for run in load_sweep(asked.config).runs():
+        title = f"{run.title} {run.first_guess}"
+        if asked.only not in title:
+            continue
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+            t = alone.submit(took, run).result()
+        least = smallest.setdefault((run.scene_name, run.solver.name, run.first_guess), t)
+        growth = f"{log(t.step / least.step) / log(t.vertices / least.vertices):.2f}" if least is not t else ""
+        line = f"{title} | {t.vertices:,} | {t.prepare:.2f} | {t.step:.3g} | {t.wall:.3g}"
+        print(f"{line} | {t.iterations:.1f} | {t.left:.2e} | {t.peak:.2f} | {growth}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
