@@ -4,8 +4,8 @@ A step of implicit Euler minimises the incremental potential (Liu et al. 2013, e
 
     g(p) = sum of energies(p) + c/(2 dt^2) |p - target|_M^2 - tr(p' f) + sum_pins w/2 |p_i - pin_i|^2
 
-over the positions p, with c = 1 and target = 2 p^t - p^(t-dt); other integrators have another c and another target
-(see `solvers.integrators`). `StepProblem` states it in plain NumPy: every accuracy figure is taken from it.
+over the positions p that keep all exact lengths, with c = 1 and target = 2 p^t - p^(t-dt); other integrators have
+others (see `solvers.integrators`). `StepProblem` states g in plain NumPy: every accuracy figure is taken from it.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from typing import ClassVar, Literal, Protocol, TypeGuard, runtime_checkable
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+
+from solvers.held import Lengths, Pins
 
 Positions = NDArray[np.float64]
 """Positions [m], shape (n, 3), float64, C-contiguous."""
@@ -62,26 +64,13 @@ class ProjectiveEnergy(Energy, Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pins:
-    """Pinned vertices: `vertices` (q,), sorted and unique; `weight` (q,) [N/m], infinite for an exact pin."""
-
-    vertices: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
-    weight: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-
-    @property
-    def exact(self) -> NDArray[np.bool_]:
-        """Which pins are eliminated rows instead of penalties, shape (q,)."""
-        return np.isinf(self.weight)
-
-
 @dataclass(frozen=True, eq=False)
 class System:
     """What stays fixed in a run, and so is factorised once.
 
     mass: (n,) [kg], zero is allowed where springs or pins hold the vertex; time_step: dt [s];
     energies: potentials of the positions; pins: which vertices are pinned, and how; factor, speed: of the integrator,
-    c and the unknown's velocity over its change in 1/dt, None for sqrt(c).
+    c and the unknown's velocity over its change in 1/dt, None for sqrt(c); lengths: what is kept exactly.
     """
 
     mass: NDArray[np.float64]
@@ -90,6 +79,7 @@ class System:
     pins: Pins = field(default_factory=Pins)
     factor: float = 1.0
     speed: float | None = None
+    lengths: tuple[Lengths, ...] = ()
 
     @property
     def rate(self) -> float:
@@ -132,7 +122,7 @@ class Start:
     positions: p^t (n, 3) [m]; velocity: v^t, filters included, (n, 3) [m/s]; time: t [s]; origin (n, 3) [m] and rate
     [1/s]: the unknown x moves with the velocity rate (x - origin); until: the time of x [s] (nan, which spoils all that
     depends on it, where it is not told); ahead: how far [s] to extrapolate what is lagged; lagged: where it is taken
-    instead, (n, 3) [m]; acceleration: what the motion so far leads to expect, (n, 3) [m/s^2].
+    instead, (n, 3) [m]; acceleration: what the motion so far leads to expect, (n, 3) [m/s^2]; kept: by the last solve.
     """
 
     positions: Positions
@@ -144,6 +134,7 @@ class Start:
     ahead: float = 0.0
     lagged: Positions | None = None
     acceleration: Positions | None = None
+    kept: NDArray[np.float64] | None = None
 
     @property
     def expected(self) -> Positions:
@@ -246,7 +237,8 @@ class Solution:
     """Where a solve ended. positions: (n, 3) [m]; iterations: how many were done; residual: |Q^-1 grad g|_Q [J^(1/2)]
     over the unpinned vertices, by which the rule judged (nan for a method that does not minimise), of the iterate that
     residual_of names; yardstick: the same at the current positions (nan without a tolerance); stopped: "iterations",
-    "tolerance", "floor", or "stalled" where nothing descends any more; velocity: (n, 3) [m/s], of a method's own."""
+    "tolerance", "floor", or "stalled" where nothing descends any more; velocity: (n, 3) [m/s], of a method's own; kept
+    (of any shape): what it begins the next step with."""
 
     positions: Positions
     iterations: int
@@ -255,6 +247,7 @@ class Solution:
     stopped: str
     velocity: Positions | None = None
     residual_of: ResidualOf = "returned"
+    kept: NDArray[np.float64] | None = None
 
 
 class Prepared(Protocol):
@@ -289,7 +282,8 @@ class Prepared(Protocol):
 
 class Solver(Protocol):
     """A frozen dataclass of a method's parameters. minimises: whether its iterates tend to a minimum of the step's
-    objective; others are graded on their trajectories. descends: whether it rises in no iteration, round-off apart."""
+    objective; others are graded on their trajectories. descends: whether it rises in no iteration, round-off apart.
+    One that keeps exact lengths has `keeps_lengths` as well, True."""
 
     minimises: ClassVar[bool]
     descends: ClassVar[bool]

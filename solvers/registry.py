@@ -7,7 +7,7 @@ from typing import Any
 from solvers.about import About
 from solvers.plugins import Table, load
 
-__all__ = ["EVERY", "OPTIONAL", "SOLVERS", "about", "load", "minimises"]
+__all__ = ["EVERY", "OPTIONAL", "SOLVERS", "about", "load", "minimises", "name_of"]
 
 SOLVERS = {
     "dense": "solvers.methods.local_global:DenseLocalGlobal",
@@ -38,6 +38,7 @@ SOLVERS = {
     "a-jacobi": "solvers.methods.a_jacobi:AggregatedJacobi",
     "mgpbd": "solvers.methods.mgpbd:MultigridXpbd",
     "jgs2": "solvers.methods.jgs2:Jgs2",
+    "avbd": "solvers.methods.avbd:AugmentedVertexBlockDescent",
 }
 
 OPTIONAL = {
@@ -57,6 +58,13 @@ EVERY = Table("springbench.solvers", SOLVERS, OPTIONAL)
 def minimises(solver: Any) -> bool:
     """Whether a solver's iterates tend to a minimum; one that does not say counts as one whose do, and is graded so."""
     return getattr(solver, "minimises", True)
+
+
+def name_of(solver: Any) -> str:
+    """The name of a solver of the registry, and of another that of its class."""
+    kind: type = solver if isinstance(solver, type) else solver.__class__
+    named = {target: name for name, target in (SOLVERS | OPTIONAL).items()}
+    return named.get(f"{kind.__module__}:{kind.__qualname__}", kind.__name__)
 
 
 def about(solver: Any, name: str) -> About:

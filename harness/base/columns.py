@@ -170,6 +170,12 @@ COLUMNS = (
         "what 99 % of the springs stay below of it; the largest grows with the mesh where a single vertex bears a load",
     ),
     Column(
+        "off",
+        _REAL,
+        "",
+        "where lengths are exact: the largest error of one after the step, over the longest that is allowed",
+    ),
+    Column(
         "penetration",
         _REAL,
         "m",

@@ -3,7 +3,8 @@
 What is stationary `harness.reference.oracle` tells, with a matrix that it assembles and factorises itself, whatever the
 solver does. A stationary point is a minimum where the smallest eigenvalue of its Hessian is positive beyond round-off
 (`harness.reference.curvature`). The motion is compared with a reference run, each step of which was taken down to
-round-off, and vertex by vertex: a distance counts by the size of the component that the vertex belongs to.
+round-off, and vertex by vertex: a distance counts by the size of the component that the vertex belongs to. A step
+that keeps lengths exactly is judged by its Lagrangian (`harness.reference.exact`).
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.reference.curvature import curvature
+from harness.reference.curvature import Curvature, curvature
+from harness.reference.exact import FIRM, Exact
 from harness.reference.minimiser import TO_THE_END
 from harness.reference.oracle import Oracle, Reading, sizes
 from harness.scenes.bind import Scene
 from harness.simulation.step import Step, prepare, simulate
-from solvers.problem import Positions, Solver, StepProblem
+from solvers.problem import Positions, Solver, StepProblem, System
 
 LOST = 1e-6
 """A reference step ends at most this far, in stationarity beyond round-off, from a stationary point."""
@@ -31,6 +33,7 @@ class Judge:
         """reference: positions (frames, n, 3) [m], nan from the frame on in which there is none, None for none at all;
         minimises: whether the solver means to."""
         self._oracles: dict[float, Oracle] = {}
+        self._exact: dict[float, Exact] = {}
         self._sizes = sizes(scene.system, scene.mesh.rest)
         self._reference, self._minimises = reference, minimises
 
@@ -45,16 +48,32 @@ class Judge:
         if self._minimises:
             readings = [self.stationarity(stated, solution.positions) for stated, solution in step.stages]
             row["stationarity"], row["attainable"], row["beyond"] = max(readings, key=_worse)
-            found = [curvature(stated, solution.positions) for stated, solution in step.stages]
+            found = [self.curvature(stated, solution.positions) for stated, solution in step.stages]
             row["minimum"], row["flat"] = all(one.convex for one in found), any(one.flat for one in found)
         return row
 
     def stationarity(self, problem: StepProblem, p: Positions) -> Reading:
         """As `Oracle` has it; a scene whose first step or every second one differs has two systems."""
-        system = problem.system
+        exact = self._lengths(problem.system)
+        system = exact.augmented if exact else problem.system
         if system.rate not in self._oracles:
             self._oracles[system.rate] = Oracle(system)
-        return self._oracles[system.rate].stationarity(problem, p)
+        oracle = self._oracles[system.rate]
+        if not exact:
+            return oracle.stationarity(problem, p)
+        tension = exact.tensions(problem, p)
+        slack = oracle.yardstick(exact.lagrangian(problem, np.zeros_like(tension)))
+        return oracle.stationarity(exact.lagrangian(problem, tension), p, slack)
+
+    def curvature(self, problem: StepProblem, p: Positions) -> Curvature:
+        """That of the objective, or of a Lagrangian whose penalties are large."""
+        exact = self._lengths(problem.system)
+        return curvature(exact.lagrangian(problem, exact.tensions(problem, p), FIRM) if exact else problem, p)
+
+    def _lengths(self, system: System) -> Exact | None:
+        if system.lengths and system.rate not in self._exact:
+            self._exact[system.rate] = Exact(system)
+        return self._exact.get(system.rate)
 
 
 def reference(scene: Scene, solver: Solver, *, first_guess: str, frames: int) -> NDArray[np.float64]:

@@ -48,6 +48,8 @@ class Field:
             raise Unintegrable("vertices without mass have no acceleration; give them mass or pin them")
         if not system.pins.exact.all():
             raise Unintegrable("pins by penalty vibrate faster than can be followed; make them exact")
+        if system.lengths:
+            raise Unintegrable("lengths that are exact make it no differential equation; give them a stiffness")
         if without_contact(system) is not system:
             raise Unintegrable("contact is stiff, and its friction begins anew each step; leave it out")
         x = scene.springs

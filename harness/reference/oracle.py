@@ -123,9 +123,10 @@ class Oracle:
             self._known = problem, max(self.residual(problem, problem.current), floor)
         return self._known[1]
 
-    def stationarity(self, problem: StepProblem, p: Positions) -> Reading:
-        """How stationary p (n, 3) [m] is."""
-        yardstick, gradient, bound = self.yardstick(problem), problem.gradient(p), gradient_round_off(problem, p)
+    def stationarity(self, problem: StepProblem, p: Positions, yardstick: float | None = None) -> Reading:
+        """How stationary p (n, 3) [m] is, by the step's yardstick or another [J^(1/2)]."""
+        yardstick = self.yardstick(problem) if yardstick is None else yardstick
+        gradient, bound = problem.gradient(p), gradient_round_off(problem, p)
         reached = self.length(gradient) / yardstick
         doubtless = gradient - within(gradient, FACTOR * bound)
         beyond = min(reached, self.length(doubtless) / yardstick)

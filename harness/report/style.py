@@ -81,8 +81,9 @@ SPEARHEADS: tuple[Any, ...] = (
     ((1, 0), (-1, 0.5), (-1, -0.5), (1, 0)),
     ((-1, 0), (1, 0.5), (1, -0.5), (-1, 0)),
     ((0, -1), (0.5, 1), (-0.5, 1), (0, -1)),
+    ((0, 1), (0.5, -1), (-0.5, -1), (0, 1)),
 )
-"""Slim triangles that point to the right, to the left and down."""
+"""Slim triangles that point to the right, to the left, down and up."""
 _MARKERS: tuple[Any, ...] = (
     "s",
     "o",

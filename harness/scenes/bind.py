@@ -92,8 +92,15 @@ class Scene:
 
     @cached_property
     def springs(self) -> Springs:
-        """All springs that have stiffness: effect by effect, each in the mesh's order."""
-        return Springs.joined([energy for energy in self.system.energies if isinstance(energy, Springs)])
+        """All springs that have stiffness: effect by effect, each in the mesh's order; last those that are exact, whose
+        stiffness is infinite."""
+        exact = [x for x in self.system.lengths if (x.low == x.high).all()]
+        return Springs.joined(
+            [
+                *(energy for energy in self.system.energies if isinstance(energy, Springs)),
+                *(Springs(x.edges, np.full(len(x.low), np.inf), x.high, x.rest_direction) for x in exact),
+            ]
+        )
 
 
 def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Scene:
@@ -110,12 +117,13 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
     energies = tuple(energy for part in parts for energy in part.energies)
     energies += tuple(energy for part in parts for derive in part.derived for energy in derive(energies))
     forces = [force for part in parts for force in part.forces]
+    lengths = tuple(one for part in parts for one in part.lengths)
     load = np.zeros_like(mesh.rest)
     for force in forces:
         if isinstance(force, Steady):
             load += force.force
     load.flags.writeable = False
-    system = System(mass, spec.time_step, energies, pins, method.factor, method.speed)
+    system = System(mass, spec.time_step, energies, pins, method.factor, method.speed, lengths)
     _require_determined(system)
     start = spec.start or AT_REST
     _check(parts, start.positions(mesh.rest))

@@ -61,8 +61,9 @@ def spring_stiffness(
     """The stiffness of each spring, (m,) [N/m], from a constant for each family, or by its direction, and one of
     `RULES`.
 
-    Raises InputError for an unknown rule, a constant that is not finite or below zero, a rule that does not
-    fit the mesh, and a `reference` that is missing (liu2013) or has no meaning (the others).
+    A constant of stretch or shear may be infinite: those springs are exact. Raises InputError for an unknown rule, any
+    other constant that is not finite, one below zero, a rule that does not fit the mesh, and a `reference` that is
+    missing (liu2013) or has no meaning (the others).
     """
     if rule not in RULES:
         raise InputError(Mistake(f"unknown rule {rule!r}; wanted {did_you_mean(rule, RULES)}", key="rule"))
@@ -74,7 +75,7 @@ def spring_stiffness(
         if isinstance(constant, Weave):
             k[of] = constant.of(mesh, mesh.springs[of]) * RULES[rule](mesh, family, reference)
             continue
-        if not 0 <= constant < np.inf:
+        if not 0 <= constant < np.inf and (family == BEND or constant != np.inf):
             raise InputError(Mistake(f"{constant} is no stiffness; wanted a finite number >= 0", key=family))
         k[of] = constant * RULES[rule](mesh, family, reference)
     return _relieved(mesh, k) if rule == "continuum" else k

@@ -21,6 +21,7 @@ from harness.simulation.measure import NO_CLOCK, Diverged, Settings, StepFailed,
 from harness.simulation.step import Step, start
 from harness.simulation.trace import EnergyNorm, trace
 from solvers.contact.energy import Contact
+from solvers.energies.augmented import off
 from solvers.problem import Positions, Prepared
 
 _OWN = ("springs", "inertia", "force", "pins")
@@ -87,6 +88,7 @@ def columns(scene: Scene, step: Step, terms: Mapping[str, float], residual: floa
         "energy_effects": sum(value for name, value in terms.items() if name not in _OWN),
         "objective": sum(terms.values()),
         **strain_of(scene, p),
+        "off": off_of(scene, p),
         "penetration": penetration(scene, p, scene.time(step.index)),
         "intersections": intersections(scene, p, scene.time(step.index)),
         "iterations": step.iterations,
@@ -147,6 +149,12 @@ def strain_of(scene: Scene, p: Positions) -> dict[str, float]:
     strain = np.abs(of_spring)
     percentile = float(np.percentile(strain, 99)) if len(strain) else 0.0
     return {"largest_strain": float(strain.max(initial=0.0)), "strain_99": percentile}
+
+
+def off_of(scene: Scene, p: Positions) -> float | None:
+    """The largest error of a length that is exact at p (n, 3) [m], over the longest allowed; None where none is."""
+    errors = [np.abs(off(lengths, p) / lengths.high).max(initial=0.0) for lengths in scene.system.lengths]
+    return float(max(errors)) if errors else None
 
 
 def require_numbers(by_frame: Mapping[int, dict[str, Any]], *, minimises: bool, tolerance: bool) -> None:

@@ -7,26 +7,32 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from weakref import WeakKeyDictionary
 
+import numpy as np
+from numpy.typing import NDArray
+
 from harness.base.errors import InputError
 from harness.scenes.bind import COARSEST, Scene
 from harness.simulation.algebraic import LocalErrors, Stated, Stop
 from harness.simulation.coarser import Coarser
 from harness.simulation.stages import Guess, Stages, require_mass
 from solvers.core.clearing import begun_free
+from solvers.core.driver import EXACT
 from solvers.integrators import IMPLICIT_EULER, Integrator, Motion
 from solvers.problem import Positions, Prepared, Solution, Solver, Start, StepProblem, StopRule, System, Unsupported
-from solvers.registry import SOLVERS, load
+from solvers.registry import SOLVERS, load, name_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
     """now, the motion at the start of the next step; before, one step earlier and filtered, None where there is none;
-    index of the last step, 0 at the start; acceleration (n, 3) [m/s^2] now, None where it is not known."""
+    index of the last step, 0 at the start; acceleration (n, 3) [m/s^2] now, None where it is not known; kept: of the
+    last step's solution."""
 
     now: Motion
     before: Motion | None
     index: int
     acceleration: Positions | None = None
+    kept: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +84,9 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
     target, origin = method.predict(now, before, dt)
     when, ahead = time + method.when * dt, method.ahead * dt
     led = (now.velocity - before.velocity) / dt if first_guess == "motion" and state.before else None
-    begun = Start(now.positions, now.velocity, time, origin, system.rate, when, ahead, acceleration=led)
+    begun = Start(
+        now.positions, now.velocity, time, origin, system.rate, when, ahead, acceleration=led, kept=state.kept
+    )
     force = scene.load
     if scene.forces:
         a = method.ahead
@@ -95,8 +103,11 @@ def problem(scene: Scene, state: State, first_guess: str) -> StepProblem:
 
 def prepare(scene: Scene, solver: Solver) -> Prepared:
     """The solver, ready for all of the scene's steps; raises what `solver.prepare` raises, and Unsupported where steps
-    differ in length and the integrator goes by two of them, or where it needs masses that are not there."""
+    differ in length and the integrator goes by two of them, where it needs masses that are not there, or where lengths
+    are exact and the solver does not keep them."""
     require_mass(scene)
+    if scene.system.lengths and not getattr(solver, "keeps_lengths", False):
+        raise Unsupported(f"{name_of(solver)}: {EXACT}")
     history, alternate = isinstance(scene.integrator, Integrator) and scene.integrator.history, scene.alternate
     if history and alternate:
         raise Unsupported("the integrator's formula holds for steps of one length, and the scene alternates two")
@@ -127,7 +138,7 @@ def _single(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, 
     assert isinstance(usual, Integrator)
     method = IMPLICIT_EULER if usual.history and state.before is None else usual
     before = Motion(stated.start.positions, stated.start.velocity)
-    after = State(method.advance(stated.start, solution), before, state.index + 1)
+    after = State(method.advance(stated.start, solution), before, state.index + 1, kept=solution.kept)
     return Step(stated, solution, after, solution.iterations, ((stated, solution),), stop)
 
 

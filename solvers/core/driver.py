@@ -14,10 +14,11 @@ from operator import methodcaller
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from solvers.kernels import loop
 from solvers.kernels.loop import Limits, at_most
-from solvers.problem import Positions, ResidualOf, Solution, StepProblem, StopRule
+from solvers.problem import Positions, ResidualOf, Solution, StepProblem, StopRule, Unsupported
 from solvers.round_off import at_rest
 
 _STOPPED = {
@@ -35,6 +36,13 @@ _CLOSE = 1e-5
 """A tolerance from which on the last point should be a minimum; a greater one asks for less than that."""
 
 
+EXACT = (
+    "minimises what is finite, and the scene has lengths that are kept exactly (a stiffness that is `exact`): take "
+    "avbd, which keeps them, or give springs and strain limits a stiffness in figures"
+)
+"""Why a method that does not keep lengths refuses them, after its name."""
+
+
 _loop = loop.over(methodcaller("advance"), methodcaller("residual"))
 
 
@@ -42,11 +50,12 @@ class Iterating(ABC):
     """A solve that has begun.
 
     positions: where it is (n, 3) [m]; the next iteration may overwrite them. velocity: at the step's end (n, 3) [m/s],
-    of a method that keeps its own.
+    of a method that keeps its own. kept: see `solvers.problem.Solution`.
     """
 
     positions: Positions
     velocity: Positions | None = None
+    kept: NDArray[np.float64] | None = None
 
     @abstractmethod
     def advance(self) -> bool:
@@ -70,10 +79,12 @@ class Iterative(ABC):
     """A method that is ready for a system; with `choice` and `facts` a `solvers.problem.Prepared`.
 
     residual_of: the iterate that its residuals belong to. It is the previous one of a method that tells them by its
-    iteration, |p - LG(p)|; "none" of a method that does not minimise, and does all iterations.
+    iteration, |p - LG(p)|; "none" of a method that does not minimise, and does all iterations. keeps_lengths: whether
+    it keeps those of a system that are exact; `iterates` and `solve` of others raise Unsupported where there are any.
     """
 
     residual_of: ClassVar[ResidualOf] = "returned"
+    keeps_lengths: ClassVar[bool] = False
 
     @abstractmethod
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
@@ -81,7 +92,7 @@ class Iterative(ABC):
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """The iterates from `problem.first_guess`; a yielded array may be overwritten by the next one."""
-        run = self.begin(problem, problem.first_guess)
+        run = self._begun(problem)
         while True:
             run.advance()
             yield run.positions
@@ -89,7 +100,7 @@ class Iterative(ABC):
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """Iterate until `stop` says so, or until nothing descends; without a tolerance only the last residual is
         computed."""
-        run = self.begin(problem, problem.first_guess)
+        run = self._begun(problem)
         limits, yardstick, close = at_most(stop.iterations), float("nan"), False
         if (stop.tolerance is not None or stop.within > 0.0) and self.residual_of != "none":
             near, limit = _NEAR * self.scale(problem) if stop.floor > 0.0 else 0.0, stop.within
@@ -104,7 +115,13 @@ class Iterative(ABC):
             count += more
             if not more and ended != loop.ITERATIONS:
                 ended = loop.STALLED
-        return Solution(run.positions, count, residual, yardstick, _STOPPED[ended], run.velocity, self.residual_of)
+        ended = _STOPPED[ended]
+        return Solution(run.positions, count, residual, yardstick, ended, run.velocity, self.residual_of, run.kept)
+
+    def _begun(self, problem: StepProblem) -> Iterating:
+        if problem.system.lengths and not self.keeps_lengths:
+            raise Unsupported(EXACT)
+        return self.begin(problem, problem.first_guess)
 
     @staticmethod
     def _iterated(run: Iterating, problem: StepProblem, limits: Limits, floor: float) -> tuple[int, float, int]:

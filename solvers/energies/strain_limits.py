@@ -34,13 +34,14 @@ def _within(numbers, e, squared):
 
 
 @inner
-def _beyond(numbers, e, length):
+def excess(numbers, e, length):
     """By how much a length is beyond the limits."""
     return length - min(max(length, numbers[e, 1]), numbers[e, 2])
 
 
 @inner
-def _direction(numbers, e, length, z0, z1, z2):
+def direction(numbers, e, length, z0, z1, z2):
+    """Of an element, from its second end to its first; one of no length takes that of its rest shape."""
     if length <= TINY:
         return numbers[e, 3], numbers[e, 4], numbers[e, 5]
     return z0 / length, z1 / length, z2 / length
@@ -49,7 +50,7 @@ def _direction(numbers, e, length, z0, z1, z2):
 @inner
 def _value(numbers, e, z0, z1, z2):
     squared = z0 * z0 + z1 * z1 + z2 * z2
-    return 0.0 if _within(numbers, e, squared) else 0.5 * numbers[e, 0] * _beyond(numbers, e, np.sqrt(squared)) ** 2
+    return 0.0 if _within(numbers, e, squared) else 0.5 * numbers[e, 0] * excess(numbers, e, np.sqrt(squared)) ** 2
 
 
 @inner
@@ -58,10 +59,10 @@ def _gradient(numbers, e, z0, z1, z2):
     if _within(numbers, e, squared):
         return 0.0, 0.0, 0.0
     length = np.sqrt(squared)
-    force = numbers[e, 0] * _beyond(numbers, e, length)
+    force = numbers[e, 0] * excess(numbers, e, length)
     if force == 0.0:
         return 0.0, 0.0, 0.0
-    n0, n1, n2 = _direction(numbers, e, length, z0, z1, z2)
+    n0, n1, n2 = direction(numbers, e, length, z0, z1, z2)
     return force * n0, force * n1, force * n2
 
 
@@ -71,10 +72,10 @@ def _curvature(numbers, e, z0, z1, z2):
     if _within(numbers, e, squared):
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     length = np.sqrt(squared)
-    beyond = _beyond(numbers, e, length)
+    beyond = excess(numbers, e, length)
     if beyond == 0.0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    n0, n1, n2 = _direction(numbers, e, length, z0, z1, z2)
+    n0, n1, n2 = direction(numbers, e, length, z0, z1, z2)
     return line(k, k * beyond / length if length > TINY else 0.0, n0, n1, n2)
 
 
@@ -85,7 +86,7 @@ def _rise(numbers, e, z0, z1, z2, s0, s1, s2):
     if _within(numbers, e, before) and _within(numbers, e, after):
         return 0.0
     before, after = np.sqrt(before), np.sqrt(after)
-    one, other = _beyond(numbers, e, before), _beyond(numbers, e, after)
+    one, other = excess(numbers, e, before), excess(numbers, e, after)
     longer = other - one
     if one * other > 0.0:  # the same limit: the difference of the lengths, which keeps its digits
         longer = (s0 * (z0 + t0) + s1 * (z1 + t1) + s2 * (z2 + t2)) / (before + after)
@@ -146,4 +147,4 @@ class StrainLimits(Edges):
         """The Hessian [N/m], shape (3n, 3n): that of springs beyond the limits, nothing within."""
         _, length, beyond, unit = self._beyond(p)
         lateral = np.divide(beyond, length, out=np.zeros_like(length), where=length > TINY)
-        return self._blocks(lateral, unit, len(p), (beyond != 0.0).astype(float))
+        return self._blocks(lateral, unit, len(p), ((beyond != 0.0) | (self.low == self.high)).astype(float))

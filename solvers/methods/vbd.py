@@ -148,7 +148,7 @@ class PreparedVertexBlockDescent(Iterative):
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """See Iterative."""
-        sweeps = _Iterating(self, problem, guess)
+        sweeps = Sweeps(self, problem, guess)
         if not any(map(is_bounded, self.system.energies)):
             return sweeps
         from solvers.contact.pairs_vbd import Guarded  # for those who need it
@@ -184,11 +184,13 @@ class PreparedVertexBlockDescent(Iterative):
         return half_spaces(contacts, self.row, self.blocks.bundles, self.blocks.unknowns)
 
 
-class _Iterating(Iterating):
+class Sweeps(Iterating):
+    """Sweeps over all vertices in one step problem."""
+
     def __init__(self, prepared: PreparedVertexBlockDescent, problem: StepProblem, guess: Positions) -> None:
         contacts, blocks = touching(problem), prepared.blocks
         self._beside = prepared.beside.begun(problem)
-        self._prepared, self._gauge = prepared, prepared.measure.gauge(problem)
+        self._prepared, self._blocks, self._gauge = prepared, blocks, prepared.measure.gauge(problem)
         pull = vertex_terms.pull(replace(problem, force=prepared.parts.force(problem)))
         p, y = (prepared.in_rows(x) for x in (vertex_terms.placed(guess, problem), pull))
         self._right = blocks.bundles.right(prepared.held, y)
@@ -203,7 +205,7 @@ class _Iterating(Iterating):
 
     def advance(self) -> bool:
         """See Iterating."""
-        self._sweep(1)
+        self.sweep(1)
         return True
 
     def residual(self) -> float:
@@ -214,7 +216,7 @@ class _Iterating(Iterating):
         """See `solvers.contact.pairs_vbd.Sweeps`."""
         if p is not self.positions:
             self._begin_at(p)
-        self._sweep(1)
+        self.sweep(1)
         return self.positions
 
     def pushed(self, p: Positions, planes: Planes) -> Positions:
@@ -226,7 +228,7 @@ class _Iterating(Iterating):
         self._spaces = of_planes(
             planes, np.ones(len(planes.vertices)), made.row, made.blocks.bundles, made.blocks.unknowns
         )
-        self._sweep(1)
+        self.sweep(1)
         self._spaces = None
         return self.positions
 
@@ -239,13 +241,14 @@ class _Iterating(Iterating):
         """See Iterating; all at once where no residual may end them."""
         if limits.wanted == EACH:
             return super().iterate(limits)
-        self._sweep(limits.iterations)
+        self.sweep(limits.iterations)
         return limits.iterations, self.residual() if limits.wanted == LAST else float("nan"), ITERATIONS
 
-    def _sweep(self, iterations: int) -> None:
+    def sweep(self, iterations: int) -> None:
+        """That many."""
         made = self._prepared
         made.beside.kernel(
-            made.blocks,
+            self._blocks,
             self._spaces,
             self._beside,
             self._right,

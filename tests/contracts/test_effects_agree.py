@@ -24,7 +24,7 @@ INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 TAKE_ALL = {"newton", "newton-cg", "hybrid", "lbfgs"}
 PROJECTIVE = {"sparse", "numba", "anderson", "chebyshev"}
 ALONG_EDGES = {"admm": {"bending", "strain limits", "air drag", "attachments"}}
-CONTACT = {*PROJECTIVE, *TAKE_ALL, "vbd"}
+CONTACT = {*PROJECTIVE, *TAKE_ALL, "vbd", "avbd"}
 """Who takes what; those not named take springs only."""
 STOP = StopRule(5000, 1e-11)
 NOISE = np.random.default_rng(0)
@@ -35,7 +35,9 @@ def takes(solver: str, scene: str) -> bool:
         return solver in CONTACT
     if solver in ALONG_EDGES:
         return scene in ALONG_EDGES[solver]
-    return solver in {*TAKE_ALL, "pncg"} or (solver in {*PROJECTIVE, "vbd", "a-jacobi", "jgs2"} and "gas" not in scene)
+    return solver in {*TAKE_ALL, "pncg"} or (
+        solver in {*PROJECTIVE, "vbd", "avbd", "a-jacobi", "jgs2"} and "gas" not in scene
+    )
 
 
 @cache

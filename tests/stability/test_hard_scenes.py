@@ -26,9 +26,9 @@ from tests.scenes import THREADS, far, of_one_unknown
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 CASES = {path.stem: path for path in sorted((CONFIGS / "hard").glob("*.yaml"))}
-ALIKE = {"blanes-moan-4", "blanes-moan-6", "runge-kutta-4", "tsitouras-5", "dormand-prince-8"}
+ALIKE = {"blanes-moan-4", "blanes-moan-6", "runge-kutta-4", "tsitouras-5", "dormand-prince-8", "avbd"}
 """Methods of the same code as velocity-verlet, and those that give up by themselves where no step keeps to an error:
-`tests/unit/test_explicit.py`."""
+`tests/unit/test_explicit.py`; and what is vbd where no length is exact: `tests/unit/test_avbd.py`."""
 METHODS: dict[str, Solver] = {
     **{name: load(target)() for name, target in SOLVERS.items() if name not in ALIKE},
     "numba float32": CompiledLocalGlobal(precision="float32"),

@@ -30,6 +30,7 @@ _SYMBOLS: dict[Any, str] = {
     CORNERS[3]: "triangle-se", HOURGLASS: "hourglass", BOWTIE: "bowtie", LOZENGE: "diamond-wide",
     ARROWHEAD: "arrow", BARS[0]: "arrow-bar-up", BARS[1]: "arrow-bar-down", CHEVRON: "arrow-wide",
     SPEARHEADS[0]: "arrow-right", SPEARHEADS[1]: "arrow-left", SPEARHEADS[2]: "arrow-down",
+    SPEARHEADS[3]: "arrow-up",
 }  # fmt: skip
 _DASHES: dict[Any, str] = {"-": "solid", DASHED: "dash", DOTTED: "dot", DASH_DOTTED: "dashdot"}
 

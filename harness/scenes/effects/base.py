@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.base.errors import InputError
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.motion import KeyedMotion
 from solvers import integrators
 from solvers.energies.springs import Springs
+from solvers.held import Lengths
 from solvers.integrators import splits
 from solvers.problem import Energy, Positions
 
@@ -77,6 +79,7 @@ class Contribution:
     pins: tuple[Pin, ...] = field(default=())
     filters: tuple[VelocityFilter, ...] = field(default=())
     derived: tuple[Derived, ...] = field(default=())
+    lengths: tuple[Lengths, ...] = field(default=())
     checks: tuple[Check, ...] = field(default=())
     once: tuple[str, ...] = field(default=())
     """What a scene can have but once, in words; a second one would be added to the first."""
@@ -94,7 +97,7 @@ class Contribution:
     @property
     def empty(self) -> bool:
         """Whether there is nothing in any place."""
-        return not (self.energies or self.forces or self.pins or self.filters or self.derived)
+        return not (self.energies or self.forces or self.pins or self.filters or self.derived or self.lengths)
 
 
 class Effect(Protocol):
@@ -160,6 +163,23 @@ class Steady:
     def __call__(self, p: Positions, v: Positions, t: float) -> Positions:
         """The same force at all times."""
         return self.force
+
+
+def kept(mesh: Mesh, springs: NDArray[np.int64], shortest: float, longest: float) -> Contribution:
+    """Lengths of springs (m, 2) that are exact, from `shortest` to `longest` times those at rest; nothing for none.
+
+    Raises InputError for a spring of no length.
+    """
+    if not len(springs):
+        return Contribution()
+    rest = Springs.at_rest(mesh.rest, springs, np.ones(len(springs)))
+    r = rest.rest_length
+    if len(none := np.flatnonzero(r == 0.0)):
+        i, j = springs[none[0]]
+        problem = f"the spring {i}-{j} has no length at rest, and none that could be kept; give a stiffness in figures"
+        raise InputError(problem)
+    lengths = Lengths(rest.edges, shortest * r, longest * r, rest.rest_direction)
+    return Contribution(lengths=(lengths,), ends=("keeps lengths as they are at the end of a step",))
 
 
 def steady(force: Positions) -> tuple[Steady, ...]:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 
 from harness.base.model import Model
-from harness.scenes.effects.base import FEW, Contribution, Seen
+from harness.scenes.effects.base import FEW, Contribution, Seen, kept
 from harness.scenes.material import spring_stiffness
 from harness.scenes.mesh.base import Mesh
 from solvers.energies import strain_limits
@@ -18,7 +18,8 @@ STRETCH = 0.1
 
 
 class StrainLimits(Model):
-    """Limits how far the mesh's springs along and across its cells stretch and shrink, with a stated stiffness."""
+    """Limits how far the mesh's springs along and across its cells stretch and shrink, with a stated stiffness or
+    exactly."""
 
     exact_to: ClassVar[float] = 1.0
 
@@ -27,8 +28,9 @@ class StrainLimits(Model):
     """The largest length, as a multiple of the rest length."""
     shortest: float = Field(default=0.0, ge=0.0, le=1.0)
     """The smallest length, as a multiple of the rest length; 0 lets springs shrink freely."""
-    stiffness: NonNegativeFloat
-    """What a spring resists with beyond its limits, in the unit of the `stretch` of springs by the same rule."""
+    stiffness: NonNegativeFloat | Literal["exact"]
+    """What a spring resists with beyond its limits, in the unit of the `stretch` of springs by the same rule; or
+    `exact`: none is beyond them, which `avbd` alone can do."""
     rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
     """What the stiffness means when the mesh size changes, as for springs."""
     reference: PositiveInt | None = None
@@ -41,12 +43,14 @@ class StrainLimits(Model):
         return self
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """The limits as one energy; none at all for a stiffness of zero."""
-        s = self.stiffness
+        """The limits as one energy, none at all for a stiffness of zero, or as lengths that are exact."""
+        s = 1.0 if self.stiffness == "exact" else self.stiffness
         k = spring_stiffness(mesh, rule=self.rule, stretch=s, shear=s, bend=0.0, reference=self.reference)
         edges = mesh.springs[k > 0.0]
         if not len(edges):
             return Contribution()
+        if self.stiffness == "exact":
+            return kept(mesh, edges, self.shortest, self.longest)
         rest, direction = rest_directions(mesh.rest, edges)
         limits = self.shortest * rest, self.longest * rest
         return Contribution(energies=(strain_limits.StrainLimits(edges, k[k > 0.0], *limits, direction),))

@@ -88,6 +88,13 @@ def steps(at: Place) -> Iterator[Finding]:
         yield Finding("pinned vertices", 1.0)
         return
     soft = max((w for w in stated.weights if np.isfinite(w)), default=0.0)
+    found = sorted(
+        (*edge, low, high)
+        for one in system.lengths
+        for edge, low, high in zip(one.edges.tolist(), one.low.tolist(), one.high.tolist(), strict=True)
+    )
+    wanted = sorted((*edge, *kept) for one in at.side.opinions for edge, kept in one.exact.items())
+    yield from differ("exact lengths", np.reshape(found, (-1, 4)), np.reshape(wanted, (-1, 4)), reach)
     yield from differ("weights of pins", system.pins.weight, stated.weights, soft)
     yield from differ("targets of pins", problem.pin_targets, stated.held, at.aim)
 

@@ -74,7 +74,8 @@ class Opinion:
     begin: the energy of a step; resists: its share (n,) [N/m] of the diagonal of Q at the rate 1/dt, None for none;
     needs: the energy where it depends on the diagonal of Q (n,) [N/m] that all effects and inertia add up to;
     force; decay: of velocities (n, 3) before a step; pins: by vertex;
-    shortest: the shortest length [m] that the energy goes by besides the springs', reach: the largest coordinate [m].
+    shortest: the shortest length [m] that the energy goes by besides the springs', reach: the largest coordinate [m];
+    exact: of each edge (i, j) whose length is kept exactly, the shortest and the longest [m] that are allowed.
     """
 
     begin: Begin | None = None
@@ -85,6 +86,9 @@ class Opinion:
     pins: dict[int, PinnedVertex] = field(default_factory=dict[int, PinnedVertex])
     shortest: float = np.inf
     reach: float = 0.0
+    exact: dict[tuple[int, int], tuple[float, float]] = field(
+        default_factory=dict[tuple[int, int], tuple[float, float]]
+    )
 
 
 def counts(edges: NDArray[np.int64], weight: Array, n: int) -> Array:

@@ -72,24 +72,40 @@ def _relieve(mesh: Mesh, k: Array) -> None:
 def springs(effect: Any, declared: Declared) -> Opinion:
     """Springs along all edges that have stiffness."""
     k = of_springs(effect, declared)
+    exact, k = _exact(declared, k, 1.0, 1.0), finite(k)
     edges, n = declared.mesh.springs, len(declared.mass)
     r = _lengths(declared.rest, edges)
 
     def begin(moment: Moment) -> Values:
         return lambda x: wide(k) / 2 * (_lengths(x, edges) - r) ** 2
 
-    return Opinion(begin, counts(edges, k, n))
+    return Opinion(begin, counts(edges, k, n), exact=exact)
 
 
 def of_springs(effect: Any, declared: Declared) -> Array:
     """The stiffness (m,) [N/m] of an effect `springs`."""
-    shear = effect.stretch if effect.shear is None else effect.shear
-    return stiffness(declared.mesh, effect, effect.stretch, shear, effect.bend)
+    given = effect.stretch, effect.stretch if effect.shear is None else effect.shear
+    stretch, shear = (np.inf if x == "exact" else x for x in given)
+    return stiffness(declared.mesh, effect, stretch, shear, effect.bend)
+
+
+def finite(k: Array) -> Array:
+    """The stiffnesses (m,) [N/m] of what resists as an energy: none of what is exact."""
+    return np.where(np.isinf(k), 0.0, k)
+
+
+def _exact(declared: Declared, k: Array, low: float, high: float) -> dict[tuple[int, int], tuple[float, float]]:
+    """The edges whose stiffness (m,) is infinite, with the lengths allowed [m], low and high times those at rest."""
+    edges = declared.mesh.springs
+    r = _lengths(declared.rest, edges)
+    return {(*edges[e].tolist(),): (low * float(r[e]), high * float(r[e])) for e in np.flatnonzero(np.isinf(k))}
 
 
 def strain_limits(effect: Any, declared: Declared) -> Opinion:
     """Edges that resist beyond their limits."""
-    k = stiffness(declared.mesh, effect, effect.stiffness, effect.stiffness, 0.0)
+    given = np.inf if effect.stiffness == "exact" else effect.stiffness
+    k = stiffness(declared.mesh, effect, given, given, 0.0)
+    exact, k = _exact(declared, k, effect.shortest, effect.longest), finite(k)
     edges, r = declared.mesh.springs, _lengths(declared.rest, declared.mesh.springs)
     low, high = effect.shortest * r, effect.longest * r
 
@@ -98,7 +114,7 @@ def strain_limits(effect: Any, declared: Declared) -> Opinion:
         allowed = np.where(np.real(l) < low, low, np.where(np.real(l) > high, high, l))
         return wide(k) / 2 * (l - allowed) ** 2
 
-    return Opinion(lambda moment: values, counts(edges, k, len(declared.mass)))
+    return Opinion(lambda moment: values, counts(edges, k, len(declared.mass)), exact=exact)
 
 
 def sewing(effect: Any, declared: Declared) -> Opinion:

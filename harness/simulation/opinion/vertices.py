@@ -17,7 +17,7 @@ import numpy as np
 
 from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, Opinion, PinnedVertex
 from harness.simulation.opinion.derivatives import Values, Wide, wide
-from harness.simulation.opinion.edges import along_edges, of_springs
+from harness.simulation.opinion.edges import along_edges, finite, of_springs
 from harness.simulation.opinion.motion import place, speed
 from harness.simulation.opinion.selected import chosen
 from harness.simulation.opinion.surfaces import damped_bending
@@ -86,7 +86,7 @@ def rayleigh(effect: Any, declared: Declared) -> Opinion:
     """Damping in proportion to the masses and to the stiffness of springs and bending."""
     b, parts = effect.stiffness, [_drag(effect.mass * declared.mass)]
     if b:
-        parts += [along_edges(declared, b * of_springs(s, declared)) for s in declared.of_kind("springs")]
+        parts += [along_edges(declared, b * finite(of_springs(s, declared))) for s in declared.of_kind("springs")]
         parts += [damped_bending(one, b, declared) for one in declared.of_kind("bending")]
 
     def begin(moment: Moment) -> Values:

@@ -67,7 +67,7 @@ Object.assign(springbench, (() => {
     "arrow-wide": "M-6.5 4.5L0-1L6.5 4.5V0L0-5.5L-6.5 0Z",
     "arrow-right": "M6.5 0L-6.5 3.5V-3.5Z",
     "arrow-left": "M-6.5 0L6.5 3.5V-3.5Z",
-    "arrow-down": "M0 6.5L3.5-6.5H-3.5Z",
+    "arrow-down": "M0 6.5L3.5-6.5H-3.5Z", "arrow-up": "M0-6.5L3.5 6.5H-3.5Z",
   };
   function glyph(mark) {
     const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");

@@ -1,0 +1,102 @@
+"""Steps that keep lengths exactly, judged: their tensions by least squares, their Lagrangian by the oracle.
+
+    minimise grad g . d + |d|_Q^2 / 2   such that   low <= l + n . A d <= high
+
+with lengths l and directions n at p, and the Q of the step's projective energies and of the penalties of exact lengths
+(`solvers.energies.augmented`). Its solution d is zero just where p is a stationary point, with the tensions t that its
+constraints have: of all tensions those that leave least of the gradient, in the norm of Q^-1, once the lengths are
+mended. Which limits hold is found as semismooth Newton's method does (Hintermueller, Ito and Kunisch 2002): where
+l + t/k is beyond them. Lengths that follow from others share their tension.
+
+The step of the Lagrangian with these tensions keeps no lengths: the oracle, its round-off and the curvature that
+certifies a minimum are those of any other step. Penalties of a certificate are FIRM times larger: were the curvature
+negative along the constraints, no penalty would lift it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import block_array, csr_array, diags_array, kron
+from scipy.sparse.linalg import splu
+
+from harness.reference.oracle import stiffness
+from solvers.energies.augmented import augmented, joined, penalties
+from solvers.energies.edges import directions
+from solvers.held import Lengths
+from solvers.matrices import signed_incidence_matrix_sparse
+from solvers.problem import Positions, StepProblem, System
+
+GIVE, PASSES = 1e-10, 4
+"""What the constraints of a factor give, as a part of what the penalties do, and how often it is used in turn."""
+
+FIRM = 1e4
+CHANGES = 50
+"""How often what holds is looked at anew."""
+
+
+class Exact:
+    """The lengths that a system keeps, and its Lagrangians."""
+
+    def __init__(self, system: System) -> None:
+        """Raises NotPositiveDefinite."""
+        self._system, self.lengths = system, joined(system.lengths)
+        self._penalties = penalties(system, self.lengths)
+        self.augmented = self._with(np.zeros(len(self._penalties)), 1.0)
+        free, Q = system.free, stiffness(self.augmented)
+        self._Q = csr_array(kron(Q[free][:, free], np.eye(3)))
+        self._columns = (3 * free[:, None] + np.arange(3)).ravel()
+
+    def _with(self, tension: NDArray[np.float64], firm: float) -> System:
+        return augmented(self._system, self.lengths, firm * self._penalties, tension)
+
+    def lagrangian(self, problem: StepProblem, tension: NDArray[np.float64], firm: float = 1.0) -> StepProblem:
+        """The step with the Lagrangian of tensions (m,) [N] for its objective, and penalties `firm` times larger."""
+        return replace(problem, system=self._with(tension, firm))
+
+    def tensions(self, problem: StepProblem, p: Positions) -> NDArray[np.float64]:
+        """The tensions (m,) [N] at p (n, 3) [m], zero where an edge is within its limits."""
+        x, k, rows = self.lengths, self._penalties, len(self._columns)
+        length, n = directions(p[x.edges[:, 0]] - p[x.edges[:, 1]], x.rest_direction)
+        J = _along(x, n, len(p))[:, self._columns]
+        downhill = -problem.gradient(p).ravel()[self._columns]
+        tension = k * (length - np.clip(length, x.low, x.high))
+        held = self._held(length, tension)
+        for _ in range(CHANGES):
+            e = np.flatnonzero(held)
+            to = np.where(held > 0, x.high, x.low)[e]
+            found = _solved(self._Q, J[e], GIVE / k[e], np.concatenate([downhill, to - length[e]]))
+            tension = np.zeros(len(k))
+            tension[e] = found[rows:]
+            before, held = held, self._held(length + J @ found[:rows], tension)
+            if np.array_equal(before, held):
+                break
+        return tension
+
+    def _held(self, length: NDArray[np.float64], tension: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Which limit holds each length: 1 the longest, -1 the shortest, 0 none."""
+        x, pulled = self.lengths, length + tension / self._penalties
+        return np.where((pulled > x.high) | (x.low == x.high), 1, np.where(pulled < x.low, -1, 0))
+
+
+def _along(x: Lengths, n: Positions, vertices: int) -> csr_array:
+    """n_e . (p_i - p_j) of all edges as a matrix (m, 3 vertices)."""
+    A, whole = signed_incidence_matrix_sparse(x.edges, vertices), csr_array((len(n), 3 * vertices))
+    for c in range(3):
+        whole = csr_array(whole + kron(diags_array(n[:, c]) @ A, np.eye(3)[c : c + 1]))
+    return whole
+
+
+def _solved(Q: csr_array, J: csr_array, gives: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The solution of [Q J'; J 0] x = b, by a factor of a matrix that gives a little, until that tells no more: so
+    lengths that follow from others make nothing singular, and those that do not are mended all the same."""
+    if not len(gives):
+        return np.asarray(splu(Q.tocsc()).solve(right))
+    K = block_array([[Q, J.T], [J, None]]).tocsc()
+    firm = np.concatenate([np.zeros(Q.shape[0]), -gives])
+    factor, x = splu((K + diags_array(firm)).tocsc()), np.zeros_like(right)
+    for _ in range(PASSES):
+        x += factor.solve(right - K @ x)
+    return x

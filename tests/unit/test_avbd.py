@@ -1,0 +1,240 @@
+"""Augmented vertex block descent: exact lengths against closed forms, the very stiff limit and their own conditions."""
+
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from harness.base.errors import InputError
+from harness.reference.exact import Exact
+from harness.reference.judge import Judge
+from harness.scenes.bind import Scene, build
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.effects.strain_limits import StrainLimits
+from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Net
+from harness.simulation.step import prepare, simulate
+from solvers import registry
+from solvers.energies import springs
+from solvers.energies.augmented import joined, off
+from solvers.held import Lengths
+from solvers.methods.avbd import AugmentedVertexBlockDescent as Avbd
+from solvers.methods.newton import Newton
+from solvers.methods.vbd import VertexBlockDescent
+from solvers.problem import StepProblem, StopRule, Unsupported
+from tests.scenes import first_problem, scene
+
+FIRST = Pins.model_validate({"at": ["first"], "weight": "exact"})
+EXACT = Springs.model_validate({"stretch": "exact", "rule": "fixed"})
+DOWN = Chain(direction=(0.0, -1.0, 0.0))
+ROUND_OFF = 1e-9
+"""Of metres and newtons of size one, after solves to a residual of 1e-11 of the step's."""
+
+
+def chain(size: int, mesh: Chain | None = None, *others: object, **settings: object) -> Scene:
+    return scene(mesh or Chain(), EXACT, Gravity(), FIRST, *others, size=size, **settings)
+
+
+def heavier(stated: StepProblem, times: float) -> StepProblem:
+    """The same chain with a last vertex that is so many times as heavy."""
+    mass = stated.system.mass.copy()
+    mass[-1] *= times
+    force = stated.force * (mass / stated.system.mass)[:, None]
+    return replace(stated, system=replace(stated.system, mass=mass), force=force)
+
+
+def solved(stated: StepProblem, iterations: int = 20_000, tolerance: float = 1e-11, **settings: object):
+    prepared = Avbd(**settings).prepare(stated.system)
+    return prepared.solve(stated, StopRule(iterations, tolerance))
+
+
+def test_a_pendulum_ends_where_its_sphere_is_nearest_to_free_fall():
+    """The step minimises |p - y|^2 on a sphere: p = r y/|y|, and the tension is m/dt^2 (|y| - r)."""
+    stated = first_problem(chain(2, mass=1.0))
+    m, dt = stated.system.mass[1], stated.system.time_step
+    y = stated.target[1] + stated.force[1] * dt**2 / m - stated.current[0]
+    r = float(joined(stated.system.lengths).high[0])
+    found = solved(stated)
+    assert found.stopped == "tolerance"
+    np.testing.assert_allclose(found.positions[1] - stated.current[0], r * y / np.linalg.norm(y), atol=ROUND_OFF)
+    assert found.kept is not None
+    np.testing.assert_allclose(found.kept[0, 0], m / dt**2 * (np.linalg.norm(y) - r), rtol=1e-6)
+
+
+@pytest.mark.parametrize("heavy", [1.0, 1e4])
+def test_a_chain_at_rest_carries_what_hangs_below(heavy):
+    """Least squares find the tensions at rest, whatever the ratio of masses, and so does the method."""
+    stated = heavier(first_problem(chain(9, DOWN, mass=1.0)), heavy)
+    weight = 9.81 * np.cumsum(stated.system.mass[:0:-1])[::-1]
+    np.testing.assert_allclose(Exact(stated.system).tensions(stated, stated.current), weight, rtol=1e-6)
+    found = solved(stated)
+    np.testing.assert_allclose(found.positions, stated.current, atol=1e-6)
+    assert found.kept is not None
+    np.testing.assert_allclose(found.kept[:, 0], weight, rtol=1e-3)
+
+
+def test_a_swinging_chain_is_the_limit_of_stiff_ones():
+    """Springs of k differ from exact ones by their stretch, t/k, along the whole chain."""
+    bound = chain(9, mass=1.0)
+    steps = [step.positions for step in simulate(bound, prepare(bound, Avbd()), StopRule(20_000, 1e-10),
+                                                 first_guess="current", frames=6)]  # fmt: skip
+    away = []
+    for k in (1e6, 1e7):
+        stiff = scene(Chain(), Springs(stretch=k, rule="fixed"), Gravity(), FIRST, size=9)
+        run = simulate(stiff, prepare(stiff, Newton()), StopRule(200), first_guess="current", frames=6)
+        away.append(max(np.abs(step.positions - p).max() for step, p in zip(run, steps, strict=True)))
+    assert away[0] < 1e-4
+    assert away[1] < 0.2 * away[0]  # a tenth, if both are converged
+
+
+def limited() -> Scene:
+    """A net that hangs by its corners, so soft that most of what would be its sag is beyond its limits."""
+    corners = Pins.model_validate({"at": ["corners"], "weight": "exact"})
+    limits = StrainLimits.model_validate({"stiffness": "exact", "longest": 1.05})
+    return scene(Net(), Springs(stretch=5.0, rule="fixed"), limits, Gravity(), corners, size=5, mass=1.0)
+
+
+def test_exact_limits_hold_and_pull_only_where_they_are_reached():
+    bound = limited()
+    lengths = joined(bound.system.lengths)
+    for step in simulate(bound, prepare(bound, Avbd()), StopRule(20_000, 1e-9), first_guess="current", frames=8):
+        assert step.solution.kept is not None
+        tension, out = step.solution.kept[:, 0], off(lengths, step.positions)
+        assert np.abs(out / lengths.high).max() < 1e-6
+        length = np.linalg.norm(np.diff(step.positions[lengths.edges], axis=1)[:, 0], axis=1)
+        slack = length < lengths.high * (1.0 - 1e-6)
+        assert (tension[slack] == 0.0).all()
+        assert (tension >= 0.0).all()
+    assert not slack.all()
+
+
+@pytest.mark.parametrize("bound", [chain(9, mass=1.0), limited()], ids=["chain", "limits"])
+def test_the_judge_finds_a_minimum_where_it_ends_and_nowhere_else(bound):
+    stated = first_problem(bound)
+    judge, p = Judge(bound, None, minimises=True), solved(stated).positions
+    assert judge.stationarity(stated, p).beyond < 1e-7
+    assert judge.curvature(stated, p).convex
+    moved = p.copy()
+    moved[stated.system.free[-1]] += 1e-3
+    assert judge.stationarity(stated, moved).beyond > 1e-3
+
+
+def test_the_farthest_point_of_a_sphere_is_stationary_and_no_minimum():
+    stated = first_problem(chain(2, mass=1.0))
+    p = solved(stated).positions
+    p[1] = 2.0 * p[0] - p[1]
+    judge = Judge(chain(2, mass=1.0), None, minimises=True)
+    assert judge.stationarity(stated, p).beyond < 1e-7
+    assert not judge.curvature(stated, p).convex
+
+
+def test_where_nothing_is_exact_it_is_vertex_block_descent():
+    stated = first_problem(scene(Net(), Springs(stretch=300.0), Gravity(), size=5))
+    both = (
+        (p.copy() for p in islice(m.prepare(stated.system).iterates(stated), 5)) for m in (Avbd(), VertexBlockDescent())
+    )
+    for one, other in zip(*both, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_softened_springs_end_at_the_minimum():
+    """However soft they begin: every second one is a hundred times as stiff as the others."""
+    stated = first_problem(scene(DOWN, Springs(stretch=100.0, rule="fixed"), Gravity(), FIRST, size=9))
+    (found,) = stated.system.energies
+    assert isinstance(found, springs.Springs)
+    ratio = replace(found, stiffness=np.where(np.arange(8) % 2, 100.0, 1.0) * found.stiffness)
+    stated = replace(stated, system=replace(stated.system, energies=(ratio,)))
+    end = Newton().prepare(stated.system).solve(stated, StopRule(200)).positions
+    assert np.abs(end - solved(stated, softened=True, ramp=1e6).positions).max() < 1e-6
+
+
+HARD = {
+    "no pins": lambda: first_problem(scene(Net(), EXACT, Gravity(), size=4)),
+    "lengths that follow from others": lambda: _doubled(first_problem(chain(5, mass=1.0)), 3),
+    "all in one point": lambda: _at(first_problem(chain(5, mass=1.0)), 0.0),
+    "a last vertex 10,000 times as heavy": lambda: heavier(first_problem(chain(17, mass=1.0)), 1e4),
+}
+
+
+def _doubled(stated: StepProblem, times: int) -> StepProblem:
+    return replace(stated, system=replace(stated.system, lengths=stated.system.lengths * times))
+
+
+def _at(stated: StepProblem, part: float) -> StepProblem:
+    """The same from a shape that has so much of its size."""
+    first = stated.current[0]
+    return replace(stated, first_guess=first + part * (stated.current - first))
+
+
+@pytest.mark.parametrize("case", HARD)
+def test_hard_cases_keep_their_lengths(case):
+    stated = HARD[case]()
+    found = solved(stated, 50_000, 1e-9)
+    lengths = joined(stated.system.lengths)
+    assert np.abs(off(lengths, found.positions) / lengths.high).max() < 1e-6
+
+
+def test_lengths_that_cannot_all_be_kept_are_missed_and_that_is_told():
+    """A chain of 1 m between pins that are 2 m apart: tensions stay bounded, all links give, a metre in all."""
+    stated = first_problem(scene(Chain(), EXACT, Pins.model_validate({"at": ["ends"], "weight": "exact"}), size=5))
+    far = stated.pin_targets.copy()
+    far[1] = far[0] + 2.0 * (far[1] - far[0])
+    stated = replace(stated, pin_targets=far)
+    found = solved(stated, 5000)
+    assert found.stopped == "iterations"
+    away = off(joined(stated.system.lengths), found.positions)
+    assert (away > 0.0).all()
+    np.testing.assert_allclose(away.sum(), 1.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name in registry.SOLVERS if name != "avbd"])
+def test_every_other_solver_refuses_exact_lengths_by_name(name):
+    solver = registry.load(registry.SOLVERS[name])()
+    with pytest.raises(Unsupported, match=f"^{name}: .*exact.*avbd"):
+        prepare(chain(3, mass=1.0), solver)
+
+
+def test_whoever_prepares_a_solver_without_the_harness_is_refused_too():
+    stated = first_problem(chain(3, mass=1.0))
+    with pytest.raises(Unsupported, match="exact"):
+        Newton().prepare(stated.system).solve(stated, StopRule(1))
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"ramp": -1.0}, "ramp"),
+        ({"bound": 0.5}, "bound"),
+        ({"decay": 1.5}, "decay"),
+        ({"stabilisation": 2.0}, "stabilisation"),
+        ({"spectral_radius": 1.0}, "spectral_radius"),
+    ],
+)
+def test_settings_that_mean_nothing_are_named(settings, said):
+    with pytest.raises(ValueError, match=f"^{said}: should be"):
+        Avbd(**settings)
+
+
+def test_a_length_that_is_none_cannot_be_kept():
+    mesh = scene(Chain(), Gravity(), size=3).mesh
+    flat = replace(mesh, rest=np.zeros_like(mesh.rest))
+    with pytest.raises(InputError, match="spring 0-1 has no length"):
+        EXACT.bind(flat, np.ones(3), 0.1)
+
+
+def test_lengths_are_kept_at_a_steps_end_and_integrators_of_other_unknowns_are_refused():
+    bound = chain(3, mass=1.0)
+    assert isinstance(bound.system.lengths[0], Lengths)
+    with pytest.raises(InputError, match="take implicit-euler or bdf2"):
+        build(_spec(), 3, "midpoint")
+
+
+def _spec():
+    from pathlib import Path
+
+    from harness.scenes.spec import SceneSpec
+
+    return SceneSpec(mesh=Chain(), mass=1.0, time_step=0.1, frames=1, effects=(EXACT,), path=Path("scene.yaml"))
