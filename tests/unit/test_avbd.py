@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from harness.base.errors import InputError
+from harness.config.load import load_scene
 from harness.reference.exact import Exact
 from harness.reference.judge import Judge
 from harness.scenes.bind import Scene, build
@@ -16,6 +18,8 @@ from harness.scenes.effects.springs import Springs
 from harness.scenes.effects.strain_limits import StrainLimits
 from harness.scenes.mesh.chain import Chain
 from harness.scenes.mesh.grid import Net
+from harness.scenes.spec import SceneSpec
+from harness.simulation.opinion.second import second_opinion
 from harness.simulation.step import prepare, simulate
 from solvers import registry
 from solvers.energies import springs
@@ -27,6 +31,7 @@ from solvers.methods.vbd import VertexBlockDescent
 from solvers.problem import StepProblem, StopRule, Unsupported
 from tests.scenes import first_problem, scene
 
+CONFIGS = Path(__file__).parents[2] / "configs" / "exact"
 FIRST = Pins.model_validate({"at": ["first"], "weight": "exact"})
 EXACT = Springs.model_validate({"stretch": "exact", "rule": "fixed"})
 DOWN = Chain(direction=(0.0, -1.0, 0.0))
@@ -225,16 +230,20 @@ def test_a_length_that_is_none_cannot_be_kept():
         EXACT.bind(flat, np.ones(3), 0.1)
 
 
+@pytest.mark.parametrize("name", ["cloth", "limits", "pendulum"])
+def test_a_second_opinion_knows_which_lengths_are_exact(name):
+    spec = load_scene(CONFIGS / f"{name}.yaml")
+    bound = build(spec, 5)
+    assert second_opinion(spec, bound, "implicit-euler") == "agrees"
+    (one,) = bound.system.lengths
+    longer = replace(one, high=one.high * np.where(np.arange(len(one.high)) == 1, 1.01, 1.0))
+    lying = replace(bound, system=replace(bound.system, lengths=(longer,)))
+    assert "exact lengths" in second_opinion(spec, lying, "implicit-euler")
+
+
 def test_lengths_are_kept_at_a_steps_end_and_integrators_of_other_unknowns_are_refused():
     bound = chain(3, mass=1.0)
     assert isinstance(bound.system.lengths[0], Lengths)
+    spec = SceneSpec(mesh=Chain(), mass=1.0, time_step=0.1, frames=1, effects=(EXACT,), path=Path("scene.yaml"))
     with pytest.raises(InputError, match="take implicit-euler or bdf2"):
-        build(_spec(), 3, "midpoint")
-
-
-def _spec():
-    from pathlib import Path
-
-    from harness.scenes.spec import SceneSpec
-
-    return SceneSpec(mesh=Chain(), mass=1.0, time_step=0.1, frames=1, effects=(EXACT,), path=Path("scene.yaml"))
+        build(spec, 3, "midpoint")

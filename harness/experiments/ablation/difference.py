@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.scenes.bind import Scene
+from solvers.energies.springs import Springs
 
 States = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Positions [m] and velocities [m/s], (frames, n, 3) each."""
@@ -34,5 +35,7 @@ def rest_length(scene: Scene) -> float:
 
 
 def _energy(scene: Scene, p: NDArray[np.float64], v: NDArray[np.float64]) -> float:
-    """Kinetic energy and that of the whole scene's springs [J]: the same yardstick for all motions."""
-    return 0.5 * float(scene.system.mass @ np.einsum("ij,ij->i", v, v)) + scene.springs.value(p)
+    """Kinetic energy and that of the whole scene's springs [J], of those that can have any: the same yardstick for all
+    motions."""
+    elastic = sum(energy.value(p) for energy in scene.system.energies if isinstance(energy, Springs))
+    return 0.5 * float(scene.system.mass @ np.einsum("ij,ij->i", v, v)) + elastic
