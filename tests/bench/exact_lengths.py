@@ -1,0 +1,175 @@
+"""What augmented vertex block descent keeps of lengths in few iterations (Giles, Diaz and Yuksel 2025).
+
+    python -m tests.bench.exact_lengths
+
+Three tables. A pendulum of 50 links with a bob that is 50,000 times as heavy as a link's vertex, let go level
+(figures 7 and 8 of the paper): by how much of its length the worst link is off, mean and largest over two seconds of
+frames of 1/60 s. A chain of 11 springs between fixed ends, every second one 10,000 times as stiff (figure 4): how
+far it is after four seconds from where it should be, over its sag. The first step of that pendulum, hanging straight:
+iterations until all lengths are within a thousandth, and what an iteration takes and reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from time import thread_time
+from typing import Any, cast
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from harness.base.machine import pinned_threads
+from harness.scenes.bind import Scene
+from harness.scenes.effects.ether_drag import EtherDrag
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins
+from harness.scenes.effects.springs import Springs
+from harness.scenes.mesh.chain import Chain
+from harness.simulation.step import problem, simulate, start
+from solvers.energies import springs
+from solvers.energies.augmented import joined, off
+from solvers.methods.avbd import AugmentedVertexBlockDescent as Avbd
+from solvers.methods.avbd import PreparedAugmented
+from solvers.methods.newton import Newton
+from solvers.methods.vbd import VertexBlockDescent as Vbd
+from solvers.methods.xpbd import PreparedXpbd, Xpbd, XpbdSmallSteps
+from solvers.problem import Prepared, Solver, StepProblem, StopRule
+from tests.scenes import scene
+
+FRAME, LINKS, HEAVY = 1 / 60, 50, 50_000.0
+FIRST = Pins.model_validate({"at": ["first"], "weight": "exact"})
+ENDS = Pins.model_validate({"at": ["ends"], "weight": "exact"})
+AS_PUBLISHED = Avbd(stabilisation=0.95)
+FIRM = 1e12
+"""The stiffness [N/m] of springs that are to be exact: XPBD takes any, and stretches by it are below round-off."""
+
+
+def pendulum(stiffness: float | str, mesh: Chain, heavy: float = HEAVY) -> Scene:
+    """A chain of vertices of a kilogram and a heavy one; stiffness: of its springs [N/m], or `exact`."""
+    held = Springs.model_validate({"stretch": stiffness, "rule": "fixed"})
+    made = scene(mesh, held, Gravity(), FIRST, size=LINKS + 1, mass=float(LINKS), time_step=FRAME)
+    mass = made.system.mass.copy()
+    mass[-1] = heavy * mass[1]
+    load = made.load * (mass / made.system.mass)[:, None]
+    return replace(made, system=replace(made.system, mass=mass), load=load)
+
+
+def errors(made: Scene, solver: Solver, iterations: int, seconds: float) -> tuple[float, float]:
+    """The worst link's error over its length, in the mean and at most; infinite where it is no number."""
+    lengths = joined(pendulum("exact", Chain()).system.lengths)
+    run = simulate(made, solver.prepare(made.system), StopRule(iterations), first_guess="inertial",
+                   frames=round(seconds / FRAME))  # fmt: skip
+    found = np.array([np.abs(off(lengths, step.positions) / lengths.high).max() for step in run])
+    return (float(found.mean()), float(found.max())) if np.isfinite(found).all() else (np.inf, np.inf)
+
+
+def swinging() -> Table:
+    """The first table."""
+    table = Table("method", "iterations", "mean", "largest", box=SIMPLE_HEAD)
+    exact, firm = (pendulum(k, Chain()) for k in ("exact", FIRM))
+    stiff = pendulum(HEAVY * 9.81 * LINKS / 1e-3, Chain())  # a thousandth of stretch by the bob at rest
+    of = [("avbd, stabilisation: 0.95", exact, AS_PUBLISHED), ("avbd", exact, Avbd()), ("xpbd", firm, Xpbd()),
+          ("xpbd-small-steps", firm, XpbdSmallSteps()), ("vbd", stiff, Vbd()),
+          ("vbd, spectral_radius: 0", stiff, Vbd(spectral_radius=0.0))]  # fmt: skip
+    for name, made, solver in of:
+        for iterations in (5, 20, 100):
+            table.add_row(name, str(iterations), *(f"{x:.1e}" for x in errors(made, solver, iterations, 2.0)))
+    return table
+
+
+def ratios() -> Table:
+    """The second table."""
+    chain = scene(Chain(), Springs(stretch=1e4, rule="fixed"), Gravity(), ENDS, EtherDrag(rate=2.0), size=12,
+                  mass=11.0, time_step=FRAME)  # fmt: skip
+    (found,) = chain.system.energies
+    assert isinstance(found, springs.Springs)
+    k = np.where(np.arange(11) % 2, 1e4, 1.0) * found.stiffness
+    chain = replace(chain, system=replace(chain.system, energies=(replace(found, stiffness=k),)))
+
+    def end(solver: Solver, iterations: int) -> np.ndarray:
+        run = simulate(chain, solver.prepare(chain.system), StopRule(iterations), first_guess="inertial", frames=240)
+        return [step.positions for step in run][-1]
+
+    wanted = end(Newton(), 200)
+    sag = np.abs(wanted - chain.mesh.rest).max()
+    table = Table("method", "iterations", "off, over the sag", box=SIMPLE_HEAD)
+    for name, solver in {
+        "avbd, softened": Avbd(softened=True),
+        "avbd, softened, ramp: 10000": Avbd(softened=True, ramp=1e4),
+        "vbd, spectral_radius: 0": Vbd(spectral_radius=0.0),
+        "vbd": Vbd(),
+        "xpbd": Xpbd(),
+    }.items():
+        for iterations in (1, 5, 100):
+            table.add_row(name, str(iterations), f"{np.abs(end(solver, iterations) - wanted).max() / sag:.1e}")
+    return table
+
+
+def hanging() -> Table:
+    """The third table."""
+    table = Table("bob", "method", "iterations", "CPU time of one, over vbd's", "bytes", box=SIMPLE_HEAD)
+    for heavy in (1.0, 100.0, 1e4, HEAVY):
+        for row in _hanging(heavy):
+            table.add_row(f"{heavy:g}", *row)
+    return table
+
+
+def _hanging(heavy: float) -> Iterator[tuple[str, ...]]:
+    down = Chain(direction=(0.0, -1.0, 0.0))
+    exact, firm, stiff = (pendulum(k, down, heavy) for k in ("exact", FIRM, heavy * 9.81 * LINKS / 1e-3))
+    lengths = joined(exact.system.lengths)
+    usual = None
+    for name, made, solver in (
+        ("vbd", stiff, Vbd(spectral_radius=0.0)),
+        ("avbd", exact, Avbd()),
+        ("xpbd", firm, Xpbd()),
+    ):
+        stated, prepared = problem(made, start(made), "inertial"), cast(Any, solver.prepare(made.system))
+        run, done, most = prepared.begin(stated, stated.first_guess), 0, 200_000
+        while done < most and np.abs(off(lengths, run.positions) / lengths.high).max() > 1e-3:
+            run.advance()
+            done += 1
+        took = _of_one(prepared, stated)
+        usual = usual or took
+        yield name, f"{done:,}" if done < most else "–", f"{took / usual:.1f}", f"{_bytes(prepared):,}"
+
+
+def _of_one(prepared: Prepared, stated: StepProblem) -> float:
+    """Processor time [s] of an iteration, the least of five times a thousand."""
+
+    def once() -> float:
+        begun = thread_time()
+        prepared.solve(stated, StopRule(1000))
+        return (thread_time() - begun) / 1000
+
+    return min(once() for _ in range(5))
+
+
+def _bytes(prepared: Any) -> int:
+    """Of the arrays that an iteration goes through, each once, and the positions [B]."""
+    made = getattr(prepared, "made", prepared)
+    through = (
+        (prepared.constraints, prepared.ease, prepared.compliance, prepared.ease)
+        if isinstance(prepared, PreparedXpbd)
+        else (made.blocks, made.beside.around, made.held)
+    )
+    duals = 7 * 8 * len(prepared.least) if isinstance(prepared, PreparedAugmented) else 0
+    return _size(through) + duals + 24 * prepared.system.vertices
+
+
+def _size(x: Any) -> int:
+    return sum(map(_size, x)) if isinstance(x, tuple) else int(getattr(x, "nbytes", 0))
+
+
+def main() -> None:
+    """Print the tables."""
+    with pinned_threads(1):
+        for table in (swinging(), ratios(), hanging()):
+            Console(width=120).print(table)
+
+
+if __name__ == "__main__":
+    main()
