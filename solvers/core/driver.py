@@ -50,12 +50,16 @@ class Iterating(ABC):
     """A solve that has begun.
 
     positions: where it is (n, 3) [m]; the next iteration may overwrite them. velocity: at the step's end (n, 3) [m/s],
-    of a method that keeps its own. kept: see `solvers.problem.Solution`.
+    of a method that keeps its own.
     """
 
     positions: Positions
     velocity: Positions | None = None
-    kept: NDArray[np.float64] | None = None
+
+    @property
+    def kept(self) -> NDArray[np.float64] | None:
+        """See `solvers.problem.Solution`."""
+        return None
 
     @abstractmethod
     def advance(self) -> bool:

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from solvers.about import About, Reference
 from solvers.core.bounds import is_bounded
 from solvers.core.driver import Iterating, Iterative
-from solvers.energies.augmented import augmented, joined, off, penalties
+from solvers.energies.augmented import Augmented, augmented, joined, off, penalties
 from solvers.energies.springs import Springs
 from solvers.held import Lengths
 from solvers.kernels import avbd as kernels
@@ -172,7 +172,8 @@ class Augmenting(Sweeps):
         begun = np.zeros((len(prepared.least), 2)) if kept is None else method.decay * kept
         past = method.stabilisation * np.where(prepared.exact, off(edges, problem.start.positions), 0.0)
         base = np.ones(made.system.vertices + 2)
-        base[made.row] = made.majorant - made.system.energies[-1].stiffness_matrix(made.system.vertices).diagonal()
+        first = cast(Augmented, made.system.energies[-1])
+        base[made.row] = made.majorant - first.stiffness_matrix(made.system.vertices).diagonal()
         self._duals = kernels.Duals(
             edges.low + past,
             edges.high + past,

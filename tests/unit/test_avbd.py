@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ ROUND_OFF = 1e-9
 """Of metres and newtons of size one, after solves to a residual of 1e-11 of the step's."""
 
 
-def chain(size: int, mesh: Chain | None = None, *others: object, **settings: object) -> Scene:
+def chain(size: int, mesh: Chain | None = None, *others: Any, **settings: Any) -> Scene:
     return scene(mesh or Chain(), EXACT, Gravity(), FIRST, *others, size=size, **settings)
 
 
@@ -51,7 +52,7 @@ def heavier(stated: StepProblem, times: float) -> StepProblem:
     return replace(stated, system=replace(stated.system, mass=mass), force=force)
 
 
-def solved(stated: StepProblem, iterations: int = 20_000, tolerance: float = 1e-11, **settings: object):
+def solved(stated: StepProblem, iterations: int = 20_000, tolerance: float = 1e-11, **settings: Any):
     prepared = Avbd(**settings).prepare(stated.system)
     return prepared.solve(stated, StopRule(iterations, tolerance))
 
@@ -104,7 +105,7 @@ def limited() -> Scene:
 
 def test_exact_limits_hold_and_pull_only_where_they_are_reached():
     bound = limited()
-    lengths = joined(bound.system.lengths)
+    lengths, slack = joined(bound.system.lengths), np.empty(0)
     for step in simulate(bound, prepare(bound, Avbd()), StopRule(20_000, 1e-9), first_guess="current", frames=8):
         assert step.solution.kept is not None
         tension, out = step.solution.kept[:, 0], off(lengths, step.positions)

@@ -43,8 +43,8 @@ class Springs(Model):
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
         """The springs as one energy, none at all where no spring has stiffness, and the lengths that are exact."""
-        stretch, shear = (inf if x == "exact" else x for x in (self.stretch, self.shear))
-        shear = stretch if shear is None else shear
+        given = self.stretch if self.shear is None else self.shear
+        stretch, shear = (inf if x == "exact" else x for x in (self.stretch, given))
         k = spring_stiffness(
             mesh, rule=self.rule, stretch=stretch, shear=shear, bend=self.bend, reference=self.reference
         )
