@@ -125,7 +125,7 @@ _FAMILIES = (
     "#99634c",
 )
 _MEMBERS: tuple[tuple[float, Any], ...] = (
-    *((0.0, "-"), (-0.27, DASHED), (0.3, "-"), (0.2, DASH_DOTTED), (-0.12, (0, (1, 3)))),
+    *((0.0, "-"), (-0.27, DASHED), (0.3, (0, (14, 2))), (0.2, DASH_DOTTED), (-0.12, (0, (1, 3)))),
 )
 """How much lighter the members of a family are drawn, or darker where negative, and in which line style."""
 _MANY: tuple[tuple[float, Any], ...] = (
