@@ -17,7 +17,7 @@ from solvers import matrices
 from solvers.core.pattern import Matrix
 from solvers.energies.elements import Elements, Law
 from solvers.energies.springs import Springs
-from solvers.kernels import objective
+from solvers.kernels import hessian, objective
 from solvers.kernels.forms import Form
 from solvers.problem import Energy, ProjectiveEnergy, System, is_lagged
 
@@ -99,11 +99,9 @@ class Objective:
 
     def between(self, vertices: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Every two different vertices of each row (a, k), as numbers of free ones, each pair once, the lower first."""
-        number = self.number[vertices]
-        one, two = np.triu_indices(vertices.shape[1], 1)
-        i, j = number[:, one].ravel(), number[:, two].ravel()
-        low, high, size = np.minimum(i, j), np.maximum(i, j), len(self.system.free)
-        return np.divmod(np.unique((low * size + high)[low >= 0]), size)
+        (a, k), size = vertices.shape, len(self.system.free)
+        keys = np.empty(a * k * (k - 1) // 2, np.int64)
+        return np.divmod(np.unique(keys[: hessian.meetings(self.number, size, vertices, keys)]), size)
 
     def _matrix(self, graph: csr_array, i: NDArray[np.int64], j: NDArray[np.int64]) -> Matrix:
         return Matrix.of(self.system, self.terms, self.form, self.number, graph, i, j)

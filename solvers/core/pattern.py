@@ -82,7 +82,9 @@ class Matrix:
         m, k = vertices.shape
         if k == 1:
             return self.places.diagonal[vertices]
-        return self._between(np.repeat(vertices, k, axis=1), np.tile(vertices, k)).reshape(m, k * k)
+        out, graph = np.empty((m, k * k), np.int64), self.graph
+        hessian.locate(self._number, graph.indptr, graph.indices, np.ascontiguousarray(vertices), out)
+        return out
 
     def _between(self, i: Indices, j: Indices) -> Indices:
         """The blocks between vertices i and j, of one shape; -1 where one is not free."""

@@ -52,6 +52,45 @@ class Places(NamedTuple):
 
 
 @kernel
+def locate(number, starts, columns, vertices, out):
+    """Write where the blocks of every vertex of each row (m, k) with every one lie in rows of sorted columns to `out`
+    (m, k^2); -1 where one of both is not free. number: of each vertex among the free ones, or -1."""
+    many = vertices.shape[1]
+    for e in range(len(vertices)):
+        for a in range(many):
+            i = number[vertices[e, a]]
+            for b in range(many):
+                j, at = number[vertices[e, b]], many * a + b
+                if i < 0 or j < 0:
+                    out[e, at] = -1
+                    continue
+                low, high = starts[i], starts[i + 1] - 1
+                while low < high:
+                    middle = (low + high) // 2
+                    if columns[middle] < j:
+                        low = middle + 1
+                    else:
+                        high = middle
+                out[e, at] = low
+
+
+@kernel
+def meetings(number, size, vertices, out):
+    """Write every two different free vertices of each row (m, k) to `out`, the lower number times `size` and the higher
+    one; how many they are. number: see `locate`."""
+    count = 0
+    for e in range(len(vertices)):
+        for a in range(vertices.shape[1]):
+            i = number[vertices[e, a]]
+            for b in range(a):
+                j = number[vertices[e, b]]
+                if i >= 0 and j >= 0 and i != j:
+                    out[count] = min(i, j) * size + max(i, j)
+                    count += 1
+    return count
+
+
+@kernel
 def tensions(terms, p, d, out):
     """Write the springs' tensions [N] at p, linearised for a step d (both (n, 3)), to out (m,)."""
     for e in range(len(terms.stiffness)):
