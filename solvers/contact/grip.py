@@ -17,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.contact import barrier
-from solvers.contact.barrier import Pairs
+from solvers.contact.contacts import Contacts
 from solvers.problem import Positions
 
 Array = NDArray[np.float64]
 
 
 class Grip(NamedTuple):
-    """Pairs that grip. vertices (g, 4); weights: c (g, 4); normal (g, 3); anchor: sum_i c_i x_i^t (g, 3) [m]; force:
-    mu F (g,) [N]; slip: s [m]."""
+    """Contacts that grip. vertices (g, 4), with no weight where there are fewer; weights: c (g, 4); normal (g, 3);
+    anchor: sum_i c_i x_i^t (g, 3) [m]; force: mu F (g,) [N]; slip: s [m]."""
 
     vertices: NDArray[np.int64]
     weights: Array
@@ -35,14 +35,12 @@ class Grip(NamedTuple):
     slip: float
 
     @classmethod
-    def of(cls, pairs: Pairs, p: Positions, friction: float, slip: float) -> Self:
-        """What pairs in range at the step's start p (n, 3) [m] do in the step. slip: s [m]."""
-        which = np.empty(len(pairs.vertices), np.int64)
-        which = which[: barrier.active(pairs, p, 1.0, which)]
-        weights, between, force = np.empty((len(which), 4)), np.empty((len(which), 3)), np.empty(len(which))
-        barrier.press(pairs, which, p, weights, between, force)
+    def of(cls, contacts: Contacts, friction: float, slip: float) -> Self:
+        """What is in range at the step's start does in the step. slip: s [m]."""
+        between, force = contacts.between.copy(), np.empty(len(contacts.vertices))
+        barrier.forces(contacts, force)
         normal = between / np.sqrt(np.einsum("ij,ij->i", between, between))[:, None]
-        return cls(pairs.vertices[which], weights, normal, between, friction * force, slip)
+        return cls(contacts.vertices.copy(), contacts.weights.copy(), normal, between, friction * force, slip)
 
     def _slipped(self, p: Positions) -> tuple[Array, Array]:
         """u (g, 3) and |u| (g,) [m]."""

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.contact import boxes
-from solvers.contact.barrier import Pairs, distances
+from solvers.contact.barrier import distances
 from solvers.contact.boxes import Tree
+from solvers.contact.contacts import Pairs
 from solvers.contact.mollifier import MOLLIFIED
 from solvers.problem import Positions
 
@@ -21,7 +22,7 @@ Indices = NDArray[np.int64]
 class Side(NamedTuple):
     """points (q, 1), edges and triangles of one of both, by vertices of all; length: of its edges (m,) [m]."""
 
-    points: Indices
+    points: Tree
     edges: Tree
     triangles: Tree
     length: Array
@@ -30,10 +31,10 @@ class Side(NamedTuple):
     def of(cls, rest: Positions, edges: Indices, triangles: Indices, first: int = 0) -> Self:
         """The side of a shape (n, 3) [m] whose vertices are counted from `first`."""
         points = np.unique(np.append(edges.ravel(), triangles.ravel())).astype(np.int64)
-        length = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
         one, two = Tree.of(rest, edges), Tree.of(rest, triangles)
-        one, two = (tree._replace(corners=tree.corners + first) for tree in (one, two))
-        return cls(points[:, None] + first, one, two, length)
+        length = np.linalg.norm(rest[one.corners[:, 0]] - rest[one.corners[:, 1]], axis=1)
+        trees = (tree._replace(corners=tree.corners + first) for tree in (Tree.of(rest, points[:, None]), one, two))
+        return cls(*trees, length)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +67,11 @@ class Against:
     def _pairs(self, p: Positions, q: Positions, reach: float) -> Pairs:
         a, b = self.mesh, self.others
         one, two = (boxes.found(x.points, y.triangles, p, q, reach).T for x, y in ((a, b), (b, a)))
-        e, f = boxes.found(a.edges.corners, b.edges, p, q, reach).T
+        e, f = boxes.found(a.edges, b.edges, p, q, reach).T
         vertices = np.concatenate(
             [
-                np.column_stack([a.points[one[0]], b.triangles.corners[one[1]]]),
-                np.column_stack([b.points[two[0]], a.triangles.corners[two[1]]]),
+                np.column_stack([a.points.corners[one[0]], b.triangles.corners[one[1]]]),
+                np.column_stack([b.points.corners[two[0]], a.triangles.corners[two[1]]]),
                 np.column_stack([a.edges.corners[e], b.edges.corners[f]]),
             ]
         )

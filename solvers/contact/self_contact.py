@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
-from solvers.contact import barrier, ways
-from solvers.contact.barrier import Pairs
+from solvers.contact import barrier, contacts, ways
 from solvers.contact.blocks import Blocks
+from solvers.contact.contacts import Contacts, Pairs, padded
+from solvers.contact.curvature import curvature
 from solvers.contact.grip import NO_GRIP, Grip
 from solvers.problem import Positions, Start
 
@@ -29,6 +30,11 @@ Array = NDArray[np.float64]
 
 _ROUND = 8.0 * np.finfo(np.float64).eps
 """Of the largest coordinate: by so much boxes are made wider."""
+
+
+_WIDE = 1.5
+"""Of the range: so far pairs are looked up. More would be looked at each time for longer than it takes to look them up
+anew now and then."""
 
 
 class Surfaces(Protocol):
@@ -66,15 +72,27 @@ class _Kept(NamedTuple):
     pairs: Pairs
 
 
+class _Met(NamedTuple):
+    """What is in range at p (n, 3), its energy [J] and gradient (n, 3) [N]; space: where the contacts are written."""
+
+    p: Positions
+    contacts: Contacts
+    value: float
+    gradient: Positions
+    space: Contacts
+
+
 @dataclass(frozen=True, eq=False)
 class PairContact:
-    """A barrier of pairs, and their friction. kept: what was found last, one or none; grip: of a step that has begun;
-    friction: mu; slip [m/s]: below it a pair counts as sticking."""
+    """A barrier of pairs, and their friction. kept: what was found last, one or none; met: at the last two positions
+    that were asked about, for value, slopes and second derivatives are asked for in turn; grip: of a step that has
+    begun; friction: mu; slip [m/s]: below it a pair counts as sticking."""
 
     surface: Surfaces
     friction: float = 0.0
     slip: float = 1e-3
     kept: list[_Kept] = field(default_factory=list[_Kept])
+    met: list[_Met] = field(default_factory=list[_Met])
     grip: Grip = NO_GRIP
 
     @property
@@ -90,7 +108,7 @@ class PairContact:
 
     def _gripping(self, p: Positions, start: Start) -> Grip:
         """p: all vertices at the step's start."""
-        return Grip.of(self.pairs(p), p, self.friction, self.slip * (start.until - start.time))
+        return Grip.of(self._at(p).contacts, self.friction, self.slip * (start.until - start.time))
 
     def whole(self, p: Positions) -> Positions:
         """Positions of all vertices that pairs name, those of the mesh (n, 3) first."""
@@ -105,7 +123,7 @@ class PairContact:
         for kept in self.kept:
             if kept.p.shape == p.shape and 2.0 * _apart(kept.p, p) <= kept.reach - self.range:
                 return kept.pairs
-        reach = 2.0 * self.range + _ROUND * float(np.abs(p).max(initial=0.0))
+        reach = _WIDE * self.range + _ROUND * float(np.abs(p).max(initial=0.0))
         kept = _Kept(p.copy(), reach, self.surface.within(p, reach))
         self.kept[:] = [kept]
         return kept.pairs
@@ -115,7 +133,7 @@ class PairContact:
         p = self.whole(p)
         if not np.isfinite(p).all():
             return np.inf
-        pressed = barrier.value(self.pairs(p), p)
+        pressed = self._at(p).value
         return pressed + self.grip.value(p) if len(self.grip.vertices) else pressed
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
@@ -123,30 +141,44 @@ class PairContact:
         n, p = len(p), self.whole(p)
         if not np.isfinite(p).all():
             return
-        total = out if len(p) == n else np.zeros_like(p)
-        barrier.add_gradient(self.pairs(p), p, total)
+        met = self._at(p)
+        if len(met.contacts.vertices):
+            out += met.gradient[:n]
         if len(self.grip.vertices):
+            total = np.zeros_like(p)
             self.grip.add_gradient(p, total)
-        if total is not out:
             out += total[:n]
 
     def blocks(self, p: Positions, keep: float = 1.0) -> Blocks:
-        """The second derivatives of each pair in range at p (n, 3); keep: of what bends downwards."""
+        """The second derivatives of each contact in range at p (n, 3); keep: of what bends downwards."""
         n, p = len(p), self.whole(p)
-        pairs = self.pairs(p)
-        which = np.empty(len(pairs.vertices), np.int64)
-        which = which[: barrier.active(pairs, p, 1.0, which)]
-        values = np.empty((len(which), 12, 12))
-        barrier.curve(pairs, which, p, keep, np.empty((6, 12)), values)
-        vertices = pairs.vertices[which]
+        blocks = curvature(self._at(p).contacts, p, keep)
         if len(self.grip.vertices):
-            vertices = np.concatenate([vertices, self.grip.vertices])
-            values = np.concatenate([values, self.grip.curvature(p)])
-        return Blocks(np.where(vertices < n, vertices, -1) if len(p) > n else vertices, values)
+            blocks = blocks.followed(Blocks.whole(self.grip.vertices, self.grip.curvature(p)))
+        return blocks._replace(vertices=np.where(blocks.vertices < n, blocks.vertices, -1)) if len(p) > n else blocks
+
+    def _at(self, p: Positions) -> _Met:
+        """What is in range at p, all vertices' (N, 3)."""
+        for met in self.met:
+            if np.array_equal(met.p, p):
+                return met
+        pairs = self.pairs(p)
+        many = len(pairs.vertices)
+        if not many:
+            nothing = contacts.room(0, pairs.thickness, pairs.reach)
+            return _Met(p, nothing, 0.0, p, nothing)
+        gradient = np.zeros_like(p)
+        space = self.met.pop(0).space if len(self.met) > 1 else None
+        if space is None or len(space.vertices) < many:
+            space = contacts.room(many, pairs.thickness, pairs.reach)
+        near = contacts.in_range(pairs, padded(p), space)
+        self.met.append(_Met(p.copy(), near, barrier.press(near, p, gradient), gradient, space))
+        return self.met[-1]
 
     def hessian(self, p: Positions) -> csr_array:
         """The Hessian [N/m], shape (3n, 3n)."""
-        vertices, values = self.blocks(p)
+        blocks = self.blocks(p)
+        vertices, values = blocks.vertices, blocks.values
         at = (3 * vertices[:, :, None] + np.arange(3)).reshape(len(vertices), 12)
         rows, columns, values = np.repeat(at, 12, axis=1).ravel(), np.tile(at, 12).ravel(), values.ravel()
         own = (rows >= 0) & (columns >= 0)
@@ -184,7 +216,7 @@ class PairContact:
             pad = self.surface.thickness + _ROUND * float(np.abs(p).max(initial=0.0))
             pairs = self.surface.on_way(p, p + way, pad)
         scratch = np.empty(4, np.int64), np.empty((4, 3)), np.empty((4, 3))
-        return ways.largest(pairs, p, way, most, *scratch)
+        return ways.largest(pairs, padded(p), padded(way), most, *scratch)
 
     def closed(self, p: Positions) -> list[tuple[NDArray[np.int64], bool, float]]:
         """Pairs that are not farther apart than their thickness at p (n, 3): their vertices (4,), whether they are

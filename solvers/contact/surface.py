@@ -7,11 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from solvers.compiling import inner, kernel
 from solvers.contact import boxes
-from solvers.contact.barrier import Pairs, distances
-from solvers.contact.boxes import Indices, Tree, Trees
+from solvers.contact.barrier import distances
+from solvers.contact.boxes import Indices, Tree
+from solvers.contact.closest import dot, edge_edge_way, point_triangle_way
+from solvers.contact.contacts import Pairs, padded
 from solvers.contact.mollifier import MOLLIFIED
 from solvers.problem import Positions
+from solvers.vectors.eights import bits, lowest, rows
 
 Array = NDArray[np.float64]
 
@@ -23,7 +27,7 @@ _NOTHING = np.empty(0)
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Points (q,), edges (m, 2) and triangles (f, 3) of a mesh at rest, that keep a thickness [m] from each other and
+    """Points (q, 1), edges (m, 2) and triangles (f, 3) of a mesh at rest, that keep a thickness [m] from each other and
     feel each other within a range [m] beyond it.
 
     Pairs that share a vertex are none. Those that are nearer at rest than thickness and range have both in proportion
@@ -31,7 +35,7 @@ class Surface:
     stiffness (n,): [N/m]; near: the keys of such pairs, sorted, and that proportion.
     """
 
-    points: Indices
+    points: Tree
     edges: Tree
     triangles: Tree
     length: Array
@@ -47,46 +51,51 @@ class Surface:
         """The surface of a rest shape (n, 3) [m]."""
         points = np.unique(np.append(edges.ravel(), triangles.ravel())).astype(np.int64)
         rest = np.array(rest, order="C")
-        lengths = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
         none = np.empty(0, np.int64), np.empty(0)
-        trees = Tree.of(rest, edges), Tree.of(rest, triangles)
-        bare = cls(points, *trees, lengths, np.array(stiffness), thickness, reach, none)
-        found, first = boxes.near(points, bare._trees, rest, rest, thickness + reach)
+        trees = Tree.of(rest, points[:, None]), Tree.of(rest, edges), Tree.of(rest, triangles)
+        lengths = _lengths(rest, trees[1].corners)
+        bare = cls(*trees, lengths, np.array(stiffness), thickness, reach, none)
+        found, first = bare._near(rest, rest, thickness + reach)
         apart = distances(bare._bare(found, first), rest)
         close = apart < thickness + reach
         keys, share = bare._keys(found, first)[close], _LESS * apart[close] / (thickness + reach)
         order = np.argsort(keys)
         near = keys[order], share[order]
-        return cls(points, *trees, lengths, np.array(stiffness), thickness, reach, near)
+        return cls(*trees, lengths, np.array(stiffness), thickness, reach, near)
 
-    @property
-    def _trees(self) -> Trees:
-        return self.triangles, self.edges
+    def _near(self, p: Positions, q: Positions, reach: float) -> tuple[Indices, int]:
+        return boxes.near(self.points, self.triangles, self.edges, p, q, reach)
 
     def within(self, p: Positions, reach: float) -> Pairs:
         """Pairs that are nearer than `reach` [m] at p (n, 3) [m]."""
-        found, first = boxes.near(self.points, self._trees, p, p, reach)
-        bare = self._bare(found, first)
-        close = distances(bare, p) < reach
-        found, vertices = found[close], bare.vertices[close]
-        first = int(close[:first].sum())
-        two, parallel = found[first:].T, np.zeros(len(found))
-        parallel[first:] = MOLLIFIED * (self.length[two[0]] * self.length[two[1]]) ** 2
-        stiffness = self.stiffness[vertices].mean(axis=1)
-        return Pairs(vertices, first, self._scale(found, first), stiffness, parallel, self.thickness, self.reach)
+        found, first = self._near(p, p, reach)
+        many = len(found)
+        vertices, numbers = np.empty((many, 4), np.int64), (np.empty(many), np.empty(many))
+        pairs = Pairs(vertices, first, _NOTHING, *numbers, self.thickness, self.reach)
+        points, count = nearer(pairs, found, self._parts, self.length, self.stiffness, padded(p), reach)
+        scale = self._scale(found[:count], points)
+        return pairs._replace(
+            vertices=pairs.vertices[:count],
+            points=points,
+            scale=scale,
+            stiffness=pairs.stiffness[:count],
+            parallel=pairs.parallel[:count],
+        )
+
+    @property
+    def _parts(self) -> tuple[Indices, Indices, Indices]:
+        return self.points.corners, self.triangles.corners, self.edges.corners
 
     def on_way(self, p: Positions, q: Positions, reach: float) -> Pairs:
         """Pairs that may come nearer than `reach` [m] on the straight way from p to q, (n, 3) [m] both; without what
         they press with."""
-        found, first = boxes.near(self.points, self._trees, p, q, reach)
+        found, first = self._near(p, q, reach)
         return self._bare(found, first)._replace(scale=self._scale(found, first))
 
     def _bare(self, found: Indices, first: int) -> Pairs:
         """Pairs by their numbers (k, 2), the first ones of points and triangles; no more than where they are."""
-        one, two = found[:first].T, found[first:].T
         vertices = np.empty((len(found), 4), np.int64)
-        vertices[:first, 0], vertices[:first, 1:] = self.points[one[0]], self.triangles.corners[one[1]]
-        vertices[first:, :2], vertices[first:, 2:] = self.edges.corners[two[0]], self.edges.corners[two[1]]
+        name(found, first, self._parts, vertices)
         return Pairs(vertices, first, _NOTHING, _NOTHING, _NOTHING, self.thickness, self.reach)
 
     def _scale(self, found: Indices, first: int) -> Array:
@@ -102,5 +111,74 @@ class Surface:
         """A number of each pair."""
         many = max(len(self.triangles.corners), len(self.edges.corners), 1)
         key = found[:, 0] * many + found[:, 1]
-        key[first:] += len(self.points) * many
+        key[first:] += len(self.points.corners) * many
         return key
+
+
+def _lengths(x: Positions, edges: Indices) -> Array:
+    return np.asarray(np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1), np.float64)
+
+
+@inner
+def _name(found, e, edges, parts, vertices, k):
+    """Write the vertices of pair e to row k."""
+    points, triangles, sides = parts
+    i, j = found[e, 0], found[e, 1]
+    if edges:
+        vertices[k, 0], vertices[k, 1], vertices[k, 2], vertices[k, 3] = (
+            sides[i, 0],
+            sides[i, 1],
+            sides[j, 0],
+            sides[j, 1],
+        )
+    else:
+        vertices[k, 0] = points[i, 0]
+        vertices[k, 1], vertices[k, 2], vertices[k, 3] = triangles[j, 0], triangles[j, 1], triangles[j, 2]
+
+
+@kernel
+def name(found, first, parts, vertices):
+    """Write the vertices (k, 4) of pairs (k, 2), the first ones of points and triangles; parts: points, triangles and
+    edges."""
+    for e in range(len(found)):
+        _name(found, e, e >= first, parts, vertices, e)
+
+
+@kernel
+def nearer(pairs, found, parts, lengths, stiffness, x, reach):
+    """Leave those of found pairs (k, 2) that are nearer than `reach` at x (n, 4), and write their vertices, stiffness
+    and e to `pairs`; how many are of points and triangles, and of both kinds."""
+    count, points, begin, limit = 0, 0, 0, reach * reach
+    for edges in (False, True):
+        end = len(found) if edges else pairs.points
+        for first in range(begin, end, 8):
+            many = min(8, end - first)
+            for k in range(many):
+                _name(found, first + k, edges, parts, pairs.vertices, count + k)
+            left, last = _near(pairs.vertices, x, count, count + many - 1, edges, limit), count
+            while left != 0:
+                lane = lowest(left)
+                left &= left - 1
+                if lane < many:
+                    e = first + lane
+                    i, j = found[e, 0], found[e, 1]
+                    found[count, 0], found[count, 1] = i, j
+                    v = pairs.vertices[count]
+                    for a in range(4):
+                        v[a] = pairs.vertices[last + lane, a]
+                    pairs.stiffness[count] = 0.25 * (
+                        stiffness[v[0]] + stiffness[v[1]] + stiffness[v[2]] + stiffness[v[3]]
+                    )
+                    pairs.parallel[count] = MOLLIFIED * (lengths[i] * lengths[j]) ** 2 if edges else 0.0
+                    count += 1
+        begin, points = end, points if edges else count
+    return points, count
+
+
+@inner
+def _near(vertices, x, first, last, edges, limit):
+    """Which of eight pairs are nearer than the root of a limit, as bits."""
+    a, b = rows(x, vertices, first, last, 0), rows(x, vertices, first, last, 1)
+    c, d = rows(x, vertices, first, last, 2), rows(x, vertices, first, last, 3)
+    z = edge_edge_way(a, b, c, d)[4] if edges else point_triangle_way(a, b, c, d)[4]
+    return bits(dot(z, z) < limit)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from solvers.contact.closest import at, edge_edge_way, point_triangle_way
 from solvers.vectors.block import ROWS
 from solvers.vectors.springs import LANES, RIGHT
 
@@ -214,3 +215,21 @@ def add(source, at, target, to, count):
     """target += source."""
     for r in range(count):
         target[to + r] += source[at + r]
+
+
+def eight(vertices, x, first, last, edges, limit, tile):
+    """See `solvers.contact.contacts`."""
+    left = 0
+    for lane in range(8):
+        v = vertices[min(first + lane, last)]
+        a, b, c, d = at(x, v[0]), at(x, v[1]), at(x, v[2]), at(x, v[3])
+        if edges:
+            c0, c1, c2, c3, z, area = edge_edge_way(a, b, c, d)
+        else:
+            c0, c1, c2, c3, z = point_triangle_way(a, b, c, d)
+            area = 0.0
+        squared = z[0] * z[0] + z[1] * z[1] + z[2] * z[2]
+        for row, value in enumerate((c0, c1, c2, c3, z[0], z[1], z[2], squared, area)):
+            tile[row, lane] = value
+        left |= (1 << lane) * (squared < limit)
+    return left

@@ -24,7 +24,10 @@ from scipy.sparse import csr_array
 from harness.base.machine import describe, pinned_threads
 from harness.experiments.gates.abba import CALL, Turn, orders
 from harness.experiments.gates.sequential import interval
+from harness.scenes.touching import outline
 from harness.simulation.step import problem, start
+from solvers.contact import contacts
+from solvers.contact.surface import Surface
 from solvers.kernels import accelerate, accelerate_springs, accelerate_step, springs, vbd
 from solvers.linear import block, block_factor, multigrid_kernels, supernodal, supernodal_solve
 from solvers.linear.conjugate_gradients import ConjugateGradients
@@ -32,6 +35,7 @@ from solvers.linear.supernodal import Supernodal
 from solvers.problem import Positions
 from tests.bench import plain
 from tests.bench.gates import STOP, prepare, sheet
+from tests.bench.pairs import folded
 from tests.bench.solves import system_matrix
 
 SIZE, TURNS = 64, 40
@@ -176,6 +180,18 @@ def system() -> tuple[csr_array, Positions]:
     return system_matrix(scene), np.random.default_rng(0).uniform(-1.0, 1.0, (scene.system.vertices, 3))
 
 
+def of_eights() -> Iterator[Case]:
+    """Over pairs of four layers that touch."""
+    made = folded(SIZE)
+    mesh, p = made.mesh, made.p
+    surface = Surface.of(mesh.rest, outline(mesh)[0], mesh.triangles, np.ones(len(p)), made.thickness, made.reach)
+    pairs = surface.within(p, 1.5 * (made.thickness + made.reach))
+    space = contacts.room(len(pairs.vertices), made.thickness, made.reach)
+    slots = np.empty(1 << (2 * len(pairs.vertices)).bit_length(), np.int32)
+    arguments = pairs, contacts.padded(p), np.empty((9, 8)), slots, space
+    yield Case("closest points of pairs", contacts.gather, arguments, {"eight": plain.eight}, (2, 3))
+
+
 CASES = {
     "forces": of_springs,
     "descent": of_descent,
@@ -184,6 +200,7 @@ CASES = {
     "supernodal": of_supernodal,
     "block": of_block,
     "rows": of_rows,
+    "eights": of_eights,
 }
 """By the file of `solvers/vectors`."""
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from harness.scenes.intersections import crossings
-from solvers.contact.barrier import Pairs, add_gradient, distances
+from solvers.contact.barrier import distances, press
+from solvers.contact.contacts import Pairs, in_range, padded, room
 from solvers.contact.self_contact import SelfContact
 from solvers.contact.surface import Surface
 from tests.self_contacts import RANGE, THICKNESS, sides, touching, way
@@ -17,6 +18,13 @@ from tests.self_contacts import RANGE, THICKNESS, sides, touching, way
 def pair(edges: bool) -> Pairs:
     one = np.ones(1)
     return Pairs(np.arange(4)[None], 0 if edges else 1, one, one, 0 * one, THICKNESS, RANGE)
+
+
+def pushed(pairs: Pairs, p: np.ndarray) -> np.ndarray:
+    """The gradient."""
+    out = np.zeros_like(p)
+    press(in_range(pairs, padded(p), room(len(pairs.vertices), THICKNESS, RANGE)), p, out)
+    return out
 
 
 def sampled(p: np.ndarray, edges: bool) -> float:
@@ -139,8 +147,32 @@ def test_candidates_are_all_that_are_near():
     every = Pairs(np.array(wanted), first, one, one, 0 * one, THICKNESS, RANGE)
     near = distances(every, p) < reach
     found = surface.within(p, reach)
-    assert {tuple(x) for x in found.vertices.tolist()} == {tuple(x) for x in every.vertices[near].tolist()}
-    assert found.points == int(near[:first].sum())
+    assert named(found.vertices, found.points) == named(every.vertices[near], int(near[:first].sum()))
+    assert len(found.vertices) == int(near.sum())
+
+
+def named(vertices: np.ndarray, points: int) -> set[object]:
+    """Points with their triangles, and edges with each other, whichever of two comes first."""
+    one, two = vertices[:points].tolist(), vertices[points:].tolist()
+    return {tuple(x) for x in one} | {frozenset((tuple(x[:2]), tuple(x[2:]))) for x in two}
+
+
+def test_each_contact_stands_for_all_pairs_that_have_its_closest_points():
+    contact, p, _ = touching(noise=5e-4)
+    pairs, total, gradient = contact.pairs(p), 0.0, np.zeros_like(p)
+    for e in range(len(pairs.vertices)):
+        arrays = (a[e : e + 1] for a in (pairs.vertices, pairs.scale, pairs.stiffness, pairs.parallel))
+        vertices, scale, stiffness, parallel = arrays
+        single = Pairs(vertices, int(e < pairs.points), scale, stiffness, parallel, THICKNESS, RANGE)
+        total += press(in_range(single, padded(p), room(1, THICKNESS, RANGE)), p, gradient)
+    met, summed = contact.blocks(p), np.zeros_like(p)
+    contact.add_gradient(p, summed)
+    near = int((distances(pairs, p) < THICKNESS + RANGE).sum())
+    assert len(met.vertices) < 0.7 * near
+    assert (met.vertices[:, 2] < 0).sum() > 20  # of a point and a point
+    # The same sums in another order.
+    assert contact.value(p) == pytest.approx(total, rel=1e-13)
+    np.testing.assert_allclose(summed, gradient, atol=1e-13 * np.abs(gradient).max())
 
 
 def test_what_was_kept_changes_no_bit():
@@ -192,14 +224,11 @@ def _shrunk(by: float):
 @pytest.mark.parametrize("gap", [1e-2, 1e-5, 1e-7, 1e-9])
 def test_forces_are_the_slope_of_the_value_down_to_gaps_of_round_off(gap: float):
     p = np.array([[0.2, THICKNESS + gap * RANGE, 0.2], [0, 0, 0], [0, 0, 1], [1, 0, 0]], float)
-    out, x = np.zeros_like(p), (p[0, 1] - THICKNESS) / RANGE
-    add_gradient(pair(False), p, out)
+    out, x = pushed(pair(False), p), (p[0, 1] - THICKNESS) / RANGE
     slope = (1 - x) * (2 * np.log(x) - (1 - x) / x)
     assert out[0, 1] == pytest.approx(RANGE * slope, rel=1e-6)
     closed = p - [[0, 2 * gap * RANGE, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]]
-    out[:] = 0.0
-    add_gradient(pair(False), closed, out)
-    assert -2e6 * RANGE < out[0, 1] < 0.0  # finite, and apart
+    assert -2e6 * RANGE < pushed(pair(False), closed)[0, 1] < 0.0  # finite, and apart
 
 
 def test_values_are_infinite_where_a_gap_is_closed():

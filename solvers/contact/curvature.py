@@ -1,0 +1,120 @@
+"""The barrier's second derivatives, in closed form.
+
+With z = sum_i c_i x_i and its free places, the ways w_a in which c changes along them (`contact.closest`), D = |z|^2/2,
+
+    D'' = c c' (x) I - B G^-1 B',     B_ia = c_i z_a + w_ia z,     z_a = sum_i w_ia x_i,     G_ab = z_a z_b
+
+so that f(d)'' = f'' g g' + f'/d (c c' (x) (I - n n') - B G^-1 B'), and f' is negative: only the first part of the
+bracket bends downwards. `keep` says how much of what bends downwards is kept: with 1 the blocks are exact, with 0 they
+are positive semidefinite, and never less than exact ones. A contact of k vertices has a block of 3 k rows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.compiling import inner, kernel
+from solvers.contact.barrier import law, length, pushing
+from solvers.contact.blocks import Blocks
+from solvers.contact.contacts import EDGES, POINT_EDGE, POINT_TRIANGLE, Contacts
+from solvers.contact.mollifier import add_mollified, crossed, mollifier
+
+Array = NDArray[np.float64]
+
+
+def curvature(contacts: Contacts, p: Array, keep: float) -> Blocks:
+    """The second derivatives [N/m] of contacts at p (n, 3); keep: of what bends downwards."""
+    width = np.minimum(contacts.kind, 4)
+    starts = np.concatenate([[0], np.cumsum(9 * width * width)])
+    values = np.empty(starts[-1])
+    curve(contacts, p, keep, starts, np.empty((6, 12)), values)
+    return Blocks(np.where(np.arange(4) < width[:, None], contacts.vertices, -1), starts, values)
+
+
+@kernel
+def curve(contacts, p, keep, starts, work, out):
+    """Write the block of each contact at p (n, 3), row by row, to `out` from where it starts; work (6, 12): scratch."""
+    for k in range(len(contacts.vertices)):
+        many = 3 * min(contacts.kind[k], 4)
+        _curve(contacts, k, p, keep, work, out[starts[k] : starts[k + 1]].reshape(many, many))
+
+
+@inner
+def _curve(contacts, k, p, keep, work, H):
+    x, kind, many = contacts.vertices[k], contacts.kind[k], len(H)
+    z0, z1, z2 = contacts.between[k, 0], contacts.between[k, 1], contacts.between[k, 2]
+    d, gap = length(contacts, k)
+    d = max(d, 1e-300)
+    n, c, g, dc, first, second = work[0], contacts.weights[k], work[2], work[3], work[4], work[5]
+    n[0], n[1], n[2] = z0 / d, z1 / d, z2 / d
+    b, b1, b2 = law(pushing(gap))
+    r, m, m1, m2 = contacts.scale[k] * contacts.reach, 1.0, 0.0, 0.0
+    f, f1, f2 = contacts.stiffness[k] * r * r * b, contacts.stiffness[k] * r * b1, contacts.stiffness[k] * b2
+    if contacts.parallel[k] > 0.0:
+        m, m1, m2 = mollifier(crossed(p, x).c, contacts.parallel[k])
+    across = f1 / d
+    lag, hold = _rows(p, x, kind, c, z0, z1, z2, first, second)
+    for i in range(many // 3):
+        for a in range(3):
+            g[3 * i + a] = c[i] * n[a]
+    along, side = m * (f2 - keep * across), keep * m * across
+    lag, hold = m * across * lag, m * across * hold
+    for i in range(many):
+        one, two, three = along * g[i], lag * first[i], hold * second[i]
+        if hold != 0.0:
+            for j in range(many):
+                H[i, j] = one * g[j] - (two * first[j] + three * second[j])
+        elif lag != 0.0:
+            for j in range(many):
+                H[i, j] = one * g[j] - two * first[j]
+        else:
+            for j in range(many):
+                H[i, j] = one * g[j]
+    if side != 0.0:
+        for i in range(many // 3):
+            for j in range(many // 3):
+                for a in range(3):
+                    H[3 * i + a, 3 * j + a] += side * c[i] * c[j]
+    if m1 != 0.0:
+        add_mollified(crossed(p, x), (m, m1, m2), (f, f1, f2), keep, g, dc, H)
+
+
+@inner
+def _rows(p, x, kind, c, z0, z1, z2, first, second):
+    """The columns of B, made orthogonal by G: the weights of their squares in B G^-1 B'."""
+    around = kind in (POINT_EDGE, POINT_TRIANGLE)
+    if around:
+        one, two = (1, 2), (1, 3)
+    else:
+        one, two = (1, 0), (2, 3)
+    firstly = around or (kind == EDGES and c[0] != 0.0 and c[1] != 0.0)
+    secondly = kind == POINT_TRIANGLE or (kind == EDGES and c[2] != 0.0 and c[3] != 0.0)
+    if not firstly:
+        if not secondly:
+            return 0.0, 0.0
+        one, secondly = two, False
+    a0, a1, a2 = _way(p, x, one, c, z0, z1, z2, first)
+    size = a0 * a0 + a1 * a1 + a2 * a2
+    if not secondly:
+        return 1.0 / size, 0.0
+    b0, b1, b2 = _way(p, x, two, c, z0, z1, z2, second)
+    mixed = (a0 * b0 + a1 * b1 + a2 * b2) / size
+    n0, n1, n2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    for i in range(12):
+        second[i] -= mixed * first[i]
+    return 1.0 / size, size / (n0 * n0 + n1 * n1 + n2 * n2)
+
+
+@inner
+def _way(p, x, ends, c, z0, z1, z2, out):
+    """z_a of a way along which c grows at the first of two ends as it falls at the other, and its column of B (12,)."""
+    i, j = ends
+    a0, a1, a2 = p[x[i], 0] - p[x[j], 0], p[x[i], 1] - p[x[j], 1], p[x[i], 2] - p[x[j], 2]
+    for k in range(4):
+        out[3 * k], out[3 * k + 1], out[3 * k + 2] = c[k] * a0, c[k] * a1, c[k] * a2
+    for end, w in ((i, 1.0), (j, -1.0)):
+        out[3 * end] += w * z0
+        out[3 * end + 1] += w * z1
+        out[3 * end + 2] += w * z2
+    return a0, a1, a2
