@@ -157,18 +157,16 @@ def look(one, other, mine, boxes, same, stack, out):
                 while left != 0:
                     f = first + lowest(left)
                     left &= left - 1
-                    if _share(one.corners, begin + k, other.corners, f):
-                        continue
-                    if count < len(out):
+                    if count < len(out):  # what shares a vertex is written over: nobody could foretell a branch here
                         out[count, 0], out[count, 1] = begin + k, f
-                    count += 1
+                    count += not _share(one.corners, begin + k, other.corners, f)
     return count
 
 
 @inner
 def _share(first, e, second, f):
+    shared = False
     for a in range(first.shape[1]):
         for b in range(second.shape[1]):
-            if first[e, a] == second[f, b]:
-                return True
-    return False
+            shared |= first[e, a] == second[f, b]
+    return shared
