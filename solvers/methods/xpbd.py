@@ -12,7 +12,8 @@ largest. Small steps (Macklin et al. 2019) divides the time step instead, and do
 
 Neither minimises the step's objective. Tensions are added along directions that turn as the iteration goes on, and
 the terms that would correct for that are left out: the fixed point is the minimiser where springs do not turn (a
-straight chain), and near to it where they turn little in a step.
+straight chain), and near to it where they turn little in a step. With `device: cuda` the same iterates come from
+`solvers.cuda.xpbd`.
 """
 
 from __future__ import annotations
@@ -27,13 +28,14 @@ from solvers.about import About, Reference
 from solvers.core import colouring, vertex_terms
 from solvers.core.driver import Iterating, Iterative, Substeps
 from solvers.core.prefactored import only_springs
+from solvers.device import Precise
 from solvers.kernels import xpbd as kernels
 from solvers.kernels.loop import ITERATIONS, ONE, Limits
-from solvers.problem import Positions, ResidualOf, StepProblem, System
+from solvers.problem import Positions, Prepared, ResidualOf, StepProblem, System
 
 
 @dataclass(frozen=True)
-class Xpbd:
+class Xpbd(Precise):
     """XPBD; the first guess is not used, nor is a tolerance."""
 
     minimises: ClassVar[bool] = False
@@ -48,15 +50,17 @@ class Xpbd:
         ),
     )
 
-    def prepare(self, system: System) -> PreparedXpbd:
+    def prepare(self, system: System) -> Prepared:
         """Raises Unsupported for energies other than springs, and for vertices without mass that are not pinned."""
         held = vertex_terms.held(system)
-        constraints, choice = _prepared(system, held, "xpbd")
+        if self.device == "cuda":
+            return _on_device(self, system, held, "xpbd", small=False)
+        constraints, _, choice = _prepared(system, held, "xpbd")
         return PreparedXpbd(system, constraints, *_eased(constraints, held), choice)
 
 
 @dataclass(frozen=True)
-class XpbdSmallSteps:
+class XpbdSmallSteps(Precise):
     """XPBD in small steps: as many substeps of one iteration as the stop rule has iterations. The k-th iterate is the
     whole step in k substeps; pins move evenly, and forces stay. The first guess is not used, nor is a tolerance."""
 
@@ -75,10 +79,13 @@ class XpbdSmallSteps:
         first=True,
     )
 
-    def prepare(self, system: System) -> PreparedSmallSteps:
+    def prepare(self, system: System) -> Prepared:
         """Raises Unsupported as `Xpbd` does, and for integrators other than implicit Euler."""
         vertex_terms.require_implicit_euler(system, "xpbd-small-steps")
-        constraints, choice = _prepared(system, vertex_terms.held(system), "xpbd-small-steps")
+        held = vertex_terms.held(system)
+        if self.device == "cuda":
+            return _on_device(self, system, held, "xpbd-small-steps", small=True)
+        constraints, _, choice = _prepared(system, held, "xpbd-small-steps")
         return PreparedSmallSteps(system, constraints, choice)
 
 
@@ -146,14 +153,28 @@ class PreparedSmallSteps(Iterative):
         return p, v
 
 
-def _prepared(system: System, held: NDArray[np.float64], solver: str) -> tuple[kernels.Constraints, str]:
-    """The springs by colour, and that in words; self-loops, which stretch nothing, are left out."""
+def _on_device(method: Precise, system: System, held: NDArray[np.float64], solver: str, *, small: bool) -> Prepared:
+    """See `solvers.cuda.xpbd`."""
+    from solvers.cuda.device import ready  # for those who ask for it
+
+    ready(solver)
+    from solvers.cuda.xpbd import prepare
+
+    constraints, first, choice = _prepared(system, held, solver)
+    return prepare(system, constraints, first, method.real, choice, small=small)
+
+
+def _prepared(
+    system: System, held: NDArray[np.float64], solver: str
+) -> tuple[kernels.Constraints, NDArray[np.int64], str]:
+    """The springs by colour, the first of each (colours + 1,), and that in words; self-loops, which stretch nothing,
+    are left out."""
     springs = only_springs(system, solver)
     vertex_terms.require_mass(system, held, solver)
     keep = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])
     coloured = colouring.of_springs(springs.edges[keep], system.vertices)
     constraints = kernels.Constraints.of(springs, keep[coloured.order])
-    return constraints, f"springs in {coloured.colours} colours"
+    return constraints, coloured.start, f"springs in {coloured.colours} colours"
 
 
 def _eased(
