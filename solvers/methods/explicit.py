@@ -5,7 +5,8 @@
 Compositions of kicks and drifts are symplectic: without drag their energy stays near where it was for as long as one
 likes. Runge-Kutta methods of Tsitouras and of Dormand and Prince choose their substeps by an estimate of their error.
 Substeps of the others are stable while omega h is below a limit of the method, omega^2 the largest eigenvalue of
-M^-1 A'KA, which is that of the springs at their stiffest.
+M^-1 A'KA, which is that of the springs at their stiffest. With `device: cuda` the same frames come from
+`solvers.cuda.explicit`.
 """
 
 from __future__ import annotations
@@ -20,9 +21,7 @@ from numpy.typing import NDArray
 from solvers.about import About, Reference
 from solvers.core import vertex_terms
 from solvers.core.driver import Iterating, Iterative
-from solvers.core.forces import ForceParts, Whole, frequency, rows_of_four
-from solvers.kernels.explicit_steps import Coefficients, Forces, Scratch, Subdivision, compose, integrate
-from solvers.methods.explicit_tables import (
+from solvers.core.explicit_tables import (
     BLANES_MOAN_4,
     BLANES_MOAN_6,
     RUNGE_KUTTA_4,
@@ -31,20 +30,25 @@ from solvers.methods.explicit_tables import (
     Composition,
     Tableau,
     dormand_prince_8,
+    in_time,
+    most_steps,
 )
-from solvers.problem import Positions, ResidualOf, StepProblem, System, Unsupported
+from solvers.core.forces import ForceParts, Whole, frequency, rows_of_four
+from solvers.device import Precise
+from solvers.kernels.explicit_steps import Coefficients, Forces, Scratch, Subdivision, compose, integrate
+from solvers.problem import Positions, Prepared, ResidualOf, StepProblem, System, Unsupported
 
 _SAFETY = 0.95
 """Of the limit: at the limit itself a vibration neither grows nor keeps its size, and springs are not linear."""
 
 _MOST = 1e9
 """Springs that a step may go through, some seconds: compiled code cannot be interrupted meanwhile."""
-_TRIED = 20
-"""Steps that may be tried to keep to an error, for each that is stable."""
+_DEVICES = 100.0
+"""So many times as many on a device, which goes through them in less time."""
 
 
 @dataclass(frozen=True)
-class Explicit:
+class Explicit(Precise):
     """What they share."""
 
     minimises: ClassVar[bool] = False
@@ -56,18 +60,23 @@ class Explicit:
         """The coefficients."""
         return self.coefficients
 
-    def _prepared(self, system: System, substeps: int, error: float) -> PreparedExplicit:
+    def _prepared(self, system: System, substeps: int, error: float) -> Prepared:
         """substeps: times the fewest that are stable; error: of the springs' mean length, 0 for none."""
+        if self.device == "cuda":
+            from solvers.cuda.device import ready  # for those who ask for it
+
+            ready(self.name)
         vertex_terms.require_implicit_euler(system, self.name)
         vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), self.name)
         method, parts = self.method(), ForceParts.of(system, self.name)
         omega = frequency(system)
         rate = omega + float(parts.drag.max(initial=0.0))
         needed = substeps * max(1.0, ceil(system.time_step * rate / (_SAFETY * method.limit)))
-        if needed * method.evaluations * max(1, len(parts.springs.edges)) > _MOST:
+        most = _MOST * (_DEVICES if self.device == "cuda" else 1.0)
+        if needed * method.evaluations * max(1, len(parts.springs.edges)) > most:
             raise Unsupported(
                 f"{self.name}: is stable with {needed:.3g} substeps a step of {method.evaluations} evaluations, which "
-                f"for {len(parts.springs.edges)} springs are beyond the {_MOST:.0e} allowed; take a shorter time step"
+                f"for {len(parts.springs.edges)} springs are beyond the {most:.0e} allowed; take a shorter time step"
             )
         soft = int((~system.pins.exact).sum())
         taken = f"; {soft} pins by penalty taken as exact" if soft else ""
@@ -75,6 +84,11 @@ class Explicit:
         lengths = parts.springs.rest_length
         tolerance = error * (float(lengths.mean()) if len(lengths) else 1.0)
         choice = f"{told}, for vibrations of at most {omega:.3g} rad/s{taken}"
+        if self.device == "cuda":
+            from solvers.cuda.explicit import Substeps, prepare
+
+            substeps_taken = Substeps(int(needed), tolerance, rate, choice)
+            return prepare(self.name, system, method, parts, substeps_taken, self.real)
         return PreparedExplicit(system, method, parts, int(needed), tolerance, rate, choice)
 
 
@@ -84,7 +98,7 @@ class _Fixed(Explicit):
 
     refine: int = 1
 
-    def prepare(self, system: System) -> PreparedExplicit:
+    def prepare(self, system: System) -> Prepared:
         """Raises Unsupported for energies that are neither springs, constant quadratic forms nor drag on vertices, for
         integrators other than `own` and implicit Euler, vertices without mass that are not pinned, and too many
         substeps."""
@@ -100,7 +114,7 @@ class _Controlled(Explicit):
 
     error: float = 1e-6
 
-    def prepare(self, system: System) -> PreparedExplicit:
+    def prepare(self, system: System) -> Prepared:
         """Raises Unsupported as `_Fixed` does, and for an error that is no number from 1e-14 to 1."""
         if not 1e-14 <= self.error <= 1.0:
             raise Unsupported(f"{self.name}: error came as {self.error}; wanted a number from 1e-14 to 1")
@@ -257,11 +271,8 @@ class PreparedExplicit(Iterative):
 
     def _compose(self, forces: Forces, method: Composition, p: NDArray[np.float64], v: NDArray[np.float64]) -> None:
         h = self.system.time_step / self.substeps
-        gone = h * method.kicks[:, None] * forces.drag
-        gained = np.divide(
-            -np.expm1(-gone), forces.drag, out=h * method.kicks[:, None] + 0.0 * gone, where=forces.drag > 0
-        )
-        compose(forces, method.drifts, np.exp(-gone), gained, self.substeps, h, p, v, np.zeros_like(v))
+        kept, gained = in_time(method.kicks, h, forces.drag)
+        compose(forces, method.drifts, kept, gained, self.substeps, h, p, v, np.zeros_like(v))
 
     def _integrate(
         self,
@@ -275,16 +286,12 @@ class PreparedExplicit(Iterative):
         frame, fixed = self.system.time_step, not self.tolerance
         first = frame / self.substeps if fixed else min(frame, h or (1.0 / self.rate if self.rate else frame))
         errors = np.zeros((1, len(method.a))) if fixed else method.errors
-        most = self.substeps if fixed else _TRIED * self.substeps + 10_000
-        steps = Subdivision(frame, self.tolerance or 1.0, float(most), first)
+        most = float(most_steps(self.substeps, self.tolerance))
+        steps = Subdivision(frame, self.tolerance or 1.0, most, first)
         stages = Coefficients(method.a, method.times, errors, method.power)
         integrate(forces, stages, steps, p, v, Scratch.of(len(method.a), len(p)), told)
         if told[3] < frame:
-            raise RuntimeError(
-                f"the error of {self.tolerance:.3g} m was not kept within {told[0] + told[1]:.0f} steps, the last of "
-                f"{told[2]:.3g} s: after {told[3]:.6g} of {frame:.6g} s of the frame the forces are too sudden, or "
-                "round-off is larger; ask for a larger error"
-            )
+            raise RuntimeError(method.unfinished(told[0] + told[1], told[2], told[3], frame, self.tolerance))
 
 
 def _of_rows(of_vertices: NDArray[np.float64]) -> NDArray[np.float64]:

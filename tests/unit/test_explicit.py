@@ -25,10 +25,10 @@ from harness.scenes.mesh.chain import Chain
 from harness.scenes.mesh.grid import Grid
 from harness.scenes.spec import SceneSpec
 from harness.simulation.step import State, prepare, simulate, start
+from solvers.core.explicit_tables import BLANES_MOAN_4, RUNGE_KUTTA_4, TSITOURAS_5, VERLET
 from solvers.core.forces import frequency
 from solvers.integrators import Motion
 from solvers.methods.explicit import PreparedExplicit
-from solvers.methods.explicit_tables import BLANES_MOAN_4, RUNGE_KUTTA_4, TSITOURAS_5, VERLET
 from solvers.methods.newton import Newton
 from solvers.problem import StopRule, Unsupported
 from solvers.registry import SOLVERS, load

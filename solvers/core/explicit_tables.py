@@ -1,4 +1,4 @@
-"""Coefficients of explicit methods.
+"""Coefficients of explicit methods, and what follows from them alone.
 
 Compositions: drifts a and kicks b in turns, a_0 b_0 a_1 ... b_(k-1) a_k, the same backwards as forwards (Blanes and
 Moan 2002, "Practical symplectic partitioned Runge-Kutta and Runge-Kutta-Nystrom methods", S6 of order 4 and S10 of
@@ -68,6 +68,14 @@ class Tableau:
         """Of the forces, in a step."""
         return len(self.a) - 1
 
+    def unfinished(self, tried: float, h: float, reached: float, frame: float, tolerance: float) -> str:
+        """What to say where so many steps, the last of h [s], led only so far into a frame [s]; tolerance: [m]."""
+        return (
+            f"the error of {tolerance:.3g} m was not kept within {tried:.0f} steps, the last of {h:.3g} s: after "
+            f"{reached:.6g} of {frame:.6g} s of the frame the forces are too sudden, or round-off is larger; ask for a "
+            "larger error"
+        )
+
     def power_of(self, y: float) -> complex:
         """R(i y)."""
         s = len(self.a)
@@ -85,6 +93,23 @@ class Tableau:
         return _limit(self)
 
 
+_TRIED = 20
+"""Steps that may be tried to keep to an error, for each that is stable."""
+
+
+def most_steps(count: int, tolerance: float) -> int:
+    """How many may be tried where `count` are stable; as many where none has to keep to a tolerance."""
+    return _TRIED * count + 10_000 if tolerance else count
+
+
+def in_time(kicks: Array, h: float, drag: Array) -> tuple[Array, Array]:
+    """What each kick (k,) of a step of h [s] leaves of a velocity, and what that gains of the acceleration [s], both
+    exact for drag (r,) [1/s], (k, r)."""
+    gone = h * kicks[:, None] * drag
+    gained = np.divide(-np.expm1(-gone), drag, out=h * kicks[:, None] + 0.0 * gone, where=drag > 0)
+    return np.exp(-gone), gained
+
+
 def _limit(method: Composition | Tableau) -> float:
     grows = method.power if isinstance(method, Composition) else method.power_of
     found = next(y for y in np.arange(0.01, 40.0, 0.01) if abs(grows(float(y))) > 1.0 + 1e-6)
@@ -99,6 +124,7 @@ def _lower(*rows: list[float]) -> Array:
     return out
 
 
+SYMPLECTIC_EULER = Composition(1, np.array([0.0, 1.0]), np.array([1.0]))
 VERLET = Composition(2, np.array([0.0, 1.0, 0.0]), np.array([0.5, 0.5]))
 BLANES_MOAN_4 = Composition.symmetric(
     4, [0.0792036964311957, 0.353172906049774, -0.0420650803577195], [0.209515106613362, -0.143851773179818]
