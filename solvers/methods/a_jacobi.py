@@ -6,6 +6,7 @@ S grad g is what l sweeps of Jacobi's method make of Q x = grad g from x = 0. Th
 computed once, so that an iteration is a pass over the springs and one product, whatever l. Its rows reach l - 1 rings
 of neighbours. I - S Q = (I - D^-1 Q)^l, and the eigenvalues of D^-1 Q lie between 0 and 2, for Q is dominated by its
 diagonal: so S is positive definite, 2 S^-1 - Q is too, and as Q majorises the Hessian no iteration raises the energy.
+Bending has entries that let them exceed 2; there D is the diagonal times half of the largest.
 
 The iterations are accelerated by Chebyshev's polynomials, as Wang (2015) does those of Jacobi's method
 (`solvers.methods.chebyshev`). These expect eigenvalues of I - S Q that are not negative: for odd l, S is divided by the
@@ -41,6 +42,9 @@ _SCHEME = Scheme("a-jacobi", CHEBYSHEV, 1, 0, True)
 _MOST = 8
 """Sweeps: with more a row of S on a cloth has hundreds of entries."""
 
+_ROUNDED = 2.0 + 1e-12
+"""What round-off makes of the largest eigenvalue that springs have."""
+
 
 @dataclass(frozen=True)
 class AggregatedJacobi:
@@ -62,8 +66,7 @@ class AggregatedJacobi:
 
     def __post_init__(self) -> None:
         """Raises ValueError."""
-        if not 1 <= self.sweeps <= _MOST:
-            raise ValueError(f"sweeps: should be from 1 to {_MOST}, not {self.sweeps}")
+        require_sweeps(self.sweeps)
 
     def prepare(self, system: System) -> PreparedAggregatedJacobi:
         """Raises Unsupported for energies that are not projective, contact among them, NotPositiveDefinite."""
@@ -78,18 +81,25 @@ class AggregatedJacobi:
         return PreparedAggregatedJacobi(base, measure, Objective(system))
 
 
+def require_sweeps(sweeps: int) -> None:
+    """Raise ValueError for none, or too many."""
+    if not 1 <= sweeps <= _MOST:
+        raise ValueError(f"sweeps: should be from 1 to {_MOST}, not {sweeps}")
+
+
 class Aggregated:
     """So many sweeps of Jacobi's method for Q x = b from x = 0, as one matrix. nonzeros: its entries."""
 
     def __init__(self, Q: csr_array, sweeps: int) -> None:
-        n = len(Q.indptr) - 1
-        inverse = csr_array(dia_array((1.0 / Q.diagonal()[None, :], np.array([0])), shape=(n, n)))
+        n, largest = len(Q.indptr) - 1, largest_eigenvalue(Q, Q.diagonal())
+        damped = 0.5 * largest if largest > _ROUNDED else 1.0
+        inverse = csr_array(dia_array((1.0 / (damped * Q.diagonal())[None, :], np.array([0])), shape=(n, n)))
         S = term = inverse
         for _ in range(sweeps - 1):
             term = csr_array(term - inverse @ (Q @ term))
             S = csr_array(S + term)
         if sweeps % 2:
-            S = csr_array(S / (1.0 + max(0.0, largest_eigenvalue(Q, Q.diagonal()) - 1.0) ** sweeps))
+            S = csr_array(S / (1.0 + max(0.0, largest / damped - 1.0) ** sweeps))
         self.matrix = without_zeros(S)
         self.nonzeros: int | None = int(self.matrix.nnz)
 

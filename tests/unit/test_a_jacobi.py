@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from harness.scenes.effects.bending import Bending
+from solvers.core.descent import Metric
 from solvers.core.prefactored import prepared, projective
 from solvers.methods.a_jacobi import Aggregated, AggregatedJacobi
 from solvers.methods.newton import Newton
 from solvers.problem import StopRule, Unsupported
 from tests.effects import SCENES, stepped
+from tests.effects import cloth as cloth_with
 from tests.scenes import cloth, first_problem
 
 HANGING = first_problem(cloth(8, "exact", stretch=100.0))
@@ -39,6 +42,14 @@ def test_its_inverse_majorises_the_hessian_as_q_does(sweeps):
     assert np.abs(products.imag).max() <= 1e-12
     assert products.real.min() > 0.0
     assert products.real.max() <= 1.0 + 1e-2  # the largest eigenvalue of D^-1 Q is an estimate
+
+
+@pytest.mark.parametrize("sweeps", [1, 2, 3, 4])
+def test_stiff_bending_leaves_its_matrix_positive_definite(sweeps):
+    """Eigenvalues of D^-1 Q reach 2.8 there; with D itself two sweeps would have a negative one."""
+    Q = Metric(cloth_with(Bending(stiffness=50.0)).system).inner
+    products = np.linalg.eigvals(Aggregated(Q, sweeps).matrix @ Q.toarray()).real
+    assert 0.0 < products.min() <= products.max() <= 1.0 + 1e-12
 
 
 @pytest.mark.parametrize("sweeps", [1, 2, 5])
