@@ -87,7 +87,7 @@ class Hybrid:
     def prepare(self, system: System) -> PreparedDescent:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
         metric, objective = Metric(system), Objective(system)
-        lbfgs = Lbfgs(precision="float32").prepare(without_bounded(system))
+        lbfgs = Lbfgs(precision="float32").by_factor(without_bounded(system))
         method = HybridMethod(objective, metric, lbfgs)
         factor = objective.matrix.factor
         facts = metric.facts | {"nnz_hessian_factor": float(factor.nonzeros)}

@@ -8,23 +8,42 @@ cloths. With no pair the direction is a local-global iteration. It is taken at f
 not fall enough; then the line search shortens it. A pair is kept if s y > .01 y Q^-1 y: where the Hessian is positive
 and below Q, s y is not less than y Q^-1 y, and H stays positive definite. Takes any energies: those that are not
 projective leave Q as it is.
+
+`preconditioner: a-jacobi` takes S, what some sweeps of Jacobi's method make of Q^-1 (`solvers.methods.a_jacobi`), in
+its place: a product with a sparse matrix, as suits a graphics processor. With `device: cuda` the iterates come from
+`solvers.cuda.lbfgs`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
+
+import numpy as np
 
 from solvers.about import About, Reference
-from solvers.core.acceleration import Scheme
+from solvers.contact.touching import without_contact
+from solvers.core.acceleration import Interpreted, Scheme
+from solvers.core.bounds import without_bounded
+from solvers.core.descent import Metric
+from solvers.core.driver import Iterating, Iterative
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
+from solvers.core.prefactored import PreparedLocalGlobal, prepared
+from solvers.device import OnDevice
 from solvers.kernels.accelerate_coefficients import LBFGS
+from solvers.methods.a_jacobi import Aggregated, require_sweeps
 from solvers.methods.quasi_newton import PreparedAccelerated, Windowed, prepare
-from solvers.problem import System
+from solvers.problem import Positions, Prepared, ProjectiveEnergy, StepProblem, System, Unsupported
 
 
 @dataclass(frozen=True)
-class Lbfgs(Windowed):
-    """pairs: kept of the latest iterations; linear, precision: the solver of Q x = b and of its stored entries."""
+class Lbfgs(Windowed, OnDevice):
+    """pairs: kept of the latest iterations; linear, precision: the solver of Q x = b and of its stored entries, on a
+    device those of S and of the pairs; preconditioner: what is in the place of Q^-1, a device knows a-jacobi; sweeps:
+    of Jacobi's method in that, 1 to 8."""
+
+    unstated: ClassVar[frozenset[str]] = frozenset({"device", "preconditioner", "sweeps"})
 
     about: ClassVar[About] = About(
         "quasi-Newton",
@@ -38,6 +57,84 @@ class Lbfgs(Windowed):
         to_error=True,
     )
 
-    def prepare(self, system: System) -> PreparedAccelerated:
-        """Raises NotPositiveDefinite, and Unsupported where Q fits nowhere."""
-        return prepare(system, Scheme("lbfgs", LBFGS, self.pairs, 5, False), self.linear, self.precision)
+    preconditioner: Literal["factor", "a-jacobi"] = "factor"
+    sweeps: int = 2
+
+    def __post_init__(self) -> None:
+        """Raises ValueError."""
+        super().__post_init__()
+        require_sweeps(self.sweeps)
+        if self.preconditioner == "factor":
+            return
+        if self.linear != "auto":
+            raise ValueError(f"linear: {self.linear} is for `preconditioner: factor`; a-jacobi solves no system")
+        if self.precision != "float64" and self.device == "cpu":
+            raise ValueError(f"precision: {self.precision} is of a factor's entries, or for `device: cuda`")
+
+    def prepare(self, system: System) -> Prepared:
+        """Raises NotPositiveDefinite, Unsupported where Q fits nowhere, and with a-jacobi for contact."""
+        if self.device == "cuda":
+            from solvers.cuda.device import ready  # for those who ask for it
+
+            ready("lbfgs")
+            if self.preconditioner == "factor" or self.precision == "float16":
+                raise Unsupported(
+                    "lbfgs, device: cuda: knows preconditioner: a-jacobi in float64 or float32, not "
+                    f"{self.preconditioner} in {self.precision}; take these, or device: cpu"
+                )
+        if self.preconditioner == "factor":
+            return self.by_factor(system)
+        if without_bounded(without_contact(system)) is not system:
+            raise Unsupported(
+                "lbfgs, preconditioner: a-jacobi: its matrix, which is made once, has no rows for what begins to "
+                "touch; take preconditioner: factor"
+            )
+        metric, words, scheme = Metric(system), f"{self.sweeps} sweeps of Jacobi", self._scheme
+        if self.device == "cuda":
+            from solvers.cuda.lbfgs import prepare as on_device
+
+            real, S = np.float32 if self.precision == "float32" else np.float64, Aggregated(metric.inner, self.sweeps)
+            return on_device(system, metric, S.matrix, scheme, real, words)
+        energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
+        base = prepared(system, energies, lambda Q: (Aggregated(Q, self.sweeps), words))
+        return _Prepared(base, metric, scheme, Objective(system))
+
+    def by_factor(self, system: System) -> PreparedAccelerated:
+        """With Q's factor. Raises as `prepare` does."""
+        return prepare(system, self._scheme, self.linear, self.precision)
+
+    @property
+    def _scheme(self) -> Scheme:
+        return Scheme("lbfgs", LBFGS, self.pairs, 5, False)
+
+
+class _Prepared(Iterative):
+    """With S for a factor of Q. metric: of residuals."""
+
+    def __init__(self, base: PreparedLocalGlobal, metric: Metric, scheme: Scheme, objective: Objective) -> None:
+        self._base, self._metric, self._scheme, self._objective = base, metric, scheme, objective
+        self.choice = f"{base.choice}; for the residual alone {metric.choice}"
+        self.facts = base.facts
+
+    def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
+        """See Iterative."""
+        step = StepObjective(self._objective, problem)
+        return _Iterating(self._metric, self._base, self._scheme, step, guess)
+
+    def scale(self, problem: StepProblem) -> float:
+        """See Iterative."""
+        return self._base.scale(problem)
+
+
+class _Iterating(Interpreted):
+    """See Interpreted, whose residual is that of Q's factor."""
+
+    def __init__(
+        self, metric: Metric, base: PreparedLocalGlobal, scheme: Scheme, step: StepObjective, guess: Positions
+    ) -> None:
+        super().__init__(base, scheme, step, guess)
+        self._metric = metric
+
+    def residual(self) -> float:
+        """See Iterating."""
+        return self._metric.residual(self.gradient())

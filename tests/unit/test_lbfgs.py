@@ -6,20 +6,35 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
+from solvers.core.descent import Metric
 from solvers.matrices import assemble
+from solvers.methods.a_jacobi import Aggregated
 from solvers.methods.lbfgs import Lbfgs
-from solvers.problem import Positions, ProjectiveEnergy, StepProblem
+from solvers.problem import Positions, ProjectiveEnergy, StepProblem, StopRule, Unsupported
+from tests.effects import SCENES as EFFECTS
 from tests.scenes import random_problem
 
 PROBLEMS = {"random": lambda: random_problem(4), "larger": lambda: random_problem(8, n=30, m=80)}
 
 
-def two_loops(problem: StepProblem, pairs: int, count: int) -> list[Positions]:
-    """Nocedal and Wright 2006, algorithms 7.4 and 7.5, in NumPy, with steps of full length."""
+def free_matrix(problem: StepProblem) -> csr_array:
+    """Q of the free vertices."""
+    system = problem.system
+    Q = assemble(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
+    return csr_array(Q[system.free][:, system.free])
+
+
+def two_loops(
+    problem: StepProblem, pairs: int, count: int, inverse: NDArray[np.float64] | None = None
+) -> list[Positions]:
+    """Nocedal and Wright 2006, algorithms 7.4 and 7.5, in NumPy, with steps of full length. inverse: in the place of
+    Q^-1, which it is if left out."""
     system = problem.system
     free = system.free
-    Q = assemble(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)]).toarray()[np.ix_(free, free)]
+    inverse = np.linalg.inv(free_matrix(problem).toarray()) if inverse is None else inverse
     p = problem.first_guess.copy()
     p[system.pins.vertices[system.pins.exact]] = problem.pin_targets[system.pins.exact]
     window: list[tuple[Positions, Positions]] = []
@@ -30,10 +45,10 @@ def two_loops(problem: StepProblem, pairs: int, count: int) -> list[Positions]:
         for s, y in reversed(window):
             alphas.append(np.vdot(s, q) / np.vdot(s, y))
             q -= alphas[-1] * y
-        direction = np.linalg.solve(Q, q)
+        direction = inverse @ q
         if window:
             s, y = window[-1]
-            direction *= np.vdot(s, y) / np.vdot(y, np.linalg.solve(Q, y))
+            direction *= np.vdot(s, y) / np.vdot(y, inverse @ y)
         for (s, y), alpha in zip(window, reversed(alphas), strict=True):
             direction += s * (alpha - np.vdot(y, direction) / np.vdot(s, y))
         p = p.copy()
@@ -65,3 +80,41 @@ def test_pairs_of_negative_curvature_are_left_out():
     assert problem.value(path[-1]) < problem.value(guess)
     begun = np.abs(problem.gradient(problem.current)).max()
     assert np.abs(problem.gradient(path[-1])).max() <= 1e-7 * begun  # half of the digits, by the condition of Q
+
+
+@pytest.mark.parametrize("sweeps", [1, 2])
+def test_with_a_sparse_matrix_iterates_are_those_of_the_recursion_with_it(sweeps: int) -> None:
+    problem = random_problem(8, n=30, m=80)
+    S = Aggregated(free_matrix(problem), sweeps).matrix.toarray()
+    solver = Lbfgs(3, preconditioner="a-jacobi", sweeps=sweeps)
+    wanted = two_loops(problem, 3, 6, S)
+    values = [problem.value(p) for p in wanted]
+    assert values == sorted(values, reverse=True), "the recursion needs shorter steps here"
+    for p, q in zip(islice(solver.prepare(problem.system).iterates(problem), 6), wanted, strict=True):
+        assert np.abs(p - q).max() <= 1e-8 * np.abs(q).max()  # as above
+
+
+def test_with_a_sparse_matrix_residuals_are_those_of_q() -> None:
+    problem = random_problem(4)
+    solved = Lbfgs(preconditioner="a-jacobi").prepare(problem.system).solve(problem, StopRule(500, 1e-8))
+    assert solved.stopped == "tolerance"
+    assert solved.residual == pytest.approx(Metric(problem.system).residual(problem.gradient(solved.positions)))
+    assert solved.residual <= 1e-8 * solved.yardstick
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"sweeps": 9}, "sweeps: should be from 1 to 8"),
+        ({"linear": "cg"}, "a-jacobi solves no system"),
+        ({"precision": "float32"}, "or for `device: cuda`"),
+    ],
+)
+def test_what_has_no_meaning_with_a_sparse_matrix_is_refused(given: dict[str, object], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        Lbfgs(preconditioner="a-jacobi", **given)  # pyright: ignore[reportArgumentType]
+
+
+def test_with_a_sparse_matrix_contact_is_refused() -> None:
+    with pytest.raises(Unsupported, match="no rows for what begins to touch"):
+        Lbfgs(preconditioner="a-jacobi").prepare(EFFECTS["contact"]().system)

@@ -1,0 +1,206 @@
+"""L-BFGS on a device: the iterates of `solvers.methods.lbfgs`, whose Q^-1 is a sparse matrix S.
+
+    c = -S grad g(p),    d = scale c - sum over j of (a_j s_j + b_j w_j),    w_j = c_j - c_(j+1)
+
+Vectors stay on the device. The host has their scalar products, of which it makes coefficients and judges trials by the
+kernels of the processor's method, `solvers.kernels.accelerate`, on a `Window` of one entry: the line p + t d. It waits
+twice an iteration: for the numbers of a trial, and for the products of a step that is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from solvers.core.acceleration import Scheme, window_for
+from solvers.core.descent import Metric
+from solvers.core.driver import largest
+from solvers.cuda import device, objective_kernels, sums
+from solvers.cuda.descent import trial
+from solvers.cuda.lbfgs_kernels import Rows, kernels
+from solvers.cuda.network import Edges, Network, require_known
+from solvers.cuda.pncg import dotted
+from solvers.cuda.run import EVERY, DeviceIterating, DeviceIterative, Stream
+from solvers.kernels import accelerate
+from solvers.kernels.loop import EACH, ITERATIONS, LAST, STALLED, Limits, verdict
+from solvers.linear.schwarz import ordered
+from solvers.problem import Positions, StepProblem, System
+
+Real = type[np.float32] | type[np.float64]
+_TRIED = 3
+"""Sums of a trial: g'd, the rise, and g'd there."""
+
+
+def prepare(system: System, metric: Metric, S: csr_array, scheme: Scheme, real: Real, choice: str) -> PreparedLbfgs:
+    """The method on the device, which is `ready`. S (f, f): in the place of Q^-1 of the free vertices, symmetric and
+    positive definite. Raises Unsupported for what kernels do not know, and for what the device has no room for."""
+    require_known(scheme.name, system)
+    order = ordered(metric.inner)
+    network, size = Network.of(scheme.name, system, order), np.dtype(real).itemsize
+    rows = Rows.of(csr_array(csr_array(S[order])[:, order]))
+    vectors = 3.0 * network.free * (6 * 8 + (2 * scheme.pairs + 3) * size)
+    device.require_memory(scheme.name, network.bytes + vectors + (4.0 + size) * len(rows.other))
+    with device.guarded():
+        stream = Stream()
+        S_there = Rows(stream.upload(rows.first), stream.upload(rows.other), stream.upload(rows.value, real))
+        edges = network.upload(stream)
+        words = f"{choice}; kernels in {np.dtype(real)}, the gradient in float64"
+        return PreparedLbfgs(metric, network, stream, edges, S_there, scheme, real, device.told(), words)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedLbfgs(DeviceIterative):
+    """metric: of residuals, on the host; the rest, but for the network, is on the device."""
+
+    metric: Metric
+    network: Network
+    stream: Stream
+    edges: Edges
+    S: Rows
+    scheme: Scheme
+    real: Real
+    columns: dict[str, Any]
+    choice: str
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """Exact counts of what was built."""
+        return self.metric.facts
+
+    def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
+        """See Iterative."""
+        with device.guarded():
+            return _Iterating(self, problem, guess)
+
+    def scale(self, problem: StepProblem) -> float:
+        """See Iterative."""
+        return largest(problem) * self.metric.trace**0.5
+
+
+class _Iterating(DeviceIterating):
+    """p, q (n, 3): where it is and a trial, in rows; g, there: the gradients at them, c, after: -S of these, d: the
+    direction, all (f, 3); steps, images (m, f, 3): s and w; window: of the line."""
+
+    def __init__(self, made: PreparedLbfgs, problem: StepProblem, guess: Positions) -> None:
+        super().__init__(made.stream)
+        self._made, stream, network, m = made, made.stream, made.network, made.scheme.pairs
+        self._edges, self._given = network.begun(stream, made.edges, problem), network.given(stream, problem)
+        placed, rows = network.placed(guess, problem), network.free
+        self._p, self._q = stream.upload(placed), stream.upload(placed)
+        self.uploaded()
+        self._g, self._there = (stream.zeros((rows, 3), np.float64) for _ in range(2))
+        self._c, self._after, self._d = (stream.zeros((rows, 3), made.real) for _ in range(3))
+        self._steps, self._images = (stream.zeros((m, rows, 3), made.real) for _ in range(2))
+        self._a, self._b = stream.zeros(m, np.float64), stream.zeros(m, np.float64)
+        self._kernels, most = kernels(made.real), max(_TRIED, 3 + 2 * m)
+        self._partials, self._sums = sums.partials(most), stream.zeros(most, np.float64)
+        self._over = sums.blocks(max(rows, len(network.ends))), sums.THREADS, stream.queue
+        self._window, self._moves, self._stalled = window_for(made.scheme, 1, 1), 0, False
+        self._window.correction[:] = self._window.direction[:] = 1.0
+        now = self._window.now[0]
+        now["newest"] = -1
+        self._look(self._p, self._g, self._c)
+        dotted[self._over](self._g, self._c, 0, self._partials)
+        now["squared"] = -self._collected(1)[0]
+
+    def sweep(self, count: int) -> None:
+        """See DeviceIterating; each iteration waits for its numbers."""
+        for _ in range(count):
+            if self._stalled or not self._one():
+                self._stalled = True
+                return
+            self._moves += 1
+
+    def advance(self) -> bool:
+        """See Iterating."""
+        self.launch(1)
+        return not self._stalled
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating; a residual after each EVERY iterations where it may end them."""
+        first, found, ended = self._moves, float("nan"), ITERATIONS
+        while self._moves - first < limits.iterations and ended == ITERATIONS:
+            left = limits.iterations - (self._moves - first)
+            self.launch(min(EVERY - self._moves % EVERY, left) if limits.wanted == EACH else left)
+            if limits.wanted == EACH:
+                found = self.residual()
+                ended = verdict(found, limits)
+            if ended == ITERATIONS and self._stalled:
+                ended = STALLED
+        if limits.wanted == LAST or (limits.wanted == EACH and self._moves == first):
+            found = self.residual()
+        return self._moves - first, found, ended
+
+    def fetch(self) -> Positions:
+        """See DeviceIterating."""
+        return self._made.network.fetched(self.stream.download(self._p))
+
+    def residual(self) -> float:
+        """See Iterating; on the host, of the device's gradient."""
+        with device.guarded():
+            return self._made.metric.residual(self._made.network.fetched(self.stream.download(self._g)))
+
+    def _look(self, p: Any, g: Any, c: Any) -> None:
+        """The gradient at p, and -S of it."""
+        objective_kernels.gradient[self._over](self._edges, self._given, p, g)
+        self._kernels.multiply[self._over](self._made.S, g, c)
+
+    def _collected(self, count: int) -> NDArray[np.float64]:
+        """The first sums; waits for them."""
+        sums.collect[1, sums.THREADS, self.stream.queue](count, self._partials, self._over[0], self._sums)
+        return self.stream.download(self._sums)[:count]
+
+    def _one(self) -> bool:
+        """An iteration; False where nothing descends."""
+        window, now = self._window, self._window.now[0]
+        accelerate.propose(window)
+        self.stream.put(window.a, self._a)
+        self.stream.put(window.b, self._b)
+        self._kernels.combine[self._over](
+            float(now["scale"]), self._c, self._a, self._b, self._steps, self._images, self._d
+        )
+        window.direction[0], first, along = 1.0, True, self._d
+        judged = accelerate.AGAIN
+        while judged == accelerate.AGAIN:
+            trial[self._over](self._p, along, float(now["length"]), self._q, self._g, 0, self._partials)
+            objective_kernels.rise[self._over](self._edges, self._given, self._p, self._q, 1, self._partials)
+            objective_kernels.gradient[self._over](self._edges, self._given, self._q, self._there)
+            dotted[self._over](self._there, along, 2, self._partials)
+            slope, now["rise"], there = self._collected(_TRIED)
+            if first:
+                now["slope"], first = slope, False
+            window.descent_there[0] = -there
+            judged = accelerate.judge(window)
+            along = self._c if now["plain"] else self._d
+        if judged == accelerate.STALLED:
+            return False
+        self._accept(window, now)
+        return True
+
+    def _accept(self, window: accelerate.Window, now: Any) -> None:
+        """Go to the trial, and keep the pair of this step and all its products, as `accelerate.accept` does."""
+        m = len(window.a)
+        new = (int(now["newest"]) + 1) % m
+        now["count"] = min(int(now["count"]) + 1, m)
+        self._kernels.multiply[self._over](self._made.S, self._there, self._after)
+        self._kernels.keep[self._over](
+            new, self._p, self._q, self._g, self._there, self._c, self._after, self._steps, self._images, self._partials
+        )
+        self._kernels.against[self._over](self._steps, self._images, self._there, self._partials)
+        self._p, self._q, self._g, self._there = self._q, self._p, self._there, self._g
+        self._c, self._after = self._after, self._c
+        found = self._collected(3 + 2 * m)
+        window.sy[:, new], window.wy[:, new] = -window.sg, -window.wg
+        now["squared"], window.sy[new, new], window.wy[new, new] = found[:3]
+        kept = [(new - back) % m for back in range(int(now["count"]))]
+        window.sg[:] = window.wg[:] = 0.0
+        window.sg[kept], window.wg[kept] = found[3 : 3 + m][kept], found[3 + m :][kept]
+        others = np.arange(m) != new
+        window.sy[others, new] += window.sg[others]
+        window.wy[others, new] += window.wg[others]
+        window.wy[new] = window.wy[:, new]
+        now["newest"] = new
