@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from solvers.core.descent import Metric
 from solvers.core.driver import largest
 from solvers.core.preconditioning import LEAST, Preconditioning
-from solvers.cuda import device, objective_kernels, sums
+from solvers.cuda import device, objective_kernels, schwarz, sums
 from solvers.cuda.network import Edges, Network, require_known
 from solvers.cuda.preconditioning import Jacobi
 from solvers.cuda.run import EVERY, DeviceIterating, DeviceIterative, Stream
@@ -38,7 +39,8 @@ Real = type[np.float32] | type[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """A system on the device. metric: of residuals, on the host; hold, least: h and what blocks get beside it (f,)."""
+    """A system on the device. metric: of residuals, on the host; hold, least: h and what blocks get beside it (f,);
+    preconditioning: makes the preconditioner of a solve, of so many rows."""
 
     metric: Metric
     network: Network
@@ -47,15 +49,16 @@ class Base:
     hold: Any
     least: Any
     real: Real
+    preconditioning: Callable[[Stream, int, Real], Jacobi]
 
     @classmethod
     def of(cls, solver: str, system: System, preconditioner: Preconditioning, real: Real) -> Base:
         """Raises Unsupported for what kernels do not know and for what the device has no room for, and
         NotPositiveDefinite."""
-        if preconditioner != "block-jacobi":
+        if preconditioner == "factor":
             raise Unsupported(
-                f"{solver}, device: cuda: knows preconditioner: block-jacobi, not {preconditioner}; take that, or "
-                "device: cpu"
+                f"{solver}, device: cuda: knows preconditioner: block-jacobi and schwarz, not {preconditioner}; take "
+                "one of these, or device: cpu"
             )
         require_known(solver, system)
         metric = Metric(system)
@@ -63,12 +66,17 @@ class Base:
         network = Network.of(solver, system, order)
         size = np.dtype(real).itemsize
         vectors = 3.0 * network.free * (6 * 8 + 8 * size) + 6.0 * size * network.free
+        held = network.hold[: network.free] + LEAST * metric.diagonal[order]
+        levels = schwarz.levels(network, held) if preconditioner == "schwarz" else []
+        vectors += schwarz.needed(levels, size)
         device.require_memory(solver, network.bytes + vectors + 4.0 * size * len(network.entries.other))
         with device.guarded():
             stream = Stream()
             hold = stream.upload(network.hold[: network.free])
             least = stream.upload(LEAST * metric.diagonal[order])
-            return cls(metric, network, stream, network.upload(stream), hold, least, real)
+            uploaded = [schwarz.Uploaded.of(stream, level) for level in levels]
+            making = partial(schwarz.Schwarz, levels, uploaded) if levels else Jacobi
+            return cls(metric, network, stream, network.upload(stream), hold, least, real, making)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +115,10 @@ class Descending(DeviceIterating):
         self.p, self.q = stream.upload(placed), stream.upload(placed)
         self.floor = base.metric.round_off(placed)
         self.uploaded()
-        self.kernels, self.preconditioner = objective_kernels.kernels(base.real), Jacobi(stream, rows, base.real)
+        self.kernels, self.preconditioner = (
+            objective_kernels.kernels(base.real),
+            base.preconditioning(stream, rows, base.real),
+        )
         self.linear = stream.zeros((4, len(network.entries.other)), base.real)
         self.g, self.z, self.d, self.h = (stream.zeros((rows, 3), t) for t in (np.float64, *(base.real,) * 3))
         self.partials, self.sums = sums.partials(_SUMS), stream.zeros(_SUMS, np.float64)
@@ -167,6 +178,7 @@ class Descending(DeviceIterating):
         self.kernels.linearise[self.launch_over](
             self.edges, base.hold, base.least, self.p, self.linear, preconditioner.blocks
         )
+        preconditioner.linearised(self.edges, self.p)
         negated[self.launch_over](self.g, preconditioner.r)
         preconditioner.apply(self.z, 0, self.partials, self.idle)
 

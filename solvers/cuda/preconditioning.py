@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from solvers.cuda import sums
+from solvers.cuda.network import Edges
 from solvers.cuda.run import Stream
 from solvers.cuda.target import cuda
 
@@ -45,6 +46,9 @@ class Jacobi:
     def __init__(self, stream: Stream, rows: int, real: type[np.float32] | type[np.float64]) -> None:
         self._stream, self._kernel = stream, kernels(real)
         self.r, self.blocks = stream.zeros((rows, 3), real), stream.zeros((6, rows), real)
+
+    def linearised(self, edges: Edges, p: Any) -> None:
+        """What else is needed where the Hessian is linearised, at rows p (n, 3) [m]: nothing."""
 
     def apply(self, z: Any, which: int, partials: Any, now: Any) -> None:
         """Write z (f, 3), and keep the first stage of r'z."""

@@ -35,7 +35,7 @@ from solvers.problem import Positions, Prepared, StepProblem, System, Unsupporte
 class NonlinearCG(Precise):
     """Preconditioned nonlinear conjugate gradients: takes all energies, with the memory of local-global.
 
-    preconditioner: `solvers.core.preconditioning` tells them. A device knows block-jacobi.
+    preconditioner: `solvers.core.preconditioning` tells them. A device knows the last two.
     """
 
     unstated: ClassVar[frozenset[str]] = Precise.unstated | {"preconditioner"}

@@ -1,0 +1,226 @@
+"""Kernels of the additive Schwarz preconditioner: put patches of a level together, invert them, multiply by them.
+
+A patch is inverted where it is put together, in shared memory, in float64 and in place: it is symmetric, and half of
+it, packed by rows, is all there is. Sweeping each pivot of a positive definite A leaves -A^-1 (Goodnight 1979, "A
+tutorial on the SWEEP operator"):
+
+    a_ij <- a_ij - a_ik a_kj / a_kk,   a_ik <- a_ik / a_kk,   a_kk <- -1 / a_kk
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from solvers.cuda import sums
+from solvers.cuda.target import cuda
+from solvers.energies.edges import TINY
+
+Real = type[np.float32] | type[np.float64]
+
+
+def packed(nodes: int) -> int:
+    """Numbers in half of a patch of so many nodes."""
+    return 3 * nodes * (3 * nodes + 1) // 2
+
+
+@cuda.jit
+def stiffen(edges, p, stiff):
+    """Write b of all edges at rows p, the six numbers of a symmetric block, to `stiff` (6, m) [N/m]."""
+    e = cuda.grid(1)
+    while e < edges.ends.shape[0]:
+        i, j, k, rest = edges.ends[e, 0], edges.ends[e, 1], edges.strength[e], edges.length[e]
+        v0, v1, v2 = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
+        length, lateral = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2), 0.0
+        if rest == rest and length > TINY:  # a dashpot's length at rest is nan, and its direction is its axis
+            n0, n1, n2 = v0 / length, v1 / length, v2 / length
+            lateral = max(0.0, min(k * (length - rest) / length, k))
+        else:
+            n0, n1, n2 = edges.axis[e, 0], edges.axis[e, 1], edges.axis[e, 2]
+        if rest == 0.0:
+            lateral = k
+        a = k - lateral
+        stiff[0, e], stiff[3, e], stiff[5, e] = a * n0 * n0 + lateral, a * n1 * n1 + lateral, a * n2 * n2 + lateral
+        stiff[1, e], stiff[2, e], stiff[4, e] = a * n0 * n1, a * n0 * n2, a * n1 * n2
+        e += cuda.gridsize(1)
+
+
+@cuda.jit
+def fold(level, count, finer, stiff):
+    """Add up b of each of `count` edges of a level from those of finer edges (6, m)."""
+    e = cuda.grid(1)
+    while e < count:
+        for c in range(6):
+            total = 0.0
+            for k in range(level.lists[e], level.lists[e + 1]):
+                total += finer[c, level.finer[k]]
+            stiff[c, e] = total
+        e += cuda.gridsize(1)
+
+
+class Kernels(NamedTuple):
+    """Of a precision and a size of patches: see each."""
+
+    invert: Any
+    gather: Any
+    multiply: Any
+    dot: Any
+
+
+@cache
+def kernels(real: Real, patch: int) -> Kernels:
+    """Those whose inverses and residuals are `real`."""
+    rows, half = 3 * patch, packed(patch)
+
+    @cuda.jit
+    def invert(level, stiff, nodes, inverses):
+        """Write the inverses of a level's patches, packed by rows; a block of threads goes from patch to patch."""
+        a = cuda.shared.array(half, np.float64)
+        column = cuda.shared.array(rows, np.float64)  # by its line the simulator tells it from another
+        b = cuda.blockIdx.x
+        while b < inverses.shape[0]:
+            begin = patch * b
+            count = min(patch, nodes - begin)
+            size, t = 3 * count, cuda.threadIdx.x
+            while t < size * (size + 1) // 2:
+                a[t] = 0.0
+                t += cuda.blockDim.x
+            cuda.syncthreads()
+            t = cuda.threadIdx.x
+            while t < count:
+                i = begin + t
+                xx = yy = zz = level.held[i]
+                xy = xz = yz = 0.0
+                one, two, three = (
+                    3 * t * (3 * t + 1) // 2,
+                    (3 * t + 1) * (3 * t + 2) // 2,
+                    (3 * t + 2) * (3 * t + 3) // 2,
+                )
+                e, end = level.first[i >> 5] + (i & 31), level.first[(i >> 5) + 1]
+                while e < end:
+                    j, k = level.other[e], level.edge[e]
+                    if j == i:
+                        break
+                    k = ~k if k < 0 else k
+                    s0, s1, s2, s3, s4, s5 = (
+                        stiff[0, k],
+                        stiff[1, k],
+                        stiff[2, k],
+                        stiff[3, k],
+                        stiff[4, k],
+                        stiff[5, k],
+                    )
+                    xx, xy, xz, yy, yz, zz = xx + s0, xy + s1, xz + s2, yy + s3, yz + s4, zz + s5
+                    if begin <= j and j < i:
+                        at = 3 * (j - begin)
+                        a[one + at], a[one + at + 1], a[one + at + 2] = (
+                            a[one + at] - s0,
+                            a[one + at + 1] - s1,
+                            a[one + at + 2] - s2,
+                        )
+                        a[two + at], a[two + at + 1], a[two + at + 2] = (
+                            a[two + at] - s1,
+                            a[two + at + 1] - s3,
+                            a[two + at + 2] - s4,
+                        )
+                        a[three + at], a[three + at + 1], a[three + at + 2] = (
+                            a[three + at] - s2,
+                            a[three + at + 1] - s4,
+                            a[three + at + 2] - s5,
+                        )
+                    e += 32
+                at = 3 * t
+                a[one + at] = xx
+                a[two + at], a[two + at + 1] = xy, yy
+                a[three + at], a[three + at + 1], a[three + at + 2] = xz, yz, zz
+                t += cuda.blockDim.x
+            cuda.syncthreads()
+            for k in range(size):
+                t = cuda.threadIdx.x
+                while t < size:
+                    column[t] = a[t * (t + 1) // 2 + k] if t >= k else a[k * (k + 1) // 2 + t]
+                    t += cuda.blockDim.x
+                cuda.syncthreads()
+                inverse, t = 1.0 / column[k], cuda.threadIdx.x
+                while t < size:
+                    at, scaled = t * (t + 1) // 2, column[t] * inverse
+                    for c in range(t + 1):
+                        if t == k:
+                            a[at + c] = -inverse if c == k else column[c] * inverse
+                        elif c == k:
+                            a[at + c] = scaled
+                        else:
+                            a[at + c] -= scaled * column[c]
+                    t += cuda.blockDim.x
+                cuda.syncthreads()
+            t = cuda.threadIdx.x
+            while t < size * (size + 1) // 2:
+                inverses[b, t] = real(-a[t])
+                t += cuda.blockDim.x
+            cuda.syncthreads()
+            b += cuda.gridDim.x
+
+    @cuda.jit
+    def gather(r, coarse, now):
+        """Write the sums of the parts of a level's nodes (N, 3); nothing where now[0] is not 0."""
+        if now[0] != 0.0:
+            return
+        i = cuda.grid(1)
+        while i < coarse.shape[0]:
+            for c in range(3):
+                total = real(0.0)
+                for k in range(patch * i, min(patch * i + patch, r.shape[0])):
+                    total += r[k, c]
+                coarse[i, c] = total
+            i += cuda.gridsize(1)
+
+    @cuda.jit
+    def multiply(inverses, r, coarse, add, z, now):
+        """Write B^-1 r of a level's patches to z (N, 3), and add what the next level moves each patch by, if there is
+        one."""
+        if now[0] != 0.0:
+            return
+        a = cuda.shared.array(half, real)
+        x = cuda.shared.array(rows, real)
+        b = cuda.blockIdx.x
+        while b < inverses.shape[0]:
+            begin = patch * b
+            size, t = 3 * min(patch, r.shape[0] - begin), cuda.threadIdx.x
+            while t < size * (size + 1) // 2:
+                a[t] = inverses[b, t]
+                t += cuda.blockDim.x
+            t = cuda.threadIdx.x
+            while t < size:
+                x[t] = r[begin + t // 3, t % 3]
+                t += cuda.blockDim.x
+            cuda.syncthreads()
+            t = cuda.threadIdx.x
+            while t < size:
+                total, at = real(0.0), t * (t + 1) // 2
+                for c in range(t + 1):
+                    total += a[at + c] * x[c]
+                at += t
+                for c in range(t + 1, size):
+                    at += c
+                    total += a[at] * x[c]
+                z[begin + t // 3, t % 3] = total + coarse[b, t % 3] if add else total
+                t += cuda.blockDim.x
+            cuda.syncthreads()
+            b += cuda.gridDim.x
+
+    @cuda.jit
+    def dot(r, z, which, partials, now):
+        """The first stage of r'z."""
+        if now[0] != 0.0:
+            return
+        total, i = 0.0, cuda.grid(1)
+        while i < z.shape[0]:
+            for c in range(3):
+                total += np.float64(r[i, c]) * np.float64(z[i, c])
+            i += cuda.gridsize(1)
+        sums.keep(total, which, partials)
+
+    return Kernels(invert, gather, multiply, dot)
