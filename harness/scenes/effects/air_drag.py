@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeFloat
 
 from harness.base.model import Model
-from harness.scenes.effects.base import Contribution, Force, Seen, VelocityFilter
+from harness.scenes.effects.base import Contribution, Force, Seen
 from harness.scenes.mesh.base import Mesh
 from solvers.energies.quadratic import AirDrag as Energy
+from solvers.filters import QuadraticDrag
 from solvers.problem import Positions
 
 ALIVE = 0.1
@@ -48,7 +49,7 @@ class AirDrag(Model):
         def force() -> Contribution:
             return Contribution(forces=(_force(c, mass / time_step),))
 
-        return Contribution(filters=(_quadratic(mass, c * time_step),), continuous=(force,))
+        return Contribution(filters=(QuadraticDrag(mass, c * time_step),), continuous=(force,))
 
     @classmethod
     def called_for(cls, seen: Seen) -> str:
@@ -67,16 +68,6 @@ class AirDrag(Model):
             f"has {100 * late / most:.0f} % of its largest kinetic energy, and only the time integrator's own "
             "damping, which depends on the time step, would ever bring it to rest"
         )
-
-
-def _quadratic(mass: NDArray[np.float64], c: NDArray[np.float64]) -> VelocityFilter:
-    """The filter for masses (n,) [kg] and c dt (n,) [kg s/m]."""
-
-    def slow(v: Positions) -> Positions:
-        drag = c * np.linalg.norm(v, axis=1)
-        return v * np.divide(mass, mass + drag, out=np.ones_like(mass), where=drag > 0.0)[:, None]
-
-    return slow
 
 
 def _force(c: NDArray[np.float64], limit: NDArray[np.float64]) -> Force:

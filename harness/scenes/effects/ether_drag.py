@@ -15,7 +15,7 @@ from harness.base.model import Model
 from harness.scenes.effects.base import Contribution
 from harness.scenes.mesh.base import Mesh
 from solvers.energies.quadratic import EtherDrag as Energy
-from solvers.problem import Positions
+from solvers.filters import Decay
 
 
 class EtherDrag(Model):
@@ -33,12 +33,8 @@ class EtherDrag(Model):
         """A filter that scales the velocity; none at all for a rate of zero."""
         if self.rate == 0.0:
             return Contribution()
-        kept = exp(-self.rate * time_step)
-
-        def decay(v: Positions) -> Positions:
-            return kept * v
 
         def drag() -> Contribution:
             return Contribution(energies=(Energy.of_vertices(self.rate * mass),))
 
-        return Contribution(filters=(decay,), continuous=(drag,))
+        return Contribution(filters=(Decay(exp(-self.rate * time_step)),), continuous=(drag,))
