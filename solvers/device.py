@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+
+from solvers.problem import Positions, Solution, StepProblem, StopRule, System
 
 Device = Literal["cpu", "cuda"]
 
@@ -45,6 +47,62 @@ class Precise(OnDevice):
         return np.float64 if self.precision == "float64" else np.float32
 
 
+class Event(Protocol):
+    """A point on a device's stream."""
+
+    def elapsed_time(self, event: Any) -> float:
+        """Milliseconds from here to an event that is later on the stream."""
+        ...
+
+
+class Marks(NamedTuple):
+    """What a solve put on the stream: it began, its data are there (up), kernels are done, its end is copied (down)."""
+
+    began: Event
+    up: Event
+    done: Event
+    down: Event
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What a device needs to go on by itself from step to step of implicit Euler.
+
+    positions [m], velocity [m/s]: at the start, (n, 3); load: the forces that never change, (n, 3) [N]; filters: of the
+    velocity (`solvers.filters`), before each step, in their order; first_guess: its name; pins_at: where the pins want
+    their vertices at a time [s], (q, 3) [m]; pins_move: whether that changes.
+    """
+
+    system: System
+    positions: Positions
+    velocity: Positions
+    load: Positions
+    filters: tuple[object, ...]
+    first_guess: str
+    pins_at: Callable[[float], Positions]
+    pins_move: bool
+
+
+class Steps(Protocol):
+    """Steps that follow each other on a device."""
+
+    def restart(self) -> None:
+        """Bring the start to the device; waits for it."""
+        ...
+
+    def step(self, iterations: int) -> Marks | None:
+        """The next step by so many iterations, and no look at it; waits for its end."""
+        ...
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """The next step up to where `stop` ends it, and a copy of that; problem: the same step, as a host states it."""
+        ...
+
+    def positions(self) -> Positions:
+        """A copy of where the last step ended, (n, 3) [m]."""
+        ...
+
+
 @runtime_checkable
 class Remote(Protocol):
     """A prepared solver that computes on a device. Its iterates are copied where somebody asks for them; its times are
@@ -55,12 +113,25 @@ class Remote(Protocol):
         """What rows tell of the device."""
         ...
 
-    def replay(self, problem: Any, iterations: int) -> tuple[Any, dict[str, float]]:
-        """The Solution of a `StepProblem` after so many iterations, without a residual; and `kernel_seconds` and
-        `transfer_seconds` of it, by events on the device."""
+    def state(self) -> dict[str, float | None]:
+        """Columns of the device's clocks, power and temperature now; None for what it does not tell."""
         ...
 
-    def uncopied(self, problem: Any) -> Iterator[Callable[[], Any]]:
+    def triad(self) -> tuple[float, Event, Event] | None:
+        """Bytes that a triad a = b + s c read and wrote, between two events that have been waited for; None of a device
+        without a clock, or without room for it."""
+        ...
+
+    def stepping(self, course: Course) -> Steps:
+        """Steps that stay on the device. Raises Unsupported with the reason why a host has to state each."""
+        ...
+
+    def replay(self, problem: StepProblem, iterations: int) -> tuple[Solution, Marks | None]:
+        """The solution of a host's problem after so many iterations, without a residual; None for marks of a device
+        that has no clock."""
+        ...
+
+    def uncopied(self, problem: StepProblem) -> Iterator[Callable[[], Positions]]:
         """The iterates of `iterates`, each done when it is yielded, and copied where it is called."""
         ...
 

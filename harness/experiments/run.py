@@ -40,8 +40,9 @@ from harness.simulation.algebraic import stop_rule
 from harness.simulation.clock import measured_again
 from harness.simulation.measure import Measured, Settings, digest, measure, roughly
 from harness.simulation.observe import observe, require_numbers
+from harness.simulation.on_device import columns as device_columns
 from harness.simulation.step import prepare
-from solvers import device, sources
+from solvers import sources
 from solvers.problem import Positions, Solver
 from solvers.registry import SOLVERS, load, minimises
 
@@ -93,13 +94,14 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None, turn
             measured, told = roughly(scene, _solver(run)), None
         else:
             measured, told = _measured(scene, _solver(run), settings, tick)
+        where = device_columns(measured.prepared)
     turn.look()
     by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
     told = told or times.rows(measured)
     require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=isinstance(run.tolerance, float))
     stands = _standing(run)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
-    facts |= {"choice": measured.prepared.choice} | device.told(measured.prepared) | stands | how
+    facts |= {"choice": measured.prepared.choice} | where | stands | how
     return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
 
 

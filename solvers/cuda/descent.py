@@ -9,24 +9,25 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.core.descent import Metric
+from solvers.core.descent import Stiffness
 from solvers.core.driver import largest
 from solvers.core.preconditioning import LEAST, Preconditioning
-from solvers.cuda import device, objective_kernels, schwarz, sums
-from solvers.cuda.network import Edges, Network, require_known
+from solvers.cuda import device, objective_kernels, residual, sums
+from solvers.cuda.network import Network, require_known
 from solvers.cuda.preconditioning import Jacobi
-from solvers.cuda.run import EVERY, DeviceIterating, DeviceIterative, Stream
+from solvers.cuda.resident import AT_ONCE, Resident, ResidentIterating
+from solvers.cuda.run import EVERY, Stream
+from solvers.cuda.steps import Begun, Step, Uploaded
 from solvers.cuda.target import cuda
 from solvers.kernels.line_search import falls
 from solvers.kernels.loop import EACH, ITERATIONS, LAST, STALLED, Limits, verdict
 from solvers.linear.schwarz import ordered
-from solvers.problem import Positions, StepProblem, System, Unsupported
+from solvers.problem import StepProblem, System, Unsupported
 
 _HALVINGS = 60
 """A step so often halved has no digit left."""
@@ -39,93 +40,95 @@ Real = type[np.float32] | type[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """A system on the device. metric: of residuals, on the host; hold, least: h and what blocks get beside it (f,);
-    preconditioning: makes the preconditioner of a solve, of so many rows."""
+    """A system on the device. stiffness: Q, on the host, without a factor; least: what blocks get beside h (f,)."""
 
-    metric: Metric
-    network: Network
-    stream: Stream
-    edges: Edges
-    hold: Any
+    stiffness: Stiffness
+    uploaded: Uploaded
     least: Any
     real: Real
-    preconditioning: Callable[[Stream, int, Real], Jacobi]
 
     @classmethod
     def of(cls, solver: str, system: System, preconditioner: Preconditioning, real: Real) -> Base:
         """Raises Unsupported for what kernels do not know and for what the device has no room for, and
         NotPositiveDefinite."""
-        if preconditioner == "factor":
+        if preconditioner != "block-jacobi":
             raise Unsupported(
-                f"{solver}, device: cuda: knows preconditioner: block-jacobi and schwarz, not {preconditioner}; take "
-                "one of these, or device: cpu"
+                f"{solver}, device: cuda: knows preconditioner: block-jacobi, not {preconditioner}; take that, or "
+                "device: cpu"
             )
         require_known(solver, system)
-        metric = Metric(system)
-        order = ordered(metric.inner)
+        stiffness = Stiffness(system)
+        order = ordered(stiffness.inner)
         network = Network.of(solver, system, order)
         size = np.dtype(real).itemsize
-        vectors = 3.0 * network.free * (6 * 8 + 8 * size) + 6.0 * size * network.free
-        held = network.hold[: network.free] + LEAST * metric.diagonal[order]
-        levels = schwarz.levels(network, held) if preconditioner == "schwarz" else []
-        vectors += schwarz.needed(levels, size)
-        device.require_memory(solver, network.bytes + vectors + 4.0 * size * len(network.entries.other))
+        vectors = network.free * (3.0 * (12 * 8 + 8 * size) + 6.0 * size + 8.0 * (8 + residual.NUMBERS))
+        solves = vectors + 4.0 * size * len(network.entries.other)
+        device.require_memory(solver, network.bytes + AT_ONCE * solves)
         with device.guarded():
             stream = Stream()
-            hold = stream.upload(network.hold[: network.free])
-            least = stream.upload(LEAST * metric.diagonal[order])
-            uploaded = [schwarz.Uploaded.of(stream, level) for level in levels]
-            making = partial(schwarz.Schwarz, levels, uploaded) if levels else Jacobi
-            return cls(metric, network, stream, network.upload(stream), hold, least, real, making)
+            least = stream.upload(LEAST * stiffness.diagonal[order])
+            return cls(stiffness, Uploaded.of(network, stream), least, real)
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedDescent(DeviceIterative):
-    """A method that is ready. columns: of the device; solving: begins a solve."""
+class PreparedDescent(Resident):
+    """A method that is ready. columns: of the device; solving: memory for solves."""
 
     base: Base
     columns: dict[str, Any]
     choice: str
-    solving: Callable[[Base, StepProblem, Positions], Descending]
+    solving: Callable[[Base], Descending]
+
+    @property
+    def uploaded(self) -> Uploaded:  # pyright: ignore[reportIncompatibleVariableOverride] the base's
+        """See Resident."""
+        return self.base.uploaded
 
     @property
     def facts(self) -> dict[str, float]:
         """Exact counts of what was built."""
-        return self.base.metric.facts
+        return self.base.stiffness.facts
 
-    def begin(self, problem: StepProblem, guess: Positions) -> Descending:
-        """See Iterative."""
-        with device.guarded():
-            return self.solving(self.base, problem, guess)
+    def iterating(self) -> ResidentIterating:
+        """See Resident."""
+        return self.solving(self.base)
 
     def scale(self, problem: StepProblem) -> float:
         """See Iterative."""
-        return largest(problem) * self.base.metric.trace**0.5
+        return largest(problem) * self.base.stiffness.trace**0.5
 
 
-class Descending(DeviceIterating):
+class Descending(ResidentIterating):
     """From point to point. p, q (n, 3): where it is and a trial, in rows; g: the gradient at p (f, 3); z: what the
-    preconditioner makes of -g; numbers: the last sums."""
+    preconditioner makes of -g; floor: g H^-1 g [J] of round-off."""
 
-    def __init__(self, base: Base, problem: StepProblem, guess: Positions) -> None:
-        super().__init__(base.stream)
-        self.base, stream, network, rows = base, base.stream, base.network, base.network.free
-        placed = network.placed(guess, problem)
-        self.edges, self.given = network.begun(stream, base.edges, problem), network.given(stream, problem)
-        self.p, self.q = stream.upload(placed), stream.upload(placed)
-        self.floor = base.metric.round_off(placed)
-        self.uploaded()
-        self.kernels, self.preconditioner = (
-            objective_kernels.kernels(base.real),
-            base.preconditioning(stream, rows, base.real),
-        )
+    def __init__(self, base: Base) -> None:
+        uploaded, network = base.uploaded, base.uploaded.network
+        super().__init__(uploaded)
+        self.base, stream, rows = base, uploaded.stream, network.free
+        self._begun = Begun(uploaded)
+        self.edges, self.given = self._begun.edges, self._begun.given
+        self.p, self.q = (stream.zeros((len(network.order), 3), np.float64) for _ in range(2))
+        self.kernels, self.preconditioner = objective_kernels.kernels(base.real), Jacobi(stream, rows, base.real)
         self.linear = stream.zeros((4, len(network.entries.other)), base.real)
         self.g, self.z, self.d, self.h = (stream.zeros((rows, 3), t) for t in (np.float64, *(base.real,) * 3))
         self.partials, self.sums = sums.partials(_SUMS), stream.zeros(_SUMS, np.float64)
-        self.idle = stream.zeros(1, np.float64)
-        self.launch_over, self.stalled = (sums.blocks(rows), sums.THREADS, stream.queue), False
+        self.idle, self._largest = stream.zeros(1, np.float64), stream.zeros(1, np.float64)
+        self.launch_over = sums.blocks(rows), sums.THREADS, stream.queue
         self.over_all = sums.blocks(max(rows, len(network.ends))), sums.THREADS, stream.queue
-        self.moves = 0
+        self.floor, self.stalled, self.moves = 0.0, False, 0
+
+    def take(self, step: Step) -> None:
+        """See ResidentIterating; waits for the largest coordinate, by which round-off is told."""
+        self._begun.take(step, self.p, self.q)
+        self.stream.put(np.zeros(1), self._largest)
+        farthest[self.over_all](self.p, self._largest)
+        self.floor = self.base.stiffness.round_off(self.stream.download(self._largest)[:, None])
+        self.stalled, self.moves = False, 0
+
+    def settled(self) -> Any:
+        """See ResidentIterating."""
+        return self.p
 
     @abstractmethod
     def one(self) -> bool:
@@ -159,14 +162,10 @@ class Descending(DeviceIterating):
             found = self.residual()
         return self.moves - first, found, ended
 
-    def fetch(self) -> Positions:
-        """See DeviceIterating."""
-        return self.base.network.fetched(self.stream.download(self.p))
-
     def residual(self) -> float:
-        """See Iterating; on the host, of the device's gradient."""
+        """See Iterating; on the device, of its gradient."""
         with device.guarded():
-            return self.base.metric.residual(self.base.network.fetched(self.stream.download(self.g)))
+            return self.of.residuals.of(self.g)
 
     def look(self) -> None:
         """The gradient at p."""
@@ -176,9 +175,8 @@ class Descending(DeviceIterating):
         """The Hessian at p, and z of the gradient there."""
         base, preconditioner = self.base, self.preconditioner
         self.kernels.linearise[self.launch_over](
-            self.edges, base.hold, base.least, self.p, self.linear, preconditioner.blocks
+            self.edges, self.of.hold, base.least, self.p, self.linear, preconditioner.blocks
         )
-        preconditioner.linearised(self.edges, self.p)
         negated[self.launch_over](self.g, preconditioner.r)
         preconditioner.apply(self.z, 0, self.partials, self.idle)
 
@@ -204,8 +202,19 @@ class Descending(DeviceIterating):
     def _tried(self, direction: Any, t: float) -> tuple[float, float]:
         trial[self.over_all](self.p, direction, t, self.q, self.g, 0, self.partials)
         objective_kernels.rise[self.over_all](self.edges, self.given, self.p, self.q, 1, self.partials)
-        slope, rise = self.collected(2, max(self.base.network.free, len(self.base.network.ends)))
+        slope, rise = self.collected(2, max(self.of.network.free, len(self.of.network.ends)))
         return float(slope), float(rise)
+
+
+@cuda.jit
+def farthest(p, out):
+    """The largest coordinate of p (n, 3), if it is larger than out[0]; which it is depends on no order."""
+    most, i = 0.0, cuda.grid(1)
+    while i < p.shape[0]:
+        for c in range(3):
+            most = max(most, abs(p[i, c]))
+        i += cuda.gridsize(1)
+    cuda.atomic.max(out, 0, most)
 
 
 @cuda.jit

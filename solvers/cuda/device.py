@@ -7,7 +7,7 @@ same kernels thread by thread in Python, without one; rows then say so.
 from __future__ import annotations
 
 import json
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
@@ -64,7 +64,7 @@ def require_memory(solver: str, needed: float) -> None:
 
 
 def told() -> dict[str, Any]:
-    """The columns of rows that tell of the device: its name, its memory, its driver, versions, and its state now."""
+    """The columns of rows that tell of the device: its name, its memory, its driver and versions."""
     versions = json.dumps(dict(_versions()), sort_keys=True)
     if simulated():
         return {"device": _SIMULATED, "device_versions": versions}
@@ -78,7 +78,7 @@ def told() -> dict[str, Any]:
         "device_memory_gib": round(memory / 2**30, 1),
         "device_versions": versions,
     }
-    return columns | _state(device)
+    return columns | _driver()
 
 
 def _versions() -> Generator[tuple[str, str]]:
@@ -87,38 +87,48 @@ def _versions() -> Generator[tuple[str, str]]:
             yield package, version(package)
 
 
-def _state(device: Any) -> dict[str, Any]:
-    """The driver, clocks and power, as NVIDIA's management library tells them; else that it does not."""
+_ASKED: dict[str, Callable[[Any, Any], float]] = {
+    "sm_clock_mhz": lambda nvml, handle: nvml.nvmlDeviceGetClockInfo(handle, nvml.NVML_CLOCK_SM),
+    "memory_clock_mhz": lambda nvml, handle: nvml.nvmlDeviceGetClockInfo(handle, nvml.NVML_CLOCK_MEM),
+    "power_w": lambda nvml, handle: nvml.nvmlDeviceGetPowerUsage(handle) / 1000,
+    "power_limit_w": lambda nvml, handle: nvml.nvmlDeviceGetEnforcedPowerLimit(handle) / 1000,
+    "performance_state": lambda nvml, handle: nvml.nvmlDeviceGetPerformanceState(handle),
+    "temperature_c": lambda nvml, handle: nvml.nvmlDeviceGetTemperature(handle, nvml.NVML_TEMPERATURE_GPU),
+}
+"""What NVIDIA's management library tells of a device's state, by column."""
+
+
+def state() -> dict[str, float | None]:
+    """The columns of its clocks, power and temperature now; None for what is not told, by the simulator everything."""
+    found: dict[str, float | None] = dict.fromkeys(_ASKED)
+    with _management() as nvml, suppress(Exception):  # the library, its driver or the right to ask may be missing
+        handle = _handle(nvml, import_module("numba.cuda").get_current_device())
+        for name, ask in _ASKED.items():
+            with suppress(Exception):  # not every device tells everything
+                found[name] = float(ask(nvml, handle))
+    return found
+
+
+def _driver() -> dict[str, str]:
+    with _management() as nvml, suppress(Exception):
+        told = nvml.nvmlSystemGetDriverVersion()
+        return {"device_driver": told.decode() if isinstance(told, bytes) else str(told)}
+    return {}
+
+
+@contextmanager
+def _management() -> Generator[Any]:
+    """NVIDIA's management library; None where it cannot be had."""
+    nvml: Any = None
+    if not simulated():
+        with suppress(Exception):
+            nvml = import_module("pynvml")
+            nvml.nvmlInit()
     try:
-        nvml = import_module("pynvml")
-        nvml.nvmlInit()
-    except Exception as error:  # the library or its driver is missing
-        return {"device_state": f"not known: {type(error).__name__}: {error}"}
-    try:
-        handle = _handle(nvml, device)
-        asked = {
-            "sm_clock_mhz": lambda: nvml.nvmlDeviceGetClockInfo(handle, nvml.NVML_CLOCK_SM),
-            "memory_clock_mhz": lambda: nvml.nvmlDeviceGetClockInfo(handle, nvml.NVML_CLOCK_MEM),
-            "most_sm_clock_mhz": lambda: nvml.nvmlDeviceGetMaxClockInfo(handle, nvml.NVML_CLOCK_SM),
-            "power_w": lambda: nvml.nvmlDeviceGetPowerUsage(handle) / 1000,
-            "power_limit_w": lambda: nvml.nvmlDeviceGetEnforcedPowerLimit(handle) / 1000,
-            "performance_state": lambda: nvml.nvmlDeviceGetPerformanceState(handle),
-            "temperature_c": lambda: nvml.nvmlDeviceGetTemperature(handle, nvml.NVML_TEMPERATURE_GPU),
-            "busy_percent": lambda: nvml.nvmlDeviceGetUtilizationRates(handle).gpu,
-        }
-        state: dict[str, Any] = {}
-        for name, ask in asked.items():
-            try:
-                state[name] = ask()
-            except nvml.NVMLError as error:  # not every device tells everything
-                state[name] = str(error)
-        driver = nvml.nvmlSystemGetDriverVersion()
-        driver = driver.decode() if isinstance(driver, bytes) else str(driver)
-        return {"device_driver": driver, "device_state": json.dumps(state)}
-    except nvml.NVMLError as error:
-        return {"device_state": f"not known: {error}"}
+        yield nvml
     finally:
-        nvml.nvmlShutdown()
+        with suppress(Exception):
+            nvml.nvmlShutdown()
 
 
 def _handle(nvml: Any, device: Any) -> Any:

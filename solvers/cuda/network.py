@@ -22,7 +22,7 @@ from solvers.contact.touching import without_contact
 from solvers.core.bounds import without_bounded
 from solvers.core.parts import Parts, split
 from solvers.cuda.run import Stream
-from solvers.problem import Positions, StepProblem, System, Unsupported
+from solvers.problem import Positions, System, Unsupported
 
 WARP = 32
 """Rows whose entries are side by side."""
@@ -144,37 +144,12 @@ class Network:
             stream.upload(np.zeros(len(self.rest))),
         )
 
-    def begun(self, stream: Stream, edges: Edges, problem: StepProblem) -> Edges:
-        """The edges in a step."""
-        if not self.parts.dashpots:
-            return edges
-        from solvers.energies.dashpots import Dashpots
-
-        steps, axis = [e for e in problem.energies if isinstance(e, Dashpots)], self.axis.copy()
-        first = len(self.parts.whole.edges)
-        offset = np.zeros(len(self.rest))
-        axis[first:] = np.concatenate([e.direction for e in steps])
-        offset[first:] = np.concatenate([e.offset for e in steps])
-        return edges._replace(axis=stream.upload(axis), offset=stream.upload(offset))
-
-    def given(self, stream: Stream, problem: StepProblem) -> Given:
-        """What a step gives."""
-        s, inside = self.system, self.order[: self.free]
-        soft, pinned, weight = s.penalty
-        held = s.inertia[:, None] * problem.target
-        held[pinned] += weight[:, None] * problem.pin_targets[soft]
-        whole = s.inertia.copy()
-        whole[pinned] += weight
-        centre = np.divide(held, whole[:, None], out=problem.target.copy(), where=whole[:, None] > 0.0)
-        # h of a form is about the origin; what is not there already is a force.
-        force = self.parts.force(problem) - self.parts.held[:, None] * centre
-        return Given(*(stream.upload(x) for x in (self.hold[: self.free], centre[inside], force[inside])))
-
-    def placed(self, p: Positions, problem: StepProblem) -> Positions:
-        """Positions (n, 3) in rows, with exactly pinned vertices on their targets."""
-        rows = p[self.order]
-        rows[self.free :] = problem.pin_targets[self.system.pins.exact]
-        return rows
+    @property
+    def diagonal(self) -> NDArray[np.float64]:
+        """Q's diagonal, of all rows [N/m]."""
+        kept = self.ends[:, 0] != self.ends[:, 1]
+        twice = np.repeat(self.stiffness[kept], 2)
+        return self.hold + np.bincount(self.ends[kept].ravel(), twice, minlength=len(self.order))
 
     def fetched(self, rows: Positions) -> Positions:
         """Rows as vertices, (n, 3); rows that are not there are zero."""

@@ -13,7 +13,8 @@ from solvers.core.preconditioning import Preconditioning
 from solvers.cuda import device, sums
 from solvers.cuda.conjugate import BEFORE, COUNT, CURVED, ENDED, GOING, LIMIT, PRODUCT, curve, judge, kernels
 from solvers.cuda.descent import Base, Descending, PreparedDescent, Real
-from solvers.problem import Positions, StepProblem, System
+from solvers.cuda.steps import Step
+from solvers.problem import System
 
 TOGETHER = 16
 """Iterations of conjugate gradients that are launched at a time."""
@@ -26,25 +27,28 @@ def prepare(
     iterations of conjugate gradients. Raises Unsupported, NotPositiveDefinite."""
     base = Base.of("newton-cg", system, preconditioner, real)
 
-    def begin(base: Base, problem: StepProblem, guess: Positions) -> Descending:
-        return _Iterating(base, problem, guess, forcing, most)
+    def solving(base: Base) -> Descending:
+        return _Iterating(base, forcing, most)
 
-    return PreparedDescent(base, device.told(), f"kernels in {np.dtype(real)}, the gradient in float64", begin)
+    return PreparedDescent(base, device.told(), f"kernels in {np.dtype(real)}, the gradient in float64", solving)
 
 
 class _Iterating(Descending):
     """product: g'z [J] at the point where it is; s, y, w (f, 3): a direction, its product and what the preconditioner
     makes of a residual, of conjugate gradients."""
 
-    def __init__(
-        self, base: Base, problem: StepProblem, guess: Positions, forcing: tuple[float, float], most: int
-    ) -> None:
-        super().__init__(base, problem, guess)
+    def __init__(self, base: Base, forcing: tuple[float, float], most: int) -> None:
+        super().__init__(base)
         self._loose, self._tight = forcing
-        self._eta, self._most, self._conjugate = self._loose, most, kernels(base.real)
+        self._most, self._conjugate = most, kernels(base.real)
         self._s, self._y, self._w = (self.stream.zeros(self.d.shape, base.real) for _ in range(3))
         self._now = self.stream.zeros(6, np.float64)
-        self._product = self._arrived()
+        self._eta = self._product = 0.0
+
+    def take(self, step: Step) -> None:
+        """See ResidentIterating."""
+        super().take(step)
+        self._eta, self._product = self._loose, self._arrived()
 
     def _arrived(self) -> float:
         self.look()
@@ -82,7 +86,7 @@ class _Iterating(Descending):
         launch, one, count = self.launch_over, (1, sums.THREADS, self.stream.queue), self.launch_over[0]
         self._conjugate.turn[launch](z, self._s, self._now)
         self.kernels.multiply[launch](
-            self.edges, self.base.hold, self.linear, self._s, self._y, 0, self.partials, self._now
+            self.edges, self.of.hold, self.linear, self._s, self._y, 0, self.partials, self._now
         )
         curve[one](self.partials, 0, count, self._now)
         self._conjugate.go[launch](self._s, self._y, self.d, self.preconditioner.r, self._now)

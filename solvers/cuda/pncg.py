@@ -7,8 +7,9 @@ import numpy as np
 from solvers.core.preconditioning import Preconditioning
 from solvers.cuda import device, sums
 from solvers.cuda.descent import Base, Descending, PreparedDescent, Real
+from solvers.cuda.steps import Step
 from solvers.cuda.target import cuda
-from solvers.problem import Positions, StepProblem, System
+from solvers.problem import System
 
 
 def prepare(system: System, preconditioner: Preconditioning, real: Real) -> PreparedDescent:
@@ -20,11 +21,16 @@ def prepare(system: System, preconditioner: Preconditioning, real: Real) -> Prep
 class _Iterating(Descending):
     """came (f, 3): the direction that led to the last point."""
 
-    def __init__(self, base: Base, problem: StepProblem, guess: Positions) -> None:
-        super().__init__(base, problem, guess)
+    def __init__(self, base: Base) -> None:
+        super().__init__(base)
         self._beta, (n, _) = 0.0, self.d.shape
         self._came, self._before = self.stream.zeros((n, 3), base.real), self.stream.zeros((n, 3), base.real)
         self._gradient = self.stream.zeros((n, 3), np.float64)
+
+    def take(self, step: Step) -> None:
+        """See ResidentIterating."""
+        super().take(step)
+        self._beta = 0.0
         self.look()
         self.linearise()
 
@@ -51,7 +57,7 @@ class _Iterating(Descending):
         combined[self.launch_over](z, beta, self._came, self.d)
         dotted[self.launch_over](self.g, self.d, 0, self.partials)
         self.kernels.multiply[self.launch_over](
-            self.edges, self.base.hold, self.linear, self.d, self.h, 1, self.partials, self.idle
+            self.edges, self.of.hold, self.linear, self.d, self.h, 1, self.partials, self.idle
         )
         slope, curvature = self.collected(2, len(self.d))
         return float(slope), float(curvature)
@@ -67,7 +73,7 @@ def combined(z, beta, came, d):
     i = cuda.grid(1)
     while i < d.shape[0]:
         for c in range(3):
-            d[i, c] = np.float64(z[i, c]) + beta * np.float64(came[i, c])
+            d[i, c] = np.float64(z[i, c]) + beta * np.float64(came[i, c]) if beta != 0.0 else z[i, c]
         i += cuda.gridsize(1)
 
 

@@ -16,13 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.core.driver import Iterating, Iterative
-from solvers.cuda import device
+from solvers.cuda import device, triad
 from solvers.cuda.target import cuda
+from solvers.device import Course, Event, Marks, Steps
 from solvers.kernels.loop import EACH, ITERATIONS, LAST, Limits, verdict
-from solvers.problem import Positions, Solution, StepProblem, StopRule
+from solvers.problem import Positions, Solution, StepProblem, StopRule, Unsupported
 
 EVERY = 8
 """Iterations from one residual to the next."""
+
+_TRIAD = 2**26
+"""Float64 in each array of a triad: many times what caches hold."""
 
 THREADS = 8 if device.simulated() else 128
 """In a block; the simulator's take a thread of the processor each."""
@@ -46,6 +50,10 @@ class Stream:
     def put(self, array: NDArray[Any], there: Any) -> None:
         """Copy a host's array to one of the device of the same shape and type."""
         there.copy_to_device(np.ascontiguousarray(array, there.dtype), stream=self.queue)
+
+    def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
+        """Memory of the device, with whatever is there."""
+        return cuda.device_array(shape, dtype, stream=self.queue)
 
     def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """Zeros on the device."""
@@ -76,6 +84,11 @@ class DeviceIterating(Iterating):
         self._began = self._up = self._asked = self._down = stream.mark()
         self._copy: Positions | None = None
         self._done = 0
+
+    def begun(self) -> None:
+        """A solve begins: what it needs is copied from here on."""
+        self._began = self._up = self._asked = self._down = self.stream.mark()
+        self._copy, self._done = None, 0
 
     def uploaded(self) -> None:
         """All that the solve needs is on its way."""
@@ -133,20 +146,33 @@ class DeviceIterating(Iterating):
             found = self.residual()
         return count, found, ended
 
-    def seconds(self) -> dict[str, float]:
-        """Up to the last copy of positions, by events on the stream [s]: of kernels, and of transfers; none of the
-        simulator, which has no events."""
-        if device.simulated():
-            return {}
-        self._down.synchronize()
-        transfers = self._began.elapsed_time(self._up) + self._asked.elapsed_time(self._down)  # in milliseconds
-        return {"kernel_seconds": 1e-3 * self._up.elapsed_time(self._asked), "transfer_seconds": 1e-3 * transfers}
+    def marks(self) -> Marks | None:
+        """Events up to the last copy of positions, which has been waited for; none of the simulator, whose events tell
+        nothing."""
+        return None if device.simulated() else Marks(self._began, self._up, self._asked, self._down)
+
+    def marks_until(self, done: Any) -> Marks | None:
+        """The same where nothing was copied, up to an event that has been waited for."""
+        return None if device.simulated() else Marks(self._began, self._up, done, done)
 
 
 class DeviceIterative(Iterative):
     """A method that is ready on a device, with `columns` for its rows."""
 
     columns: dict[str, Any]
+
+    def state(self) -> dict[str, float | None]:
+        """See Remote."""
+        return device.state()
+
+    def triad(self) -> tuple[float, Event, Event] | None:
+        """See Remote."""
+        with device.guarded():
+            return None if device.simulated() else triad.once(_TRIAD)
+
+    def stepping(self, course: Course) -> Steps:
+        """See Remote."""
+        raise Unsupported("the method takes each step from the host")
 
     @abstractmethod
     def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
@@ -166,11 +192,11 @@ class DeviceIterative(Iterative):
                 run.stream.wait()
                 yield lambda: run.positions
 
-    def replay(self, problem: StepProblem, iterations: int) -> tuple[Solution, dict[str, float]]:
+    def replay(self, problem: StepProblem, iterations: int) -> tuple[Solution, Marks | None]:
         """See Remote."""
         with device.guarded():
             run = self.begin(problem, problem.first_guess)
             run.launch(iterations)
             p, nan = run.positions, float("nan")
             found = Solution(p, iterations, nan, nan, "iterations", run.velocity, self.residual_of)
-            return found, run.seconds()
+            return found, run.marks()

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from solvers.cuda.run import Stream
 from solvers.cuda.target import cuda
 from solvers.kernels.springs import TINY_SQUARED, Bundles
-from solvers.vectors.springs import LANES, RIGHT
+from solvers.vectors.springs import LANES
 
 SHORT = {np.float32: 1e-36, np.float64: TINY_SQUARED}
 """Squared lengths [m^2] up to which a spring counts as one without length, where smaller ones have no digits."""
@@ -95,8 +95,7 @@ class Kernels(NamedTuple):
     unit: Any
     change: Any
     clear: Any
-    bring: Any
-    fetch: Any
+    settle: Any
     linearise: Any
 
 
@@ -145,34 +144,24 @@ def kernels(real: Any) -> Kernels:
                 x[i, c], u[i, c], older[i, c], before[i, c] = 0.0, zero, zero, zero
 
     @cuda.jit
-    def bring(p, row, x):
-        """Positions (n, 3) [m] into rows of four."""
+    def settle(x, u, out):
+        """Positions x + u [m], in rows of three."""
         i = cuda.grid(1)
-        if i < len(row):
+        if i < len(out):
             for c in range(3):
-                x[row[i], c] = p[i, c]
+                out[i, c] = x[i, c] + float64(u[i, c])
 
     @cuda.jit
-    def fetch(x, u, row, out):
-        """Positions x + u out of rows of four, (n, 3) [m]."""
-        i = cuda.grid(1)
-        if i < len(row):
-            for c in range(3):
-                out[i, c] = x[row[i], c] + float64(u[row[i], c])
-
-    @cuda.jit
-    def linearise(own, start, neighbour, kind, weights, spring, direction, arrows, nobody, far, right, x, force):
+    def linearise(own, start, neighbour, kind, weights, spring, direction, arrows, nobody, far, given, x, force):
         """Write the arrows of the reference, and minus the gradient there, in float64, to `force` (3, lanes) [N]."""
         t = cuda.grid(1)
         if t >= len(own) or own[t] == nobody:
             return
         i, b, lane = own[t], t // LANES, t % LANES
-        at = RIGHT * b + lane
-        held = right[at + 3 * LANES]
-        x0, x1, x2 = x[i, 0], x[i, 1], x[i, 2]
-        f0 = right[at] - held * x0
-        f1 = right[at + LANES] - held * x1
-        f2 = right[at + 2 * LANES] - held * x2
+        held, x0, x1, x2 = given.hold[i], x[i, 0], x[i, 1], x[i, 2]
+        f0 = held * (given.centre[i, 0] - x0) + given.force[i, 0]
+        f1 = held * (given.centre[i, 1] - x1) + given.force[i, 1]
+        f2 = held * (given.centre[i, 2] - x2) + given.force[i, 2]
         for entry in range(start[b], start[b + 1]):
             e = LANES * entry + lane
             j = neighbour[e]
@@ -193,4 +182,4 @@ def kernels(real: Any) -> Kernels:
             f0, f1, f2 = f0 + pull * v0, f1 + pull * v1, f2 + pull * v2
         force[0, t], force[1, t], force[2, t] = real(f0), real(f1), real(f2)
 
-    return Kernels(unit, change, clear, bring, fetch, linearise)
+    return Kernels(unit, change, clear, settle, linearise)

@@ -7,39 +7,33 @@ gradient computed there: in float32 too iterates tend to the minimum in float64.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from solvers.core import vertex_terms
 from solvers.core.driver import largest
 from solvers.core.parts import Parts
 from solvers.core.vertex_blocks import VertexBlocks
-from solvers.cuda import device, springs
-from solvers.cuda.run import THREADS, DeviceIterating, DeviceIterative, Stream, blocks
+from solvers.cuda import device, objective_kernels, residual, springs, sums
+from solvers.cuda.network import Network
+from solvers.cuda.resident import AT_ONCE, Resident, ResidentIterating
+from solvers.cuda.run import THREADS, Stream, blocks
 from solvers.cuda.springs import Lanes
-from solvers.cuda.target import cuda
+from solvers.cuda.steps import Begun, Step, Uploaded
 from solvers.cuda.vbd_kernels import ASKED, CONTROLS, KNOWN, WEIGHT, kernels
 from solvers.energies.quadratic import Quadratic
 from solvers.energies.springs import Springs
-from solvers.problem import Positions, StepProblem, System, Unsupported
+from solvers.problem import StepProblem, System, Unsupported
 from solvers.vectors.springs import LANES
-
-if TYPE_CHECKING:
-    from solvers.contact.local_global import Idle
 
 REBASE = 16
 """Iterations from one gradient in float64 to the next."""
 
 
-def prepare(
-    system: System, parts: Parts, made: VertexBlocks, radius: float, real: Any, measure: Callable[[], Idle]
-) -> PreparedVertexBlockDescent:
-    """The method on the device, which is `ready`. radius: rho of the acceleration; real: what kernels compute in;
-    measure: makes what tells residuals on the processor. Raises Unsupported."""
+def prepare(system: System, parts: Parts, made: VertexBlocks, radius: float, real: Any) -> PreparedVertexBlockDescent:
+    """The method on the device, which is `ready`. radius: rho of the acceleration; real: what kernels compute in.
+    Raises Unsupported."""
     taken = Springs, Quadratic
     others = sorted({type(energy).__name__ for energy in system.energies if not isinstance(energy, taken)})
     if others:
@@ -47,10 +41,11 @@ def prepare(
             f"vbd: on a device it takes springs and quadratic forms alone, not {', '.join(others)}; "
             "without `device: cuda` it takes these too"
         )
+    order = np.searchsorted(system.free, np.argsort(made.row)[: made.free])
+    network = Network.of("vbd", system, order)  # in the rows of the colours
     rows, size = system.vertices + 2, np.dtype(real).itemsize
-    per_lane = 4 * 8 + 3 * size  # the right-hand side, the gradient
-    needed = springs.needed(made.bundles, real) + len(made.bundles.own) * per_lane + rows * (4 * 8 + 12 * size + 64)
-    device.require_memory("vbd", needed)
+    solves = len(made.bundles.own) * 6 * size + rows * (4 * 8 + 12 * size + 8 * (18 + residual.NUMBERS))
+    device.require_memory("vbd", springs.needed(made.bundles, real) + network.bytes + AT_ONCE * solves)
     with device.guarded():
         stream = Stream()
         return PreparedVertexBlockDescent(
@@ -59,33 +54,28 @@ def prepare(
             made,
             radius,
             real,
-            measure,
             device.told(),
-            stream,
+            Uploaded.of(network, stream),
             Lanes.of(stream, made.bundles, system.vertices, real),
             stream.upload(made.bundles.in_lanes(made.held), real),
             stream.upload(made.bundles.in_lanes(made.majorant), real),
-            stream.upload(made.row, np.int32),
         )
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedVertexBlockDescent(DeviceIterative):
-    """parts, made: as on the processor; the rest is on the device: lanes; held, majorant, of each lane [N/m]; row (n,):
-    where each vertex is."""
+class PreparedVertexBlockDescent(Resident):
+    """parts, made: as on the processor; the rest is on the device: lanes; held, majorant, of each lane [N/m]."""
 
     system: System
     parts: Parts
     made: VertexBlocks
     radius: float
     real: Any
-    residuals: Callable[[], Idle]
     columns: dict[str, Any]
-    stream: Stream
+    uploaded: Uploaded
     lanes: Lanes
     held: Any
     majorant: Any
-    row: Any
     facts: dict[str, float] = field(default_factory=dict[str, float])
 
     def __post_init__(self) -> None:
@@ -96,18 +86,9 @@ class PreparedVertexBlockDescent(DeviceIterative):
         """What it chose."""
         return f"vertices in {self.made.colours} colours; kernels in {np.dtype(self.real)}, the gradient in float64"
 
-    @cached_property
-    def measure(self) -> Idle:
-        """What tells residuals, made where one is asked for: it may factorise."""
-        return self.residuals()
-
-    def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
-        """See Iterative."""
-        return _Iterating(self, problem, guess)
-
-    def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """See Iterative; on the processor, by an iteration of local-global."""
-        return self.measure.gauge(problem)(p)
+    def iterating(self) -> ResidentIterating:
+        """See Resident."""
+        return _Iterating(self)
 
     def scale(self, problem: StepProblem) -> float:
         """See Iterative."""
@@ -115,41 +96,43 @@ class PreparedVertexBlockDescent(DeviceIterative):
         return largest(problem) * float(stiffness.sum()) ** 0.5
 
 
-class _Iterating(DeviceIterating):
+class _Iterating(ResidentIterating):
     """x (n + 2, 4), the reference in float64; u, the displacement from it; older, the iterate before, and before, the
-    one where the sweep began, from it too [m]. force (3, lanes): minus the gradient at it [N]."""
+    one where the sweep began, from it too [m]. force (3, lanes): minus the gradient at it [N]; rows (n, 3): where it
+    is, and gradient (f, 3) there, both where somebody asks for them."""
 
-    def __init__(self, made: PreparedVertexBlockDescent, problem: StepProblem, guess: Positions) -> None:
-        stream, rows, lanes = made.stream, problem.system.vertices + 2, len(made.made.bundles.own)
-        super().__init__(stream)
-        self._made, self._problem, self._kernels = made, problem, kernels(made.real)
-        self._springs = springs.kernels(made.real)
-        y = np.zeros((rows, 4))
-        y[made.made.row, :3] = vertex_terms.pull(replace(problem, force=made.parts.force(problem)))
-        right = stream.upload(made.made.bundles.right(made.made.held, y))
-        p = stream.upload(vertex_terms.placed(guess, problem), np.float64)
-        self._x = cuda.device_array((rows, 4), np.float64, stream=stream.queue)
-        self._u, self._older, self._before = (
-            cuda.device_array((rows, 4), made.real, stream=stream.queue) for _ in range(3)
-        )
-        self._force = cuda.device_array((3, max(1, lanes)), made.real, stream=stream.queue)
-        self._right, self._out = right, p
+    def __init__(self, made: PreparedVertexBlockDescent) -> None:
+        super().__init__(made.uploaded)
+        self._made, self._kernels, self._springs = made, kernels(made.real), springs.kernels(made.real)
+        stream, lanes, n = self.stream, len(made.made.bundles.own), made.system.vertices
+        self._x = stream.empty((n + 2, 4), np.float64)
+        self._u, self._older, self._before = (stream.empty((n + 2, 4), made.real) for _ in range(3))
+        self._force = stream.empty((3, max(1, lanes)), made.real)
+        self._rows, self._gradient = stream.empty((n, 3), np.float64), stream.empty((n, 3), np.float64)
         self._sums = [stream.zeros(blocks(lanes), np.float64) for _ in range(2)]
-        control = np.zeros(CONTROLS)
-        control[[KNOWN, WEIGHT]] = np.nan, 1.0
-        self._control = stream.upload(control)
-        self.uploaded()
-        self._launch(self._springs.clear, rows, self._x, self._u, self._older, self._before)
-        self._launch(self._springs.bring, problem.system.vertices, p, made.row, self._x)
+        self._begun, self._control = Begun(made.uploaded), stream.zeros(CONTROLS, np.float64)
+        self._fresh = np.zeros(CONTROLS)
+        self._fresh[[KNOWN, WEIGHT]] = np.nan, 1.0
 
-    def gauge(self, p: Positions) -> float:
-        """See DeviceIterating."""
-        return self._made.residual_at(self._problem, p)
+    def take(self, step: Step) -> None:
+        """See ResidentIterating."""
+        self._launch(self._springs.clear, len(self._x), self._x, self._u, self._older, self._before)
+        self.stream.put(self._fresh, self._control)
+        self._begun.take(step, self._x)
 
-    def fetch(self) -> Positions:
-        """See DeviceIterating."""
-        self._launch(self._springs.fetch, len(self._made.row), self._x, self._u, self._made.row, self._out)
-        return self.stream.download(self._out)
+    def settled(self) -> Any:
+        """See ResidentIterating."""
+        self._launch(self._springs.settle, len(self._rows), self._x, self._u, self._rows)
+        return self._rows
+
+    def residual(self) -> float:
+        """See Iterating; on the device."""
+        with device.guarded():
+            made, free = self._made.uploaded, self._made.made.free
+            launch = sums.blocks(free), sums.THREADS, self.stream.queue
+            g = self._gradient[:free]
+            objective_kernels.gradient[launch](self._begun.edges, self._begun.given, self.settled(), g)
+            return made.residuals.of(g)
 
     def sweep(self, count: int) -> None:
         """See DeviceIterating."""
@@ -164,8 +147,8 @@ class _Iterating(DeviceIterating):
         if moved:
             self._launch(self._kernels.rebase, len(self._x), self._x, self._u, self._older, self._control)
         self._launch(
-            self._springs.linearise, len(lanes.own), *lanes.written, lanes.nobody, lanes.far, self._right, self._x,
-            self._force,
+            self._springs.linearise, len(lanes.own), *lanes.written, lanes.nobody, lanes.far, self._begun.given,
+            self._x, self._force,
         )  # fmt: skip
 
     def _once(self) -> None:

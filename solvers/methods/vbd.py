@@ -99,15 +99,11 @@ class VertexBlockDescent(Precise):
                 "while its neighbours rest and to fall back on what cannot rise"
             )
         made = VertexBlocks.of(system, parts, beside)
-
-        def measure() -> Idle:
-            return cast("Idle", CompiledLocalGlobal().prepare(system))
-
         if self.device == "cuda":
             from solvers.cuda.vbd import prepare  # for those who ask for it
 
-            return prepare(system, parts, made, self.spectral_radius, self.real, measure)
-        gauge = measure()
+            return prepare(system, parts, made, self.spectral_radius, self.real)
+        gauge = cast("Idle", CompiledLocalGlobal().prepare(system))
         shares = Shares.of(made.bundles, made.held, made.row[system.pins.vertices[system.pins.exact]])
         return PreparedVertexBlockDescent(
             system,

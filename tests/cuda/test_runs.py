@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,16 @@ from harness.cli import app
 from harness.config.load import load_any
 from harness.experiments.plan import Files
 from solvers import device as where
-from solvers.cuda import device, run, vbd
+from solvers.cuda import device, run
+from solvers.cuda.resident import Stepping
+from solvers.cuda.residual import Residuals
 from tests.scenes import CLOTH_FILE
 
 SWEEP = """
 scenes: [cloth.yaml]
 sizes: [3]
 solvers: [{name: vbd, device: cuda, spectral_radius: 0}, {name: vbd, spectral_radius: 0}]
-options: {iterations: 40, tolerance: 1.0e-3, rounds: 2, frames: 2, threads: 1, pictures: false}
+options: {iterations: 40, tolerance: 1.0e-2, rounds: 1, frames: 2, threads: 1, pictures: false, convergence_frames: []}
 """
 
 
@@ -38,26 +41,30 @@ def test_rows_tell_of_the_device_and_timed_steps_ask_for_no_residual(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked, timed = list[float](), list[tuple[int, int]]()
-    gauge, replay = vbd.PreparedVertexBlockDescent.residual_at, run.DeviceIterative.replay
+    of, step = Residuals.of, Stepping.step
 
-    def counted(self: Any, problem: Any, p: Any) -> float:
-        asked.append(gauge(self, problem, p))
+    def counted(self: Any, g: Any) -> float:
+        asked.append(of(self, g))
         return asked[-1]
 
-    def seen(self: Any, problem: Any, iterations: int) -> Any:
+    def seen(self: Any, iterations: int) -> Any:
         before = len(asked)
-        found = replay(self, problem, iterations)
+        found = step(self, iterations)
         timed.append((iterations, len(asked) - before))
         return found
 
-    monkeypatch.setattr(vbd.PreparedVertexBlockDescent, "residual_at", counted)
-    monkeypatch.setattr(run.DeviceIterative, "replay", seen)
+    monkeypatch.setattr(Residuals, "of", counted)
+    monkeypatch.setattr(Stepping, "step", seen)
     told, (here, there) = ran(tmp_path)
     assert told.exit_code == 0, told.output
     assert {row["device"] for row in here} == {device.told()["device"]}
     assert {row["device"] for row in there} == {None}
+    assert {row["through_host"] for row in (*here, *there)} == {None}
     assert all(row["sweep_bytes"] > 0 for row in here)
+    phases = Counter(row["phase"] for row in here)
+    assert phases == {"prepare": 2, "step": 2, "upload": 1, "download": 1}
     steps = [row for row in here if row["phase"] == "step"]
+    assert all((row["power_w"] is None) == device.simulated() for row in steps)
     assert {row["stopped"] for row in steps} == {"tolerance"}
     assert timed == [(row["iterations"], 0) for row in steps]
     assert all(count % run.EVERY == 0 for count, _ in timed)

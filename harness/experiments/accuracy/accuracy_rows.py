@@ -85,7 +85,7 @@ COLUMNS = (
     Column("against_error", _REAL, "", "its error, estimated as that of the goal"),
     Column("against_seconds", _REAL, "s", "its processor time, in the process of the goal's (`cpu_seconds`)"),
     Column("wanted", _REAL, "", "the part of that which is wanted"),
-    *as_in_runs("device", "device_memory_gib", "device_driver", "device_versions", "device_state"),
+    *as_in_runs("device", "device_memory_gib", "device_driver", "device_versions"),
     *PROVENANCE,
 )
 

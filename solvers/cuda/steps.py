@@ -1,0 +1,168 @@
+"""A step on a device: what it gives, from a host's problem or from where the last step ended, and rows of it.
+
+    centre_i = (c m/dt^2 target + w pin) / (c m/dt^2 + w),     force_i = f_i - h_i centre_i        h: of forms
+    n = v/|v| and n'(A origin) of dashpots, v = A p at the step's start
+
+Rows are those of `solvers.cuda.network`; a step's arrays are by vertices, as a host has them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from solvers.cuda import sums
+from solvers.cuda.network import Edges, Given, Network
+from solvers.cuda.residual import Residuals
+from solvers.cuda.run import Stream
+from solvers.cuda.target import cuda
+from solvers.energies.edges import TINY
+from solvers.problem import Positions, StepProblem
+
+
+class Step(NamedTuple):
+    """On the device, by vertices. target, guess (n, 3) [m]; force (n, 3) [N], with that of forms; pins (q, 3): where
+    they want their vertices [m], one row where there are none; origin, lagged (n, 3) [m]: of the unknown's velocity,
+    and where dashpots take their directions, any of a network without these."""
+
+    target: Any
+    force: Any
+    guess: Any
+    pins: Any
+    origin: Any
+    lagged: Any
+
+
+class Places(NamedTuple):
+    """On the device, of each row (n,). vertex: which it is; pin: the number of its pin, -1 for none; inertia: c m/dt^2,
+    weight: of a pin by penalty, form: h of all forms [N/m]."""
+
+    vertex: Any
+    pin: Any
+    inertia: Any
+    weight: Any
+    form: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Uploaded:
+    """A network on a device. edges, places: of it; hold (f,): h of all that hold a row [N/m]; axis (m, 3): of edges as
+    they were made."""
+
+    network: Network
+    stream: Stream
+    edges: Edges
+    places: Places
+    hold: Any
+
+    @classmethod
+    def of(cls, network: Network, stream: Stream) -> Uploaded:
+        """Copy a network to the device."""
+        system, order = network.system, network.order
+        pin, weight = np.full(system.vertices, -1, np.int32), np.zeros(system.vertices)
+        pin[system.pins.vertices] = np.arange(len(system.pins.vertices))
+        _, pinned, weights = system.penalty
+        weight[pinned] = weights
+        places = Places(
+            stream.upload(order, np.int32),
+            stream.upload(pin[order]),
+            stream.upload(system.inertia[order]),
+            stream.upload(weight[order]),
+            stream.upload(network.parts.held[order]),
+        )
+        hold = stream.upload(network.hold[: network.free])
+        return cls(network, stream, network.upload(stream), places, hold)
+
+    @cached_property
+    def residuals(self) -> Residuals:
+        """What tells residuals, made where one is asked for."""
+        return Residuals(self.stream, self.network, self.edges, self.hold)
+
+    def step(self, problem: StepProblem, guess: Positions) -> Step:
+        """A host's problem, from a first guess (n, 3) [m]."""
+        force, up = self.network.parts.force(problem), self.stream.upload
+        target, start = up(problem.target), problem.start
+        lags = bool(self.network.parts.dashpots)
+        return Step(
+            target,
+            up(force),
+            up(guess),
+            up(problem.pin_targets if len(problem.pin_targets) else np.zeros((1, 3))),
+            up(start.origin) if lags else target,
+            up(start.expected) if lags else target,
+        )
+
+
+class Begun:
+    """What a solve holds of its step, in rows. edges: as they are in it; given: what holds the free rows (f,), and by
+    what (f, 3)."""
+
+    def __init__(self, uploaded: Uploaded) -> None:
+        stream, network, edges = uploaded.stream, uploaded.network, uploaded.edges
+        self._uploaded, rows = uploaded, (network.free, 3)
+        if network.parts.dashpots:
+            own = stream.upload(network.axis), stream.zeros(len(network.rest), np.float64)
+            edges = edges._replace(axis=own[0], offset=own[1])
+        self.edges = edges
+        self.given = Given(uploaded.hold, stream.zeros(rows, np.float64), stream.zeros(rows, np.float64))
+
+    def take(self, step: Step, *rows: Any) -> None:
+        """The step, and its first guess in each of these rows of three numbers or more, exactly pinned vertices on
+        their targets."""
+        uploaded, queue = self._uploaded, self._uploaded.stream.queue
+        network, places = uploaded.network, uploaded.places
+        launch = sums.blocks(len(network.order)), sums.THREADS, queue
+        give[launch](places, step.target, step.force, step.pins, self.given)
+        for each in rows:
+            place[launch](places, network.free, step.guess, step.pins, each)
+        first, edges = len(network.parts.whole.edges), len(network.ends)
+        if first < edges:
+            over = sums.blocks(edges - first), sums.THREADS, queue
+            lag[over](first, places.vertex, step.origin, step.lagged, uploaded.edges.axis, self.edges)
+
+
+@cuda.jit
+def give(places, target, force, pins, given):
+    """Write what holds the free rows where, and what pulls at them besides."""
+    i = cuda.grid(1)
+    while i < given.centre.shape[0]:
+        v, m, w = places.vertex[i], places.inertia[i], places.weight[i]
+        for c in range(3):
+            centre, whole = target[v, c], m + w
+            if w > 0.0:
+                centre = (m * centre + w * pins[places.pin[i], c]) / whole
+            given.centre[i, c] = centre
+            given.force[i, c] = force[v, c] - places.form[i] * centre
+        i += cuda.gridsize(1)
+
+
+@cuda.jit
+def place(places, free, guess, pins, rows):
+    """Write a guess by vertices (n, 3) to rows; from row `free` on they are on their pins' targets."""
+    i = cuda.grid(1)
+    while i < places.vertex.shape[0]:
+        for c in range(3):
+            rows[i, c] = guess[places.vertex[i], c] if i < free else pins[places.pin[i], c]
+        i += cuda.gridsize(1)
+
+
+@cuda.jit
+def lag(first, vertex, origin, lagged, made, edges):
+    """Write directions and offsets of dashpots, which are the edges from `first` on; made: directions of those without
+    length."""
+    e = first + cuda.grid(1)
+    while e < edges.ends.shape[0]:
+        i, j = vertex[edges.ends[e, 0]], vertex[edges.ends[e, 1]]
+        v0, v1, v2 = lagged[i, 0] - lagged[j, 0], lagged[i, 1] - lagged[j, 1], lagged[i, 2] - lagged[j, 2]
+        length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+        n0, n1, n2 = made[e, 0], made[e, 1], made[e, 2]
+        if length > TINY:
+            n0, n1, n2 = v0 / length, v1 / length, v2 / length
+        edges.axis[e, 0], edges.axis[e, 1], edges.axis[e, 2] = n0, n1, n2
+        moved = n0 * (origin[i, 0] - origin[j, 0]) + n1 * (origin[i, 1] - origin[j, 1])
+        edges.offset[e] = moved + n2 * (origin[i, 2] - origin[j, 2])
+        e += cuda.gridsize(1)
