@@ -122,8 +122,9 @@ def _management() -> Generator[Any]:
     nvml: Any = None
     if not simulated():
         with suppress(Exception):
-            nvml = import_module("pynvml")
-            nvml.nvmlInit()
+            there = import_module("pynvml")
+            there.nvmlInit()
+            nvml = there
     try:
         yield nvml
     finally:

@@ -85,7 +85,7 @@ class Residuals:
             if now[ENDED] == CURVED or (now[ENDED] == NEAR and not self._masked):
                 break
             if now[ENDED] == NEAR:
-                enough = self._mu * (0.5 * ACCURACY / self._masked) ** 2 * self._unpinned()
+                enough = self._mu * (0.5 * ACCURACY / self._masked) ** 2 * self._unpinned(now)
                 if now[PRODUCT] <= enough or not self._mu > 0.0:
                     break
                 factor, now[LIMIT], now[ENDED] = 0.0, enough, GOING
@@ -114,11 +114,13 @@ class Residuals:
             return float("nan")
         beyond = float(now[PRODUCT]) / self._mu if self._mu > 0.0 else 0.0
         if self._masked:
-            return self._unpinned() ** 0.5 + self._masked * beyond**0.5
+            return self._unpinned(now) ** 0.5 + self._masked * beyond**0.5
         return (float(now[_SUM]) + beyond) ** 0.5
 
-    def _unpinned(self) -> float:
+    def _unpinned(self, now: Any) -> float:
         """|P x_k|_Q^2 [J]; waits for it."""
+        if not now[_SUM] > 0.0:  # it ended before the first step, and x is an older gradient's
+            return 0.0
         launch, one, count = self._over()
         kept[launch](self._x, self._loose, self._kept)
         multiply[launch](self._edges, self._hold, self._kept, self._y, 0, self._partials, self._idle)

@@ -51,10 +51,12 @@ def test_it_is_the_oracles_and_no_less(name: str, method: str) -> None:
         assert (1.0 - ROUND_OFF) * truth <= told <= (1.0 + residual.ACCURACY + ROUND_OFF) * truth
 
 
-def test_at_a_minimum_it_is_nothing_and_of_nan_it_is_nan() -> None:
-    problem = first_problem(cloth(3, "exact"))
+@pytest.mark.parametrize("weight", ["exact", 1e10], ids=["pinned exactly", "by penalty"])
+def test_at_a_minimum_it_is_nothing_and_of_nan_it_is_nan(weight: float | str) -> None:
+    problem = first_problem(cloth(3, weight))
     prepared = METHODS["newton-cg"]().prepare(problem.system)
     begun = prepared.begin(problem, problem.first_guess)
+    assert begun.residual() > 0.0
     begun.stream.put(np.zeros(begun.g.shape), begun.g)
     assert begun.residual() == 0.0
     begun.stream.put(np.full(begun.g.shape, np.nan), begun.g)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,6 +13,9 @@ from harness.base import rows
 from harness.cli import app
 from harness.config.load import load_any
 from harness.experiments.plan import Files
+from harness.simulation.on_device import bandwidth, seconds
+from solvers.cuda import device
+from solvers.device import Marks
 from tests.scenes import CLOTH_FILE
 
 SWEEP = """
@@ -64,3 +68,67 @@ def test_what_no_device_knows_is_refused(entry: str, said: str, sweep: Path) -> 
     told = CliRunner().invoke(app, ["run", str(sweep), "--results", str(sweep.parent / "r")])
     assert told.exit_code == 2
     assert said in " ".join(told.output.split())
+
+
+class At:
+    """An event at so many milliseconds."""
+
+    def __init__(self, when: float) -> None:
+        self.when = when
+
+    def elapsed_time(self, event: Any) -> float:
+        return event.when - self.when
+
+
+def test_events_tell_kernels_and_transfers_apart() -> None:
+    told = seconds(Marks(At(1.0), At(3.0), At(10.0), At(10.5)))
+    assert told == pytest.approx({"kernel_seconds": 7e-3, "transfer_seconds": 2.5e-3})
+    assert seconds(None) == {}, "of a device without a clock nothing is told"
+
+
+def test_a_devices_bandwidth_is_that_of_its_best_triad() -> None:
+    took = iter([9.0, 4.0, 2.0, 4.0, 4.0, 4.0])
+    remote: Any = SimpleNamespace(triad=lambda: (6e9, At(0.0), At(next(took))))
+    assert bandwidth(remote) == pytest.approx(3e12)
+    silent: Any = SimpleNamespace(triad=lambda: None)
+    assert bandwidth(silent) is None
+
+
+class Refused(Exception):
+    """As NVIDIA's management library refuses."""
+
+
+@pytest.fixture
+def nvml(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """A management library that tells a clock and refuses to tell the power."""
+
+    def refuses(*_: Any) -> float:
+        raise Refused
+
+    made = SimpleNamespace(
+        NVML_CLOCK_SM=1,
+        NVML_CLOCK_MEM=2,
+        NVML_TEMPERATURE_GPU=0,
+        nvmlInit=lambda: None,
+        nvmlShutdown=lambda: None,
+        nvmlDeviceGetHandleByUUID=lambda uuid: uuid,
+        nvmlDeviceGetClockInfo=lambda handle, kind: {"GPU-0": {1: 1980, 2: 2619}}[handle][kind],
+        nvmlDeviceGetPowerUsage=refuses,
+        nvmlDeviceGetEnforcedPowerLimit=lambda handle: 700_000,
+        nvmlDeviceGetPerformanceState=lambda handle: 0,
+        nvmlDeviceGetTemperature=lambda handle, of: 41,
+    )
+    there = {"pynvml": made, "numba.cuda": SimpleNamespace(get_current_device=lambda: SimpleNamespace(uuid="GPU-0"))}
+    monkeypatch.setattr(device, "simulated", lambda: False)
+    monkeypatch.setattr(device, "import_module", there.__getitem__)
+    return made
+
+
+def test_a_row_has_what_the_device_tells_of_its_state_and_null_for_what_it_does_not(nvml: SimpleNamespace) -> None:
+    told = {"sm_clock_mhz": 1980.0, "memory_clock_mhz": 2619.0, "power_w": None, "power_limit_w": 700.0}
+    assert device.state() == told | {"performance_state": 0.0, "temperature_c": 41.0}
+
+
+def test_where_the_library_cannot_begin_all_is_null(nvml: SimpleNamespace) -> None:
+    nvml.nvmlInit = nvml.nvmlDeviceGetPowerUsage
+    assert set(device.state().values()) == {None}
