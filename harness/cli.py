@@ -164,12 +164,19 @@ def report(
         bool, typer.Option("--viewer/--without-viewer", help="Put Rerun's viewer into the page, 19 MB.")
     ] = True,
 ) -> None:
-    """Write the page of all results, `index.html`, and the map of solvers x cases of those that were judged."""
+    """Write the page of all results, `index.html`, the map of solvers x cases of those that were judged, and what a
+    device saves where runs asked for one."""
     from harness.experiments.older import older_of
+    from harness.report.devices_plot import draw_devices
     from harness.report.robustness import summary
     from harness.report.robustness_map import draw_maps
     from harness.report.site import update
 
+    for picture, words in draw_devices(results):
+        for line in words:
+            _say(line)
+        if picture:
+            _say(f"what a device saves is drawn in {picture}")
     page = update(results, recorded=True, viewer=viewer, say=_say)
     for picture, cells in draw_maps(results, older_of):
         out().print(narrow(summary(cells)))

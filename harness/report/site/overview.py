@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 
 from harness.base import rows, shelf
 from harness.base.files import replacing
+from harness.report.devices import told as of_devices
 from harness.report.site import ablation, frames, hard, provenance, runs, speed
 from harness.report.site.failures import Failed, causes
 from harness.report.site.folders import Folder, stored
@@ -79,7 +80,7 @@ def _runs(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
     table = runs.read(folder)
     found = runs.table_of(folder, table)
     scripts: dict[str, Any] = {}
-    findings = sentences(found)
+    findings = [{"words": words} for words in of_devices(table, provenance.config_of(folder.path))] + sentences(found)
     if speed.is_speed(table):
         scripts["speed"], said = speed.chart(table)
         findings = [{"words": words} for words in said]

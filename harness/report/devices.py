@@ -1,0 +1,196 @@
+"""What a CUDA device saves, from a sweep's rows alone: time to a residual on it and on the processor beside it.
+
+    time(errors, vertices) = least over solvers of the median wall seconds of a step, of runs whose every step got there
+    share of bandwidth     = bytes that iterations must move / seconds of kernels / the device's own in a triad
+
+Times are compared within one computer. Where no run on a device ended well nothing is said of what one saves, but why
+there is none, and the command that fills it in.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import pyarrow as pa
+
+from harness.report.page import count, factor, quantity
+from harness.report.sql import answer
+
+ALIKE = 1.05
+"""Times within this factor are alike, and neither side pays."""
+
+
+class Run(NamedTuple):
+    """One run. asked: whether for a device; vertices: None where it failed before it knew; seconds: of a step, None
+    without; reached: whether all steps ended by their tolerance; share: of the device's bandwidth."""
+
+    place: str
+    scene: str
+    size: int
+    tolerance: float | None
+    solver: str
+    asked: bool
+    device: str | None
+    vertices: int | None
+    status: str
+    reason: str | None
+    seconds: float | None
+    reached: bool | None
+    share: float | None
+    bandwidth: float | None
+    through_host: str | None
+
+    @property
+    def got_there(self) -> bool:
+        """Whether its steps were to reach a residual, and all did."""
+        return bool(self.status == "ok" and self.tolerance and self.reached and self.vertices and self.seconds)
+
+
+_RUNS = """
+select coalesce(any_value(machine), '') || coalesce(any_value(node), ''), any_value(scene), any_value("size"),
+    any_value(tolerance), any_value(solver), coalesce(any_value(parameters) like '%"device": "cuda"%', false),
+    any_value(device), any_value(vertices),
+    coalesce(any_value(status) filter (status <> 'ok'), 'ok'), any_value(reason) filter (status <> 'ok'),
+    median(seconds) filter (phase = 'step'),
+    bool_and(coalesce(stopped in ('tolerance', 'floor'), false)) filter (phase = 'step'),
+    median(sweep_bytes * iterations / kernel_seconds / device_bandwidth) filter (phase = 'step' and kernel_seconds > 0),
+    any_value(device_bandwidth), any_value(through_host)
+from rows_of group by run_id order by any_value("size"), any_value(solver), run_id
+"""
+
+
+class Pair(NamedTuple):
+    """The best of both sides to one residual on one mesh; None where no run got there."""
+
+    vertices: int
+    there: Run | None
+    here: Run | None
+
+    @property
+    def ratio(self) -> float | None:
+        """The processor's time over the device's."""
+        if self.there and self.here and self.there.seconds and self.here.seconds:
+            return self.here.seconds / self.there.seconds
+        return None
+
+
+Panel = tuple[str, float]
+"""A scene, and the tolerance that its steps were solved to."""
+
+
+def runs(table: pa.Table) -> list[Run]:
+    """The runs of a sweep, from its rows (schema: `harness.base.columns.SCHEMA`); none where no run asked for a
+    device."""
+    found = [Run(*row) for row in answer(_RUNS, table)]
+    return found if any(run.asked for run in found) else []
+
+
+def pairs(found: Sequence[Run]) -> dict[Panel, list[Pair]]:
+    """By scene and tolerance, the meshes by their vertices, on computers where a run on a device ended well."""
+    places = {run.place for run in found if run.asked and run.status == "ok"}
+    groups: dict[Panel, dict[tuple[str, int], list[Run]]] = defaultdict(lambda: defaultdict(list))
+    for run in found:
+        if run.place in places and run.got_there:
+            groups[run.scene, run.tolerance or 0.0][run.place, run.vertices or 0].append(run)
+    order = sorted(groups, key=lambda panel: (panel[0], -panel[1]))
+    return {
+        panel: sorted((_pair(at, mine) for (_, at), mine in groups[panel].items()), key=lambda p: p.vertices)
+        for panel in order
+    }
+
+
+def _pair(vertices: int, mine: Sequence[Run]) -> Pair:
+    there, here = (
+        min((run for run in mine if run.asked == on), key=lambda run: run.seconds or 0.0, default=None)
+        for on in (True, False)
+    )
+    return Pair(vertices, there, here)
+
+
+def pays_from(compared: Sequence[Pair]) -> Pair | None:
+    """The smallest mesh from which on the device is faster wherever both sides got there; None for none."""
+    both = [pair for pair in compared if pair.ratio is not None]
+    first = None
+    for pair in reversed(both):
+        if (pair.ratio or 0.0) <= ALIKE:
+            break
+        first = pair
+    return first
+
+
+def told(table: pa.Table, config: str) -> list[str]:
+    """What the rows of a sweep say of devices, in sentences."""
+    return words(runs(table), config)
+
+
+def words(found: Sequence[Run], config: str) -> list[str]:
+    """What runs say, in sentences; nothing of a sweep in which none asked for a device. config: of the sweep, "" where
+    it is gone."""
+    asked = [run for run in found if run.asked]
+    if not asked:
+        return []
+    if not any(run.status == "ok" for run in asked):
+        return [
+            f"No run on a device ended well, so nothing is said of what one saves ({_why(asked)}). Where there is a "
+            f"device, `.venv/bin/springbench run {config or 'CONFIG'}` fills this in."
+        ]
+    said = [_said(panel, compared) for panel, compared in pairs(found).items()]
+    return [*said, *_bandwidths(asked), *_kept_from(asked)]
+
+
+def _why(runs: Sequence[Run]) -> str:
+    """The reason that most of them give."""
+    return Counter(run.reason or run.status for run in runs).most_common(1)[0][0]
+
+
+def _said(panel: Panel, compared: Sequence[Pair]) -> str:
+    scene, tolerance = panel
+    begun = f"{scene}, to {tolerance:g} of the residual at a step's start"
+    both = [pair for pair in compared if pair.ratio is not None]
+    if not both:
+        got = ", ".join(sorted({"the device" if pair.there else "the processor" for pair in compared}))
+        return f"{begun}: at no size did both sides get there ({got} alone), so nothing is compared."
+    first, last = pays_from(compared), both[-1]
+    if first:
+        told = f"a device pays from {count(first.vertices)} vertices on, {_faster(first)}"
+        told += f", and {_faster(last)} at {count(last.vertices)}" if last is not first else ""
+        told += "" if first is not both[0] else ", the smallest that was measured"
+    else:
+        told = f"a device does not pay up to {count(last.vertices)} vertices, where both got there: {_faster(last)}"
+    alone = [f"{count(p.vertices)} ({'device' if p.there else 'processor'})" for p in compared if p.ratio is None]
+    return f"{begun}: {told}" + (f"; one side alone got there at {', '.join(alone)}" if alone else "") + "."
+
+
+def _faster(pair: Pair) -> str:
+    """Of a pair in which both sides got there."""
+    assert pair.there
+    assert pair.here
+    assert pair.ratio is not None
+    how = f"takes {factor(1 / pair.ratio)} times the time of"
+    if pair.ratio > ALIKE:
+        how = f"is {factor(pair.ratio)} times as fast as"
+    return f"{pair.there.solver} there {how} {pair.here.solver} on the processor"
+
+
+def _bandwidths(asked: Sequence[Run]) -> Iterator[str]:
+    """Of each solver on a device, what it reaches on its largest mesh."""
+    for solver in sorted({run.solver for run in asked}):
+        known = [run for run in asked if run.solver == solver and run.share is not None and run.vertices]
+        if known:
+            run = max(known, key=lambda run: (run.vertices or 0, run.share or 0.0))
+            own = f"{quantity((run.bandwidth or 0.0) / 1e9)} GB/s"
+            yield (
+                f"{solver} on {run.device} reaches {100 * (run.share or 0.0):.0f} % of its bandwidth of {own} at "
+                f"{count(run.vertices or 0)} vertices, by the bytes that an iteration must move."
+            )
+
+
+def _kept_from(asked: Sequence[Run]) -> Iterator[str]:
+    """Runs on a device without a time, or whose steps did not stay there."""
+    failed = [run for run in asked if run.status != "ok"]
+    if failed:
+        yield f"{len(failed)} of {len(asked)} runs on a device have no time: {_why(failed)}."
+    for why in sorted({run.through_host for run in asked if run.through_host}):
+        yield f"Some states went through the host before each step: {why}."

@@ -1,0 +1,114 @@
+"""What a device saves, told from rows alone: made ones, in a test's folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from harness.base import rows
+from harness.cli import app
+from harness.report.devices import pairs, pays_from, runs, words
+from tests.unit.test_machines import table_of
+
+ON = '{"device": "cuda", "spectral_radius": 0.999}'
+
+
+def made(
+    number: int, solver: str, vertices: int, seconds: float, *, on: bool = False, tolerance: float = 1e-3, **more: Any
+) -> list[dict[str, Any]]:
+    """The rows of a run of two steps; more: columns that differ."""
+    told = {"run_id": f"{number:012x}", "sweep": "gpu", "scene": "cloth", "size": round(vertices**0.5), "phase": "step"}
+    told |= {"solver": solver, "parameters": ON if on else "{}", "vertices": vertices, "tolerance": tolerance}
+    told |= {"status": "ok", "stopped": "tolerance", "machine": "m", "node": "n", "iterations": 10, "round": 0}
+    told |= {"integrator": "implicit-euler", "time_step": 1 / 30, "minimises": True, "started": "2026-01-01T00:00:00"}
+    if on:
+        told |= {"device": "a device", "device_bandwidth": 2e12, "sweep_bytes": 10**9, "kernel_seconds": 0.01}
+    return [told | {"frame": frame, "seconds": seconds} | more for frame in (1, 2)]
+
+
+def refused(number: int, reason: str) -> dict[str, Any]:
+    told = made(number, "vbd", 0, 0.0, on=True)[0]
+    gone = ("vertices", "seconds", "stopped", "phase", "device", "device_bandwidth", "sweep_bytes", "kernel_seconds")
+    return told | dict.fromkeys(gone) | {"status": "unsupported", "reason": reason}
+
+
+MEASURED = [
+    *(made(0, "vbd", 10_000, 0.02, on=True) + made(1, "hybrid", 10_000, 0.01) + made(2, "numba", 10_000, 0.5)),
+    *(made(3, "vbd", 100_000, 0.05, on=True) + made(4, "hybrid", 100_000, 0.2)),
+    *(made(5, "vbd", 1_000_000, 0.1, on=True) + made(6, "numba", 1_000_000, 3.0)),
+    *made(7, "vbd", 4_000_000, 0.4, on=True),
+    *(made(8, "vbd", 10_000, 1.0, on=True, tolerance=1e-4) + made(9, "hybrid", 10_000, 0.1, tolerance=1e-4)),
+    *made(10, "numba", 10_000, 1e-9, stopped="iterations"),  # it did not get there
+    *made(11, "hybrid", 100_000, 1e-9, node="another"),  # where no device was
+]
+
+
+def told(some: list[dict[str, Any]], config: str = "configs/gpu.yaml") -> str:
+    return " ".join(words(runs(table_of(some)), config)).replace("\u2009", ",")
+
+
+def test_a_device_pays_from_where_it_is_faster_on_all_larger_meshes() -> None:
+    said = told(MEASURED)
+    assert "cloth, to 0.001 of the residual at a step's start: a device pays from 100,000 vertices on" in said
+    assert "vbd there is 4 times as fast as hybrid on the processor" in said
+    assert "vbd there is 30 times as fast as numba on the processor at 1,000,000" in said
+    assert "one side alone got there at 4,000,000 (device)" in said
+    assert "to 0.0001 of the residual at a step's start: a device does not pay up to 10,000 vertices" in said
+    assert "vbd there takes 10 times the time of hybrid" in said
+    assert "vbd on a device reaches 50 % of its bandwidth of 2,000 GB/s at 4,000,000 vertices" in said
+
+
+@pytest.mark.parametrize(
+    ("ratios", "first"),
+    [([0.5, 2.0, 3.0], 1), ([2.0, 0.5, 3.0], 2), ([2.0, 3.0, 1.02], None), ([1.5], 0), ([], None)],
+)
+def test_a_mesh_in_between_that_is_slower_moves_the_size(ratios: list[float], first: int | None) -> None:
+    sizes = [10**k for k in range(3, 6)]
+    some = [
+        row
+        for k, (n, ratio) in enumerate(zip(sizes, ratios, strict=False))
+        for row in made(2 * k, "vbd", n, 1.0, on=True) + made(2 * k + 1, "hybrid", n, ratio)
+    ]
+    mine = pairs(runs(table_of(some))).get(("cloth", 1e-3), [])
+    found = pays_from(mine)
+    assert (found.vertices if found else None) == (None if first is None else sizes[first])
+
+
+def test_without_a_device_nothing_is_claimed_and_the_command_is_told() -> None:
+    said = told([*made(0, "hybrid", 10_000, 0.1), refused(1, "vbd: there is no CUDA device")])
+    assert "nothing is said of what one saves (vbd: there is no CUDA device)" in said
+    assert "`.venv/bin/springbench run configs/gpu.yaml` fills this in" in said
+    assert "times as fast" not in said
+    assert told(made(0, "hybrid", 10_000, 0.1)) == "", "of sweeps that ask for none nothing is said"
+
+
+def test_what_has_no_time_and_what_went_through_the_host_are_told() -> None:
+    some = [*made(0, "vbd", 100, 0.1, on=True, through_host="wind"), refused(1, "the device has no memory left")]
+    said = told(some)
+    assert "1 of 2 runs on a device have no time: the device has no memory left." in said
+    assert "through the host before each step: wind." in said
+    assert "at no size did both sides get there (the device alone), so nothing is compared" in said
+
+
+@pytest.mark.parametrize("there", [True, False], ids=["measured", "no device"])
+def test_the_report_draws_it_and_the_page_says_it(there: bool, tmp_path: Path) -> None:
+    kept = MEASURED if there else [*made(0, "hybrid", 10_000, 0.1), refused(1, "vbd: there is no CUDA device")]
+    folder = tmp_path / "r" / "gpu" / "rows"
+    folder.mkdir(parents=True)
+    for unit in {row["run_id"] for row in kept}:
+        rows.write(folder / f"{unit}.parquet", [row for row in kept if row["run_id"] == unit])
+    done = CliRunner().invoke(app, ["report", str(tmp_path / "r"), "--without-viewer"])
+    assert done.exit_code == 0, done.output
+    said = " ".join(done.output.split())
+    picture = tmp_path / "r" / "gpu" / "pictures" / "devices.png"
+    assert picture.exists() is there
+    wanted = "a device pays from 100" if there else "nothing is said of what one saves"
+    assert wanted in said
+    assert wanted in (tmp_path / "r" / "site" / "data" / "index.js").read_text()
+    if there:
+        with Image.open(picture) as image:
+            assert image.convert("L").getextrema()[0] < 100, "something is drawn"
