@@ -50,7 +50,9 @@ def draw(compared: dict[tuple[str, float], list[Pair]], path: Path, title: str, 
     tall = (HEIGHT - _TOP - 60 - _GAP * (lines - 1)) / lines
     with matplotlib.rc_context(RC):
         page = new_page()
-        header(page, title, [*facts, "seconds of a step, the best solver of each side, by its mark"])
+        header(
+            page, title, [*facts, "seconds of a step, the best of each side", "upright: from there on a device pays"]
+        )
         for k, ((scene, tolerance), mine) in enumerate(compared.items()):
             line, column = divmod(k, columns)
             left, top = _LEFT + column * (width + _GAP), _TOP + line * (tall + _GAP)
