@@ -33,8 +33,8 @@ def made(
 
 def refused(number: int, reason: str) -> dict[str, Any]:
     told = made(number, "vbd", 0, 0.0, on=True)[0]
-    gone = ("vertices", "seconds", "stopped", "phase", "device", "device_bandwidth", "sweep_bytes", "kernel_seconds")
-    return told | dict.fromkeys(gone) | {"status": "unsupported", "reason": reason}
+    gone = ("vertices", "seconds", "stopped", "frame", "device", "device_bandwidth", "sweep_bytes", "kernel_seconds")
+    return told | dict.fromkeys(gone) | {"phase": "run", "status": "unsupported", "reason": reason}
 
 
 MEASURED = [
