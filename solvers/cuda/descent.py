@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from solvers.core.descent import Stiffness
 from solvers.core.driver import largest
 from solvers.core.preconditioning import LEAST, Preconditioning
-from solvers.cuda import device, objective_kernels, residual, sums
+from solvers.cuda import device, objective_kernels, residual, schwarz, sums
 from solvers.cuda.network import Network, require_known
 from solvers.cuda.preconditioning import Jacobi
 from solvers.cuda.resident import AT_ONCE, Resident, ResidentIterating
@@ -40,21 +41,23 @@ Real = type[np.float32] | type[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """A system on the device. stiffness: Q, on the host, without a factor; least: what blocks get beside h (f,)."""
+    """A system on the device. stiffness: Q, on the host, without a factor; least: what blocks get beside h (f,);
+    preconditioning: makes the preconditioner of a solve, of so many rows."""
 
     stiffness: Stiffness
     uploaded: Uploaded
     least: Any
     real: Real
+    preconditioning: Callable[[Stream, int, Real], Jacobi]
 
     @classmethod
     def of(cls, solver: str, system: System, preconditioner: Preconditioning, real: Real) -> Base:
         """Raises Unsupported for what kernels do not know and for what the device has no room for, and
         NotPositiveDefinite."""
-        if preconditioner != "block-jacobi":
+        if preconditioner == "factor":
             raise Unsupported(
-                f"{solver}, device: cuda: knows preconditioner: block-jacobi, not {preconditioner}; take that, or "
-                "device: cpu"
+                f"{solver}, device: cuda: knows preconditioner: block-jacobi and schwarz, not {preconditioner}; take "
+                "one of these, or device: cpu"
             )
         require_known(solver, system)
         stiffness = Stiffness(system)
@@ -62,12 +65,16 @@ class Base:
         network = Network.of(solver, system, order)
         size = np.dtype(real).itemsize
         vectors = network.free * (3.0 * (12 * 8 + 8 * size) + 6.0 * size + 8.0 * (8 + residual.NUMBERS))
-        solves = vectors + 4.0 * size * len(network.entries.other)
+        held = network.hold[: network.free] + LEAST * stiffness.diagonal[order]
+        levels = schwarz.levels(network, held) if preconditioner == "schwarz" else []
+        solves = vectors + schwarz.needed(levels, size) + 4.0 * size * len(network.entries.other)
         device.require_memory(solver, network.bytes + AT_ONCE * solves)
         with device.guarded():
             stream = Stream()
             least = stream.upload(LEAST * stiffness.diagonal[order])
-            return cls(stiffness, Uploaded.of(network, stream), least, real)
+            uploaded = [schwarz.UploadedLevel.of(stream, level) for level in levels]
+            making = partial(schwarz.Schwarz, levels, uploaded) if levels else Jacobi
+            return cls(stiffness, Uploaded.of(network, stream), least, real, making)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +116,8 @@ class Descending(ResidentIterating):
         self._begun = Begun(uploaded)
         self.edges, self.given = self._begun.edges, self._begun.given
         self.p, self.q = (stream.zeros((len(network.order), 3), np.float64) for _ in range(2))
-        self.kernels, self.preconditioner = objective_kernels.kernels(base.real), Jacobi(stream, rows, base.real)
+        self.kernels = objective_kernels.kernels(base.real)
+        self.preconditioner = base.preconditioning(stream, rows, base.real)
         self.linear = stream.zeros((4, len(network.entries.other)), base.real)
         self.g, self.z, self.d, self.h = (stream.zeros((rows, 3), t) for t in (np.float64, *(base.real,) * 3))
         self.partials, self.sums = sums.partials(_SUMS), stream.zeros(_SUMS, np.float64)
@@ -177,6 +185,7 @@ class Descending(ResidentIterating):
         self.kernels.linearise[self.launch_over](
             self.edges, self.of.hold, base.least, self.p, self.linear, preconditioner.blocks
         )
+        preconditioner.linearised(self.edges, self.p)
         negated[self.launch_over](self.g, preconditioner.r)
         preconditioner.apply(self.z, 0, self.partials, self.idle)
 

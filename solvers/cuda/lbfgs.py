@@ -17,49 +17,51 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers.core.acceleration import Scheme, window_for
-from solvers.core.descent import Metric
+from solvers.core.descent import Stiffness
 from solvers.core.driver import largest
-from solvers.cuda import device, objective_kernels, sums
+from solvers.cuda import device, objective_kernels, residual, sums
 from solvers.cuda.descent import trial
 from solvers.cuda.lbfgs_kernels import Rows, kernels
-from solvers.cuda.network import Edges, Network, require_known
+from solvers.cuda.network import Network, require_known
 from solvers.cuda.pncg import dotted
-from solvers.cuda.run import EVERY, DeviceIterating, DeviceIterative, Stream
+from solvers.cuda.resident import AT_ONCE, Resident, ResidentIterating
+from solvers.cuda.run import EVERY, Stream
+from solvers.cuda.steps import Begun, Step, Uploaded
 from solvers.kernels import accelerate
 from solvers.kernels.loop import EACH, ITERATIONS, LAST, STALLED, Limits, verdict
 from solvers.linear.schwarz import ordered
-from solvers.problem import Positions, StepProblem, System
+from solvers.problem import StepProblem, System
 
 Real = type[np.float32] | type[np.float64]
 _TRIED = 3
 """Sums of a trial: g'd, the rise, and g'd there."""
 
 
-def prepare(system: System, metric: Metric, S: csr_array, scheme: Scheme, real: Real, choice: str) -> PreparedLbfgs:
+def prepare(
+    system: System, stiffness: Stiffness, S: csr_array, scheme: Scheme, real: Real, choice: str
+) -> PreparedLbfgs:
     """The method on the device, which is `ready`. S (f, f): in the place of Q^-1 of the free vertices, symmetric and
     positive definite. Raises Unsupported for what kernels do not know, and for what the device has no room for."""
     require_known(scheme.name, system)
-    order = ordered(metric.inner)
+    order = ordered(stiffness.inner)
     network, size = Network.of(scheme.name, system, order), np.dtype(real).itemsize
     rows = Rows.of(csr_array(csr_array(S[order])[:, order]))
-    vectors = 3.0 * network.free * (6 * 8 + (2 * scheme.pairs + 3) * size)
-    device.require_memory(scheme.name, network.bytes + vectors + (4.0 + size) * len(rows.other))
+    vectors = network.free * (3.0 * (12 * 8 + (2 * scheme.pairs + 3) * size) + 8.0 * (8 + residual.NUMBERS))
+    device.require_memory(scheme.name, network.bytes + AT_ONCE * vectors + (4.0 + size) * len(rows.other))
     with device.guarded():
         stream = Stream()
         S_there = Rows(stream.upload(rows.first), stream.upload(rows.other), stream.upload(rows.value, real))
-        edges = network.upload(stream)
+        uploaded = Uploaded.of(network, stream)
         words = f"{choice}; kernels in {np.dtype(real)}, the gradient in float64"
-        return PreparedLbfgs(metric, network, stream, edges, S_there, scheme, real, device.told(), words)
+        return PreparedLbfgs(stiffness, uploaded, S_there, scheme, real, device.told(), words)
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedLbfgs(DeviceIterative):
-    """metric: of residuals, on the host; the rest, but for the network, is on the device."""
+class PreparedLbfgs(Resident):
+    """stiffness: Q, on the host, without a factor; the rest is on the device."""
 
-    metric: Metric
-    network: Network
-    stream: Stream
-    edges: Edges
+    stiffness: Stiffness
+    uploaded: Uploaded
     S: Rows
     scheme: Scheme
     real: Real
@@ -69,29 +71,27 @@ class PreparedLbfgs(DeviceIterative):
     @property
     def facts(self) -> dict[str, float]:
         """Exact counts of what was built."""
-        return self.metric.facts
+        return self.stiffness.facts
 
-    def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
-        """See Iterative."""
-        with device.guarded():
-            return _Iterating(self, problem, guess)
+    def iterating(self) -> ResidentIterating:
+        """See Resident."""
+        return _Iterating(self)
 
     def scale(self, problem: StepProblem) -> float:
         """See Iterative."""
-        return largest(problem) * self.metric.trace**0.5
+        return largest(problem) * self.stiffness.trace**0.5
 
 
-class _Iterating(DeviceIterating):
+class _Iterating(ResidentIterating):
     """p, q (n, 3): where it is and a trial, in rows; g, there: the gradients at them, c, after: -S of these, d: the
     direction, all (f, 3); steps, images (m, f, 3): s and w; window: of the line."""
 
-    def __init__(self, made: PreparedLbfgs, problem: StepProblem, guess: Positions) -> None:
-        super().__init__(made.stream)
-        self._made, stream, network, m = made, made.stream, made.network, made.scheme.pairs
-        self._edges, self._given = network.begun(stream, made.edges, problem), network.given(stream, problem)
-        placed, rows = network.placed(guess, problem), network.free
-        self._p, self._q = stream.upload(placed), stream.upload(placed)
-        self.uploaded()
+    def __init__(self, made: PreparedLbfgs) -> None:
+        super().__init__(made.uploaded)
+        self._made, stream, network, m = made, self.stream, made.uploaded.network, made.scheme.pairs
+        self._begun, rows = Begun(made.uploaded), network.free
+        self._edges, self._given = self._begun.edges, self._begun.given
+        self._p, self._q = (stream.zeros((len(network.order), 3), np.float64) for _ in range(2))
         self._g, self._there = (stream.zeros((rows, 3), np.float64) for _ in range(2))
         self._c, self._after, self._d = (stream.zeros((rows, 3), made.real) for _ in range(3))
         self._steps, self._images = (stream.zeros((m, rows, 3), made.real) for _ in range(2))
@@ -100,6 +100,11 @@ class _Iterating(DeviceIterating):
         self._partials, self._sums = sums.partials(most), stream.zeros(most, np.float64)
         self._over = sums.blocks(max(rows, len(network.ends))), sums.THREADS, stream.queue
         self._window, self._moves, self._stalled = window_for(made.scheme, 1, 1), 0, False
+
+    def take(self, step: Step) -> None:
+        """See ResidentIterating."""
+        self._begun.take(step, self._p, self._q)
+        self._window, self._moves, self._stalled = window_for(self._made.scheme, 1, 1), 0, False
         self._window.correction[:] = self._window.direction[:] = 1.0
         now = self._window.now[0]
         now["newest"] = -1
@@ -135,14 +140,14 @@ class _Iterating(DeviceIterating):
             found = self.residual()
         return self._moves - first, found, ended
 
-    def fetch(self) -> Positions:
-        """See DeviceIterating."""
-        return self._made.network.fetched(self.stream.download(self._p))
+    def settled(self) -> Any:
+        """See ResidentIterating."""
+        return self._p
 
     def residual(self) -> float:
-        """See Iterating; on the host, of the device's gradient."""
+        """See Iterating; on the device, of its gradient."""
         with device.guarded():
-            return self._made.metric.residual(self._made.network.fetched(self.stream.download(self._g)))
+            return self.of.residuals.of(self._g)
 
     def _look(self, p: Any, g: Any, c: Any) -> None:
         """The gradient at p, and -S of it."""

@@ -80,7 +80,7 @@ def needed(of: list[Level], size: int) -> float:
     )
 
 
-class Uploaded(NamedTuple):
+class UploadedLevel(NamedTuple):
     """A level on the device: its entries, h, and lists of finer edges."""
 
     first: Any
@@ -91,7 +91,7 @@ class Uploaded(NamedTuple):
     finer: Any
 
     @classmethod
-    def of(cls, stream: Stream, level: Level) -> Uploaded:
+    def of(cls, stream: Stream, level: Level) -> UploadedLevel:
         """A copy; a device has no empty arrays."""
         first, other, edge = level.entries
         some = np.zeros(1, np.int32)
@@ -108,7 +108,7 @@ class Uploaded(NamedTuple):
 class Schwarz(Jacobi):
     """The inverses of one solve, of each level those of its patches, packed; `blocks` are left as they are found."""
 
-    def __init__(self, of: list[Level], uploaded: list[Uploaded], stream: Stream, rows: int, real: Real) -> None:
+    def __init__(self, of: list[Level], uploaded: list[UploadedLevel], stream: Stream, rows: int, real: Real) -> None:
         super().__init__(stream, rows, real)
         self._levels, self._uploaded, self._of = of, uploaded, kernels(real, schwarz.PATCH)
         self._stiff = [cuda.device_array((6, max(1, one.edges)), np.float64) for one in of]

@@ -25,7 +25,7 @@ from solvers.about import About, Reference
 from solvers.contact.touching import without_contact
 from solvers.core.acceleration import Interpreted, Scheme
 from solvers.core.bounds import without_bounded
-from solvers.core.descent import Metric
+from solvers.core.descent import Metric, Stiffness
 from solvers.core.driver import Iterating, Iterative
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
@@ -89,12 +89,14 @@ class Lbfgs(Windowed, OnDevice):
                 "lbfgs, preconditioner: a-jacobi: its matrix, which is made once, has no rows for what begins to "
                 "touch; take preconditioner: factor"
             )
-        metric, words, scheme = Metric(system), f"{self.sweeps} sweeps of Jacobi", self._scheme
+        words, scheme = f"{self.sweeps} sweeps of Jacobi", self._scheme
         if self.device == "cuda":
             from solvers.cuda.lbfgs import prepare as on_device
 
-            real, S = np.float32 if self.precision == "float32" else np.float64, Aggregated(metric.inner, self.sweeps)
-            return on_device(system, metric, S.matrix, scheme, real, words)
+            stiffness, real = Stiffness(system), np.float32 if self.precision == "float32" else np.float64
+            S = Aggregated(stiffness.inner, self.sweeps)
+            return on_device(system, stiffness, S.matrix, scheme, real, words)
+        metric = Metric(system)
         energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
         base = prepared(system, energies, lambda Q: (Aggregated(Q, self.sweeps), words))
         return _Prepared(base, metric, scheme, Objective(system))
