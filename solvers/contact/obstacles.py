@@ -31,10 +31,10 @@ class Side(NamedTuple):
     def of(cls, rest: Positions, edges: Indices, triangles: Indices, first: int = 0) -> Self:
         """The side of a shape (n, 3) [m] whose vertices are counted from `first`."""
         points = np.unique(np.append(edges.ravel(), triangles.ravel())).astype(np.int64)
-        one, two = Tree.of(rest, edges), Tree.of(rest, triangles)
-        length = np.linalg.norm(rest[one.corners[:, 0]] - rest[one.corners[:, 1]], axis=1)
-        trees = (tree._replace(corners=tree.corners + first) for tree in (Tree.of(rest, points[:, None]), one, two))
-        return cls(*trees, length)
+        trees = Tree.of(rest, points[:, None]), Tree.of(rest, edges), Tree.of(rest, triangles)
+        length = np.linalg.norm(rest[trees[1].corners[:, 0]] - rest[trees[1].corners[:, 1]], axis=1)
+        one, two, three = (tree._replace(corners=tree.corners + first) for tree in trees)
+        return cls(one, two, three, length)
 
 
 @dataclass(frozen=True, eq=False)
