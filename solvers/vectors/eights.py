@@ -15,7 +15,7 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core.imputils import lower_builtin, lower_cast
-from numba.core.typeconv import Conversion
+from numba.core.typeconv.castgraph import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, models, register_model
 
@@ -63,7 +63,8 @@ def _state(symbol: Any, kind: Any, result: Any, emit: Callable[[Any, Any, Any], 
             known = kind in args and all(arg is kind or isinstance(arg, types.Float) for arg in args)
             return signature(result, kind, kind) if known and len(args) == 2 else None
 
-    infer_global(symbol)(Template)
+    register: Any = infer_global(symbol)
+    register(Template)
     lower_builtin(symbol, kind, kind)(lambda context, builder, sig, args: emit(builder, *args))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import pytest
@@ -151,7 +152,7 @@ def test_candidates_are_all_that_are_near():
     assert len(found.vertices) == int(near.sum())
 
 
-def named(vertices: np.ndarray, points: int) -> set[object]:
+def named(vertices: np.ndarray, points: int) -> set[Any]:
     """Points with their triangles, and edges with each other, whichever of two comes first."""
     one, two = vertices[:points].tolist(), vertices[points:].tolist()
     return {tuple(x) for x in one} | {frozenset((tuple(x[:2]), tuple(x[2:]))) for x in two}
@@ -161,9 +162,8 @@ def test_each_contact_stands_for_all_pairs_that_have_its_closest_points():
     contact, p, _ = touching(noise=5e-4)
     pairs, total, gradient = contact.pairs(p), 0.0, np.zeros_like(p)
     for e in range(len(pairs.vertices)):
-        arrays = (a[e : e + 1] for a in (pairs.vertices, pairs.scale, pairs.stiffness, pairs.parallel))
-        vertices, scale, stiffness, parallel = arrays
-        single = Pairs(vertices, int(e < pairs.points), scale, stiffness, parallel, THICKNESS, RANGE)
+        cut = {name: getattr(pairs, name)[e : e + 1] for name in ("vertices", "scale", "stiffness", "parallel")}
+        single = pairs._replace(points=int(e < pairs.points), **cut)
         total += press(in_range(single, padded(p), room(1, THICKNESS, RANGE)), p, gradient)
     met, summed = contact.blocks(p), np.zeros_like(p)
     contact.add_gradient(p, summed)
