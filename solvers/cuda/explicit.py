@@ -131,18 +131,18 @@ class PreparedExplicit(DeviceIterative):
 
     def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
         """The whole step."""
-        return self._begun(problem, None)
+        return self._frame(problem, None)
 
     def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, NDArray[np.float64]]:
         """Positions and velocities (n, 3) at the step's end, and steps accepted, rejected and the last one's length
         [s]; h: the first one's of a method that chooses them, from the fastest motion if left out."""
-        run = self._begun(problem, h)
+        run = self._frame(problem, h)
         run.launch(1)
         p, v = run.positions, run.velocity
         assert v is not None
         return p, v, run.told
 
-    def _begun(self, problem: StepProblem, h: float | None) -> _Frame:
+    def _frame(self, problem: StepProblem, h: float | None) -> _Frame:
         with device.guarded():
             if isinstance(self.method, Composition):
                 return _Composed(self, self.method, problem)

@@ -39,7 +39,7 @@ from solvers.linear.near_kernel import Cycle, Solving
 from solvers.methods.hybrid import Hybrid
 from solvers.methods.mgpbd import MultigridXpbd
 from solvers.methods.newton import Newton
-from solvers.methods.xpbd import Xpbd
+from solvers.methods.xpbd import PreparedXpbd, Xpbd
 from solvers.problem import StepProblem, StopRule
 from tests.scenes import first_problem, scene
 
@@ -118,6 +118,7 @@ class Reached(NamedTuple):
 def xpbd(stated: StepProblem) -> Iterator[Reached]:
     """XPBD, before its first iteration and after each."""
     made = Xpbd().prepare(stated.system)
+    assert isinstance(made, PreparedXpbd)
     run, own = made.begin(stated, stated.first_guess), made.constraints
     root, (i, j), seconds = np.sqrt(own.stiffness), own.ends.T, 0.0
     while True:

@@ -98,6 +98,7 @@ class PastItsLimit:
 
     def prepare(self, system: System) -> PreparedSymplecticEuler:
         slow = SymplecticEuler().prepare(replace(system, time_step=1e-9))
+        assert isinstance(slow, PreparedSymplecticEuler)
         return replace(slow, system=system, substeps=1)
 
 

@@ -18,7 +18,7 @@ from harness.simulation.step import State, simulate
 from solvers.energies.springs import Springs
 from solvers.integrators import Motion
 from solvers.matrices import diagonal
-from solvers.methods.symplectic_euler import SymplecticEuler, frequency_bound
+from solvers.methods.symplectic_euler import PreparedSymplecticEuler, SymplecticEuler, frequency_bound
 from solvers.problem import Pins, StopRule, System, Unsupported
 from tests.scenes import SCENES, cloth, first_problem, random_network, random_problem, scene
 from tests.unit.test_xpbd import Other, without_mass
@@ -27,9 +27,16 @@ G, DT = 9.81, 1 / 30
 STOP = StopRule(1)
 
 
+def ready(system: System) -> PreparedSymplecticEuler:
+    """The method, on the processor."""
+    prepared = SymplecticEuler().prepare(system)
+    assert isinstance(prepared, PreparedSymplecticEuler)
+    return prepared
+
+
 def motions(made: Scene, velocity: np.ndarray, frames: int, substeps: int | None = None) -> list[Motion]:
     """Positions and velocities at the start and after each step."""
-    prepared = SymplecticEuler().prepare(made.system)
+    prepared = ready(made.system)
     prepared = replace(prepared, substeps=substeps or prepared.substeps)
     state = State(Motion(made.mesh.rest, velocity), None, 0)
     run = simulate(made, prepared, STOP, first_guess="current", frames=frames, state=state)
@@ -90,7 +97,7 @@ def test_a_spring_is_stable_just_below_the_limit_and_not_above_it(share, stable)
     limit = 2.0 / frequency_bound(system, springs)
     system = replace(system, time_step=share * limit)
     problem = random_problem(0, n=2, m=0, weights=())
-    prepared = replace(SymplecticEuler().prepare(system), substeps=1)
+    prepared = replace(ready(system), substeps=1)
     p, v = np.array([[0.0, 0.0, 0.0], [0.5, 0.2, 0.1]]), np.zeros((2, 3))
     for _ in range(500):
         start = replace(problem.start, positions=p, velocity=v)
@@ -161,7 +168,7 @@ def test_pins_move_evenly_and_have_that_velocity():
 
 
 def test_pins_by_penalty_are_taken_as_exact_and_said_to_be():
-    by_penalty, exact = (SymplecticEuler().prepare(cloth(6, w).system) for w in (1e10, "exact"))
+    by_penalty, exact = (ready(cloth(6, w).system) for w in (1e10, "exact"))
     assert by_penalty.substeps == exact.substeps
     assert "2 pins by penalty taken as exact" in by_penalty.choice
     assert "penalty" not in exact.choice
@@ -172,7 +179,7 @@ def test_pins_by_penalty_are_taken_as_exact_and_said_to_be():
 @pytest.mark.parametrize("stretch", [3.0, 300.0, 3e6])
 def test_substeps_follow_from_the_stiffness(stretch):
     made = cloth(6, stretch=stretch)
-    prepared = SymplecticEuler().prepare(made.system)
+    prepared = ready(made.system)
     h = DT / prepared.substeps
     limit = 2.0 / frequency_bound(made.system, made.springs)
     assert h < limit
