@@ -60,7 +60,7 @@ def test_solvers_agree_at_convergence_or_refuse_by_name(solver, scene):
         else:
             prepared = SOLVED[solver].prepare(problem.system)
             # By other directions than Newton's it may come to another valley, and from far it does.
-            near = {"vbd": 1e-3, "newton-cg": 1e-4 if scene == "contact" else 0.0}.get(solver, 0.0)
+            near = {"vbd": 1e-3, "avbd": 1e-3, "newton-cg": 1e-4 if scene == "contact" else 0.0}.get(solver, 0.0)
             if solver == "newton-cg" and near:
                 far = prepared.solve(problem, STOP).positions
                 assert_minimum(problem, far)

@@ -104,7 +104,7 @@ _TABLE = (
     ),
     ("gravity-mass", f"{_F}/gravity.py", "mass[:, None] * np.array", "mass.mean() * np.array", f"{_U}/test_effects.py"),
     ("ether-decay", f"{_F}/ether_drag.py", "exp(-self.rate * time_step)", "1.0 - self.rate * time_step", _STEPS),
-    ("air-drag", f"{_F}/air_drag.py", "np.divide(mass, mass + drag,", "np.divide(mass, mass + 2.0 * drag,", _DAMPING),
+    ("air-drag", "solvers/filters.py", "np.divide(mass, mass + drag,", "np.divide(mass, mass + 2.0 * drag,", _DAMPING),
     ("wind-density", f"{_F}/wind.py", "f = 0.5 * wind.density", "f = wind.density", f"{_U}/test_effect_wind.py"),
 )
 
