@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from harness.base.errors import InputError
+from harness.record.obstacles import declared
 from harness.scenes.bind import Scene, build
 from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.self_contact import SelfContact
@@ -214,7 +215,7 @@ def test_a_mesh_from_a_file_is_told_by_what_it_holds(tmp_path):
     with pytest.raises(InputError):
         one.shape()
     (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 3 2\n")
-    (read,) = from_json(f"[{one.model_dump_json()}]")
+    (read,) = from_json(declared([one])["obstacles"])
     assert isinstance(read, Solid)
     for found, wanted in zip(read.shape(), one.shape(), strict=True):
         np.testing.assert_array_equal(found, wanted)
