@@ -218,7 +218,13 @@ COLUMNS = (
     Column("reason", _TEXT, "", "why the status is not ok"),
     Column("time_limit", _REAL, "s", "wall time that the run might take; null: any"),
     Column("memory_limit", _REAL, "GiB", "memory that the run might take; null: any"),
-    Column("timing", _TEXT, "", "exclusive: timed alone on the machine; shared: on cores of its own, beside others"),
+    Column(
+        "timing",
+        _TEXT,
+        "",
+        "exclusive: timed alone on the machine; shared: on cores of its own, beside others; rough: in the pass that "
+        "looks at it, beside others",
+    ),
     Column("at_once", _INT, "", "how many runs may have been timed at once"),
     Column("pinned", _TEXT, "", "of shared timing: the cores' numbers"),
     Column("machine", _TEXT, "", "id of the machine: hash of its processor, cores and memory"),

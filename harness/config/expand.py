@@ -132,6 +132,9 @@ class Expansion:
             for name in OF_ERROR:
                 if name in options.model_fields_set:
                     self.document.report("is chosen for the `accuracy` asked; leave it out", ("options", name))
+        if options.timing == "rough" and options.record:
+            problem = "has no pass after which a recording's colours are known; give `record: false`, or another timing"
+            self.document.report(problem, ("options", "timing"))
         entries = [options, *self.fields.include]
         if options.judge and any(AUTO in one.tolerance or set(one.accuracy) != {None} for one in entries):
             problem = "grades steps by a tolerance that is stated; give one, and no `accuracy`, or leave `judge` out"

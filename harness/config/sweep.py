@@ -16,7 +16,11 @@ from harness.config.options import OPTIONS, Chosen, lists
 from harness.scenes.spec import SceneSpec, Size, named_in
 from solvers.plugins import Plugin, Table, found, identity
 
-REPORTS: dict[str, str] = {"medians": "harness.report.medians:medians", "timing": "harness.report.timing_plot:timing"}
+REPORTS: dict[str, str] = {
+    "certificates": "harness.report.certificates:certificates",
+    "medians": "harness.report.medians:medians",
+    "timing": "harness.report.timing_plot:timing",
+}
 """The shipped reports by name; each is a function `report(rows, folder)` that answers the files it wrote."""
 
 EVERY_REPORT = Table("springbench.reports", REPORTS)
@@ -45,9 +49,10 @@ class Kept(Model):
     """Whether pictures are drawn from the recordings."""
     judge: bool = False
     """Whether an oracle judges each step's answer in the rows: for `springbench report`, on small meshes."""
-    timing: Literal["exclusive", "shared"] = "exclusive"
+    timing: Literal["exclusive", "shared", "rough"] = "exclusive"
     """exclusive: while a run is timed, nothing else of springbench's computes on the machine; shared: several are timed
-    at once, each on cores of its own, and their rows say so."""
+    at once, each on cores of its own, and their rows say so; rough: no pass is there to be timed, the steps are done
+    once and looked at, and their times are of that: for what is not about times, without recordings."""
     time_limit: float | None = Field(default=3600.0, gt=0, le=1e7)
     """Wall time [s] that a run may take, all of it; null is any. One that takes longer is ended, and is a row."""
     memory_limit: float | None = Field(default=None, gt=0, le=1e6)
@@ -142,6 +147,11 @@ class RunSpec(Kept, Chosen):
     def title(self) -> str:
         """The run in words."""
         return f"{self.scene_name}{f' {self.size}' if self.size else ''} {self.solver.name}"
+
+    @property
+    def passes(self) -> int:
+        """How often the steps are done: to warm up, to be timed, and to be looked at."""
+        return 1 if self.timing == "rough" else self.rounds + 2
 
     def identity(self) -> str:
         """All that determines the run's result and timing on one machine, as canonical JSON; pictures come later, from

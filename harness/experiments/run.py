@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from harness.base import machine, rows
 from harness.base.errors import InputError, RunFailed
 from harness.base.files import replacing
-from harness.base.machine_lock import Turn, alone, own_cores
+from harness.base.machine_lock import Turn, alone, beside, own_cores
 from harness.base.worker import Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.ability import of_this_machine
@@ -38,7 +38,7 @@ from harness.scenes.bind import Scene, build
 from harness.simulation import times
 from harness.simulation.algebraic import stop_rule
 from harness.simulation.clock import measured_again
-from harness.simulation.measure import Measured, Settings, digest, measure
+from harness.simulation.measure import Measured, Settings, digest, measure, roughly
 from harness.simulation.observe import observe, require_numbers
 from harness.simulation.step import prepare
 from solvers import device, sources
@@ -89,9 +89,13 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None, turn
     counts = {"vertices": len(scene.mesh.rest), "springs": len(scene.springs.edges)}
     settings = _settings(run)
     with _timed(run, tick) as how:
-        measured, told = _measured(scene, _solver(run), settings, tick)
+        if run.timing == "rough":
+            measured, told = roughly(scene, _solver(run)), None
+        else:
+            measured, told = _measured(scene, _solver(run), settings, tick)
     turn.look()
     by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
+    told = told or times.rows(measured)
     require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=isinstance(run.tolerance, float))
     stands = _standing(run)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
@@ -139,9 +143,9 @@ def _to_error(
 
 @contextmanager
 def _timed(run: RunSpec, tick: Tick) -> Generator[dict[str, Any]]:
-    """How the run is timed, as columns: alone on the machine, or on cores of its own."""
-    if run.timing == "exclusive":
-        with alone(tick):
+    """How the run is timed, as columns: alone on the machine, beside others, or on cores of its own."""
+    if run.timing != "shared":
+        with (alone if run.timing == "exclusive" else beside)(tick):
             yield {}
     else:
         with own_cores(machine.threads(run.threads).number, tick) as cores:
@@ -162,6 +166,7 @@ def _second_pass(
     with ExitStack() as cleanup:
         recorder = None
         if run.record:
+            assert measured.final is not None  # a sweep that is rough and records is refused
             seconds = [t.seconds for t in measured.timings if t.phase == "step"]
             facts = {"status": "ok", "milliseconds_per_step": 1e3 * float(np.median(seconds))}
             recorder = _recorder(run, files, scene, facts, measured.final)
@@ -178,10 +183,11 @@ def _second_pass(
             stored=stored,
             judge=_judge(run, scene),
             tick=lambda: tick("second pass"),
+            clock=measured.clock,
         )
-        if found[run.frames]["digest"] != digest(measured.final):
+        if measured.final is not None and found[run.frames]["digest"] != digest(measured.final):
             raise RunFailed("the recorded pass ended at other positions than the timed pass")
-        if recorder:
+        if recorder and measured.final is not None:
             recorder.close(times.milliseconds(measured, run.frames))
             ends = run.frames, scene.time(run.frames), measured.final
             found[run.frames]["recorded"] = require_last(files.recording, recorder.info, *ends)

@@ -39,8 +39,8 @@ class RunUnit:
 
     @property
     def ticks(self) -> int:
-        """The steps of the pass that warms up, of the timed ones and of the second pass."""
-        return self.run.frames * (self.run.rounds + 2)
+        """The steps of all passes."""
+        return self.run.frames * self.run.passes
 
     @property
     def work(self) -> float:

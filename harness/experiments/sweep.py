@@ -90,7 +90,7 @@ def run_sweep(
             if any(p.run.judge for p in todo):
                 import_module("harness.experiments.standing")
         many = min(at_once or workers_at_once(), max(1, len(todo)))
-        units = [RunUnit(p.run, p.files, positions, many if p.run.timing == "shared" else 1) for p in todo]
+        units = [RunUnit(p.run, p.files, positions, 1 if p.run.timing == "exclusive" else many) for p in todo]
         if away:
             do_together(units, claims, partial(away.do_all, folder, display), say)
             planned = plan(runs, folder, machines)

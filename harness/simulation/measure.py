@@ -2,7 +2,8 @@
 
 The timed passes record nothing. They come after a pass in which the phases are timed apart, each frame's next to an
 iteration of its solve, which warms up all that the steps use, and they repeat the whole simulation `rounds` times.
-All that is timed is timed once more by a `Watch`.
+All that is timed is timed once more by a `Watch`. Where times do not matter (`roughly`), there is the second pass
+alone.
 """
 
 from __future__ import annotations
@@ -75,12 +76,14 @@ class Settings:
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
     """What the timed passes found: the prepared solver, all times, a watch over those of each phase (of steps over
-    those of each round), and the final positions (n, 3) [m]."""
+    those of each round), and the final positions (n, 3) [m]. Without such passes final is None, and a clock times the
+    steps of the second one."""
 
     prepared: Prepared
     timings: list[Timing]
     watches: dict[tuple[str, int | None], Watch]
-    final: Positions
+    final: Positions | None
+    clock: AbstractContextManager[None] = NO_CLOCK
 
     @staticmethod
     def pass_of(timing: Timing) -> int | None:
@@ -138,6 +141,30 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
             final = step.positions
             tick("timed pass")
     return Measured(prepared, timings, watches, final)
+
+
+class _Steps(Clock):
+    """Times one step after the other, and keeps their times."""
+
+    def __init__(self, watch: Watch, timings: list[Timing]) -> None:
+        super().__init__(watch)
+        self._timings = timings
+
+    def __exit__(self, *raised: object) -> None:
+        super().__exit__(*raised)
+        self._timings.append(Timing("step", self.watch.entered, 0, self.seconds))
+
+
+def roughly(scene: Scene, solver: Solver) -> Measured:
+    """Prepare once, for a second pass that is the only one, whose clock is `Measured.clock`; whether the solver writes
+    to what it was given is not checked. Raises Unsupported, NotPositiveDefinite."""
+    preparing, stepping = (Watch(numba.get_num_threads()) for _ in range(2))
+    clock = Clock(preparing)
+    with clock:
+        prepared = prepare(scene, solver)
+    timings = [Timing("prepare", None, 0, clock.seconds)]
+    watches = {("prepare", None): preparing, ("step", 0): stepping}
+    return Measured(prepared, timings, watches, None, _Steps(stepping, timings))
 
 
 def steps(

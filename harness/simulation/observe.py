@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from harness.record.base import Frame, Recorder
 from harness.record.shading import strains
 from harness.scenes.bind import Scene
-from harness.simulation.measure import Diverged, Settings, StepFailed, digest, steps
+from harness.simulation.measure import NO_CLOCK, Diverged, Settings, StepFailed, digest, steps
 from harness.simulation.step import Step, start
 from harness.simulation.trace import EnergyNorm, trace
 from solvers.contact.energy import Contact
@@ -39,12 +40,13 @@ def observe(
     stored: NDArray[np.float64] | None,
     judge: Callable[[Step], dict[str, Any]] | None,
     tick: Callable[[], None],
+    clock: AbstractContextManager[None] = NO_CLOCK,
 ) -> dict[int, dict[str, Any]]:
     """Simulate a run's frames and return, by frame, the columns of its rows that tell of the solution.
 
     recorder: takes every frame, and how the solve converged in the frames `convergence`; stored: where to put the
     positions after each step, (frames, n, 3) [m]; judge: adds what an oracle says of each step; tick: called after
-    each step.
+    each step; clock: within which each is done.
     """
     found: dict[int, dict[str, Any]] = {}
 
@@ -61,7 +63,7 @@ def observe(
         looked: Future[None] | None = None
         if recorder:
             looked = beside.submit(recorder.frame, Frame(0, 0.0, start(scene).now.positions, {}, float("nan"), 0))
-        for step in steps(scene, prepared, settings):
+        for step in steps(scene, prepared, settings, clock):
             if looked:
                 looked.result()  # raises here what went wrong there
             # A solver's memory is one solve's: not beside the next step.

@@ -12,7 +12,7 @@ from harness.experiments.ablation.unit import run_ablation
 from harness.report.ablation import of_kind, read, verdict
 from tests.displays import Quiet
 
-SCENES = Path(__file__).resolve().parents[2] / "configs" / "scenes"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 QUICK: dict[str, int | None] = {"heavy-bob": None, "tower": 8, "hanging-cloth": 12}
 LONG: dict[str, int | None] = {
     "bending-strip": 21,
@@ -26,15 +26,26 @@ LONG: dict[str, int | None] = {
     "rope-bridge": 13,
     "spinning-skirt": 32,
 }
+TOUCH: dict[str, int | None] = {
+    "fold-over-edge": 12,
+    "garment": 9,
+    "knot": 60,
+    "net-on-block": 7,
+    "poncho": 20,
+    "ten-sheets": 4,
+    "touching-curtain": 13,
+    "touching-flag": 12,
+    "twisted-cloth": 12,
+}
 """Mesh sizes so small that an ablation takes seconds. What effects and time steps change shrinks with them alike."""
 CALLED = ("this scene calls for it", "without it this is another scene", "the scene is impossible without it")
 
 
-@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.long) for name in LONG)])
+@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.long) for name in LONG | TOUCH)])
 def test_a_scene_has_the_effects_that_its_motion_calls_for_and_no_others(name: str, tmp_path: Path):
-    size = (QUICK | LONG)[name]
+    size, folder = (QUICK | LONG | TOUCH)[name], CONFIGS / ("touch" if name in TOUCH else "scenes")
     asked = {"solvers": [SOLVER], "tolerance": TOLERANCE, "sizes": [size] if size else [], "rounds": 1, "threads": 1}
-    sweep = load_any(SCENES / f"{name}.yaml", **asked)
+    sweep = load_any(folder / f"{name}.yaml", **asked)
     rows = read(run_ablation(sweep, tmp_path, Quiet(), lambda line: None, pairs=False, isolated=False))
     told = {row["name"]: verdict(row, rows) for row in of_kind(rows, "without")}
     assert {name: words for name, words in told.items() if not any(called in words for called in CALLED)} == {}

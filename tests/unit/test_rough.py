@@ -1,0 +1,63 @@
+"""Runs that are not about times: one pass, the same positions, and certificates of what it finds."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+
+from harness.base.columns import SCHEMA
+from harness.base.errors import InputError
+from harness.config.load import load_any
+from harness.experiments.plan import Files
+from harness.experiments.run import execute
+from harness.report.certificates import certificates
+
+SCENE = """
+mesh: {kind: grid}
+mass: 1
+time_step: 0.1
+frames: 3
+default_size: 3
+effects: [{kind: springs, stretch: 10}, {kind: gravity}, {kind: self-contact}]
+"""
+
+
+def executed(folder: Path, timing: str) -> tuple[list[dict[str, Any]], list[str]]:
+    """The rows of a run, and the passes that it told of."""
+    (folder / "scene.yaml").write_text(SCENE)
+    asked: dict[str, Any] = {"solvers": ["newton"], "timing": timing, "record": False, "tolerance": 1e-3}
+    (spec,) = load_any(folder / "scene.yaml", **asked).runs()
+    files, told = Files.of(spec, folder), list[str]()
+    files.rows.parent.mkdir(exist_ok=True)
+    return execute(spec, files, told.append), told
+
+
+def test_a_rough_run_does_its_steps_once_and_ends_where_a_timed_one_does(tmp_path: Path):
+    (timed, _), (rough, passes) = executed(tmp_path, "exclusive"), executed(tmp_path, "rough")
+    assert [(row["phase"], row["frame"]) for row in rough] == [("prepare", None), ("step", 1), ("step", 2), ("step", 3)]
+    assert passes.count("second pass") == 3
+    assert {said for said in passes if "pass" in said} == {"second pass"}
+    digests = {row["frame"]: row["digest"] for row in timed if row["phase"] == "step"}
+    assert {row["frame"]: row["digest"] for row in rough if row["phase"] == "step"} == digests
+    assert all(row["seconds"] > 0 and row["timing"] == "rough" and row["status"] == "ok" for row in rough)
+    assert len({row["run_id"] for row in (timed[0], rough[0])}) == 2
+
+
+def test_certificates_count_the_frames_that_are_free(tmp_path: Path):
+    rows, _ = executed(tmp_path, "rough")
+    rows += [row | {"run_id": "other", "solver": "broken", "intersections": int(row["frame"] == 2)} for row in rows]
+    rows.append(rows[0] | {"run_id": "none", "solver": "refuses", "phase": "run", "status": "unsupported"})
+    (path,) = certificates(pa.Table.from_pylist(rows, schema=SCHEMA), tmp_path)
+    with path.open() as file:
+        found = {row["solver"]: (row["frames"], row["free"], row["status"]) for row in csv.DictReader(file)}
+    assert found == {"newton": ("3", "3", "ok"), "broken": ("3", "2", "ok"), "refuses": ("", "0", "unsupported")}
+
+
+def test_a_rough_run_keeps_no_recording(tmp_path: Path):
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    with pytest.raises(InputError, match=r"options: timing: .*give `record: false`|timing.*record: false"):
+        load_any(tmp_path / "scene.yaml", timing="rough")
