@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from harness.base.errors import RunFailed
 from harness.scenes.bind import Scene, build
 from harness.scenes.spec import SceneSpec
-from harness.simulation.step import FIRST_GUESSES, State, Step, prepare, simulate
+from harness.simulation.step import State, Step, guessed, prepare, simulate
 from solvers.integrators import Motion
 from solvers.problem import Pins, Positions, Solver, Start, StepProblem, StopRule
 
@@ -56,7 +56,7 @@ class Frozen:
 
     def stated(self, first_guess: str) -> StepProblem:
         """The problem with a first guess by name (`harness.simulation.step.FIRST_GUESSES`)."""
-        return FIRST_GUESSES[first_guess](self.problem)
+        return guessed(self.problem, first_guess)
 
 
 def bind(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Scene:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from harness.base.errors import RunFailed
 from harness.reference.curvature import Curvature, across, curvature, definite, free_hessian
 from harness.reference.oracle import sizes
-from harness.simulation.step import FIRST_GUESSES
+from harness.simulation.step import guessed
 from solvers.problem import Positions, Solver, StepProblem, StopRule
 from solvers.round_off import EPS
 
@@ -111,7 +111,7 @@ class KnownMinima:
 
 def find_minima(problem: StepProblem, solver: Solver) -> KnownMinima:
     """The minima to which Newton's method leads from the current positions and from the inertial target."""
-    guesses = (FIRST_GUESSES[name](problem).first_guess for name in ("current", "inertial"))
+    guesses = (guessed(problem, name).first_guess for name in ("current", "inertial"))
     return reference(polish(problem, guess, solver) for guess in guesses)
 
 

@@ -214,6 +214,13 @@ FIRST_GUESSES: dict[str, Callable[[StepProblem], StepProblem]] = {
     "motion": _motion,
 }
 
+
+def guessed(stated: StepProblem, first_guess: str) -> StepProblem:
+    """A problem with one of these first guesses, where that is free of intersections; see
+    `solvers.core.clearing.begun_free`, also for what it raises."""
+    return begun_free(FIRST_GUESSES[first_guess](stated))
+
+
 COARSE = "coarse"
 """The first guess that is no function of the problem alone: it is where the coarser mesh goes."""
 COARSE_BY = "hybrid"

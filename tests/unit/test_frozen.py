@@ -15,9 +15,11 @@ from harness.scenes.effects.ether_drag import EtherDrag
 from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
+from harness.scenes.effects.surface_contact import SurfaceContact
 from harness.scenes.mesh.grid import Grid
+from harness.scenes.obstacles import Plane
 from harness.scenes.spec import IntegratorName, SceneSpec
-from harness.simulation.step import prepare, simulate
+from harness.simulation.step import prepare, problem, simulate, start
 from solvers.integrators import INTEGRATORS
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.methods.newton import Newton
@@ -113,6 +115,16 @@ def test_the_first_guess_is_chosen_at_use(tmp_path):
     np.testing.assert_array_equal(one.stated("inertial").first_guess, guess)
     np.testing.assert_array_equal(one.stated("current").first_guess, one.problem.current)
     assert np.abs(guess - one.problem.current).max() > 1e-4
+
+
+def test_a_first_guess_beyond_an_obstacle_is_where_the_step_starts(tmp_path):
+    below = SurfaceContact(thickness=0.01, obstacles=(Plane(point=(0.0, -0.05, 0.0)),))
+    spec = changed(effects=(Springs(stretch=50.0), Gravity(), below), velocity=(0.0, -8.0, 0.0))
+    made = bind(spec, 3)
+    state = start(made)
+    stated = Frozen(1, problem(made, state, "current"), state.now, "").stated("inertial")
+    assert stated.target[:, 1].max() < -0.06, "by inertia alone it would be beyond"
+    np.testing.assert_array_equal(stated.first_guess, state.now.positions)
 
 
 def test_the_violent_moment_is_the_step_that_has_farthest_to_go():

@@ -22,7 +22,7 @@ from harness.reference.minimiser import KnownMinima, Minimum
 from harness.reference.oracle import Oracle
 from harness.reference.store import Store
 from harness.scenes.bind import Scene
-from harness.simulation.step import FIRST_GUESSES
+from harness.simulation.step import guessed
 from solvers import device
 from solvers.problem import Positions, Prepared, Solver, System
 from solvers.registry import EVERY, load
@@ -99,7 +99,7 @@ class GradedStep:
             "stiffness_ratio": stiffness_ratio(problem.system, self.scene.springs.stiffness),
             "mean_rest_length": self.mean_rest_length,
             "g0": problem.value(problem.current),
-            "g0_inertial": problem.value(FIRST_GUESSES["inertial"](problem).first_guess),
+            "g0_inertial": problem.value(guessed(problem, "inertial").first_guess),
             "magnitude": problem.magnitude(best),
         }
         if not reference.minima:
