@@ -27,10 +27,14 @@ LONG: dict[str, int | None] = {
     "spinning-skirt": 32,
 }
 TOUCH: dict[str, int | None] = {
+    "fold-over-edge": 12,
+    "garment": 9,
     "knot": 60,
     "net-on-block": 7,
     "ten-sheets": 4,
+    "touching-curtain": 13,
     "touching-flag": 12,
+    "twisted-cloth": 12,
 }
 """Mesh sizes so small that an ablation takes seconds. What effects and time steps change shrinks with them alike."""
 CALLED = ("this scene calls for it", "without it this is another scene", "the scene is impossible without it")
