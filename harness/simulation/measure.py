@@ -163,7 +163,7 @@ def roughly(scene: Scene, solver: Solver) -> Measured:
     with clock:
         prepared = prepare(scene, solver)
     timings = [Timing("prepare", None, 0, clock.seconds)]
-    watches = {("prepare", None): preparing, ("step", 0): stepping}
+    watches: dict[tuple[str, int | None], Watch] = {("prepare", None): preparing, ("step", 0): stepping}
     return Measured(prepared, timings, watches, None, _Steps(stepping, timings))
 
 
