@@ -43,7 +43,7 @@ CLEAR = 1e-2
 
 SLOW = ("dense", "sparse", "numba", "chebyshev", "admm", "a-jacobi")
 """Take as many iterations as k dt^2/m; `test_properties` holds each of their iterates to the same."""
-SOFT = {"vbd": 0.0, "jgs2": 0.0}
+SOFT = {"vbd": 0.0, "avbd": 0.0, "jgs2": 0.0}
 """Powers of ten of the stiffness number up to which a method converges in time: one vertex at a time is slow, and what
 answers to it at rest says little in networks as far out of shape as these."""
 
