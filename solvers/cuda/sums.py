@@ -3,6 +3,9 @@
 Threads go through the terms in strides and add up what they find, a block's threads add theirs by a tree, and one block
 adds the blocks' sums by the same tree. The two stages are two kernels, so that no block waits for another and nothing
 is added by atomics.
+
+`keep` and `of_all` are inlined: Numba compiles a function anew for each literal it is given, and takes in with each what
+that one calls, so that `of_block` and its shared array would be there twice, which libNVVM refuses.
 """
 
 from __future__ import annotations
@@ -41,7 +44,7 @@ def of_block(value):
     return shared[0]
 
 
-@cuda.jit(device=True)
+@cuda.jit(device=True, inline="always")
 def keep(value, which, partials):
     """The first stage: the block's sum, kept in a row of partials (k, MOST_BLOCKS)."""
     total = of_block(value)
@@ -49,7 +52,7 @@ def keep(value, which, partials):
         partials[which, cuda.blockIdx.x] = total
 
 
-@cuda.jit(device=True)
+@cuda.jit(device=True, inline="always")
 def of_all(which, partials, count):
     """The second stage, in a kernel of one block: the sum of a row's first `count` partials, told to all threads."""
     mine, k = 0.0, cuda.threadIdx.x

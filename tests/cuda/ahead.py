@@ -1,8 +1,8 @@
 """Kernels compiled ahead of time, for a device that need not be there: by Numba, libNVVM and NVIDIA's linker.
 
-    python -m tests.cuda.ahead LAUNCHES       of a pickle {kernel: [arguments, ...]}, without the simulator's variable
+    python -m tests.cuda.ahead LAUNCHES       of a pickle {kernel: {pickled arguments, ...}}, without the simulator
 
-prints {kernel: [[what was wrong, or ""; registers, bytes of shared memory, bytes spilled], ...]} as JSON.
+prints {kernel: [what became of it with each, ...]} as JSON; see `Compiled`.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ import json
 import pickle
 import re
 import sys
-from collections.abc import Generator
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from pkgutil import iter_modules
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +25,17 @@ from solvers.cuda.target import cuda
 from solvers.linear import schwarz
 
 CAPABILITY = 9, 0
+
+
+class Compiled(NamedTuple):
+    """wrong: why it does not compile, or ""; registers of a thread; bytes of shared memory of a block; bytes spilled by
+    a thread; doubles: instructions of arithmetic in float64."""
+
+    wrong: str
+    registers: int = 0
+    shared: int = 0
+    spilled: int = 0
+    doubles: int = 0
 
 
 def kernels() -> dict[str, Any]:
@@ -38,60 +48,49 @@ def kernels() -> dict[str, Any]:
         if "kernels" not in own:
             continue
         for real in (np.float32, np.float64):
-            given = (real, schwarz.PATCH) if len(signature(own["kernels"]).parameters) == 2 else (real,)
-            made = own["kernels"](*given)
-            each = made._asdict() if isinstance(made, tuple) else {"kernel": made}
+            more = (schwarz.PATCH,) if "patch" in signature(own["kernels"]).parameters else ()
+            made = own["kernels"](real, *more)
+            each = made._asdict() if isinstance(made, tuple) else {made.py_func.__name__: made}
             found |= {f"{name}.{k}, {real.__name__}": v for k, v in each.items()}
-    return {name: kernel for name, kernel in found.items() if not _on_device_only(kernel)}
+    return {name: kernel for name, kernel in found.items() if not for_kernels_alone(kernel)}
 
 
-def _on_device_only(kernel: Any) -> bool:
-    """Whether kernels alone call it."""
-    simulated = getattr(kernel, "_device", None)
-    return kernel.targetoptions["device"] if simulated is None else simulated
+def for_kernels_alone(function: Any) -> bool:
+    """Whether no host launches it."""
+    simulated = getattr(function, "_device", None)
+    return function.targetoptions["device"] if simulated is None else simulated
 
 
 def example(argument: Any) -> Any:
-    """What has an argument's type, and can be pickled: arrays have one entry."""
+    """What has an argument's type, and can be pickled: arrays have one entry, numbers are 0."""
     if isinstance(argument, tuple):
-        parts = [example(part) for part in argument]
+        parts = map(example, argument)
         return type(argument)(*parts) if hasattr(argument, "_fields") else tuple(parts)
-    if hasattr(argument, "shape") and argument.shape:
+    if getattr(argument, "shape", ()):
         return np.zeros((1,) * len(argument.shape), argument.dtype)
-    return argument
+    return type(argument)()
 
 
-def compiled(kernel: Any, arguments: tuple[Any, ...]) -> tuple[str, int, int, int]:
-    """What was wrong, or ""; registers, bytes of shared memory, bytes spilled."""
-    core = import_module("cuda.core")
-    types = tuple(kernel.typeof_pyval(argument) for argument in arguments)
+def compiled(kernel: Any, arguments: tuple[Any, ...]) -> Compiled:
+    """What becomes of a kernel with such arguments, up to the machine's code."""
+    core, types = import_module("cuda.core"), tuple(map(kernel.typeof_pyval, arguments))
+    options = core.LinkerOptions(arch="sm_{}{}".format(*CAPABILITY), verbose=True, ptxas_options=["-v"])
     try:
         code, _ = cuda.compile_ptx(kernel.py_func, types, cc=CAPABILITY)
-    except Exception as error:  # of Numba's types, or of libNVVM
-        return f"{type(error).__name__}: {error}", 0, 0, 0
-    arch = "sm_{}{}".format(*CAPABILITY)
-    options = core.LinkerOptions(arch=arch, verbose=True, ptxas_options=["-v"])
-    linker = core.Linker(core.ObjectCode.from_ptx(code.encode()), options=options)
-    try:
+        linker = core.Linker(core.ObjectCode.from_ptx(code.encode()), options=options)
         linker.link("cubin")
-    except Exception as error:  # nvJitLink's, of a module that stands nowhere
-        return f"{error} {linker.get_error_log()}", 0, 0, 0
+    except Exception as error:  # Numba's, libNVVM's and the linker's have nothing in common
+        return Compiled(f"{type(error).__name__}: {error}")
     log = linker.get_info_log()
-    return "", *(_number(unit, log) for unit in (r"used (\d+) registers", r"(\d+) bytes smem", r"(\d+) bytes spill st"))
-
-
-def _number(pattern: str, log: str) -> int:
-    told = re.search(pattern, log, re.IGNORECASE)
-    return int(told[1]) if told else 0
-
-
-def _all(launches: dict[str, list[tuple[Any, ...]]]) -> Generator[tuple[str, list[tuple[str, int, int, int]]]]:
-    there = kernels()
-    for name, examples in launches.items():
-        yield name, [compiled(there[name], arguments) for arguments in examples]
+    units = r"used (\d+) registers", r"(\d+) bytes smem", r"(\d+) bytes spill stores"
+    told = (re.search(unit, log, re.IGNORECASE) for unit in units)
+    doubles = re.findall(r"\b(?:add|sub|mul|fma|div|sqrt|rcp)\.[\w.]*f64\b", code)
+    return Compiled("", *(int(one[1]) if one else 0 for one in told), len(doubles))
 
 
 if __name__ == "__main__":
     # Of functions that kernels call, Numba asks the device for what to compile; there need be none.
     import_module("numba.cuda.dispatcher").get_current_device = lambda: SimpleNamespace(compute_capability=CAPABILITY)
-    sys.stdout.write(json.dumps(dict(_all(pickle.loads(Path(sys.argv[1]).read_bytes())))))
+    there, launches = kernels(), pickle.loads(Path(sys.argv[1]).read_bytes())
+    done = {name: [compiled(there[name], pickle.loads(one)) for one in launches[name]] for name in sorted(launches)}
+    sys.stdout.write(json.dumps(done))
