@@ -4,8 +4,8 @@ Threads go through the terms in strides and add up what they find, a block's thr
 adds the blocks' sums by the same tree. The two stages are two kernels, so that no block waits for another and nothing
 is added by atomics.
 
-`keep` and `of_all` are inlined: Numba compiles a function anew for each literal it is given, and takes in with each what
-that one calls, so that `of_block` and its shared array would be there twice, which libNVVM refuses.
+`keep` and `of_all` are inlined: Numba compiles a function anew for each literal that it is given, and takes in with
+each what that one calls, so that `of_block`'s shared array would be there twice, which libNVVM refuses.
 """
 
 from __future__ import annotations

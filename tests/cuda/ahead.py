@@ -49,8 +49,8 @@ def kernels() -> dict[str, Any]:
             continue
         for real in (np.float32, np.float64):
             more = (schwarz.PATCH,) if "patch" in signature(own["kernels"]).parameters else ()
-            made = own["kernels"](real, *more)
-            each = made._asdict() if isinstance(made, tuple) else {made.py_func.__name__: made}
+            made: Any = own["kernels"](real, *more)
+            each = {made.py_func.__name__: made} if hasattr(made, "py_func") else made._asdict()
             found |= {f"{name}.{k}, {real.__name__}": v for k, v in each.items()}
     return {name: kernel for name, kernel in found.items() if not for_kernels_alone(kernel)}
 
@@ -83,14 +83,15 @@ def compiled(kernel: Any, arguments: tuple[Any, ...]) -> Compiled:
         return Compiled(f"{type(error).__name__}: {error}")
     log = linker.get_info_log()
     units = r"used (\d+) registers", r"(\d+) bytes smem", r"(\d+) bytes spill stores"
-    told = (re.search(unit, log, re.IGNORECASE) for unit in units)
+    registers, shared, spilled = (int(re.findall(unit, log, re.IGNORECASE)[0]) for unit in units)
     doubles = re.findall(r"\b(?:add|sub|mul|fma|div|sqrt|rcp)\.[\w.]*f64\b", code)
-    return Compiled("", *(int(one[1]) if one else 0 for one in told), len(doubles))
+    return Compiled("", registers, shared, spilled, len(doubles))
 
 
 if __name__ == "__main__":
     # Of functions that kernels call, Numba asks the device for what to compile; there need be none.
-    import_module("numba.cuda.dispatcher").get_current_device = lambda: SimpleNamespace(compute_capability=CAPABILITY)
+    dispatcher: Any = import_module("numba.cuda.dispatcher")
+    dispatcher.get_current_device = lambda: SimpleNamespace(compute_capability=CAPABILITY)
     there, launches = kernels(), pickle.loads(Path(sys.argv[1]).read_bytes())
     done = {name: [compiled(there[name], pickle.loads(one)) for one in launches[name]] for name in sorted(launches)}
     sys.stdout.write(json.dumps(done))

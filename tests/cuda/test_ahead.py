@@ -133,6 +133,7 @@ def test_every_kernel_compiles_as_it_is_launched(tmp_path: Path, monkeypatch: py
     for name, each in found.items():
         for one in each:
             print(f"{name}: {one}")
+            assert one.spilled == 0, name
             assert one.shared <= SHARED, name
             assert one.registers * MOST_THREADS <= REGISTERS, name
     for name in WITHOUT_DOUBLES:
