@@ -5,7 +5,8 @@ happens to lie (Mytkowicz et al. 2009). So the work of both is made anew between
 eighth of the time (after Curtsinger and Berger 2013): what places do is noise then, of which there are many draws.
 What a process keeps all its life, such as where its compiled code lies, is noise likewise: both programs are started
 anew every PAIR seconds. A slowdown is believed only when a second race, by programs started anew, finds it too. Chance
-is ruled out by the first race alone, so that the second needs fewer turns.
+is ruled out by the first race alone, so that the second needs fewer turns. What the rule proves of one pair's ratio
+holds of several only as far as theirs are alike: of those the study tells how often gates are wrong.
 """
 
 from __future__ import annotations
