@@ -17,6 +17,10 @@ from solvers.problem import Positions, Solution, StepProblem, StopRule, System
 Device = Literal["cpu", "cuda"]
 
 
+_MORE = 100.0
+"""So many times the work that the processor may have in a step."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class OnDevice:
     """device: where it computes.
@@ -28,6 +32,10 @@ class OnDevice:
     unstated: ClassVar[frozenset[str]] = frozenset({"device", "precision"})
 
     device: Device = "cpu"
+
+    def allowed(self, most: float) -> float:
+        """How much work a step may be, which on the processor is `most`: a device goes through it in less time."""
+        return _MORE * most if self.device == "cuda" else most
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,8 +43,6 @@ _SAFETY = 0.95
 
 _MOST = 1e9
 """Springs that a step may go through, some seconds: compiled code cannot be interrupted meanwhile."""
-_DEVICES = 100.0
-"""So many times as many on a device, which goes through them in less time."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ class Explicit(Precise):
         omega = frequency(system)
         rate = omega + float(parts.drag.max(initial=0.0))
         needed = substeps * max(1.0, ceil(system.time_step * rate / (_SAFETY * method.limit)))
-        most = _MOST * (_DEVICES if self.device == "cuda" else 1.0)
+        most = self.allowed(_MOST)
         if needed * method.evaluations * max(1, len(parts.springs.edges)) > most:
             raise Unsupported(
                 f"{self.name}: is stable with {needed:.3g} substeps a step of {method.evaluations} evaluations, which "

@@ -37,8 +37,6 @@ _SAFETY = 0.95
 
 _MOST = 1e10
 """Springs that a step may go through, some tens of seconds: compiled code cannot be interrupted meanwhile."""
-_DEVICES = 100.0
-"""So many times as many on a device, which goes through them in less time."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class SymplecticEuler(Precise):
         vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), "symplectic-euler")
         omega = frequency_bound(system, springs)
         needed = max(1.0, ceil(system.time_step * omega / (2.0 * _SAFETY)))
-        most = _MOST * (_DEVICES if self.device == "cuda" else 1.0)
+        most = self.allowed(_MOST)
         if needed * max(1, len(springs.edges)) > most:
             raise Unsupported(
                 f"symplectic-euler: is stable with {needed:.3g} substeps a step, which for {len(springs.edges)} "
