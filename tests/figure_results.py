@@ -62,6 +62,29 @@ def winners(folder: Path) -> Path:
     return made.write(folder, rows)
 
 
+def engines(folder: Path) -> Path:
+    """Simulations on two meshes by two engines and two methods of ours; one engine refuses the second mesh."""
+    rows: list[dict[str, Any]] = []
+    tried = (("hybrid", 1, 1.0), ("velocity-verlet", 2, 2.0), ("mujoco", 4, 30.0), ("pypbd", 1, 5.0))
+    for mesh in ("net", "stiff"):
+        for solver, order, price in tried:
+            for steps in (10, 40, 160):
+                row = made.shared(mesh, 9, solver=solver, parameters="{}", kind="work")
+                row |= {
+                    "integrator": "own",
+                    "time_step": 1 / 30,
+                    "iterations": steps,
+                    "horizon": 0.5,
+                    "own_steps": True,
+                }
+                row |= {"minimises": False, "family": "engine" if solver in ("mujoco", "pypbd") else "explicit"}
+                row |= {"seconds_per_simulated": price * steps * 1e-4, "error": (1.0 / steps) ** order, "vertices": 81}
+                if (mesh, solver) == ("stiff", "pypbd"):
+                    row |= {"status": "unsupported", "reason": "expresses no such gravity", "error": None}
+                rows.append(row)
+    return made.write(folder, rows)
+
+
 def sweep(folder: Path, sizes: tuple[int, ...] = (8, 16, 32)) -> Path:
     """Runs of all solvers at these sizes, judged, of four cases of two families; one of them failed."""
     cases = ("geometry-flat", "geometry-line", "numbers-large", "numbers-small")

@@ -37,7 +37,7 @@ def test_what_other_code_measured_is_hollow_and_told(tmp_path: Path) -> None:
     assert "other code" in grid.notes[0]
 
 
-@pytest.mark.parametrize("kind", ["timing", "hard", "ablation", "prices", "speed", "convergence", "winners"])
+@pytest.mark.parametrize("kind", ["timing", "hard", "ablation", "prices", "speed", "convergence", "winners", "engines"])
 def test_and_what_code_that_is_in_no_commit_did(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     monkeypatch.setitem(made.HERE, "commit", f"{'0' * 40}-dirty")
     monkeypatch.setitem(accuracy_rows.MACHINE, "commit", f"{'0' * 40}-dirty")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.report.accuracy import work_plot
+from harness.report.accuracy import engines, work_plot
 from harness.report.accuracy.convergence import GUESSES, remarks
 from harness.report.accuracy.growth import TARGET, growths
 from harness.report.accuracy.measured import Curve, Measurements, Values, by_self_converged, without_short
@@ -29,6 +29,8 @@ def findings(table: Measurements) -> Chapters:
         "Over all steps": list(_profiles(compared)),
         "Time to accuracy": list(_times(compared)),
         "Work and precision": list(_works(table)),
+        "Outside engines: times as long as ours, by the best setting of each": list(engines.table(table.works)),
+        "Best settings of outside engines": list(engines.settings(table.works)),
         "Growth with size": list(_growth(compared)),
         "Liu et al. 2013": list(_paper(table)),
         "References that are not certified": [f"{p.name}: {p.doubt}" for p in table.problems if p.doubt],

@@ -10,7 +10,16 @@ from typing import Any, NamedTuple
 
 from harness.base.errors import InputError, Mistake, RunFailed, SpringbenchError, did_you_mean
 from harness.config.sweep import EVERY_REPORT
-from harness.report.figures import of_accuracy, of_effects, of_gates, of_hard, of_meshes, of_runs, of_winners
+from harness.report.figures import (
+    of_accuracy,
+    of_effects,
+    of_engines,
+    of_gates,
+    of_hard,
+    of_meshes,
+    of_runs,
+    of_winners,
+)
 from harness.report.figures.entry import Entry, ready
 from harness.report.figures.panel import CellMap, Panel, Picture
 from solvers.plugins import load
@@ -60,6 +69,7 @@ KINDS: dict[str, Kind] = {
     "convergence": Kind("Convergence", _ACCURACY, _rows_alone(of_accuracy.convergence), _BOTH),
     "times": Kind("Time to accuracy", _ACCURACY, _rows_alone(of_accuracy.times), (("alone",), ("over-1",))),
     "winners": Kind("The cheapest way to an error", _ACCURACY, _rows_alone(of_winners.winners)),
+    "engines": Kind("Outside engines beside ours", f"{_ACCURACY}, with engines", _rows_alone(of_engines.engines)),
     "work": Kind("Work and precision", _ACCURACY, _rows_alone(of_accuracy.work)),
     "profiles": Kind("Profiles", _ACCURACY, _rows_alone(of_accuracy.profiles), _PROFILES),
     "growth": Kind("Growth with size", _ACCURACY, _rows_alone(of_accuracy.growth)),
