@@ -32,7 +32,6 @@ RESULTS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "times": ("net:10:current:alone", made.accuracy),
     "work": ("bdf2", made.accuracy),
     "winners": ("", made.winners),
-    "engines": ("", made.engines),
     "profiles": ("performance:1e-3", made.accuracy),
     "growth": ("net:current", made.accuracy),
     "liu2013": ("figure-2", made.accuracy),
@@ -42,6 +41,7 @@ RESULTS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "prices": ("", made.ablation),
     "speed": ("step", made.speed),
     "history": ("", made.gates),
+    "engines": ("", made.engines),
 }
 
 
