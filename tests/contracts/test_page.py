@@ -27,6 +27,7 @@ VIEWS = {
     },
     **{plot: f"plots?sweep={sweep}&plot={plot}" for sweep, plot in (("cases", "hard"), ("machine", "speed"))},
     **{plot: f"plots?sweep=effects&plot={plot}" for plot in ("ablation", "prices")},
+    "engines": "plots?sweep=engines&plot=engines",
     "gates": "plots?sweep=bench&plot=gates",
 }
 
@@ -58,6 +59,7 @@ def studies(tmp_path_factory: pytest.TempPathFactory) -> str:
     figure_results.sweep(folder / "cases")
     figure_results.speed(folder / "machine")
     figure_results.ablation(folder / "effects")
+    figure_results.engines(folder / "engines")
     gate_results.write(folder / "bench" / "Linux-CPython-3.11-64bit", {"solve": gate_results.series(2, 8, (4, 1.2))})
     return results(folder, COUNT).as_uri()
 

@@ -13,6 +13,7 @@ from harness.report.accuracy.measured import WorkPoint
 from harness.report.accuracy.reading import read
 from harness.report.figures.of_engines import engines
 from harness.report.figures.panel import Plot
+from harness.report.site.engines import chart
 from tests import accuracy_rows as made
 from tests import figure_results
 
@@ -60,8 +61,18 @@ def test_each_mesh_has_a_panel_where_engines_and_ours_were_tried(tmp_path: Path)
     assert [series.label for series in drawn.series] == [OURS, "mujoco"], "pypbd refuses it"
 
 
+def test_the_page_has_a_line_for_each_program_on_each_mesh(tmp_path: Path) -> None:
+    items = chart(read(figure_results.engines(tmp_path)))["items"]
+    assert {(item["scene"], item["label"]) for item in items} == {
+        *(("net 9", OURS), ("net 9", "mujoco"), ("net 9", "pypbd")),
+        *(("stiff 9", OURS), ("stiff 9", "mujoco")),
+    }
+    assert all(len(item["setting"]) == len(item["seconds"]) for item in items)
+
+
 def test_and_nothing_is_told_where_no_engine_was_tried(tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = made.work("net", 10)
     told = findings(read(made.write(tmp_path, rows)))
     assert not [title for title in told if "engine" in title]
     assert not engines(tmp_path)
+    assert not chart(read(tmp_path))["items"]

@@ -1,5 +1,5 @@
 """The charts of an accuracy measurement for the page: convergence, times, work and precision, profiles, growth,
-winners.
+winners, engines.
 
 A chart is a list of items, each a line with its solver, what it was, and named columns of numbers; the page filters
 items by `filters`, puts them into a panel each `panel`, and draws the chosen columns.
@@ -28,7 +28,7 @@ from harness.report.accuracy.pictures import nearest, place
 from harness.report.accuracy.profiles import iteration_ratios, least_ratios, not_shown, share
 from harness.report.accuracy.times import STEPS, TARGETS, power, reach, seconds_to
 from harness.report.page import step_words
-from harness.report.site import paper, winners
+from harness.report.site import engines, paper, winners
 from harness.report.site.marks import axis, drawn
 from harness.report.site.runs import references
 from harness.report.site.script import numbers as _numbers
@@ -59,7 +59,7 @@ def charts(everything: Measurements, folder: Path) -> dict[str, Item]:
     marks = {label: drawn(mark) for label, mark in looks((each.label, each.solver) for each in everyone).items()}
     shared = {"marks": marks, "references": references((each.label, each.reference) for each in everyone)}
     made = {name: chart | shared for name, chart in made.items()}
-    made |= {"winners": winners.chart(table), "liu2013": paper.chart(everything)}
+    made |= {"winners": winners.chart(table), "engines": engines.chart(table), "liu2013": paper.chart(everything)}
     return {name: chart | {"command": _COMMAND} for name, chart in made.items() if chart["items"]}
 
 
