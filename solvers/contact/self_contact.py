@@ -32,6 +32,9 @@ _ROUND = 8.0 * np.finfo(np.float64).eps
 """Of the largest coordinate: by so much boxes are made wider."""
 
 
+_NEAR = 1.25
+"""Of the range: pairs so far apart may come into it during a solve."""
+
 _WIDE = 1.5
 """Of the range: so far pairs are looked up. More would be looked at each time for longer than it takes to look them up
 anew now and then."""
@@ -156,6 +159,12 @@ class PairContact:
         if len(self.grip.vertices):
             blocks = blocks.followed(Blocks.whole(self.grip.vertices, self.grip.curvature(p)))
         return blocks._replace(vertices=np.where(blocks.vertices < n, blocks.vertices, -1)) if len(p) > n else blocks
+
+    def neighbours(self, p: Positions) -> NDArray[np.int64]:
+        """See `solvers.core.bounds.Bounded`. What was found before has no say in it."""
+        n, p = len(p), self.whole(p)
+        near = np.concatenate([self.surface.within(p, _NEAR * self.range).vertices, self.grip.vertices])
+        return np.where(near < n, near, -1)
 
     def _at(self, p: Positions) -> _Met:
         """What is in range at p, all vertices' (N, 3)."""

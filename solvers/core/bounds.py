@@ -65,6 +65,10 @@ class Bounded(Energy, Protocol):
         """Where p (n, 3) [m] would be at the step's end, were it to move with each of the obstacles that move."""
         ...
 
+    def neighbours(self, p: Positions) -> NDArray[np.int64]:
+        """Vertices (a, k) that pairs have at p (n, 3), or may have not far from there; -1 for none."""
+        ...
+
     def blocks(self, p: Positions, keep: float = 1.0) -> PairBlocks:
         """The second derivatives at p (n, 3); keep: of what bends downwards, 0 leaves them positive semidefinite."""
         ...

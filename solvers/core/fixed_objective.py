@@ -106,9 +106,8 @@ class Objective:
     def _matrix(self, graph: csr_array, i: NDArray[np.int64], j: NDArray[np.int64]) -> Matrix:
         return Matrix.of(self.system, self.terms, self.form, self.number, graph, i, j)
 
-    def matrix_for(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Matrix:
-        """A matrix with places for entries (rows, columns) of free coordinates too."""
-        i, j = rows // 3, columns // 3
+    def matrix_for(self, i: NDArray[np.int64], j: NDArray[np.int64]) -> Matrix:
+        """A matrix with places for blocks (i, j) of free vertices too."""
         for known in (self.matrix, self._grown):
             if known is not None and known.has(i, j) and (known is self.matrix or known.needs(i, j, self.matrix)):
                 return known

@@ -3,7 +3,9 @@
 All springs are one compiled pass, all constant quadratic forms another, and so is each energy that states the law of
 its elements (`solvers.energies.elements`); what states none brings its own value, gradient and Hessian. The unknowns
 are the free vertices: exactly pinned ones stay on their targets. The Hessian's blocks lie in a matrix that is analysed
-once (`solvers.core.pattern`); what does not change in a run or in a step is added up once.
+once (`solvers.core.pattern`); what does not change in a run or in a step is added up once. What energies need beyond
+that, and may need near the positions where they first do, is analysed once too: for as long as that suffices, which is
+most often to the end of the step.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from solvers.energies.elements import Joined, add_blocks
 from solvers.kernels import forms, hessian, objective
 from solvers.linear.block import BlockCholesky
 from solvers.problem import Energy, Positions, StepProblem
+
+Indices = NDArray[np.int64]
 
 _ROUND_OFF = 4.0 * np.finfo(np.float64).eps
 """Of an energy's value, beside its size."""
@@ -57,6 +61,7 @@ class StepObjective:
             self.own = [begun[k] for k in whole.own]
             self.bounded = [energy for energy in self.own if is_bounded(energy)]
         self._constant: tuple[Matrix, NDArray[np.float64]] | None = None
+        self._matrix: Matrix | None = None
         pins = problem.system.pins
         self._exact, self._held = pins.vertices[pins.exact], problem.pin_targets[pins.exact]
 
@@ -151,6 +156,17 @@ class StepObjective:
             self._constant = matrix, blocks
         return self._constant[1]
 
+    def matrix_for(self, p: Positions, i: Indices, j: Indices, met: list[Indices]) -> Matrix:
+        """A matrix with places for blocks (i, j) of free vertices, and for those of the pairs that each bounded energy
+        has at p, between vertices (a, k)."""
+        known = self._matrix or self.whole.matrix
+        if not (known.has(i, j) and all(known.holds(-1 - k, vertices) for k, vertices in enumerate(met))):
+            pairs = [*met, *(energy.neighbours(p) for energy in self.bounded)]
+            ends = [known.blocks, (i, j), *(self.whole.between(vertices) for vertices in pairs)]
+            i, j = (np.concatenate(side) for side in zip(*ends, strict=True))
+            known = self._matrix = self.whole.matrix_for(i, j)
+        return known
+
     @cached_property
     def joined(self) -> Joined | None:
         """The elements of all energies, None for none."""
@@ -170,9 +186,9 @@ class Hessian:
         self.pairs: list[PairBlocks] = [energy.blocks(p) for energy in step.bounded]
 
     @cached_property
-    def _placed(self) -> tuple[Matrix, NDArray[np.int64], NDArray[np.float64]]:
+    def _placed(self) -> tuple[Matrix, Indices, NDArray[np.float64]]:
         """The matrix, and where in it which entries of the energies that state nothing go."""
-        whole = self._step.whole
+        step, whole = self._step, self._step.whole
         rows = columns = np.empty(0, np.int64)
         entries = np.empty(0)
         if self._others is not None:
@@ -180,11 +196,7 @@ class Hessian:
             rows, columns = (3 * whole.number[x // 3] + x % 3 for x in total.coords)
             inside = (rows >= 0) & (columns >= 0)
             rows, columns, entries = rows[inside], columns[inside], np.asarray(total.data[inside], np.float64)
-        met = [whole.between(blocks.vertices) for blocks in self.pairs if len(blocks.vertices)]
-        if not (met or len(rows)):
-            return whole.matrix, rows, entries
-        i, j = (3 * np.concatenate([ends[:0], *ends]) for ends in zip(*met, strict=True)) if met else (rows[:0],) * 2
-        matrix = whole.matrix_for(np.append(rows, i), np.append(columns, j))
+        matrix = step.matrix_for(self._p, rows // 3, columns // 3, [blocks.vertices for blocks in self.pairs])
         return matrix, matrix.entries(rows, columns), entries
 
     def factorise(

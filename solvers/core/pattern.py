@@ -1,8 +1,8 @@
 """The matrix of a Hessian: 3 x 3 blocks between free vertices, where each energy's go, and its factorisation.
 
-The blocks lie where springs, projective energies and elements have theirs, known before the first step; where another
-energy needs more, the pattern of the day is analysed and kept for as long as it lasts, so that a result depends on the
-positions alone and not on what came before.
+The blocks lie where springs, projective energies and elements have theirs, known before the first step. Where another
+energy needs more, a step takes a pattern with those (`solvers.core.objective`), and the last one is kept for a step
+that needs the same: so a result depends on its problem alone and not on what came before.
 """
 
 from __future__ import annotations
@@ -56,9 +56,16 @@ class Matrix:
         more = csr_array(coo_array((ones, (np.append(i, j), np.append(j, i))), shape=graph.shape))
         return cls(system, terms, form, number, matrices.without_zeros(abs(graph) + more))
 
+    @property
+    def blocks(self) -> tuple[Indices, Indices]:
+        """Which blocks it has: the rows and the columns of all."""
+        return self._keys // self._size, self._keys % self._size
+
     def has(self, i: Indices, j: Indices) -> bool:
         """Whether it has the blocks (i, j)."""
-        return bool(np.isin(i * self._size + j, self._keys).all())
+        keys = i * self._size + j
+        at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        return bool((self._keys[at] == keys).all())
 
     def needs(self, i: Indices, j: Indices, base: Matrix) -> bool:
         """Whether it has no blocks but those of another, and (i, j) or (j, i)."""
@@ -73,18 +80,23 @@ class Matrix:
     def of_elements(self, energy: int, vertices: Indices) -> Indices:
         """Where the blocks of an energy's elements lie, every vertex of (m, k) with every one, (m, k^2); -1 where one
         is not free. They are found once for the same array of vertices."""
-        known = self._elements.get(energy)
-        if known is None or known[0] is not vertices:
-            known = self._elements[energy] = vertices, self._found(vertices)
-        return known[1]
+        self.holds(energy, vertices)
+        return self._elements[energy][1]
 
-    def _found(self, vertices: Indices) -> Indices:
-        m, k = vertices.shape
+    def holds(self, energy: int, vertices: Indices) -> bool:
+        """Whether it has all blocks of an energy's elements."""
+        known = self._elements.get(energy)
+        if known is not None and known[0] is vertices:
+            return True
+        (m, k), graph = vertices.shape, self.graph
         if k == 1:
-            return self.places.diagonal[vertices]
-        out, graph = np.empty((m, k * k), np.int64), self.graph
-        hessian.locate(self._number, graph.indptr, graph.indices, np.ascontiguousarray(vertices), out)
-        return out
+            self._elements[energy] = vertices, self.places.diagonal[vertices]
+            return True
+        out = np.empty((m, k * k), np.int64)
+        if not hessian.locate(self._number, graph.indptr, graph.indices, np.ascontiguousarray(vertices), out):
+            return False
+        self._elements[energy] = vertices, out
+        return True
 
     def _between(self, i: Indices, j: Indices) -> Indices:
         """The blocks between vertices i and j, of one shape; -1 where one is not free."""

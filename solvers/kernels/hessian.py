@@ -54,7 +54,8 @@ class Places(NamedTuple):
 @kernel
 def locate(number, starts, columns, vertices, out):
     """Write where the blocks of every vertex of each row (m, k) with every one lie in rows of sorted columns to `out`
-    (m, k^2); -1 where one of both is not free. number: of each vertex among the free ones, or -1."""
+    (m, k^2); -1 where one of both is not free; False where a block is missing. number: of each vertex among the free
+    ones, or -1."""
     many = vertices.shape[1]
     for e in range(len(vertices)):
         for a in range(many):
@@ -71,7 +72,10 @@ def locate(number, starts, columns, vertices, out):
                         low = middle + 1
                     else:
                         high = middle
+                if columns[low] != j:
+                    return False
                 out[e, at] = low
+    return True
 
 
 @kernel

@@ -91,13 +91,14 @@ class Found(NamedTuple):
 class Ipctk:
     """ipctk's barrier, as an energy that no step passes through. What it found at the last two points it keeps.
 
-    spent: CPU time [s] by what it went into.
+    neighbours: as of ours, whose matrix this has; spent: CPU time [s] by what it went into.
     """
 
-    def __init__(self, made: Folded, stiffness: float) -> None:
+    def __init__(self, made: Folded, stiffness: float, surface: Surface) -> None:
         """stiffness: of our barrier [N/m], the force of which this one has in the middle of the range."""
         import ipctk
 
+        self.neighbours = SelfContact(surface).neighbours
         of: Any = ipctk
         of.set_num_threads(1)
         self._of, self._thickness, self._reach = of, made.thickness, made.reach
@@ -213,7 +214,7 @@ def main() -> None:
         surface = Surface.of(mesh.rest, outline(mesh)[0], mesh.triangles, k, made.thickness, made.reach)
         problem = stated(made, SelfContact(surface))
         bare = replace(problem, system=without_bounded(problem.system))
-        newton, barrier = newton_ipc(stated(made, Ipctk(made, STIFFNESS)))
+        newton, barrier = newton_ipc(stated(made, Ipctk(made, STIFFNESS, surface)))
         works = {name: (ours(problem, name), ours(bare, name)) for name in OURS}
         # All is done once, and so compiled and in the caches.
         there, count = newton()
