@@ -1,4 +1,8 @@
-"""Second derivatives of contacts of two to four vertices."""
+"""Second derivatives of contacts of two to four vertices.
+
+They are symmetric: of each row is kept what lies before the end of the block of its own vertex. Row a of vertex i has
+3 (i + 1) numbers, after those of the rows above.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +16,13 @@ from solvers.problem import Positions
 
 Array = NDArray[np.float64]
 
+NUMBERS = 90
+"""Of a contact of four vertices."""
+
 
 class Blocks(NamedTuple):
-    """vertices (a, 4), -1 for none and for those of obstacles; packed: the blocks [N/m] one after the other, each row
-    by row, of three rows for each vertex up to the last that its contact has; starts (a + 1,): where they begin."""
+    """vertices (a, 4), -1 for none and for those of obstacles; packed: the rows [N/m] of one contact after those of
+    another, for vertices up to the last that it has; starts (a + 1,): where they begin."""
 
     vertices: NDArray[np.int64]
     starts: NDArray[np.int64]
@@ -23,8 +30,9 @@ class Blocks(NamedTuple):
 
     @classmethod
     def whole(cls, vertices: NDArray[np.int64], values: Array) -> Blocks:
-        """Of blocks (a, 12, 12) of vertices (a, 4)."""
-        return cls(vertices, 144 * np.arange(len(vertices) + 1), np.ascontiguousarray(values).reshape(-1))
+        """Of symmetric blocks (a, 12, 12) of vertices (a, 4)."""
+        row, column = np.nonzero(np.arange(12) // 3 <= np.arange(12)[:, None] // 3)
+        return cls(vertices, NUMBERS * np.arange(len(vertices) + 1), np.ravel(values[:, row, column]))
 
     @property
     def values(self) -> Array:
@@ -51,47 +59,70 @@ class Blocks(NamedTuple):
         scatter(self.starts, self.packed, places, values)
 
 
+@inner
+def row(i, a):
+    """Where row a of vertex i begins."""
+    return 9 * i * (i + 1) // 2 + 3 * a * (i + 1)
+
+
+@inner
+def count(numbers):
+    """The vertices of a contact of so many numbers."""
+    return 4 if numbers == NUMBERS else 3 if numbers == 54 else 2
+
+
 @kernel
 def scatter(starts, packed, places, values):
     """Add blocks to `values` (b, 3, 3), at places (a, 16); -1 for none."""
     for k in range(len(places)):
-        begin, many = starts[k], _rows_of(starts[k + 1] - starts[k])
-        for i in range(many // 3):
-            for j in range(many // 3):
-                at = places[k, 4 * i + j]
-                if at >= 0:
-                    for a in range(3):
-                        row = begin + (3 * i + a) * many + 3 * j
-                        for b in range(3):
-                            values[at, a, b] += packed[row + b]
+        add_at(packed[starts[k] : starts[k + 1]], places[k], values)
+
+
+@inner
+def add_at(H, places, values):
+    """Add the rows H of a contact to `values` (b, 3, 3), at places (16,); -1 for none."""
+    for i in range(count(len(H))):
+        for j in range(i + 1):
+            at, across = places[4 * i + j], places[4 * j + i]
+            if at < 0:
+                continue
+            for a in range(3):
+                begin = row(i, a) + 3 * j
+                for b in range(3):
+                    values[at, a, b] += H[begin + b]
+            if i == j:
+                continue
+            for a in range(3):
+                begin = row(i, a) + 3 * j
+                for b in range(3):
+                    values[across, b, a] += H[begin + b]
 
 
 @kernel
 def spread(starts, packed, out):
     """Write blocks to the corners of `out` (a, 12, 12)."""
     for k in range(len(out)):
-        many = _rows_of(starts[k + 1] - starts[k])
-        for i in range(many):
-            for j in range(many):
-                out[k, i, j] = packed[starts[k] + i * many + j]
+        H = packed[starts[k] : starts[k + 1]]
+        for i in range(count(len(H))):
+            for a in range(3):
+                for j in range(3 * i + 3):
+                    out[k, 3 * i + a, j] = H[row(i, a) + j]
+                    out[k, j, 3 * i + a] = H[row(i, a) + j]
 
 
 @kernel
 def multiply(vertices, starts, packed, x, out):
     """Add the product of blocks with x (n, 3) to `out`; vertices: -1 for those that do not move."""
     for k in range(len(vertices)):
-        at, many = starts[k], _rows_of(starts[k + 1] - starts[k])
-        for i in range(many):
-            if vertices[k, i // 3] < 0:
-                continue
-            total = 0.0
-            for j in range(many):
-                if vertices[k, j // 3] >= 0:
-                    total += packed[at + i * many + j] * x[vertices[k, j // 3], j % 3]
-            out[vertices[k, i // 3], i % 3] += total
-
-
-@inner
-def _rows_of(size):
-    """The root of 36, 81 or 144."""
-    return 12 if size == 144 else 9 if size == 81 else 6
+        H = packed[starts[k] : starts[k + 1]]
+        for i in range(count(len(H))):
+            for j in range(i + 1):
+                v, w = vertices[k, i], vertices[k, j]
+                if v < 0 or w < 0:
+                    continue
+                for a in range(3):
+                    for b in range(3):
+                        h = H[row(i, a) + 3 * j + b]
+                        out[v, a] += h * x[w, b]
+                        if i != j:
+                            out[w, b] += h * x[v, a]

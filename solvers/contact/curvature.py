@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 from solvers.contact.barrier import law, length, pushing
-from solvers.contact.blocks import Blocks
+from solvers.contact.blocks import NUMBERS, Blocks, add_at, row
 from solvers.contact.contacts import EDGES, POINT_EDGE, POINT_TRIANGLE, Contacts
 from solvers.contact.mollifier import add_mollified, crossed, mollifier
 
@@ -26,23 +26,43 @@ Array = NDArray[np.float64]
 def curvature(contacts: Contacts, p: Array, keep: float) -> Blocks:
     """The second derivatives [N/m] of contacts at p (n, 3); keep: of what bends downwards."""
     width = np.minimum(contacts.kind, 4)
-    starts = np.concatenate([[0], np.cumsum(9 * width * width)])
+    starts = np.concatenate([[0], np.cumsum(9 * width * (width + 1) // 2)])
     values = np.empty(starts[-1])
     curve(contacts, p, keep, starts, np.empty((6, 12)), values)
-    return Blocks(np.where(np.arange(4) < width[:, None], contacts.vertices, -1), starts, values)
+    return Blocks(coupled(contacts), starts, values)
+
+
+def coupled(contacts: Contacts) -> NDArray[np.int64]:
+    """The vertices of contacts (a, 4), -1 for none."""
+    return np.where(np.arange(4) < contacts.kind[:, None], contacts.vertices, -1)
+
+
+def add_curvature(contacts: Contacts, p: Array, keep: float, places: NDArray[np.int64], values: Array) -> None:
+    """Add the second derivatives [N/m] at p (n, 3) to blocks `values` (b, 3, 3), at places (a, 16); -1 for none."""
+    enter(contacts, p, keep, places, np.empty((6, 12)), np.empty(NUMBERS), values)
 
 
 @kernel
 def curve(contacts, p, keep, starts, work, out):
-    """Write the block of each contact at p (n, 3), row by row, to `out` from where it starts; work (6, 12): scratch."""
+    """Write the block of each contact at p (n, 3) to `out` from where it starts; work (6, 12): scratch."""
     for k in range(len(contacts.vertices)):
-        many = 3 * min(contacts.kind[k], 4)
-        _curve(contacts, k, p, keep, work, out[starts[k] : starts[k + 1]].reshape(many, many))
+        _curve(contacts, k, p, keep, work, out[starts[k] : starts[k + 1]])
+
+
+@kernel
+def enter(contacts, p, keep, places, work, block, values):
+    """Add the block of each contact at p (n, 3) to blocks `values`; work (6, 12), block (NUMBERS,): scratch."""
+    for k in range(len(contacts.vertices)):
+        many = min(contacts.kind[k], 4)
+        H = block[: 9 * many * (many + 1) // 2]
+        _curve(contacts, k, p, keep, work, H)
+        add_at(H, places[k], values)
 
 
 @inner
 def _curve(contacts, k, p, keep, work, H):
-    x, kind, many = contacts.vertices[k], contacts.kind[k], len(H)
+    x, kind = contacts.vertices[k], contacts.kind[k]
+    many = min(kind, 4)
     z0, z1, z2 = contacts.between[k, 0], contacts.between[k, 1], contacts.between[k, 2]
     d, gap = length(contacts, k)
     d = max(d, 1e-300)
@@ -55,27 +75,27 @@ def _curve(contacts, k, p, keep, work, H):
         m, m1, m2 = mollifier(crossed(p, x).c, contacts.parallel[k])
     across = f1 / d
     lag, hold = _rows(p, x, kind, c, z0, z1, z2, first, second)
-    for i in range(many // 3):
+    for i in range(many):
         for a in range(3):
             g[3 * i + a] = c[i] * n[a]
     along, side = m * (f2 - keep * across), keep * m * across
     lag, hold = m * across * lag, m * across * hold
     for i in range(many):
-        one, two, three = along * g[i], lag * first[i], hold * second[i]
-        if hold != 0.0:
-            for j in range(many):
-                H[i, j] = one * g[j] - (two * first[j] + three * second[j])
-        elif lag != 0.0:
-            for j in range(many):
-                H[i, j] = one * g[j] - two * first[j]
-        else:
-            for j in range(many):
-                H[i, j] = one * g[j]
-    if side != 0.0:
-        for i in range(many // 3):
-            for j in range(many // 3):
-                for a in range(3):
-                    H[3 * i + a, 3 * j + a] += side * c[i] * c[j]
+        for a in range(3):
+            at, r, end = row(i, a), 3 * i + a, 3 * i + 3
+            one, two, three = along * g[r], lag * first[r], hold * second[r]
+            if hold != 0.0:
+                for j in range(end):
+                    H[at + j] = one * g[j] - (two * first[j] + three * second[j])
+            elif lag != 0.0:
+                for j in range(end):
+                    H[at + j] = one * g[j] - two * first[j]
+            else:
+                for j in range(end):
+                    H[at + j] = one * g[j]
+            if side != 0.0:
+                for j in range(i + 1):
+                    H[at + 3 * j + a] += side * c[i] * c[j]
     if m1 != 0.0:
         add_mollified(crossed(p, x), (m, m1, m2), (f, f1, f2), keep, g, dc, H)
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from solvers.compiling import inner
+from solvers.contact.blocks import row
 
 MOLLIFIED = 1e-3
 """Of |u|^2 |v|^2 at rest, the |u x v|^2 up to which edges count as nearly parallel (Li et al. 2020)."""
@@ -51,8 +52,8 @@ def mollifier(c, e):
 
 @inner
 def add_mollified(edges, factor, energy, keep, g, dc, H):
-    """Add what the mollifier's derivatives bring to H (12, 12); factor, energy: m, m', m'' and f, f', f''; keep: of
-    what bends downwards of it, which is f m'' and, with a = grad f, b = grad m,
+    """Add what the mollifier's derivatives bring to rows H (`contact.blocks`); factor, energy: m, m', m'' and f, f',
+    f''; keep: of what bends downwards of it, which is f m'' and, with a = grad f, b = grad m,
 
     a b' + b a' <= s a a' + b b'/s,     4 w (du x dv) <= 2 |w| (|du|^2 |v|/|u| + |dv|^2 |u|/|v|),     w = u x v.
     """
@@ -72,8 +73,9 @@ def add_mollified(edges, factor, energy, keep, g, dc, H):
         bent += rest * m1 * m1 / share
         share *= rest * f1 * f1
     for i in range(12):
-        for j in range(12):
-            H[i, j] += mixed * (g[i] * dc[j] + dc[i] * g[j]) + bent * dc[i] * dc[j] + share * g[i] * g[j]
+        at, one, two = row(i // 3, i % 3), mixed * g[i] + bent * dc[i], mixed * dc[i] + share * g[i]
+        for j in range(i // 3 * 3 + 3):
+            H[at + j] += one * dc[j] + two * g[j]
     w, weight = np.sqrt(c), 2.0 * f * m1
     more_u, more_v = rest * w * np.sqrt(vv / uu), rest * w * np.sqrt(uu / vv)
     for a in range(3):
@@ -81,17 +83,9 @@ def add_mollified(edges, factor, energy, keep, g, dc, H):
             same = 1.0 if a == b else 0.0
             huu = weight * ((vv + more_u) * same - v[a] * v[b])
             hvv = weight * ((uu + more_v) * same - u[a] * u[b])
-            huv = weight * ((1.0 + keep) * u[a] * v[b] - uv * same - keep * v[a] * u[b])
-            _four(H, a, b, 0, 0, huu)
-            _four(H, a, b, 6, 6, hvv)
-            _four(H, a, b, 0, 6, huv)
-            _four(H, b, a, 6, 0, huv)
-
-
-@inner
-def _four(H, a, b, i, j, h):
-    """A block by edges in the four blocks of their ends."""
-    H[i + a, j + b] += h
-    H[i + a, j + 3 + b] -= h
-    H[i + 3 + a, j + b] -= h
-    H[i + 3 + a, j + 3 + b] += h
+            hvu = weight * ((1.0 + keep) * u[b] * v[a] - uv * same - keep * v[b] * u[a])
+            # By edges, in the blocks of their ends.
+            for i, j, h in ((0, 0, huu), (1, 0, -huu), (1, 1, huu), (2, 2, hvv), (3, 2, -hvv), (3, 3, hvv)):
+                H[row(i, a) + 3 * j + b] += h
+            for i, j, h in ((2, 0, hvu), (2, 1, -hvu), (3, 0, -hvu), (3, 1, hvu)):
+                H[row(i, a) + 3 * j + b] += h

@@ -22,7 +22,7 @@ from scipy.sparse import coo_array, csr_array
 from solvers.contact import barrier, contacts, ways
 from solvers.contact.blocks import Blocks
 from solvers.contact.contacts import Contacts, Pairs, padded
-from solvers.contact.curvature import curvature
+from solvers.contact.curvature import add_curvature, coupled, curvature
 from solvers.contact.grip import NO_GRIP, Grip
 from solvers.problem import Positions, Start
 
@@ -165,6 +165,21 @@ class PairContact:
         n, p = len(p), self.whole(p)
         near = np.concatenate([self.surface.within(p, _NEAR * self.range).vertices, self.grip.vertices])
         return np.where(near < n, near, -1)
+
+    def coupled(self, p: Positions) -> NDArray[np.int64]:
+        """See `solvers.core.bounds.Bounded`."""
+        n, p = len(p), self.whole(p)
+        met = np.concatenate([coupled(self._at(p).contacts), self.grip.vertices])
+        return np.where(met < n, met, -1)
+
+    def add_curvature(self, p: Positions, keep: float, places: NDArray[np.int64], values: Array) -> None:
+        """See `solvers.core.bounds.Bounded`."""
+        p = self.whole(p)
+        near = self._at(p).contacts
+        many = len(near.vertices)
+        add_curvature(near, p, keep, places[:many], values)
+        if len(self.grip.vertices):
+            Blocks.whole(self.grip.vertices, self.grip.curvature(p)).add(places[many:], values)
 
     def _at(self, p: Positions) -> _Met:
         """What is in range at p, all vertices' (N, 3)."""

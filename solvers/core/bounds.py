@@ -69,6 +69,14 @@ class Bounded(Energy, Protocol):
         """Vertices (a, k) that pairs have at p (n, 3), or may have not far from there; -1 for none."""
         ...
 
+    def coupled(self, p: Positions) -> NDArray[np.int64]:
+        """The vertices (a, k) of each block at p (n, 3); -1 for none."""
+        ...
+
+    def add_curvature(self, p: Positions, keep: float, places: NDArray[np.int64], values: NDArray[np.float64]) -> None:
+        """Add the blocks at p (n, 3) to those of a matrix, (b, 3, 3) [N/m], at places (a, k^2); -1 for none."""
+        ...
+
     def blocks(self, p: Positions, keep: float = 1.0) -> PairBlocks:
         """The second derivatives at p (n, 3); keep: of what bends downwards, 0 leaves them positive semidefinite."""
         ...

@@ -1,6 +1,7 @@
 """A Hessian that has a Cholesky factor, where the exact one may have none.
 
-graded: the exact Hessian, else the nearest of a few that are more and more convex. The others change elements by their
+graded: the exact Hessian, else the nearest of a few that are more and more convex; where pairs touch, of more that
+differ less, and one less convex than that of the point before is tried first. The others change elements by their
 eigenvalues (`solvers.core.eigenvalues`), whether the whole is indefinite or not:
 
     clamp          all, lambda -> max(lambda, 0)                                     Teran et al. 2005
@@ -29,6 +30,9 @@ from solvers.core.objective import Hessian, StepObjective
 SHIFTS = tuple(10.0**k for k in range(-4, 9, 2))
 LEVELS = ((1.0, 0.0), (0.9, 0.0), (0.5, 0.0), (0.0, 0.0), *((0.0, by) for by in SHIFTS))
 """What is kept of negative lateral parts, and what multiple of a diagonal is added: the first that factorises."""
+
+_CLOSE = (*((keep, 0.0) for keep in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.25)), *LEVELS[3:])
+"""The same where pairs touch."""
 
 Indefinite = Literal["graded", "clamp", "absolute", "trust-region", "progressive"]
 
@@ -68,6 +72,23 @@ class Graded:
 
     def took(self, step: StepObjective, hessian: Hessian, at: Point, to: Point) -> None:
         """See Rule."""
+
+
+class Close(Graded):
+    """Smaller changes in one solve, where pairs touch: a compressed stack is indefinite for many iterations, and gets
+    convex by and by; all of them would factorise the exact Hessian in vain."""
+
+    def __init__(self) -> None:
+        self._level = 0
+
+    def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
+        """See Rule."""
+        for level in range(max(0, self._level - 1), len(_CLOSE)):
+            keep, by = _CLOSE[level]
+            if hessian.factorise(keep, by * diagonal):
+                self._level = level
+                return level
+        return None
 
 
 class Clamped(Graded):

@@ -183,7 +183,16 @@ class Hessian:
         self._columns = low_rank.columns(step.own, p) if step.own else None
         self._others = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
         self.curvature = step.curvature(p)
-        self.pairs: list[PairBlocks] = [energy.blocks(p) for energy in step.bounded]
+        self._ends: dict[float, NDArray[np.float64]] = {}
+
+    @cached_property
+    def pairs(self) -> list[PairBlocks]:
+        """The second derivatives of each bounded energy."""
+        return [energy.blocks(self._p) for energy in self._step.bounded]
+
+    @cached_property
+    def _coupled(self) -> list[Indices]:
+        return [energy.coupled(self._p) for energy in self._step.bounded]
 
     @cached_property
     def _placed(self) -> tuple[Matrix, Indices, NDArray[np.float64]]:
@@ -196,7 +205,7 @@ class Hessian:
             rows, columns = (3 * whole.number[x // 3] + x % 3 for x in total.coords)
             inside = (rows >= 0) & (columns >= 0)
             rows, columns, entries = rows[inside], columns[inside], np.asarray(total.data[inside], np.float64)
-        matrix = step.matrix_for(self._p, rows // 3, columns // 3, [blocks.vertices for blocks in self.pairs])
+        matrix = step.matrix_for(self._p, rows // 3, columns // 3, self._coupled)
         return matrix, matrix.entries(rows, columns), entries
 
     def factorise(
@@ -254,19 +263,29 @@ class Hessian:
         step, tension = self._step, self._tension if tension is None else tension
         constant = step.constant(matrix, self._p)
         hessian.assemble(self._terms, matrix.places, constant, self._p, tension, keep, matrix.values)
-        elements, pairs = (filtered.curvature, filtered.pairs) if filtered else (self.curvature, self.pairs)
+        elements = filtered.curvature if filtered else self.curvature
         for one, curvature in zip(step.stated, elements, strict=True):
             if not one.law.constant:
                 at = matrix.of_elements(one.number, one.elements.vertices)
                 add_blocks(one.elements, at, curvature, matrix.values)
-        for k, blocks in enumerate(pairs):
-            if len(blocks.vertices):
-                bent = blocks if filtered or keep == 1.0 else step.bounded[k].blocks(self._p, keep)
-                bent.add(matrix.of_elements(-1 - k, blocks.vertices), matrix.values)
+        for k, blocks in enumerate(filtered.pairs if filtered else []):
+            blocks.add(matrix.of_elements(-1 - k, blocks.vertices), matrix.values)
+        if not filtered and any(map(len, self._coupled)):
+            for end, share in ((1.0, keep), (0.0, 1.0 - keep)):
+                if share:
+                    matrix.values += share * self._pressed(end, matrix)
         values = matrix.values.reshape(-1)
         values[places] += entries
         values[matrix.diagonal] += shift
         return matrix
+
+    def _pressed(self, keep: float, matrix: Matrix) -> NDArray[np.float64]:
+        """What bounded energies add to the matrix's blocks (b, 3, 3); it is linear in `keep`."""
+        if keep not in self._ends:
+            out = self._ends[keep] = np.zeros_like(matrix.values)
+            for k, (energy, vertices) in enumerate(zip(self._step.bounded, self._coupled, strict=True)):
+                energy.add_curvature(self._p, keep, matrix.of_elements(-1 - k, vertices), out)
+        return self._ends[keep]
 
     def solve(self, b: Positions) -> Positions:
         """Its inverse, as it was factorised last, times b (n, 3); zero at vertices that are not free."""

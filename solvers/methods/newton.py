@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from solvers.about import About, Reference
 from solvers.contact.touching import is_contact
 from solvers.core.bounds import is_bounded
-from solvers.core.definite import LEVELS, RULES, Graded, Indefinite, Rule
+from solvers.core.definite import LEVELS, RULES, Close, Graded, Indefinite, Rule
 from solvers.core.descent import Metric, Point, PreparedDescent, dot, search
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
@@ -84,6 +84,8 @@ class NewtonMethod:
     def points(self, step: StepObjective, start: Point) -> Iterator[Point]:
         """The points after `start`."""
         point, steepest, rule = start, 0.0, self._rule()
+        if step.bounded and type(rule) is Graded:
+            rule = Close()
         if self._settling and step.touched:
             point = self._settling.start(step, point)
         while not point.stalled:

@@ -156,6 +156,14 @@ class Ipctk:
             self._bent = p.copy(), Blocks(np.column_stack([rows, H.indices]).astype(np.int64), H.data)
         return self._bent[1]
 
+    def coupled(self, p: Positions) -> NDArray[np.int64]:
+        """See `solvers.core.bounds.Bounded`."""
+        return self.blocks(p).vertices
+
+    def add_curvature(self, p: Positions, keep: float, places: NDArray[np.int64], values: NDArray[np.float64]) -> None:
+        """See `solvers.core.bounds.Bounded`; clamped."""
+        self.blocks(p).add(places, values)
+
     def largest_step(self, p: Positions, direction: Positions) -> float:
         """See `solvers.core.bounds.Bounded`."""
         V, W = np.asfortranarray(p), np.asfortranarray(p + direction)
