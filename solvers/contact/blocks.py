@@ -6,6 +6,8 @@ They are symmetric: of each row is kept what lies before the end of the block of
 
 from __future__ import annotations
 
+import weakref
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,9 +22,26 @@ NUMBERS = 90
 """Of a contact of four vertices."""
 
 
+class Room:
+    """Memory of numbers that is handed out again when no one holds the array that it was handed out as: of new memory
+    the system clears each page, which takes as long as to compute what goes there."""
+
+    def __init__(self) -> None:
+        self._memory = np.empty(0)
+        self._held: Callable[[], Array | None] = lambda: None
+
+    def take(self, many: int) -> Array:
+        """An array (many,). Parts of it do not hold it."""
+        if len(self._memory) < many or self._held() is not None:
+            self._memory = np.empty(many)
+        out = self._memory[:many]
+        self._held = weakref.ref(out)
+        return out
+
+
 class Blocks(NamedTuple):
     """vertices (a, 4), -1 for none and for those of obstacles; packed: the rows [N/m] of one contact after those of
-    another, for vertices up to the last that it has; starts (a + 1,): where they begin."""
+    another, for vertices up to the last that it has; starts (a + 1,): where they begin, and end."""
 
     vertices: NDArray[np.int64]
     starts: NDArray[np.int64]
@@ -47,8 +66,9 @@ class Blocks(NamedTuple):
 
     def followed(self, other: Blocks) -> Blocks:
         """These, and then others."""
-        starts = np.concatenate([self.starts, self.starts[-1] + other.starts[1:]])
-        return Blocks(np.concatenate([self.vertices, other.vertices]), starts, np.append(self.packed, other.packed))
+        end = self.starts[-1]
+        starts, packed = np.append(self.starts, end + other.starts[1:]), np.append(self.packed[:end], other.packed)
+        return Blocks(np.concatenate([self.vertices, other.vertices]), starts, packed)
 
     def add_product(self, x: Positions, out: Positions) -> None:
         """Add their product with x (n, 3) to `out`."""

@@ -16,20 +16,27 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 from solvers.contact.barrier import law, length, pushing
-from solvers.contact.blocks import NUMBERS, Blocks, add_at, row
+from solvers.contact.blocks import NUMBERS, Blocks, Room, add_at, row
 from solvers.contact.contacts import EDGES, POINT_EDGE, POINT_TRIANGLE, Contacts
-from solvers.contact.mollifier import add_mollified, crossed, mollifier
+from solvers.contact.mollifier import add_turning, bending, crossed, mollifier
+from solvers.vectors.eights import loaded, stored
 
 Array = NDArray[np.float64]
 
+_WORK, _SPARE = 16, 8
+"""Numbers of a row of scratch, two vectors; of what is written beyond a block."""
 
-def curvature(contacts: Contacts, p: Array, keep: float) -> Blocks:
-    """The second derivatives [N/m] of contacts at p (n, 3); keep: of what bends downwards."""
+_G, _DC, _FIRST, _SECOND = range(4)
+"""The rows of scratch, by what is in them."""
+
+
+def curvature(contacts: Contacts, p: Array, keep: float, room: Room) -> Blocks:
+    """The second derivatives [N/m] of contacts at p (n, 3); keep: of what bends downwards; room: for them."""
     width = np.minimum(contacts.kind, 4)
     starts = np.concatenate([[0], np.cumsum(9 * width * (width + 1) // 2)])
-    values = np.empty(starts[-1])
-    curve(contacts, p, keep, starts, np.empty((6, 12)), values)
-    return Blocks(coupled(contacts), starts, values)
+    packed = room.take(int(starts[-1]) + _SPARE)
+    curve(contacts, p, keep, starts, np.zeros((4, _WORK)), packed)
+    return Blocks(coupled(contacts), starts, packed)
 
 
 def coupled(contacts: Contacts) -> NDArray[np.int64]:
@@ -39,24 +46,23 @@ def coupled(contacts: Contacts) -> NDArray[np.int64]:
 
 def add_curvature(contacts: Contacts, p: Array, keep: float, places: NDArray[np.int64], values: Array) -> None:
     """Add the second derivatives [N/m] at p (n, 3) to blocks `values` (b, 3, 3), at places (a, 16); -1 for none."""
-    enter(contacts, p, keep, places, np.empty((6, 12)), np.empty(NUMBERS), values)
+    enter(contacts, p, keep, places, np.zeros((4, _WORK)), np.empty(NUMBERS + _SPARE), values)
 
 
 @kernel
 def curve(contacts, p, keep, starts, work, out):
-    """Write the block of each contact at p (n, 3) to `out` from where it starts; work (6, 12): scratch."""
+    """Write the block of each contact at p (n, 3) to `out` from where it starts; work (4, 16): scratch, zero."""
     for k in range(len(contacts.vertices)):
-        _curve(contacts, k, p, keep, work, out[starts[k] : starts[k + 1]])
+        _curve(contacts, k, p, keep, work, out[starts[k] :])
 
 
 @kernel
 def enter(contacts, p, keep, places, work, block, values):
-    """Add the block of each contact at p (n, 3) to blocks `values`; work (6, 12), block (NUMBERS,): scratch."""
+    """Add the block of each contact at p (n, 3) to blocks `values`; work (4, 16), zero, block (98,): scratch."""
     for k in range(len(contacts.vertices)):
         many = min(contacts.kind[k], 4)
-        H = block[: 9 * many * (many + 1) // 2]
-        _curve(contacts, k, p, keep, work, H)
-        add_at(H, places[k], values)
+        _curve(contacts, k, p, keep, work, block)
+        add_at(block[: 9 * many * (many + 1) // 2], places[k], values)
 
 
 @inner
@@ -66,8 +72,7 @@ def _curve(contacts, k, p, keep, work, H):
     z0, z1, z2 = contacts.between[k, 0], contacts.between[k, 1], contacts.between[k, 2]
     d, gap = length(contacts, k)
     d = max(d, 1e-300)
-    n, c, g, dc, first, second = work[0], contacts.weights[k], work[2], work[3], work[4], work[5]
-    n[0], n[1], n[2] = z0 / d, z1 / d, z2 / d
+    c, g, dc, first, second = contacts.weights[k], work[_G], work[_DC], work[_FIRST], work[_SECOND]
     b, b1, b2 = law(pushing(gap))
     r, m, m1, m2 = contacts.scale[k] * contacts.reach, 1.0, 0.0, 0.0
     f, f1, f2 = contacts.stiffness[k] * r * r * b, contacts.stiffness[k] * r * b1, contacts.stiffness[k] * b2
@@ -75,29 +80,39 @@ def _curve(contacts, k, p, keep, work, H):
         m, m1, m2 = mollifier(crossed(p, x).c, contacts.parallel[k])
     across = f1 / d
     lag, hold = _rows(p, x, kind, c, z0, z1, z2, first, second)
+    n0, n1, n2 = z0 / d, z1 / d, z2 / d
     for i in range(many):
-        for a in range(3):
-            g[3 * i + a] = c[i] * n[a]
+        g[3 * i], g[3 * i + 1], g[3 * i + 2] = c[i] * n0, c[i] * n1, c[i] * n2
     along, side = m * (f2 - keep * across), keep * m * across
     lag, hold = m * across * lag, m * across * hold
+    mixed, bent = 0.0, 0.0
+    if m1 != 0.0:
+        mixed, bent, share = bending(crossed(p, x), (m, m1, m2), (f, f1, f2), keep, dc)
+        along += share
+    else:
+        dc[:] = 0.0
+    if lag == 0.0:
+        first[:] = 0.0
+    if hold == 0.0:
+        second[:] = 0.0
+    g_low, dc_low = loaded(work, _G * _WORK), loaded(work, _DC * _WORK)
+    g_high, dc_high = loaded(work, _G * _WORK + 8), loaded(work, _DC * _WORK + 8)
+    first_low, second_low = loaded(work, _FIRST * _WORK), loaded(work, _SECOND * _WORK)
+    first_high, second_high = loaded(work, _FIRST * _WORK + 8), loaded(work, _SECOND * _WORK + 8)
     for i in range(many):
         for a in range(3):
-            at, r, end = row(i, a), 3 * i + a, 3 * i + 3
-            one, two, three = along * g[r], lag * first[r], hold * second[r]
-            if hold != 0.0:
-                for j in range(end):
-                    H[at + j] = one * g[j] - (two * first[j] + three * second[j])
-            elif lag != 0.0:
-                for j in range(end):
-                    H[at + j] = one * g[j] - two * first[j]
-            else:
-                for j in range(end):
-                    H[at + j] = one * g[j]
+            at, r = row(i, a), 3 * i + a
+            # What is written beyond the row's end is written over by the rows that follow.
+            one, two, three = along * g[r] + mixed * dc[r], lag * first[r], hold * second[r]
+            four = mixed * g[r] + bent * dc[r]
+            stored((one * g_low + four * dc_low) - (two * first_low + three * second_low), H, at)
+            if i > 1:
+                stored((one * g_high + four * dc_high) - (two * first_high + three * second_high), H, at + 8)
             if side != 0.0:
                 for j in range(i + 1):
                     H[at + 3 * j + a] += side * c[i] * c[j]
     if m1 != 0.0:
-        add_mollified(crossed(p, x), (m, m1, m2), (f, f1, f2), keep, g, dc, H)
+        add_turning(crossed(p, x), 2.0 * f * m1, keep, H)
 
 
 @inner

@@ -51,13 +51,15 @@ def mollifier(c, e):
 
 
 @inner
-def add_mollified(edges, factor, energy, keep, g, dc, H):
-    """Add what the mollifier's derivatives bring to rows H (`contact.blocks`); factor, energy: m, m', m'' and f, f',
-    f''; keep: of what bends downwards of it, which is f m'' and, with a = grad f, b = grad m,
+def bending(edges, factor, energy, keep, dc):
+    """Of what the mollifier's derivatives bring, all but how its own edges turn: writes c' to dc (12,), and returns x,
+    y and s of x (g c' + c' g) + y c' c' + s g g.
 
-    a b' + b a' <= s a a' + b b'/s,     4 w (du x dv) <= 2 |w| (|du|^2 |v|/|u| + |dv|^2 |u|/|v|),     w = u x v.
+    factor, energy: m, m', m'' and f, f', f''; keep: of what bends downwards, f m'' and, with a = grad f, b = grad m,
+
+    a b' + b a' <= s a a' + b b'/s
     """
-    u, v, uu, uv, vv, c = edges
+    u, v, _, _, _, _ = edges
     m, m1, m2 = factor
     f, f1, f2 = energy
     for a in range(3):
@@ -72,11 +74,17 @@ def add_mollified(edges, factor, energy, keep, g, dc, H):
         share = m * f2 / (f1 * f1)
         bent += rest * m1 * m1 / share
         share *= rest * f1 * f1
-    for i in range(12):
-        at, one, two = row(i // 3, i % 3), mixed * g[i] + bent * dc[i], mixed * dc[i] + share * g[i]
-        for j in range(i // 3 * 3 + 3):
-            H[at + j] += one * dc[j] + two * g[j]
-    w, weight = np.sqrt(c), 2.0 * f * m1
+    return mixed, bent, share
+
+
+@inner
+def add_turning(edges, weight, keep, H):
+    """Add what the turning of edges brings to rows H (`contact.blocks`); weight: 2 f m'; keep: of what bends downwards,
+
+    4 w (du x dv) <= 2 |w| (|du|^2 |v|/|u| + |dv|^2 |u|/|v|),     w = u x v.
+    """
+    u, v, uu, uv, vv, c = edges
+    w, rest = np.sqrt(c), 1.0 - keep
     more_u, more_v = rest * w * np.sqrt(vv / uu), rest * w * np.sqrt(uu / vv)
     for a in range(3):
         for b in range(3):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from solvers.contact import barrier, contacts, ways
-from solvers.contact.blocks import Blocks
+from solvers.contact.blocks import Blocks, Room
 from solvers.contact.contacts import Contacts, Pairs, padded
 from solvers.contact.curvature import add_curvature, coupled, curvature
 from solvers.contact.grip import NO_GRIP, Grip
@@ -88,14 +88,15 @@ class _Met(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class PairContact:
     """A barrier of pairs, and their friction. kept: what was found last, one or none; met: at the last two positions
-    that were asked about, for value, slopes and second derivatives are asked for in turn; grip: of a step that has
-    begun; friction: mu; slip [m/s]: below it a pair counts as sticking."""
+    that were asked about, for value, slopes and second derivatives are asked for in turn; room: for the latter; grip:
+    of a step that has begun; friction: mu; slip [m/s]: below it a pair counts as sticking."""
 
     surface: Surfaces
     friction: float = 0.0
     slip: float = 1e-3
     kept: list[_Kept] = field(default_factory=list[_Kept])
     met: list[_Met] = field(default_factory=list[_Met])
+    room: Room = field(default_factory=Room)
     grip: Grip = NO_GRIP
 
     @property
@@ -155,7 +156,7 @@ class PairContact:
     def blocks(self, p: Positions, keep: float = 1.0) -> Blocks:
         """The second derivatives of each contact in range at p (n, 3); keep: of what bends downwards."""
         n, p = len(p), self.whole(p)
-        blocks = curvature(self._at(p).contacts, p, keep)
+        blocks = curvature(self._at(p).contacts, p, keep, self.room)
         if len(self.grip.vertices):
             blocks = blocks.followed(Blocks.whole(self.grip.vertices, self.grip.curvature(p)))
         return blocks._replace(vertices=np.where(blocks.vertices < n, blocks.vertices, -1)) if len(p) > n else blocks
