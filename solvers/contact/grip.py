@@ -16,7 +16,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from solvers.compiling import inner, kernel
 from solvers.contact import barrier
+from solvers.contact.blocks import NUMBERS, Blocks, row
 from solvers.contact.contacts import Contacts
 from solvers.problem import Positions
 
@@ -42,39 +44,80 @@ class Grip(NamedTuple):
         normal = between / np.sqrt(np.einsum("ij,ij->i", between, between))[:, None]
         return cls(contacts.vertices.copy(), contacts.weights.copy(), normal, between, friction * force, slip)
 
-    def _slipped(self, p: Positions) -> tuple[Array, Array]:
-        """u (g, 3) and |u| (g,) [m]."""
-        u = np.einsum("gi,gia->ga", self.weights, p[self.vertices]) - self.anchor
-        u -= np.einsum("ga,ga->g", u, self.normal)[:, None] * self.normal
-        return u, np.sqrt(np.einsum("ga,ga->g", u, u))
-
     def value(self, p: Positions) -> float:
         """The energy [J] at p (n, 3)."""
-        length, s = self._slipped(p)[1], self.slip
-        y = np.minimum(length / s, 1.0)
-        return float(self.force @ (s * (y * y - y**3 / 3.0) + np.maximum(length - s, 0.0)))
+        return hold(self, p)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N] at p (n, 3) to `out`."""
-        u, length = self._slipped(p)
-        pull = (self.force * self._rate(length))[:, None] * u
-        np.add.at(out, self.vertices, self.weights[:, :, None] * pull[:, None, :])
+        pull(self, p, out)
 
-    def _rate(self, length: Array) -> Array:
-        """h'(u)/u [1/m]."""
-        y = length / self.slip
-        return np.where(y < 1.0, 2.0 - y, 1.0 / np.maximum(y, 1.0)) / self.slip
+    def blocks(self, p: Positions) -> Blocks:
+        """The second derivatives at p (n, 3), positive semidefinite."""
+        many = len(self.vertices)
+        packed = np.empty(NUMBERS * many)
+        curve(self, p, packed)
+        return Blocks(self.vertices, NUMBERS * np.arange(many + 1), packed)
 
-    def curvature(self, p: Positions) -> Array:
-        """The second derivatives (g, 12, 12) [N/m] at p (n, 3), positive semidefinite."""
-        u, length = self._slipped(p)
-        rate, along = self._rate(length), u / np.maximum(length, 1e-300)[:, None]
-        bent = np.maximum(2.0 * (1.0 - length / self.slip) / self.slip, 0.0)
-        flat = np.eye(3) - self.normal[:, :, None] * self.normal[:, None, :]
-        inner = rate[:, None, None] * flat + (bent - rate)[:, None, None] * along[:, :, None] * along[:, None, :]
-        inner *= self.force[:, None, None]
-        both = self.weights[:, :, None] * self.weights[:, None, :]
-        return np.einsum("gij,gab->giajb", both, inner).reshape(len(u), 12, 12)
+
+@inner
+def _slipped(grip, p, e):
+    """u and |u| [m] of contact e."""
+    x, c, n = grip.vertices[e], grip.weights[e], grip.normal[e]
+    u0 = c[0] * p[x[0], 0] + c[1] * p[x[1], 0] + c[2] * p[x[2], 0] + c[3] * p[x[3], 0] - grip.anchor[e, 0]
+    u1 = c[0] * p[x[0], 1] + c[1] * p[x[1], 1] + c[2] * p[x[2], 1] + c[3] * p[x[3], 1] - grip.anchor[e, 1]
+    u2 = c[0] * p[x[0], 2] + c[1] * p[x[1], 2] + c[2] * p[x[2], 2] + c[3] * p[x[3], 2] - grip.anchor[e, 2]
+    along = u0 * n[0] + u1 * n[1] + u2 * n[2]
+    u0, u1, u2 = u0 - along * n[0], u1 - along * n[1], u2 - along * n[2]
+    return u0, u1, u2, np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
+
+
+@inner
+def _rate(length, slip):
+    """h'(u)/u [1/m]."""
+    return (2.0 - length / slip) / slip if length < slip else 1.0 / length
+
+
+@kernel
+def hold(grip, p):
+    """The energy [J] at p (n, 3)."""
+    total, s = 0.0, grip.slip
+    for e in range(len(grip.vertices)):
+        length = _slipped(grip, p, e)[3]
+        y = min(length / s, 1.0)
+        total += grip.force[e] * (s * (y * y - y * y * y / 3.0) + max(length - s, 0.0))
+    return total
+
+
+@kernel
+def pull(grip, p, out):
+    """Add the gradient [N] at p (n, 3) to `out`."""
+    for e in range(len(grip.vertices)):
+        u0, u1, u2, length = _slipped(grip, p, e)
+        w = grip.force[e] * _rate(length, grip.slip)
+        for i in range(4):
+            v, c = grip.vertices[e, i], grip.weights[e, i]
+            out[v, 0] += c * (w * u0)
+            out[v, 1] += c * (w * u1)
+            out[v, 2] += c * (w * u2)
+
+
+@kernel
+def curve(grip, p, out):
+    """Write the rows of each contact's block at p (n, 3) to `out`."""
+    for e in range(len(grip.vertices)):
+        n, c, H = grip.normal[e], grip.weights[e], out[NUMBERS * e : NUMBERS * (e + 1)]
+        u0, u1, u2, length = _slipped(grip, p, e)
+        rate, least = _rate(length, grip.slip), max(length, 1e-300)
+        bent = max(2.0 * (1.0 - length / grip.slip) / grip.slip, 0.0) - rate
+        u = u0 / least, u1 / least, u2 / least
+        for a in range(3):
+            for b in range(3):
+                same = 1.0 if a == b else 0.0
+                h = grip.force[e] * (rate * (same - n[a] * n[b]) + bent * u[a] * u[b])
+                for i in range(4):
+                    for j in range(i + 1):
+                        H[row(i, a) + 3 * j + b] = c[i] * c[j] * h
 
 
 _NONE = np.empty((0, 3))

@@ -158,7 +158,7 @@ class PairContact:
         n, p = len(p), self.whole(p)
         blocks = curvature(self._at(p).contacts, p, keep, self.room)
         if len(self.grip.vertices):
-            blocks = blocks.followed(Blocks.whole(self.grip.vertices, self.grip.curvature(p)))
+            blocks = blocks.followed(self.grip.blocks(p))
         return blocks._replace(vertices=np.where(blocks.vertices < n, blocks.vertices, -1)) if len(p) > n else blocks
 
     def neighbours(self, p: Positions) -> NDArray[np.int64]:
@@ -180,7 +180,7 @@ class PairContact:
         many = len(near.vertices)
         add_curvature(near, p, keep, places[:many], values)
         if len(self.grip.vertices):
-            Blocks.whole(self.grip.vertices, self.grip.curvature(p)).add(places[many:], values)
+            self.grip.blocks(p).add(places[many:], values)
 
     def _at(self, p: Positions) -> _Met:
         """What is in range at p, all vertices' (N, 3)."""

@@ -66,7 +66,7 @@ class Bounded(Energy, Protocol):
         ...
 
     def neighbours(self, p: Positions) -> NDArray[np.int64]:
-        """Vertices (a, k) that pairs have at p (n, 3), or may have not far from there; -1 for none."""
+        """Vertices (a, k) of all pairs at p (n, 3), and of those that may come not far from there; -1 for none."""
         ...
 
     def coupled(self, p: Positions) -> NDArray[np.int64]:

@@ -157,13 +157,12 @@ class StepObjective:
         return self._constant[1]
 
     def matrix_for(self, p: Positions, i: Indices, j: Indices, met: list[Indices]) -> Matrix:
-        """A matrix with places for blocks (i, j) of free vertices, and for those of the pairs that each bounded energy
-        has at p, between vertices (a, k)."""
+        """A matrix with places for blocks (i, j) of free vertices, and for those that each bounded energy has at p,
+        between vertices `met` (a, k)."""
         known = self._matrix or self.whole.matrix
         if not (known.has(i, j) and all(known.holds(-1 - k, vertices) for k, vertices in enumerate(met))):
-            pairs = [*met, *(energy.neighbours(p) for energy in self.bounded)]
-            ends = [known.blocks, (i, j), *(self.whole.between(vertices) for vertices in pairs)]
-            i, j = (np.concatenate(side) for side in zip(*ends, strict=True))
+            near = (self.whole.between(energy.neighbours(p)) for energy in self.bounded)
+            i, j = (np.concatenate(side) for side in zip(known.blocks, (i, j), *near, strict=True))
             known = self._matrix = self.whole.matrix_for(i, j)
         return known
 

@@ -9,7 +9,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from solvers.core.definite import RULES, Clamped, Indefinite, Progressive, Trusted
+from solvers.core.definite import RULES, Clamped, Close, Indefinite, Progressive, Trusted
 from solvers.core.descent import Metric, Point
 from solvers.core.eigenvalues import Filtering
 from solvers.core.fixed_objective import Objective
@@ -178,3 +178,14 @@ def test_energies_without_elements_are_refused_by_name(rule):
     made = SCENES["gas"]()
     with pytest.raises(Unsupported, match=f"newton, indefinite: {rule}: .*none of Gas; take indefinite: graded"):
         Newton(rule).prepare(made.system)
+
+
+def test_where_pairs_touch_a_hessian_becomes_exact_by_and_by():
+    step, at, diagonal = begun(compressed())
+    rule, levels = Close(), list[int | None]()
+    for length in (0.05, 0.06, *[FIRST] * 4):
+        p = at.positions.copy()
+        p[3, 0] = p[2, 0] + length
+        levels.append(rule.factorised(step.hessian(p), at._replace(positions=p), diagonal))
+    # Inertia of 10 N/m holds a half of -19 N/m, six tenths of -15.7, and all of -1.5.
+    assert levels == [5, 4, 3, 2, 1, 0]

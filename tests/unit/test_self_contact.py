@@ -10,9 +10,13 @@ import pytest
 
 from harness.scenes.intersections import crossings
 from solvers.contact.barrier import distances, press
+from solvers.contact.blocks import Room
 from solvers.contact.contacts import Pairs, in_range, padded, room
 from solvers.contact.self_contact import SelfContact
 from solvers.contact.surface import Surface
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
+from solvers.problem import Start, StepProblem, System
 from tests.self_contacts import RANGE, THICKNESS, sides, touching, way
 
 
@@ -257,3 +261,37 @@ def test_crossings_agree_with_the_intersection_test_of_ipctk():
         edges = sides(triangles)
         mesh = ipctk.CollisionMesh(p, edges, triangles)
         assert bool(crossings(p, edges, triangles)) == ipctk.has_intersections(mesh, p)
+
+
+@pytest.mark.parametrize("keep", [1.0, 0.7, 0.0])
+def test_a_steps_matrix_has_all_blocks_while_contacts_come_and_go(keep):
+    contact, p, _ = touching(noise=2e-4)  # mollified edges among them
+    system, still = System(np.full(len(p), 10.0), 0.1, (contact,)), np.zeros_like(p)
+    start = Start(p, still, 0.0, p, system.rate, 0.1)
+    step = StepObjective(Objective(system), StepProblem(system, p, still, p[:0], p, p, start))
+    matrices, met, shift = set[int](), set[int](), 1e6
+    for seed in range(4):
+        q = p + way(seed, p, 2e-3)
+        hessian, b = step.hessian(q), way(9, p, 1.0)
+        assert hessian.factorise(keep, shift)
+        x = hessian.solve(b)
+        product = (system.inertia[:, None] + shift) * x
+        contact.blocks(q, keep).add_product(x, product)
+        # Blocks of up to 1e7 N/m beside 1e6.
+        np.testing.assert_allclose(product, b, atol=1e-12)
+        matrices.add(id(hessian.convex()))
+        met.add(len(contact.blocks(q).vertices))
+    assert len(met) == 4
+    assert len(matrices) == 1
+
+
+def test_memory_is_handed_out_again_when_no_one_holds_it():
+    room = Room()
+    one = room.take(5)
+    one[:] = 1.0
+    other = room.take(4)
+    other[:] = 2.0
+    assert (one == 1.0).all()
+    at = other.ctypes.data
+    del other
+    assert room.take(3).ctypes.data == at

@@ -85,7 +85,7 @@ def test_gradients_and_second_derivatives_are_those_of_the_value(friction):
 def test_frictions_own_derivatives_are_positive_semidefinite_and_pull_against_the_slip():
     energy, p = touching(0.5)
     grip = energy.grip
-    blocks = grip.curvature(energy.whole(p))
+    blocks = grip.blocks(energy.whole(p)).values
     assert len(blocks) > 20
     assert np.linalg.eigvalsh(blocks)[:, 0].min() >= -1e-13 * np.abs(blocks).max()
     slipped = np.zeros((len(p) + len(energy.placed), 3))
