@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 from solvers.problem import Positions
-from solvers.vectors.eights import bits, loaded, lowest
+from solvers.vectors.eights import bits, loaded, lowest, where
 
+Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _BITS = 10
@@ -39,10 +40,15 @@ class Tree(NamedTuple):
     def of(cls, rest: Positions, corners: Indices) -> Tree:
         """A tree over primitives of a rest shape (n, 3) [m]."""
         order = along_curve(rest[corners].mean(axis=1))
+        return cls.over(len(corners))._replace(corners=np.ascontiguousarray(corners[order]))
+
+    @classmethod
+    def over(cls, many: int) -> Tree:
+        """A tree over so many things that follow each other along the curve already."""
         levels = 1
-        while 8**levels < len(corners):
+        while 8**levels < many:
             levels += 1
-        return cls(np.ascontiguousarray(corners[order]), levels)
+        return cls(np.arange(many)[:, None], levels)
 
     @property
     def nodes(self) -> int:
@@ -68,34 +74,48 @@ def along_curve(x: Positions) -> Indices:
     return np.argsort(code, kind="stable")
 
 
-def near(points: Tree, triangles: Tree, edges: Tree, p: Positions, q: Positions, reach: float) -> tuple[Indices, int]:
-    """Pairs that may come nearer than `reach` [m] on the straight way from p to q, both (n, 3), by their boxes: of a
-    point and a triangle, then of two edges, by their numbers, (k, 2), and how many are of the first kind. Pairs that
-    share a vertex are left out."""
-    one = found(points, triangles, p, q, reach)
-    return np.concatenate([one, found(edges, edges, p, q, reach)]), len(one)
+def near(
+    points: Tree, triangles: Tree, edges: Tree, p: Positions, q: Positions, reach: float, share: float = 0.0
+) -> tuple[Indices, int]:
+    """Pairs that may come nearer than `reach` [m], and `share` of their distance at p, on the straight way from p to q,
+    both (n, 3), by their boxes: of a point and a triangle, then of two edges, by their numbers, (k, 2), and how many
+    are of the first kind. Pairs that share a vertex are left out."""
+    one = found(points, triangles, p, q, reach, share)
+    return np.concatenate([one, found(edges, edges, p, q, reach, share)]), len(one)
 
 
-def found(one: Tree, other: Tree, p: Positions, q: Positions, reach: float) -> Indices:
-    """What of two trees may come nearer than `reach` [m] on the straight way from p to q, by their numbers, (k, 2); of
-    a tree and itself each pair once, the lower number first."""
+def found(one: Tree, other: Tree, p: Positions, q: Positions, reach: float, share: float = 0.0) -> Indices:
+    """What of two trees may come nearer than `reach` [m], and `share` of its distance at p, on the straight way from p
+    to q, by their numbers, (k, 2); of a tree and itself each pair once, the lower number first."""
     if not (len(one.corners) and len(other.corners)):
         return np.empty((0, 2), np.int64)
-    boxes = [np.empty((tree.nodes, 6, 8)) for tree in ((one,) if one is other else (one, other))]
-    for tree, around in zip((one, other), boxes, strict=False):
-        refit(tree, p, q, 0.5 * reach, around)
-    room, stack = _ROOM * len(one.corners) + 64, np.empty((_DEPTH, 3), np.int64)
+    begin = _boxes(one, other, p)
+    end = begin if q is p else _boxes(one, other, q)
+    room, ways = _ROOM * len(one.corners) + 64, stack()
     while True:
         out = np.empty((room, 2), np.int64)
-        count = look(one, other, boxes[0], boxes[-1], one is other, stack, out)
+        count = look(one, other, begin, end, reach, share, one is other, ways, out)
         if count <= room:
             return out[:count]
         room = count
 
 
+def stack() -> Indices:
+    """Scratch of a look."""
+    return np.empty((_DEPTH, 3), np.int64)
+
+
+def _boxes(one: Tree, other: Tree, x: Positions) -> tuple[Array, Array]:
+    """The boxes of both at x (n, 3)."""
+    boxes = [np.empty((tree.nodes, 6, 8)) for tree in ((one,) if one is other else (one, other))]
+    for tree, around in zip((one, other), boxes, strict=False):
+        refit(tree, x, around)
+    return boxes[0], boxes[-1]
+
+
 @kernel
-def refit(tree, p, q, pad, boxes):
-    """Write the boxes (nodes, 6, 8), each wider by `pad` [m] on all sides; those of nothing are nowhere."""
+def refit(tree, x, boxes):
+    """Write the boxes (nodes, 6, 8) at x (n, 3); those of nothing are nowhere."""
     boxes[:, :3], boxes[:, 3:] = np.inf, -np.inf
     size, last = len(tree.corners), len(boxes) - (len(tree.corners) + 7) // 8
     for e in range(size):
@@ -103,9 +123,25 @@ def refit(tree, p, q, pad, boxes):
         for axis in range(3):
             low, high = np.inf, -np.inf
             for a in range(tree.corners.shape[1]):
-                i = tree.corners[e, a]
-                low, high = min(low, p[i, axis], q[i, axis]), max(high, p[i, axis], q[i, axis])
-            box[axis, slot], box[3 + axis, slot] = low - pad, high + pad
+                at = x[tree.corners[e, a], axis]
+                low, high = min(low, at), max(high, at)
+            box[axis, slot], box[3 + axis, slot] = low, high
+    _lift(boxes)
+
+
+@kernel
+def lift(boxes, many):
+    """Write the boxes (nodes, 6, 8) above those of so many things, of which those of the last level are written."""
+    last = len(boxes) - (many + 7) // 8
+    boxes[:last, :3], boxes[:last, 3:] = np.inf, -np.inf
+    for k in range(many, 8 * ((many + 7) // 8)):
+        boxes[last + k // 8, :3, k % 8], boxes[last + k // 8, 3:, k % 8] = np.inf, -np.inf
+    _lift(boxes)
+
+
+@inner
+def _lift(boxes):
+    """The same, with all others nowhere."""
     for node in range(len(boxes) - 1, 0, -1):
         above, slot = boxes[(node - 1) // 8], (node - 1) % 8
         for axis in range(3):
@@ -115,29 +151,46 @@ def refit(tree, p, q, pad, boxes):
             above[axis, slot], above[3 + axis, slot] = low, high
 
 
+def apart(one: tuple[int, int], other: tuple[int, int], p: Positions, q: Positions, reach: float, share: float) -> bool:
+    """Whether one box around vertices from a first to a last one, and one around others, tell that all is farther apart
+    than `reach` [m], and `share` of its distance at p, on the straight way from p to q, (n, 3) both."""
+    low, high = np.empty((2, 2, 3)), np.empty((2, 2, 3))
+    for k, x in enumerate((p, q)):
+        for j, (first, last) in enumerate((one, other)):
+            hull(x, first, last, low[k, j], high[k, j])
+    wide = reach + share * float((high[0].max(axis=0) - low[0].min(axis=0)).sum())
+    gap = np.array([low[:, 0] - high[:, 1], low[:, 1] - high[:, 0]])
+    return bool((gap > wide).all(axis=1).any())
+
+
 @kernel
-def look(one, other, mine, boxes, same, stack, out):
-    """Write the pairs of two trees, with their boxes, to `out`, as far as there is room; how many there are. same:
-    whether both are one tree, of which each pair is wanted once; stack: scratch."""
+def hull(x, first, last, low, high):
+    """Write the least and the largest coordinates (3,) of rows of x (n, 3)."""
+    low[:], high[:] = np.inf, -np.inf
+    for i in range(first, last):
+        for axis in range(3):
+            low[axis], high[axis] = min(low[axis], x[i, axis]), max(high[axis], x[i, axis])
+
+
+@kernel
+def look(one, other, begin, end, reach, share, same, stack, out):
+    """Write the pairs of two trees, with their boxes at the begin of a way and at its end, to `out`, as far as there is
+    room; how many there are. same: whether both are one tree, of which each pair is wanted once; stack: scratch."""
+    (mine, boxes), (yours, there) = begin, end
     count, leaf = 0, len(mine) - (len(one.corners) + 7) // 8
-    for begin in range(0, len(one.corners), 8):
-        around = mine[leaf + begin // 8]
-        l0, l1, l2, h0, h1, h2 = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
-        for k in range(8):
-            l0, l1, l2 = min(l0, around[0, k]), min(l1, around[1, k]), min(l2, around[2, k])
-            h0, h1, h2 = max(h0, around[3, k]), max(h1, around[4, k]), max(h2, around[5, k])
+    for first_of_eight in range(0, len(one.corners), 8):
+        around, after = mine[leaf + first_of_eight // 8], yours[leaf + first_of_eight // 8]
+        low, high = _hull(around)
+        lower, upper = _hull(after)
         # A node, its first primitive, and how many lie in each of its boxes.
         stack[0, 0], stack[0, 1], stack[0, 2], top = 0, 0, 8 ** (other.levels - 1), 1
         while top > 0:
             top -= 1
             node, first, each = stack[top, 0], stack[top, 1], stack[top, 2]
-            at = _NUMBERS * node
-            x0, x1, x2 = loaded(boxes, at), loaded(boxes, at + 8), loaded(boxes, at + 16)
-            y0, y1, y2 = loaded(boxes, at + 24), loaded(boxes, at + 32), loaded(boxes, at + 40)
             if each > 1:
-                left = bits((x0 <= h0) & (x1 <= h1) & (x2 <= h2) & (y0 >= l0) & (y1 >= l1) & (y2 >= l2))
+                left = met(boxes, there, node, low, high, lower, upper, reach, share)
                 if same:
-                    left &= -1 << max(0, (begin - first) // each)  # nothing that comes before these eight
+                    left &= -1 << max(0, (first_of_eight - first) // each)  # nothing that comes before these eight
                 for slot in range(7, -1, -1):  # the first one comes out first
                     if left >> slot & 1:
                         stack[top, 0], stack[top, 1], stack[top, 2] = (
@@ -147,24 +200,61 @@ def look(one, other, mine, boxes, same, stack, out):
                         )
                         top += 1
                 continue
-            for k in range(min(8, len(one.corners) - begin)):
-                left = bits(
-                    (x0 <= around[3, k]) & (x1 <= around[4, k]) & (x2 <= around[5, k])
-                    & (y0 >= around[0, k]) & (y1 >= around[1, k]) & (y2 >= around[2, k])
+            for k in range(min(8, len(one.corners) - first_of_eight)):
+                left = met(
+                    boxes, there, node,
+                    (around[0, k], around[1, k], around[2, k]), (around[3, k], around[4, k], around[5, k]),
+                    (after[0, k], after[1, k], after[2, k]), (after[3, k], after[4, k], after[5, k]), reach, share,
                 )  # fmt: skip
                 if same:
-                    left &= -1 << max(0, begin + k - first + 1)
+                    left &= -1 << max(0, first_of_eight + k - first + 1)
                 while left != 0:
                     f = first + lowest(left)
                     left &= left - 1
                     if count < len(out):  # what shares a vertex is written over: nobody could foretell a branch here
-                        out[count, 0], out[count, 1] = begin + k, f
-                    count += not _share(one.corners, begin + k, other.corners, f)
+                        out[count, 0], out[count, 1] = first_of_eight + k, f
+                    count += not share_vertex(one.corners, first_of_eight + k, other.corners, f)
     return count
 
 
 @inner
-def _share(first, e, second, f):
+def _hull(boxes):
+    """The least and the largest corner of eight boxes (6, 8)."""
+    l0, l1, l2, h0, h1, h2 = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
+    for k in range(8):
+        l0, l1, l2 = min(l0, boxes[0, k]), min(l1, boxes[1, k]), min(l2, boxes[2, k])
+        h0, h1, h2 = max(h0, boxes[3, k]), max(h1, boxes[4, k]), max(h2, boxes[5, k])
+    return (l0, l1, l2), (h0, h1, h2)
+
+
+@inner
+def met(boxes, there, node, low, high, lower, upper, reach, share):
+    """Which boxes of a node may come nearer to another box than `reach`, and `share` of their distance at the begin, as
+    bits: not those that lie apart along one axis, on the same side, at the begin and at the end of their ways."""
+    at = _NUMBERS * node
+    x0, x1, x2 = loaded(boxes, at), loaded(boxes, at + 8), loaded(boxes, at + 16)
+    y0, y1, y2 = loaded(boxes, at + 24), loaded(boxes, at + 32), loaded(boxes, at + 40)
+    s0, s1, s2 = loaded(there, at), loaded(there, at + 8), loaded(there, at + 16)
+    t0, t1, t2 = loaded(there, at + 24), loaded(there, at + 32), loaded(there, at + 40)
+    # No two points of both are farther apart at the begin than this over the share.
+    wide = _width(x0, y0, low[0], high[0]) + _width(x1, y1, low[1], high[1]) + _width(x2, y2, low[2], high[2])
+    wide = reach + share * wide
+    return bits(
+        ((x0 <= high[0] + wide) | (s0 <= upper[0] + wide)) & ((y0 >= low[0] - wide) | (t0 >= lower[0] - wide))
+        & ((x1 <= high[1] + wide) | (s1 <= upper[1] + wide)) & ((y1 >= low[1] - wide) | (t1 >= lower[1] - wide))
+        & ((x2 <= high[2] + wide) | (s2 <= upper[2] + wide)) & ((y2 >= low[2] - wide) | (t2 >= lower[2] - wide))
+    )  # fmt: skip
+
+
+@inner
+def _width(x, y, low, high):
+    """From the least to the largest of two intervals."""
+    return where(y > high, y, high) - where(x < low, x, low)
+
+
+@inner
+def share_vertex(first, e, second, f):
+    """Whether two primitives have a vertex in common."""
     shared = False
     for a in range(first.shape[1]):
         for b in range(second.shape[1]):

@@ -48,6 +48,11 @@ class Against:
     thickness: float
     reach: float
 
+    def clear(self, p: Positions, q: Positions, reach: float, share: float) -> bool:
+        """See `solvers.contact.self_contact.Surfaces`; by one box around each of both."""
+        n = len(self.stiffness)
+        return boxes.apart((0, n), (n, len(p)), p, q, reach, share)
+
     def within(self, p: Positions, reach: float) -> Pairs:
         """See `solvers.contact.self_contact.Surfaces`."""
         pairs = self._pairs(p, p, reach)
@@ -60,14 +65,14 @@ class Against:
             parallel=pairs.parallel[close],
         )
 
-    def on_way(self, p: Positions, q: Positions, reach: float) -> Pairs:
+    def on_way(self, p: Positions, q: Positions, reach: float, share: float) -> Pairs:
         """See `solvers.contact.self_contact.Surfaces`."""
-        return self._pairs(p, q, reach)
+        return self._pairs(p, q, reach, share)
 
-    def _pairs(self, p: Positions, q: Positions, reach: float) -> Pairs:
+    def _pairs(self, p: Positions, q: Positions, reach: float, share: float = 0.0) -> Pairs:
         a, b = self.mesh, self.others
-        one, two = (boxes.found(x.points, y.triangles, p, q, reach).T for x, y in ((a, b), (b, a)))
-        e, f = boxes.found(a.edges, b.edges, p, q, reach).T
+        one, two = (boxes.found(x.points, y.triangles, p, q, reach, share).T for x, y in ((a, b), (b, a)))
+        e, f = boxes.found(a.edges, b.edges, p, q, reach, share).T
         vertices = np.concatenate(
             [
                 np.column_stack([a.points.corners[one[0]], b.triangles.corners[one[1]]]),

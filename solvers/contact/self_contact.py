@@ -2,7 +2,8 @@
 
 Which pairs may be near is looked up for a point, and kept for as long as the vertices stay close to it (their common
 motion apart). What is kept changes no bit of what is computed: pairs out of range add nothing, and all others come in
-one order. Steps are bounded by what they may meet on the way (`solvers.contact.ways`).
+one order. Steps are bounded by what they may meet on the way (`solvers.contact.ways`). Where that is nothing, patches
+tell (`solvers.contact.patches`), and what is kept is that nothing is near where it ends.
 
 `SelfContact` is a mesh against itself, `ObstacleContact` a mesh against the surfaces of obstacles. The vertices of
 these follow those of the mesh in all that is computed; in a step they are where they are at its end, and go there from
@@ -24,6 +25,7 @@ from solvers.contact.blocks import Blocks, Room
 from solvers.contact.contacts import Contacts, Pairs, padded
 from solvers.contact.curvature import add_curvature, coupled, curvature
 from solvers.contact.grip import NO_GRIP, Grip
+from solvers.contact.ways import LEFT, unevenness
 from solvers.problem import Positions, Start
 
 Array = NDArray[np.float64]
@@ -38,6 +40,11 @@ _NEAR = 1.25
 _WIDE = 1.5
 """Of the range: so far pairs are looked up. More would be looked at each time for longer than it takes to look them up
 anew now and then."""
+_FAR = 1.25
+"""Of the range: so far nothing may be on a way after which nothing is near. The less, the fewer patches are in doubt;
+the more, the longer are steps that need no look."""
+_MANY = 3
+"""Positions around which is kept what is near them: of a step these are its start, free fall and where it goes."""
 
 
 class Surfaces(Protocol):
@@ -53,18 +60,26 @@ class Surfaces(Protocol):
         """So far beyond that they feel each other [m]."""
         ...
 
+    def clear(self, p: Positions, q: Positions, reach: float, share: float) -> bool:
+        """Whether no pair comes nearer than `reach` [m], and `share` of its distance at p, on the straight way from p
+        to q, (n, 3) [m] both; False where that would take long to say."""
+        ...
+
     def within(self, p: Positions, reach: float) -> Pairs:
         """Pairs that are nearer than `reach` [m] at p (n, 3) [m]."""
         ...
 
-    def on_way(self, p: Positions, q: Positions, reach: float) -> Pairs:
-        """Pairs that may come nearer than `reach` [m] on the straight way from p to q, (n, 3) [m] both; with what they
-        press with or without."""
+    def on_way(self, p: Positions, q: Positions, reach: float, share: float) -> Pairs:
+        """Pairs that may come nearer than `reach` [m], and `share` of their distance at p, on the straight way from p
+        to q, (n, 3) [m] both; with what they press with or without."""
         ...
 
 
 Place = Callable[[float], Positions]
 Carry = Callable[[float, float, Positions], list[Positions]]
+
+
+_NONE = np.empty((0, 4), np.int64), 0, *(np.empty(0) for _ in range(3))
 
 
 class _Kept(NamedTuple):
@@ -87,9 +102,9 @@ class _Met(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PairContact:
-    """A barrier of pairs, and their friction. kept: what was found last, one or none; met: at the last two positions
-    that were asked about, for value, slopes and second derivatives are asked for in turn; room: for the latter; grip:
-    of a step that has begun; friction: mu; slip [m/s]: below it a pair counts as sticking."""
+    """A barrier of pairs, and their friction. kept: what was found, the last first; met: at the last two positions that
+    were asked about, for value, slopes and second derivatives are asked for in turn; room: for the latter; grip: of a
+    step that has begun; friction: mu; slip [m/s]: below it a pair counts as sticking."""
 
     surface: Surfaces
     friction: float = 0.0
@@ -108,10 +123,13 @@ class PairContact:
         """The energy of a step: what was in range at its start grips."""
         if not self.friction:
             return self
-        return replace(self, grip=self._gripping(self.whole(start.positions), start))
+        grip = self._gripping(self.whole(start.positions), start)
+        return self if grip is self.grip else replace(self, grip=grip)
 
     def _gripping(self, p: Positions, start: Start) -> Grip:
         """p: all vertices at the step's start."""
+        if self._idle(p):
+            return NO_GRIP
         return Grip.of(self._at(p).contacts, self.friction, self.slip * (start.until - start.time))
 
     def whole(self, p: Positions) -> Positions:
@@ -125,29 +143,59 @@ class PairContact:
     def pairs(self, p: Positions) -> Pairs:
         """Pairs that may be in range at p, all vertices' (N, 3): all that are, and maybe more."""
         for kept in self.kept:
-            if kept.p.shape == p.shape and 2.0 * _apart(kept.p, p) <= kept.reach - self.range:
+            if self._covers(kept, p):
                 return kept.pairs
-        reach = _WIDE * self.range + _ROUND * float(np.abs(p).max(initial=0.0))
-        kept = _Kept(p.copy(), reach, self.surface.within(p, reach))
-        self.kept[:] = [kept]
-        return kept.pairs
+        reach = _WIDE * self.range + self._round(p)
+        if self.kept and not self._far(self.kept[0]):
+            return self._keep(p.copy(), reach, self.surface.within(p, reach))
+        far = self.surface.clear(p, p, reach, 0.0)
+        return self._keep(p.copy(), reach, None if far else self.surface.within(p, reach))
+
+    def _covers(self, kept: _Kept, p: Positions) -> bool:
+        """Whether all pairs in range at p (N, 3) are known from there."""
+        return kept.p.shape == p.shape and unevenness(kept.p, p) <= kept.reach - self.range
+
+    @staticmethod
+    def _far(kept: _Kept) -> bool:
+        return not len(kept.pairs.vertices)
+
+    def _keep(self, p: Positions, reach: float, pairs: Pairs | None) -> Pairs:
+        """Keep the pairs that are nearer than `reach` at p (N, 3), which nobody else writes to; None for none."""
+        if pairs is None:
+            surface = self.surface
+            pairs = Pairs(*_NONE, thickness=surface.thickness, reach=surface.reach)
+        self.kept[:] = [_Kept(p, reach, pairs), *self.kept[: _MANY - 1]]
+        return pairs
+
+    @staticmethod
+    def _round(p: Positions) -> float:
+        """By how much boxes are made wider [m]."""
+        return _ROUND * float(np.abs(p).max(initial=0.0))
+
+    def _idle(self, p: Positions) -> bool:
+        """Whether it is known that nothing is in range at p (N, 3)."""
+        return any(self._far(kept) and self._covers(kept, p) for kept in self.kept)
 
     def value(self, p: Positions) -> float:
         """The energy [J] at p, shape (n, 3); infinite where a pair is nearer than the thickness."""
         p = self.whole(p)
-        if not np.isfinite(p).all():
-            return np.inf
-        pressed = self._at(p).value
+        if not self._idle(p):
+            if not np.isfinite(p).all():
+                return np.inf
+            pressed = self._at(p).value
+        else:
+            pressed = 0.0
         return pressed + self.grip.value(p) if len(self.grip.vertices) else pressed
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N], shape (n, 3), to `out`."""
         n, p = len(p), self.whole(p)
-        if not np.isfinite(p).all():
-            return
-        met = self._at(p)
-        if len(met.contacts.vertices):
-            out += met.gradient[:n]
+        if not self._idle(p):
+            if not np.isfinite(p).all():
+                return
+            met = self._at(p)
+            if len(met.contacts.vertices):
+                out += met.gradient[:n]
         if len(self.grip.vertices):
             total = np.zeros_like(p)
             self.grip.add_gradient(p, total)
@@ -229,19 +277,29 @@ class PairContact:
 
     def _largest(self, p: Positions, way: Positions) -> float:
         """The same for all vertices, (N, 3) both."""
-        if not np.isfinite(way).all():
-            return 0.0
-        way = way - way.mean(axis=0)
-        fast, most = float(np.sqrt(np.einsum("ij,ij->i", way, way)).max(initial=0.0)), 1.0
+        q = p + way
         pairs = None
         for kept in self.kept:
-            if kept.p.shape == p.shape and 2.0 * (_apart(kept.p, p) + fast) <= kept.reach - self.surface.thickness:
-                pairs = kept.pairs
+            if kept.p.shape == p.shape:
+                before = unevenness(kept.p, p)
+                most = max(before, unevenness(kept.p, q))
+                if most + LEFT * before <= (1.0 - LEFT) * (kept.reach - self.surface.thickness):
+                    if self._far(kept):
+                        return 1.0
+                    pairs = kept.pairs
+                    break
+        if not np.isfinite(way).all():
+            return 0.0
         if pairs is None:
-            pad = self.surface.thickness + _ROUND * float(np.abs(p).max(initial=0.0))
-            pairs = self.surface.on_way(p, p + way, pad)
+            rounded = self._round(p)
+            reach = _FAR * self.range + rounded
+            if not (self.kept and len(self.kept[0].pairs.vertices)) and self.surface.clear(p, q, reach, LEFT):
+                self._keep(q, reach, None)
+                return 1.0
+            pairs = self.surface.on_way(p, q, self.surface.thickness + rounded, LEFT)
+        way = way - way.mean(axis=0)
         scratch = np.empty(4, np.int64), np.empty((4, 3)), np.empty((4, 3))
-        return ways.largest(pairs, padded(p), padded(way), most, *scratch)
+        return ways.largest(pairs, padded(p), padded(way), 1.0, *scratch)
 
     def closed(self, p: Positions) -> list[tuple[NDArray[np.int64], bool, float]]:
         """Pairs that are not farther apart than their thickness at p (n, 3): their vertices (4,), whether they are
@@ -309,10 +367,3 @@ class ObstacleContact(PairContact):
     def with_obstacles(self, p: Positions) -> list[Positions]:
         """See PairContact."""
         return self.carry(*self.times, p)
-
-
-def _apart(p: Positions, q: Positions) -> float:
-    """How far vertices have moved from p to q, (n, 3) each, at most, but for their mean [m]."""
-    way = q - p
-    way -= way.mean(axis=0)
-    return float(np.sqrt(np.einsum("ij,ij->i", way, way)).max(initial=0.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from solvers.contact.boxes import Indices, Tree
 from solvers.contact.closest import dot, edge_edge_way, point_triangle_way
 from solvers.contact.contacts import Pairs, padded
 from solvers.contact.mollifier import MOLLIFIED
+from solvers.contact.patches import Patches
 from solvers.problem import Positions
 from solvers.vectors.eights import bits, lowest, rows
 
@@ -21,6 +23,9 @@ Array = NDArray[np.float64]
 
 _LESS = 1.0 - 1e-12
 """Of a proportion: round-off at rest is no force."""
+
+_LOOKED = 4.0
+"""Of the range: pairs that are farther apart at rest are not looked at one by one."""
 
 _NOTHING = np.empty(0)
 
@@ -35,6 +40,7 @@ class Surface:
     stiffness (n,): [N/m]; near: the keys of such pairs, sorted, and that proportion.
     """
 
+    rest: Positions
     points: Tree
     edges: Tree
     triangles: Tree
@@ -54,17 +60,25 @@ class Surface:
         none = np.empty(0, np.int64), np.empty(0)
         trees = Tree.of(rest, points[:, None]), Tree.of(rest, edges), Tree.of(rest, triangles)
         lengths = _lengths(rest, trees[1].corners)
-        bare = cls(*trees, lengths, np.array(stiffness), thickness, reach, none)
+        bare = cls(rest, *trees, lengths, np.array(stiffness), thickness, reach, none)
         found, first = bare._near(rest, rest, thickness + reach)
         apart = distances(bare._bare(found, first), rest)
         close = apart < thickness + reach
         keys, share = bare._keys(found, first)[close], _LESS * apart[close] / (thickness + reach)
         order = np.argsort(keys)
         near = keys[order], share[order]
-        return cls(*trees, lengths, np.array(stiffness), thickness, reach, near)
+        return cls(rest, *trees, lengths, np.array(stiffness), thickness, reach, near)
 
-    def _near(self, p: Positions, q: Positions, reach: float) -> tuple[Indices, int]:
-        return boxes.near(self.points, self.triangles, self.edges, p, q, reach)
+    def _near(self, p: Positions, q: Positions, reach: float, share: float = 0.0) -> tuple[Indices, int]:
+        return boxes.near(self.points, self.triangles, self.edges, p, q, reach, share)
+
+    @cached_property
+    def _patches(self) -> Patches:
+        return Patches.of(self.rest, self.points, self.edges, self.triangles, _LOOKED * (self.thickness + self.reach))
+
+    def clear(self, p: Positions, q: Positions, reach: float, share: float) -> bool:
+        """See `solvers.contact.self_contact.Surfaces`."""
+        return self._patches.clear(p, q, reach, share)
 
     def within(self, p: Positions, reach: float) -> Pairs:
         """Pairs that are nearer than `reach` [m] at p (n, 3) [m]."""
@@ -86,10 +100,9 @@ class Surface:
     def _parts(self) -> tuple[Indices, Indices, Indices]:
         return self.points.corners, self.triangles.corners, self.edges.corners
 
-    def on_way(self, p: Positions, q: Positions, reach: float) -> Pairs:
-        """Pairs that may come nearer than `reach` [m] on the straight way from p to q, (n, 3) [m] both; without what
-        they press with."""
-        found, first = self._near(p, q, reach)
+    def on_way(self, p: Positions, q: Positions, reach: float, share: float) -> Pairs:
+        """See `solvers.contact.self_contact.Surfaces`; without what they press with."""
+        found, first = self._near(p, q, reach, share)
         return self._bare(found, first)._replace(scale=self._scale(found, first))
 
     def _bare(self, found: Indices, first: int) -> Pairs:

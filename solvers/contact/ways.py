@@ -13,7 +13,8 @@ import numpy as np
 
 from solvers.compiling import inner, kernel
 from solvers.contact.closest import distance, dot, edge_edge_way, minus, point_triangle_way
-from solvers.vectors.eights import bits, lowest, root, rows, where
+from solvers.problem import Positions
+from solvers.vectors.eights import bits, loaded, lowest, root, rows, stored, where
 
 LEFT = 0.1
 """Of a gap, what ends the search for a longer step; half of it is what a step leaves at least."""
@@ -123,3 +124,49 @@ def _relative(p, direction, x, edges, corners, way):
 @inner
 def _length(way, k):
     return np.sqrt(way[k, 0] ** 2 + way[k, 1] ** 2 + way[k, 2] ** 2)
+
+
+def unevenness(p: Positions, q: Positions) -> float:
+    """How far any two vertices have moved from p to q, contiguous (n, 3) both, beside each other, at most [m]; infinite
+    where something is not finite."""
+    return _unevenness(p, q, np.empty((9, 8)))
+
+
+@kernel
+def _unevenness(p, q, tile):
+    """The diagonal of the box of all q - p; tile (9, 8): scratch."""
+    whole = len(p) // 8
+    tile[:3], tile[3:6], tile[6:] = np.inf, -np.inf, 0.0
+    if whole > 0:
+        # Lanes of three registers after each other are x y z x y z ... of eight vertices.
+        x, y, z = loaded(q, 0) - loaded(p, 0), loaded(q, 8) - loaded(p, 8), loaded(q, 16) - loaded(p, 16)
+        low, high, nothing = (x, y, z), (x, y, z), (0.0 * x, 0.0 * y, 0.0 * z)
+        for k in range(24, 24 * whole, 24):
+            x, y, z = (
+                loaded(q, k) - loaded(p, k),
+                loaded(q, k + 8) - loaded(p, k + 8),
+                loaded(q, k + 16) - loaded(p, k + 16),
+            )
+            low = _less(x, low[0]), _less(y, low[1]), _less(z, low[2])
+            high = _more(x, high[0]), _more(y, high[1]), _more(z, high[2])
+            nothing = nothing[0] + 0.0 * x, nothing[1] + 0.0 * y, nothing[2] + 0.0 * z
+        for k in range(3):
+            stored(low[k], tile, 8 * k)
+            stored(high[k], tile, 24 + 8 * k)
+            stored(nothing[k], tile, 48 + 8 * k)
+    square, known = 0.0, 0.0
+    for axis in range(3):
+        least, most = np.inf, -np.inf
+        for k in range(axis, 24, 3):
+            least, most = min(least, tile[k // 8, k % 8]), max(most, tile[3 + k // 8, k % 8])
+            known += tile[6 + k // 8, k % 8]
+        for i in range(8 * whole, len(p)):
+            d = q[i, axis] - p[i, axis]
+            least, most, known = min(least, d), max(most, d), known + 0.0 * d
+        square += (most - least) ** 2 if most > least else 0.0
+    return np.sqrt(square) if known == 0.0 else np.inf
+
+
+@inner
+def _less(a, b):
+    return where(a < b, a, b)

@@ -47,7 +47,10 @@ def begun_free(problem: StepProblem) -> StepProblem:
     start, rest = p, np.zeros_like(p)
     if not free(p) and all(energy.at_part(0.0).largest_step(p, rest) == 1.0 for energy in energies):
         start = _cleared(problem, energies)
-    current, guess = (q if free(q) else start for q in (problem.current, problem.first_guess))
+    current = problem.current if free(problem.current) else start
+    guess = current
+    if problem.first_guess is not problem.current:
+        guess = problem.first_guess if free(problem.first_guess) else start
     return replace(problem, current=current, first_guess=guess)
 
 

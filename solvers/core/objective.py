@@ -72,7 +72,9 @@ class StepObjective:
 
     def reach(self, p: Positions, direction: Positions, first: float = 1.0) -> float:
         """The largest t up to `first` by which p may go along a direction, both (n, 3); see `solvers.core.bounds`."""
-        return first * reach(self.bounded, p, first * direction) if self.bounded else first
+        return (
+            first * reach(self.bounded, p, direction if first == 1.0 else first * direction) if self.bounded else first
+        )
 
     def placed(self, p: Positions) -> Positions:
         """A copy of p with the exactly pinned vertices on their targets."""
@@ -112,6 +114,8 @@ class StepObjective:
             change += one.law.rise(one.elements, p, q)
         for energy in self.own:
             before, after = energy.value(p), energy.value(q)
+            if before == after == 0.0 and is_bounded(energy):
+                continue  # nothing is in range, at either
             slope = np.zeros_like(q)
             energy.add_gradient(q, slope)
             scale = abs(before) + abs(after) + float(np.abs(slope * q).sum())
