@@ -138,9 +138,9 @@ def _put(v, tile, first, out):
 
 @kernel
 def doubtful(known, begin, end, pairs, count, apart, reach, share, out):
-    """Write those of the first pairs of patches (k, 2), at rest `apart` (k,) [m] at least, to `out` whose primitives may
-    come nearer than `reach` [m], and `share` of their distance at the begin, on the straight way from how they lie at
-    its begin to how they lie at its end; how many."""
+    """Write those of the first pairs of patches (k, 2), at rest `apart` (k,) [m] at least, to `out` whose primitives
+    may come nearer than `reach` [m], and `share` of their distance at the begin, on the straight way from how they lie
+    at its begin to how they lie at its end; how many."""
     found = 0
     for first in range(0, count, 8):
         left = 255 & ~_clear(known, begin, end, pairs, first, count - 1, loaded(apart, first), reach, share)

@@ -49,12 +49,12 @@ class Against:
     reach: float
 
     def clear(self, p: Positions, q: Positions, reach: float, share: float) -> bool:
-        """See `solvers.contact.self_contact.Surfaces`; by one box around each of both."""
+        """See `solvers.contact.known.Surfaces`; by one box around each of both."""
         n = len(self.stiffness)
         return boxes.apart((0, n), (n, len(p)), p, q, reach, share)
 
     def within(self, p: Positions, reach: float) -> Pairs:
-        """See `solvers.contact.self_contact.Surfaces`."""
+        """See `solvers.contact.known.Surfaces`."""
         pairs = self._pairs(p, p, reach)
         close = distances(pairs, p) < reach
         return pairs._replace(
@@ -66,7 +66,7 @@ class Against:
         )
 
     def on_way(self, p: Positions, q: Positions, reach: float, share: float) -> Pairs:
-        """See `solvers.contact.self_contact.Surfaces`."""
+        """See `solvers.contact.known.Surfaces`."""
         return self._pairs(p, q, reach, share)
 
     def _pairs(self, p: Positions, q: Positions, reach: float, share: float = 0.0) -> Pairs:

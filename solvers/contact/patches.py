@@ -20,6 +20,7 @@ from solvers.contact.barrier import distances
 from solvers.contact.boxes import Indices, Tree, met, share_vertex
 from solvers.contact.contacts import Pairs, padded
 from solvers.contact.flat import Lie, Rest
+from solvers.contact.ways import unevenness
 from solvers.problem import Positions
 from solvers.vectors.eights import lowest
 
@@ -125,7 +126,7 @@ class Patches:
 
     def _lies(self, p: Positions) -> _Seen:
         for one in self.seen:
-            if np.array_equal(one.p, p):
+            if one.p.shape == p.shape and unevenness(one.p, p) == 0.0:
                 return one
         one = self.seen.pop(0) if len(self.seen) > 1 else _Seen.of(self.rest, self.tree)
         one = one._replace(p=p.copy(), x=padded(p))

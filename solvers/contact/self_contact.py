@@ -1,9 +1,6 @@
 """Contact by pairs: an energy of positions alone (`solvers.contact.barrier`), and the largest safe step.
 
-Which pairs may be near is looked up for a point, and kept for as long as the vertices stay close to it (their common
-motion apart). What is kept changes no bit of what is computed: pairs out of range add nothing, and all others come in
-one order. Steps are bounded by what they may meet on the way (`solvers.contact.ways`). Where that is nothing, patches
-tell (`solvers.contact.patches`), and what is kept is that nothing is near where it ends.
+Which pairs may be near, and how far a step may go, `solvers.contact.known` tells.
 
 `SelfContact` is a mesh against itself, `ObstacleContact` a mesh against the surfaces of obstacles. The vertices of
 these follow those of the mesh in all that is computed; in a step they are where they are at its end, and go there from
@@ -14,80 +11,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
-from solvers.contact import barrier, contacts, ways
+from solvers.contact import barrier, contacts, known
 from solvers.contact.blocks import Blocks, Room
 from solvers.contact.contacts import Contacts, Pairs, padded
 from solvers.contact.curvature import add_curvature, coupled, curvature
 from solvers.contact.grip import NO_GRIP, Grip
-from solvers.contact.ways import LEFT, unevenness
+from solvers.contact.known import Kept, Surfaces
 from solvers.problem import Positions, Start
 
 Array = NDArray[np.float64]
 
-_ROUND = 8.0 * np.finfo(np.float64).eps
-"""Of the largest coordinate: by so much boxes are made wider."""
-
-
 _NEAR = 1.25
 """Of the range: pairs so far apart may come into it during a solve."""
-
-_WIDE = 1.5
-"""Of the range: so far pairs are looked up. More would be looked at each time for longer than it takes to look them up
-anew now and then."""
-_FAR = 1.25
-"""Of the range: so far nothing may be on a way after which nothing is near. The less, the fewer patches are in doubt;
-the more, the longer are steps that need no look."""
-_MANY = 3
-"""Positions around which is kept what is near them: of a step these are its start, free fall and where it goes."""
-
-
-class Surfaces(Protocol):
-    """What may touch: finds pairs among all vertices."""
-
-    @property
-    def thickness(self) -> float:
-        """So far apart pairs stay at least [m]."""
-        ...
-
-    @property
-    def reach(self) -> float:
-        """So far beyond that they feel each other [m]."""
-        ...
-
-    def clear(self, p: Positions, q: Positions, reach: float, share: float) -> bool:
-        """Whether no pair comes nearer than `reach` [m], and `share` of its distance at p, on the straight way from p
-        to q, (n, 3) [m] both; False where that would take long to say."""
-        ...
-
-    def within(self, p: Positions, reach: float) -> Pairs:
-        """Pairs that are nearer than `reach` [m] at p (n, 3) [m]."""
-        ...
-
-    def on_way(self, p: Positions, q: Positions, reach: float, share: float) -> Pairs:
-        """Pairs that may come nearer than `reach` [m], and `share` of their distance at p, on the straight way from p
-        to q, (n, 3) [m] both; with what they press with or without."""
-        ...
 
 
 Place = Callable[[float], Positions]
 Carry = Callable[[float, float, Positions], list[Positions]]
-
-
-_NONE = np.empty((0, 4), np.int64), 0, *(np.empty(0) for _ in range(3))
-
-
-class _Kept(NamedTuple):
-    """Pairs that are nearer than `reach` at p (n, 3)."""
-
-    p: Positions
-    reach: float
-    pairs: Pairs
 
 
 class _Met(NamedTuple):
@@ -109,7 +54,7 @@ class PairContact:
     surface: Surfaces
     friction: float = 0.0
     slip: float = 1e-3
-    kept: list[_Kept] = field(default_factory=list[_Kept])
+    kept: list[Kept] = field(default_factory=list[Kept])
     met: list[_Met] = field(default_factory=list[_Met])
     room: Room = field(default_factory=Room)
     grip: Grip = NO_GRIP
@@ -128,7 +73,7 @@ class PairContact:
 
     def _gripping(self, p: Positions, start: Start) -> Grip:
         """p: all vertices at the step's start."""
-        if self._idle(p):
+        if known.idle(self.surface, self.kept, p):
             return NO_GRIP
         return Grip.of(self._at(p).contacts, self.friction, self.slip * (start.until - start.time))
 
@@ -142,44 +87,12 @@ class PairContact:
 
     def pairs(self, p: Positions) -> Pairs:
         """Pairs that may be in range at p, all vertices' (N, 3): all that are, and maybe more."""
-        for kept in self.kept:
-            if self._covers(kept, p):
-                return kept.pairs
-        reach = _WIDE * self.range + self._round(p)
-        if self.kept and not self._far(self.kept[0]):
-            return self._keep(p.copy(), reach, self.surface.within(p, reach))
-        far = self.surface.clear(p, p, reach, 0.0)
-        return self._keep(p.copy(), reach, None if far else self.surface.within(p, reach))
-
-    def _covers(self, kept: _Kept, p: Positions) -> bool:
-        """Whether all pairs in range at p (N, 3) are known from there."""
-        return kept.p.shape == p.shape and unevenness(kept.p, p) <= kept.reach - self.range
-
-    @staticmethod
-    def _far(kept: _Kept) -> bool:
-        return not len(kept.pairs.vertices)
-
-    def _keep(self, p: Positions, reach: float, pairs: Pairs | None) -> Pairs:
-        """Keep the pairs that are nearer than `reach` at p (N, 3), which nobody else writes to; None for none."""
-        if pairs is None:
-            surface = self.surface
-            pairs = Pairs(*_NONE, thickness=surface.thickness, reach=surface.reach)
-        self.kept[:] = [_Kept(p, reach, pairs), *self.kept[: _MANY - 1]]
-        return pairs
-
-    @staticmethod
-    def _round(p: Positions) -> float:
-        """By how much boxes are made wider [m]."""
-        return _ROUND * float(np.abs(p).max(initial=0.0))
-
-    def _idle(self, p: Positions) -> bool:
-        """Whether it is known that nothing is in range at p (N, 3)."""
-        return any(self._far(kept) and self._covers(kept, p) for kept in self.kept)
+        return known.pairs(self.surface, self.kept, p)
 
     def value(self, p: Positions) -> float:
         """The energy [J] at p, shape (n, 3); infinite where a pair is nearer than the thickness."""
         p = self.whole(p)
-        if not self._idle(p):
+        if not known.idle(self.surface, self.kept, p):
             if not np.isfinite(p).all():
                 return np.inf
             pressed = self._at(p).value
@@ -190,7 +103,7 @@ class PairContact:
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N], shape (n, 3), to `out`."""
         n, p = len(p), self.whole(p)
-        if not self._idle(p):
+        if not known.idle(self.surface, self.kept, p):
             if not np.isfinite(p).all():
                 return
             met = self._at(p)
@@ -260,7 +173,7 @@ class PairContact:
     def largest_step(self, p: Positions, direction: Positions) -> float:
         """The largest t up to 1 by which p may go along a direction, both (n, 3), with all gaps open; 0 where one is
         closed at p. Nothing touches at any smaller t either."""
-        return self._largest(self.whole(p), self.toward(direction))
+        return known.largest_step(self.surface, self.kept, self.whole(p), self.toward(direction))
 
     def carried(self, p: Positions, direction: Positions, begin: float) -> float:
         """The largest part t of what is left of the step by which p may go along a direction, both (n, 3), while
@@ -274,32 +187,6 @@ class PairContact:
     def with_obstacles(self, p: Positions) -> list[Positions]:
         """Where p (n, 3) would be at the step's end, were it to move with each of the obstacles that move."""
         return []
-
-    def _largest(self, p: Positions, way: Positions) -> float:
-        """The same for all vertices, (N, 3) both."""
-        q = p + way
-        pairs = None
-        for kept in self.kept:
-            if kept.p.shape == p.shape:
-                before = unevenness(kept.p, p)
-                most = max(before, unevenness(kept.p, q))
-                if most + LEFT * before <= (1.0 - LEFT) * (kept.reach - self.surface.thickness):
-                    if self._far(kept):
-                        return 1.0
-                    pairs = kept.pairs
-                    break
-        if not np.isfinite(way).all():
-            return 0.0
-        if pairs is None:
-            rounded = self._round(p)
-            reach = _FAR * self.range + rounded
-            if not (self.kept and len(self.kept[0].pairs.vertices)) and self.surface.clear(p, q, reach, LEFT):
-                self._keep(q, reach, None)
-                return 1.0
-            pairs = self.surface.on_way(p, q, self.surface.thickness + rounded, LEFT)
-        way = way - way.mean(axis=0)
-        scratch = np.empty(4, np.int64), np.empty((4, 3)), np.empty((4, 3))
-        return ways.largest(pairs, padded(p), padded(way), 1.0, *scratch)
 
     def closed(self, p: Positions) -> list[tuple[NDArray[np.int64], bool, float]]:
         """Pairs that are not farther apart than their thickness at p (n, 3): their vertices (4,), whether they are
@@ -358,7 +245,8 @@ class ObstacleContact(PairContact):
     def carried(self, p: Positions, direction: Positions, begin: float) -> float:
         """See PairContact."""
         there = self.at_part(begin).placed
-        return self._largest(np.concatenate([p, there]), np.concatenate([direction, self.end - there]))
+        way = np.concatenate([direction, self.end - there])
+        return known.largest_step(self.surface, self.kept, np.concatenate([p, there]), way)
 
     def at_part(self, part: float) -> Self:
         """See PairContact."""

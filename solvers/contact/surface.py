@@ -77,7 +77,7 @@ class Surface:
         return Patches.of(self.rest, self.points, self.edges, self.triangles, _LOOKED * (self.thickness + self.reach))
 
     def clear(self, p: Positions, q: Positions, reach: float, share: float) -> bool:
-        """See `solvers.contact.self_contact.Surfaces`."""
+        """See `solvers.contact.known.Surfaces`."""
         return self._patches.clear(p, q, reach, share)
 
     def within(self, p: Positions, reach: float) -> Pairs:
@@ -101,7 +101,7 @@ class Surface:
         return self.points.corners, self.triangles.corners, self.edges.corners
 
     def on_way(self, p: Positions, q: Positions, reach: float, share: float) -> Pairs:
-        """See `solvers.contact.self_contact.Surfaces`; without what they press with."""
+        """See `solvers.contact.known.Surfaces`; without what they press with."""
         found, first = self._near(p, q, reach, share)
         return self._bare(found, first)._replace(scale=self._scale(found, first))
 
