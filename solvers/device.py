@@ -72,16 +72,31 @@ class Marks(NamedTuple):
     down: Event
 
 
+class Rule(NamedTuple):
+    """An integrator of one unknown x a step, in numbers: origin = p + recalls (p - p'), target = origin + leads v +
+    bends (v - v'), with p', v' one step before, and leads and bends [s]. ahead [s]: how far what is lagged is
+    extrapolated; when: the time of x within the step, 1 at its end."""
+
+    recalls: float
+    leads: float
+    bends: float
+    ahead: float
+    when: float
+
+
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What a device needs to go on by itself from step to step of implicit Euler.
+    """What a device needs to go on by itself from step to step of a time integrator.
 
-    positions [m], velocity [m/s]: at the start, (n, 3); load: the forces that never change, (n, 3) [N]; filters: of the
-    velocity (`solvers.filters`), before each step, in their order; first_guess: its name; pins_at: where the pins want
-    their vertices at a time [s], (q, 3) [m]; pins_move: whether that changes.
+    rule: of the integrator; first: the method ready for the system of the first step, and the rule of that, where it is
+    another; positions [m], velocity [m/s]: at the start, (n, 3); load: the forces that never change, (n, 3) [N];
+    filters: of the velocity (`solvers.filters`), before each step, in their order; first_guess: its name; pins_at:
+    where the pins want their vertices at a time [s], (q, 3) [m]; pins_move: whether that changes.
     """
 
     system: System
+    rule: Rule
+    first: tuple[Remote, Rule] | None
     positions: Positions
     velocity: Positions
     load: Positions

@@ -14,8 +14,8 @@ from harness.scenes.bind import Scene
 from harness.simulation.clock import Clock
 from harness.simulation.passing import Passing
 from harness.simulation.step import Step, Turns, start
-from solvers.device import Course, Marks, Remote, Steps
-from solvers.integrators import IMPLICIT_EULER
+from solvers.device import Course, Marks, Remote, Rule, Steps
+from solvers.integrators import IMPLICIT_EULER, Integrator
 from solvers.problem import Positions, Prepared, Solution, StepProblem, StopRule, Unsupported
 
 TRIADS = 6
@@ -101,25 +101,34 @@ def on_device(scene: Scene, prepared: Prepared, first_guess: str) -> Staying | R
     if not isinstance(usual, Remote):
         return None
     try:
-        return Staying(prepared, usual, usual.stepping(_course(scene, first_guess)))
+        return Staying(prepared, usual, usual.stepping(_course(scene, prepared, first_guess)))
     except Unsupported as error:
         return Replayed(prepared, usual, str(error))
 
 
-def _course(scene: Scene, first_guess: str) -> Course:
+def _course(scene: Scene, prepared: Prepared, first_guess: str) -> Course:
     """What steps of a scene follow from. Raises Unsupported with what a host has to do before each."""
-    if scene.integrator is not IMPLICIT_EULER:
-        raise Unsupported("the host states steps of integrators other than implicit-euler")
+    usual = scene.integrator
+    if not isinstance(usual, Integrator):
+        raise Unsupported("the host states the unknowns of integrators that have several a step")
     if scene.alternate:
         raise Unsupported("the host states steps of two lengths")
     if scene.forces:
         where = sorted({getattr(force, "__module__", type(force).__module__) for force in scene.forces})
         named = ", ".join(name.rpartition(".")[2] for name in where)
         raise Unsupported(f"the host computes a force before each step, by a function in Python ({named})")
-    begun = start(scene).now
+    dt, first, begun = scene.system.time_step, None, start(scene).now
+    if isinstance(prepared, Turns):  # of an integrator that needs the motion one step before
+        assert isinstance(prepared.other, Remote)
+        first = prepared.other, _rule(IMPLICIT_EULER, dt)
     return Course(
-        scene.system, *begun, scene.load, scene.filters, first_guess, scene.pins_at, pins_move=bool(scene.moving)
-    )
+        scene.system, _rule(usual, dt), first, *begun, scene.load, scene.filters, first_guess, scene.pins_at,
+        pins_move=bool(scene.moving),
+    )  # fmt: skip
+
+
+def _rule(method: Integrator, dt: float) -> Rule:
+    return Rule(*method.weights(dt), method.ahead * dt, method.when)
 
 
 def seconds(marks: Marks | None) -> dict[str, float]:

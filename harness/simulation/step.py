@@ -160,12 +160,12 @@ class Turns:
 
     def __init__(self, usual: Prepared, other: Prepared, rate: float) -> None:
         """rate: of the other [1/s]."""
-        self.usual, self._other, self._rate = usual, other, rate
+        self.usual, self.other, self._rate = usual, other, rate
         self.choice, self.facts = usual.choice, usual.facts
 
     def of(self, problem: StepProblem) -> Prepared:
         """The one that the problem is for."""
-        return self._other if problem.system.rate == self._rate else self.usual
+        return self.other if problem.system.rate == self._rate else self.usual
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         return self.of(problem).iterates(problem)

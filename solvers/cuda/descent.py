@@ -21,7 +21,7 @@ from solvers.core.preconditioning import LEAST, Preconditioning
 from solvers.cuda import device, objective_kernels, residual, schwarz, sums
 from solvers.cuda.network import Network, require_known
 from solvers.cuda.preconditioning import Jacobi
-from solvers.cuda.resident import AT_ONCE, Resident, ResidentIterating
+from solvers.cuda.resident import AT_ONCE, Minimising, MinimisingIterating, ResidentIterating
 from solvers.cuda.run import EVERY, Stream
 from solvers.cuda.steps import Begun, Step, Uploaded
 from solvers.cuda.target import cuda
@@ -78,7 +78,7 @@ class Base:
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedDescent(Resident):
+class PreparedDescent(Minimising):
     """A method that is ready. columns: of the device; solving: memory for solves."""
 
     base: Base
@@ -88,7 +88,7 @@ class PreparedDescent(Resident):
 
     @property
     def uploaded(self) -> Uploaded:  # pyright: ignore[reportIncompatibleVariableOverride] the base's
-        """See Resident."""
+        """See Minimising."""
         return self.base.uploaded
 
     @property
@@ -105,7 +105,7 @@ class PreparedDescent(Resident):
         return largest(problem) * self.base.stiffness.trace**0.5
 
 
-class Descending(ResidentIterating):
+class Descending(MinimisingIterating):
     """From point to point. p, q (n, 3): where it is and a trial, in rows; g: the gradient at p (f, 3); z: what the
     preconditioner makes of -g; floor: g H^-1 g [J] of round-off."""
 

@@ -27,6 +27,8 @@ from solvers.cuda.target import cuda
 from solvers.kernels.explicit_steps import CAUTION, FEWEST, FLOOR, LARGEST
 
 ENDED, T, STEP, H, LAST, BEFORE, TAKEN, ACCEPTED, REJECTED = range(9)
+NOTHING = np.zeros(9)
+"""`now` before it is told anything."""
 
 
 class Motion(NamedTuple):
@@ -118,6 +120,33 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
             i += cuda.gridsize(1)
 
     return Kernels(kick, evaluate)
+
+
+@cuda.jit
+def begin(vertex, step, motion, p, q, v):
+    """Take a step: its start for positions, in both arrays, and for velocities, its force and where pins lead."""
+    i, rows = cuda.grid(1), v.shape[0]
+    while i < p.shape[0]:
+        at = vertex[i]
+        for c in range(3):
+            here = step.positions[at, c]
+            p[i, c], q[i, c] = here, here
+            if i < rows:
+                v[i, c], motion.force[i, c] = step.velocity[at, c], step.force[at, c]
+            else:
+                motion.begin[i - rows, c], motion.end[i - rows, c] = here, step.pins[i - rows, c]
+        i += cuda.gridsize(1)
+
+
+@cuda.jit
+def speeds(motion, frame, v, out):
+    """Write velocities at a frame's end to `out` (n, 3), of pinned rows what brings them evenly to their targets."""
+    i, rows = cuda.grid(1), v.shape[0]
+    while i < out.shape[0]:
+        for c in range(3):
+            k = i - rows
+            out[i, c] = v[i, c] if i < rows else (motion.end[k, c] - motion.begin[k, c]) / frame
+        i += cuda.gridsize(1)
 
 
 @cuda.jit(device=True)

@@ -24,7 +24,7 @@ from solvers.cuda.descent import trial
 from solvers.cuda.lbfgs_kernels import Rows, kernels
 from solvers.cuda.network import Network, require_known
 from solvers.cuda.pncg import dotted
-from solvers.cuda.resident import AT_ONCE, Resident, ResidentIterating
+from solvers.cuda.resident import AT_ONCE, Minimising, MinimisingIterating, ResidentIterating
 from solvers.cuda.run import EVERY, Stream
 from solvers.cuda.steps import Begun, Step, Uploaded
 from solvers.kernels import accelerate
@@ -57,7 +57,7 @@ def prepare(
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedLbfgs(Resident):
+class PreparedLbfgs(Minimising):
     """stiffness: Q, on the host, without a factor; the rest is on the device."""
 
     stiffness: Stiffness
@@ -82,7 +82,7 @@ class PreparedLbfgs(Resident):
         return largest(problem) * self.stiffness.trace**0.5
 
 
-class _Iterating(ResidentIterating):
+class _Iterating(MinimisingIterating):
     """p, q (n, 3): where it is and a trial, in rows; g, there: the gradients at them, c, after: -S of these, d: the
     direction, all (f, 3); steps, images (m, f, 3): s and w; window: of the line."""
 

@@ -51,6 +51,10 @@ class Stream:
         """Copy a host's array to one of the device of the same shape and type."""
         there.copy_to_device(np.ascontiguousarray(array, there.dtype), stream=self.queue)
 
+    def copy(self, array: Any, there: Any) -> None:
+        """Copy an array of the device to another of the same shape and type."""
+        there.copy_to_device(array, stream=self.queue)
+
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         """Memory of the device, with whatever is there."""
         return cuda.device_array(shape, dtype, stream=self.queue)

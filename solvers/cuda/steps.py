@@ -27,7 +27,8 @@ from solvers.problem import Positions, StepProblem
 class Step(NamedTuple):
     """On the device, by vertices. target, guess (n, 3) [m]; force (n, 3) [N], with that of forms; pins (q, 3): where
     they want their vertices [m], one row where there are none; origin, lagged (n, 3) [m]: of the unknown's velocity,
-    and where dashpots take their directions, any of a network without these."""
+    and where dashpots take their directions, any of a network without these; positions [m], velocity [m/s]: at the
+    step's start (n, 3), any for a method that minimises."""
 
     target: Any
     force: Any
@@ -35,6 +36,8 @@ class Step(NamedTuple):
     pins: Any
     origin: Any
     lagged: Any
+    positions: Any
+    velocity: Any
 
 
 class Places(NamedTuple):
@@ -85,16 +88,14 @@ class Uploaded:
     def step(self, problem: StepProblem, guess: Positions) -> Step:
         """A host's problem, from a first guess (n, 3) [m]."""
         force, up = self.network.parts.force(problem), self.stream.upload
-        target, start = up(problem.target), problem.start
-        lags = bool(self.network.parts.dashpots)
-        return Step(
-            target,
-            up(force),
-            up(guess),
-            up(problem.pin_targets if len(problem.pin_targets) else np.zeros((1, 3))),
-            up(start.origin) if lags else target,
-            up(start.expected) if lags else target,
-        )
+        target, pins, start = up(problem.target), pins_of(problem, self.stream), problem.start
+        lagged = (up(start.origin), up(start.expected)) if self.network.parts.dashpots else (target, target)
+        return Step(target, up(force), up(guess), pins, *lagged, target, target)
+
+
+def pins_of(problem: StepProblem, stream: Stream) -> Any:
+    """Where the pins want their vertices, on the device, which has no empty arrays."""
+    return stream.upload(problem.pin_targets if len(problem.pin_targets) else np.zeros((1, 3)))
 
 
 class Begun:

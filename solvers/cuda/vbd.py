@@ -17,7 +17,7 @@ from solvers.core.parts import Parts
 from solvers.core.vertex_blocks import VertexBlocks
 from solvers.cuda import device, objective_kernels, residual, springs, sums
 from solvers.cuda.network import Network
-from solvers.cuda.resident import AT_ONCE, Resident, ResidentIterating
+from solvers.cuda.resident import AT_ONCE, Minimising, MinimisingIterating, ResidentIterating
 from solvers.cuda.run import THREADS, Stream, blocks
 from solvers.cuda.springs import Lanes
 from solvers.cuda.steps import Begun, Step, Uploaded
@@ -49,7 +49,6 @@ def prepare(system: System, parts: Parts, made: VertexBlocks, radius: float, rea
     with device.guarded():
         stream = Stream()
         return PreparedVertexBlockDescent(
-            system,
             parts,
             made,
             radius,
@@ -63,10 +62,9 @@ def prepare(system: System, parts: Parts, made: VertexBlocks, radius: float, rea
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedVertexBlockDescent(Resident):
+class PreparedVertexBlockDescent(Minimising):
     """parts, made: as on the processor; the rest is on the device: lanes; held, majorant, of each lane [N/m]."""
 
-    system: System
     parts: Parts
     made: VertexBlocks
     radius: float
@@ -96,7 +94,7 @@ class PreparedVertexBlockDescent(Resident):
         return largest(problem) * float(stiffness.sum()) ** 0.5
 
 
-class _Iterating(ResidentIterating):
+class _Iterating(MinimisingIterating):
     """x (n + 2, 4), the reference in float64; u, the displacement from it; older, the iterate before, and before, the
     one where the sweep began, from it too [m]. force (3, lanes): minus the gradient at it [N]; rows (n, 3): where it
     is, and gradient (f, 3) there, both where somebody asks for them."""
@@ -111,13 +109,14 @@ class _Iterating(ResidentIterating):
         self._rows, self._gradient = stream.empty((n, 3), np.float64), stream.empty((n, 3), np.float64)
         self._sums = [stream.zeros(blocks(lanes), np.float64) for _ in range(2)]
         self._begun, self._control = Begun(made.uploaded), stream.zeros(CONTROLS, np.float64)
-        self._fresh = np.zeros(CONTROLS)
-        self._fresh[[KNOWN, WEIGHT]] = np.nan, 1.0
+        fresh = np.zeros(CONTROLS)
+        fresh[[KNOWN, WEIGHT]] = np.nan, 1.0
+        self._fresh = stream.upload(fresh)
 
     def take(self, step: Step) -> None:
         """See ResidentIterating."""
         self._launch(self._springs.clear, len(self._x), self._x, self._u, self._older, self._before)
-        self.stream.put(self._fresh, self._control)
+        self.stream.copy(self._fresh, self._control)
         self._begun.take(step, self._x)
 
     def settled(self) -> Any:

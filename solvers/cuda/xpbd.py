@@ -1,17 +1,12 @@
 """XPBD on a device: the iterates of `solvers.methods.xpbd`, a colour of springs a launch, a spring a thread.
 
-    D = x_i - x_j,   w = u_i - u_j,   v = D + w,   |v| - r = (|D| - r) + (D + v).w / (|D| + |v|)
-
-No two springs of a colour share a vertex, so that nobody writes what another reads. x, where the vertices would go
-without springs, and |D| - r are float64, what the springs move from there, u, is of the kernels' type: float32 errs by
-a part of that, and of how far a spring is from its rest length. `ease` is computed where it is used.
+No two springs of a colour share a vertex, so that nobody writes what another reads. What is computed in which precision
+`solvers.cuda.xpbd_kernels` says.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
-from functools import cache
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -19,9 +14,11 @@ from numpy.typing import NDArray
 
 from solvers.core import vertex_terms
 from solvers.cuda import device, sums
-from solvers.cuda.run import DeviceIterating, DeviceIterative, Stream
-from solvers.cuda.springs import SHORT
+from solvers.cuda.resident import AT_ONCE, Resident, ResidentIterating
+from solvers.cuda.run import Stream
+from solvers.cuda.steps import Step, pins_of
 from solvers.cuda.target import cuda
+from solvers.cuda.xpbd_kernels import kernels, moved, predict, settle
 from solvers.kernels.xpbd import Constraints
 from solvers.problem import Positions, ResidualOf, StepProblem, System
 
@@ -34,12 +31,14 @@ def prepare(
     """The method on the device, which is `ready`. constraints: the springs by colour; first (colours + 1,): the first
     of each; small: whether in small steps. Raises Unsupported where the device has no room."""
     m, n, size = len(constraints.stiffness), system.vertices, np.dtype(real).itemsize
-    device.require_memory("xpbd", m * (8 + 8 + 24 + 6.0 * size) + n * (5 * 24 + 8 + 5.0 * size))
+    solves = m * 5.0 * size + n * (5 * 24 + 8 + 5.0 * size)
+    device.require_memory("xpbd", m * (8 + 8 + 24.0 + size) + n * (6 * 24 + 32) + AT_ONCE * solves)
     with device.guarded():
         stream = Stream()
-        springs = Springs.of(stream, constraints, real)
+        there = Springs.of(stream, constraints, real), Places.of(stream, system)
         told = f"{choice}; kernels in {np.dtype(real)}, from a reference in float64"
-        return PreparedXpbd(system, stream, springs, first, real, small, device.told(), told)
+        made = PreparedSmallSteps if small else PreparedXpbd
+        return made(system, stream, *there, first, real, device.told(), told)
 
 
 class Springs(NamedTuple):
@@ -74,46 +73,95 @@ class Springs(NamedTuple):
         return self._replace(arrows=cuda.device_array((4, m), real), tension=cuda.device_array(m, real))
 
 
+class Places(NamedTuple):
+    """On the device, of each vertex (n,). vertex: its own number; pin: the number of its pin, -1 for none; weight: of
+    that, 0 for none; held: c m/dt^2 + weight [N/m]; mass [kg]."""
+
+    vertex: Any
+    pin: Any
+    weight: Any
+    held: Any
+    mass: Any
+
+    @classmethod
+    def of(cls, stream: Stream, system: System) -> Places:
+        """Those of a system."""
+        n, pins = system.vertices, system.pins
+        pin, weight = np.full(n, -1, np.int32), np.zeros(n)
+        pin[pins.vertices], weight[pins.vertices] = np.arange(len(pins.vertices)), pins.weight
+        arrays = np.arange(n, dtype=np.int32), pin, weight, vertex_terms.held(system), system.mass
+        return cls(*map(stream.upload, arrays))
+
+
 @dataclass(frozen=True, eq=False)
-class PreparedXpbd(DeviceIterative):
-    """first (colours + 1,): of each colour's springs; small: whether in small steps."""
+class PreparedXpbd(Resident):
+    """first (colours + 1,): of each colour's springs."""
 
     residual_of: ClassVar[ResidualOf] = "none"
 
     system: System
     stream: Stream
     springs: Springs
+    places: Places
     first: NDArray[np.int64]
     real: Real
-    small: bool
     columns: dict[str, Any]
     choice: str
-    facts: dict[str, float] = field(default_factory=dict[str, float])
 
-    def __post_init__(self) -> None:
-        """An iteration reads and writes the rows of both ends of a spring, for each colour has others."""
+    @property
+    def facts(self) -> dict[str, float]:
+        """The bytes that a pass over m springs must move, m (8 + 25 s) with numbers of s bytes: of a spring its ends (8),
+        stiffness (s), D and |D| - r (4 s) and tension, read and written (2 s); of each of both ends a row of u, read and
+        written (8 s), and its compliance (s), which are read anew for each spring, for no two of a launch share one."""
         size = np.dtype(self.real).itemsize
-        self.facts["sweep_bytes"] = float(self.first[-1] * (8 + 7 * size + 2 * (2 * 4 + 1) * size))
+        return {"sweep_bytes": float(self.first[-1] * (8 + 25 * size))}
 
-    def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
-        """See Iterative; from where the vertices would go without springs, or where the step starts."""
-        with device.guarded():
-            return (_SmallSteps if self.small else _Passes)(self, problem)
+    def stated(self, problem: StepProblem, guess: Positions) -> Step:
+        """See Resident; the guess is not used."""
+        up, start = self.stream.upload, problem.start
+        target, force, pins = up(problem.target), up(problem.force), pins_of(problem, self.stream)
+        here = (up(start.positions), up(start.velocity)) if self.own else (target, target)
+        return Step(target, force, target, pins, target, target, *here)
+
+    def iterating(self) -> ResidentIterating:
+        """See Resident."""
+        return Passes(self)
 
 
-class _Iterating(DeviceIterating):
+class PreparedSmallSteps(PreparedXpbd):
+    """In small steps."""
+
+    own: ClassVar[bool] = True
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """The bytes that a substep of m springs and n vertices must move: those of a pass, m (16 + 5 s) + 24 n to write
+        D, |D| - r and tensions by ends, lengths at rest and x, and of a vertex, before that, x, v and the force read, x
+        and where it was written (5 x 24), its compliance, pin and weight (20) and u (3 s), and after it x, u, where it
+        was, and x, v and u written (4 x 24 + 6 s)."""
+        size, n = np.dtype(self.real).itemsize, self.system.vertices
+        linearised, moved = self.first[-1] * (16.0 + 5 * size), n * (10 * 24.0 + 20 + 9 * size)
+        return {"sweep_bytes": super().facts["sweep_bytes"] + linearised + moved}
+
+    def iterating(self) -> ResidentIterating:
+        """See Resident."""
+        return SmallSteps(self)
+
+
+class _Iterating(ResidentIterating):
     """x (n, 3): the reference [m]; u (n, 4): the displacement from it; compliance (n,): 1/held [m/N]."""
 
-    def __init__(self, made: PreparedXpbd, p: Positions, compliance: NDArray[np.float64]) -> None:
-        super().__init__(made.stream)
-        self.made, self.kernels, stream = made, kernels(made.real), made.stream
-        self.springs, self.compliance = made.springs.begun(made.real), stream.upload(compliance, made.real)
-        self.x, self.u, self.out = stream.upload(p), stream.zeros((len(p), 4), made.real), cuda.device_array(p.shape)
+    def __init__(self, made: PreparedXpbd) -> None:
+        n, stream = made.system.vertices, made.stream
+        super().__init__(stream, np.arange(n), made.places.vertex)
+        self.made, self.kernels, self.springs = made, kernels(made.real), made.springs.begun(made.real)
+        self.x, self.out = (stream.empty((n, 3), np.float64) for _ in range(2))
+        self.u, self.compliance = stream.empty((n, 4), made.real), stream.empty(n, made.real)
 
-    def fetch(self) -> Positions:
-        """See DeviceIterating."""
+    def settled(self) -> Any:
+        """See ResidentIterating."""
         self.run(moved, len(self.x), self.x, self.u, self.out)
-        return self.stream.download(self.out)
+        return self.out
 
     def run(self, kernel: Any, threads: int, *arguments: Any) -> None:
         """Launch a kernel whose threads go through so many items."""
@@ -130,10 +178,13 @@ class _Iterating(DeviceIterating):
             self.run(self.kernels.project, end - begin, begin, end, self.springs, self.compliance, self.u)
 
 
-class _Passes(_Iterating):
-    def __init__(self, made: PreparedXpbd, problem: StepProblem) -> None:
-        super().__init__(made, vertex_terms.anchors(problem), 1.0 / vertex_terms.held(problem.system))
-        self.uploaded()
+class Passes(_Iterating):
+    """From where the vertices would go without springs."""
+
+    def take(self, step: Step) -> None:
+        """See ResidentIterating."""
+        n, places = len(self.x), self.made.places
+        self.run(self.kernels.anchor, n, places, step.target, step.force, step.pins, self.x, self.u, self.compliance)
         self.linearise()
 
     def sweep(self, count: int) -> None:
@@ -142,152 +193,44 @@ class _Passes(_Iterating):
             self.project()
 
 
-class _SmallSteps(_Iterating):
+class SmallSteps(_Iterating):
     """The whole step in as many substeps as iterations were asked for so far, each time from its start."""
 
-    def __init__(self, made: PreparedXpbd, problem: StepProblem) -> None:
-        start, pins, stream = problem.start, problem.system.pins, made.stream
-        super().__init__(made, start.positions, np.zeros(problem.system.vertices))
-        self._problem, self._substeps = problem, 0
-        pin, q = np.full(problem.system.vertices, -1, np.int32), max(1, len(pins.vertices))
-        pin[pins.vertices] = np.arange(len(pins.vertices))
-        moves = np.zeros((q, 7))
-        moves[: len(pins.vertices)] = np.column_stack(
-            [pins.weight, start.positions[pins.vertices], problem.pin_targets]
-        )
-        self._pin, self._moves, self._force = stream.upload(pin), stream.upload(moves), stream.upload(problem.force)
-        self._before, self._v = stream.upload(start.positions), stream.upload(start.velocity)
-        self._gives = stream.zeros(problem.system.vertices, np.float64)
-        self.uploaded()
+    def __init__(self, made: PreparedXpbd) -> None:
+        super().__init__(made)
+        shape, empty = self.x.shape, self.stream.empty
+        self._before, self._v = (empty(shape, np.float64) for _ in range(2))
+        self._gives, self._substeps = empty(shape[0], np.float64), 0
+        self._step: Step
 
-    def fetch(self) -> Positions:
-        """See DeviceIterating; the velocity comes with it."""
-        self.velocity = self.stream.download(self._v)
-        return super().fetch()
+    def take(self, step: Step) -> None:
+        """See ResidentIterating."""
+        self._substeps, self._step = 0, step
+
+    def settled(self) -> Any:
+        """See ResidentIterating."""
+        return super().settled() if self._substeps else self._step.positions
+
+    def speeds(self) -> Any:
+        """See ResidentIterating."""
+        return self._v if self._substeps else self._step.velocity
 
     def sweep(self, count: int) -> None:
         """See DeviceIterating."""
+        step, n, places = self._step, len(self.x), self.made.places
         self._substeps += count
-        system, start, n = self._problem.system, self._problem.start, len(self.x)
-        h = system.time_step / self._substeps
-        compliance = 1.0 / vertex_terms.held(replace(system, time_step=h))
-        for given, there in (
-            (compliance, self.compliance),
-            (compliance, self._gives),
-            (start.positions, self.x),
-            (start.velocity, self._v),
-            (np.zeros((n, 4)), self.u),
-        ):
-            self.stream.put(given, there)
+        if not self._substeps:
+            return
+        h = self.made.system.time_step / self._substeps
+        self.stream.copy(step.positions, self.x)
+        self.stream.copy(step.velocity, self._v)
+        self.run(self.kernels.soften, n, places, h, self.u, self.compliance, self._gives)
         for left in range(self._substeps - 1, -1, -1):
             part = left / self._substeps
             self.run(
-                predict, n, h, part, self._pin, self._moves, self._gives, self._force, self._v, self._before, self.x,
-                self.u,
+                predict, n, h, part, places, step.positions, step.pins, self._gives, step.force, self._v, self._before,
+                self.x, self.u,
             )  # fmt: skip
             self.linearise()
             self.project()
             self.run(settle, n, h, self._before, self.x, self.u, self._v)
-
-
-class Kernels(NamedTuple):
-    """Of a precision: see each."""
-
-    linearise: Any
-    project: Any
-
-
-@cache
-def kernels(real: Real) -> Kernels:
-    """Those that compute in `real`."""
-    zero, one, short = real(0.0), real(1.0), real(SHORT[real])
-
-    @cuda.jit
-    def linearise(x, count, springs):
-        """Write D and |D| - r of `count` springs, and no tension."""
-        e = cuda.grid(1)
-        while e < count:
-            i, j = springs.ends[e, 0], springs.ends[e, 1]
-            v0, v1, v2 = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
-            length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-            springs.arrows[0, e], springs.arrows[1, e], springs.arrows[2, e] = real(v0), real(v1), real(v2)
-            springs.arrows[3, e] = real(length - springs.rest[e])
-            springs.tension[e] = zero
-            e += cuda.gridsize(1)
-
-    @cuda.jit
-    def project(begin, end, springs, compliance, u):
-        """Move both ends of the springs from `begin` to `end`, all of one colour."""
-        e = begin + cuda.grid(1)
-        while e < end:
-            i, j = springs.ends[e, 0], springs.ends[e, 1]
-            d0, d1, d2 = springs.arrows[0, e], springs.arrows[1, e], springs.arrows[2, e]
-            w0, w1, w2 = u[i, 0] - u[j, 0], u[i, 1] - u[j, 1], u[i, 2] - u[j, 2]
-            v0, v1, v2 = d0 + w0, d1 + w1, d2 + w2
-            squared = v0 * v0 + v1 * v1 + v2 * v2
-            if squared <= short:
-                stretch = -real(springs.rest[e])
-                v0, v1 = real(springs.direction[e, 0]), real(springs.direction[e, 1])
-                v2 = real(springs.direction[e, 2])
-            else:
-                length = real(math.sqrt(squared))
-                both = length + real(math.sqrt(d0 * d0 + d1 * d1 + d2 * d2))
-                stretch = springs.arrows[3, e] + ((d0 + v0) * w0 + (d1 + v1) * w1 + (d2 + v2) * w2) / both
-                scale = one / length
-                v0, v1, v2 = scale * v0, scale * v1, scale * v2
-            k, gives, takes = springs.stiffness[e], compliance[i], compliance[j]
-            change = (k * stretch - springs.tension[e]) / (one + k * (gives + takes))
-            springs.tension[e] += change
-            a, b = gives * change, takes * change
-            u[i, 0], u[i, 1], u[i, 2] = u[i, 0] - a * v0, u[i, 1] - a * v1, u[i, 2] - a * v2
-            u[j, 0], u[j, 1], u[j, 2] = u[j, 0] + b * v0, u[j, 1] + b * v1, u[j, 2] + b * v2
-            e += cuda.gridsize(1)
-
-    return Kernels(linearise, project)
-
-
-@cuda.jit
-def moved(x, u, out):
-    """Write x + u to `out`, (n, 3) [m]."""
-    i = cuda.grid(1)
-    while i < x.shape[0]:
-        for c in range(3):
-            out[i, c] = x[i, c] + np.float64(u[i, c])
-        i += cuda.gridsize(1)
-
-
-@cuda.jit
-def predict(h, left, pin, moves, compliance, force, v, before, x, u):
-    """Write to x where the vertices would go without springs in a substep of h [s]; u is 0 there.
-
-    left: the part of the step that comes after it; pin (n,): of each vertex, -1 for none; moves (q, 7): of each its
-    weight [N/m], and where it moves from and to [m].
-    """
-    i = cuda.grid(1)
-    while i < x.shape[0]:
-        q = pin[i]
-        for c in range(3):
-            here = x[i, c]
-            before[i, c], u[i, c] = here, 0.0
-            there = here + h * v[i, c] + compliance[i] * force[i, c]
-            if q >= 0:
-                target = moves[q, 4 + c] + left * (moves[q, 1 + c] - moves[q, 4 + c])
-                if math.isinf(moves[q, 0]):
-                    there = target
-                else:
-                    # What inertia alone would lead to, without the force that was added above.
-                    there += compliance[i] * moves[q, 0] * (target - here - h * v[i, c])
-            x[i, c] = there
-        i += cuda.gridsize(1)
-
-
-@cuda.jit
-def settle(h, before, x, u, v):
-    """The end of a substep: x + u is where it ends, and by that the velocity."""
-    i = cuda.grid(1)
-    while i < x.shape[0]:
-        for c in range(3):
-            there = x[i, c] + np.float64(u[i, c])
-            v[i, c] = (there - before[i, c]) / h
-            x[i, c], u[i, c] = there, 0.0
-        i += cuda.gridsize(1)

@@ -34,9 +34,10 @@ from solvers.core.explicit_tables import (
     most_steps,
 )
 from solvers.core.forces import ForceParts, Whole, frequency, rows_of_four
+from solvers.core.substeps import Substepping, Substeps
 from solvers.device import Precise
 from solvers.kernels.explicit_steps import Coefficients, Forces, Scratch, Subdivision, compose, integrate
-from solvers.problem import Positions, Prepared, ResidualOf, StepProblem, System, Unsupported
+from solvers.problem import Positions, Prepared, StepProblem, System, Unsupported
 
 _SAFETY = 0.95
 """Of the limit: at the limit itself a vibration neither grows nor keeps its size, and springs are not linear."""
@@ -77,17 +78,17 @@ class Explicit(Precise):
                 f"for {len(parts.springs.edges)} springs are beyond the {most:.0e} allowed; take a shorter time step"
             )
         soft = int((~system.pins.exact).sum())
-        taken = f"; {soft} pins by penalty taken as exact" if soft else ""
+        exact = f"; {soft} pins by penalty taken as exact" if soft else ""
         told = f"steps by an error of {error:.3g}" if error else f"{needed:.0f} substeps"
         lengths = parts.springs.rest_length
         tolerance = error * (float(lengths.mean()) if len(lengths) else 1.0)
-        choice = f"{told}, for vibrations of at most {omega:.3g} rad/s{taken}"
+        choice = f"{told}, for vibrations of at most {omega:.3g} rad/s{exact}"
+        taken = Substeps(int(needed), tolerance, rate, choice)
         if self.device == "cuda":
-            from solvers.cuda.explicit import Substeps, prepare
+            from solvers.cuda.explicit import prepare
 
-            substeps_taken = Substeps(int(needed), tolerance, rate, choice)
-            return prepare(self.name, system, method, parts, substeps_taken, self.real)
-        return PreparedExplicit(system, method, parts, int(needed), tolerance, rate, choice)
+            return prepare(self.name, system, method, parts, taken, self.real)
+        return PreparedExplicit(method, taken, system, parts)
 
 
 @dataclass(frozen=True)
@@ -207,45 +208,21 @@ class DormandPrince8(_Controlled):
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedExplicit(Iterative):
-    """substeps: of a step, where they have one length; tolerance [m]: of each where they have not, else 0; rate: of the
-    fastest motion [1/s]."""
-
-    residual_of: ClassVar[ResidualOf] = "none"
-    factorisations: ClassVar[int] = 0
+class PreparedExplicit(Substepping, Iterative):
+    """On the processor."""
 
     system: System
-    method: Composition | Tableau
     parts: ForceParts
-    substeps: int
-    tolerance: float
-    rate: float
-    choice: str
     facts: dict[str, float] = field(default_factory=dict[str, float])
+
+    @property
+    def choice(self) -> str:
+        """What it chose."""
+        return self.substeps.choice
 
     def begin(self, problem: StepProblem, guess: Positions) -> Iterating:
         """The whole step."""
         return Whole(*self.step(problem)[:2])
-
-    @property
-    def order(self) -> int:
-        """Of the error."""
-        return self.method.order
-
-    @property
-    def evaluations(self) -> int:
-        """Of the forces, in a substep."""
-        return self.method.evaluations
-
-    def within(self, tolerance: float) -> PreparedExplicit:
-        """The same with an error of each substep [m]. Raises Unsupported for substeps of one length."""
-        if isinstance(self.method, Composition) or not self.tolerance:
-            raise Unsupported("the method chooses no steps by an error")
-        return replace(self, tolerance=tolerance)
-
-    def refined(self, times: float) -> PreparedExplicit:
-        """The same with so many times the substeps, rounded up."""
-        return replace(self, substeps=ceil(times * self.substeps))
 
     def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, NDArray[np.float64]]:
         """Positions and velocities (n, 3) at the step's end, and what `integrate` tells. h: the first substep [s] of a
@@ -258,7 +235,8 @@ class PreparedExplicit(Iterative):
         inverse = _of_rows(np.divide(1.0, s.mass, out=np.zeros(s.vertices), where=s.unpinned))
         right, x = self.parts.bundles.right(np.zeros(s.vertices + 2), force), self.parts
         forces = Forces(x.bundles, right, x.pairs, x.weight, x.held, inverse, _of_rows(x.drag), pins.copy(), begin, end)
-        told = np.array([self.substeps, 0.0, frame / self.substeps, frame])
+        count = self.substeps.count
+        told = np.array([count, 0.0, frame / count, frame])
         if isinstance(self.method, Composition):
             self._compose(forces, self.method, p, v)
         else:
@@ -268,9 +246,10 @@ class PreparedExplicit(Iterative):
         return p.reshape(-1, 4)[: s.vertices, :3].copy(), velocity, told
 
     def _compose(self, forces: Forces, method: Composition, p: NDArray[np.float64], v: NDArray[np.float64]) -> None:
-        h = self.system.time_step / self.substeps
+        count = self.substeps.count
+        h = self.system.time_step / count
         kept, gained = in_time(method.kicks, h, forces.drag)
-        compose(forces, method.drifts, kept, gained, self.substeps, h, p, v, np.zeros_like(v))
+        compose(forces, method.drifts, kept, gained, count, h, p, v, np.zeros_like(v))
 
     def _integrate(
         self,
@@ -281,15 +260,15 @@ class PreparedExplicit(Iterative):
         h: float | None,
         told: NDArray[np.float64],
     ) -> None:
-        frame, fixed = self.system.time_step, not self.tolerance
-        first = frame / self.substeps if fixed else min(frame, h or (1.0 / self.rate if self.rate else frame))
+        frame, taken, fixed = self.system.time_step, self.substeps, not self.substeps.tolerance
+        first = frame / taken.count if fixed else min(frame, h or (1.0 / taken.rate if taken.rate else frame))
         errors = np.zeros((1, len(method.a))) if fixed else method.errors
-        most = float(most_steps(self.substeps, self.tolerance))
-        steps = Subdivision(frame, self.tolerance or 1.0, most, first)
+        most = float(most_steps(taken.count, taken.tolerance))
+        steps = Subdivision(frame, taken.tolerance or 1.0, most, first)
         stages = Coefficients(method.a, method.times, errors, method.power)
         integrate(forces, stages, steps, p, v, Scratch.of(len(method.a), len(p)), told)
         if told[3] < frame:
-            raise RuntimeError(method.unfinished(told[0] + told[1], told[2], told[3], frame, self.tolerance))
+            raise RuntimeError(method.unfinished(told[0] + told[1], told[2], told[3], frame, taken.tolerance))
 
 
 def _of_rows(of_vertices: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -81,7 +81,8 @@ class SymplecticEuler(Precise):
         taken = f"; {soft} pins by penalty taken as exact" if soft else ""
         choice = f"{needed:.0f} substeps for vibrations of at most {omega:.3g} rad/s{taken}"
         if self.device == "cuda":
-            from solvers.cuda.explicit import Substeps, prepare
+            from solvers.core.substeps import Substeps
+            from solvers.cuda.explicit import prepare
 
             parts, taken_steps = ForceParts.of(system, "symplectic-euler"), Substeps(int(needed), 0.0, omega, choice)
             return prepare("symplectic-euler", system, SYMPLECTIC_EULER, parts, taken_steps, self.real)

@@ -1,0 +1,151 @@
+"""Kernels of XPBD: where vertices would go without springs, springs there, and how they move their ends.
+
+    D = x_i - x_j,   w = u_i - u_j,   v = D + w,   |v| - r = (|D| - r) + (D + v).w / (|D| + |v|)
+
+x, where the vertices would go without springs, and |D| - r are float64, what the springs move from there, u, is of the
+kernels' type: float32 errs by a part of that, and of how far a spring is from its rest length. `ease` is computed where
+it is used.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from solvers.cuda.springs import SHORT
+from solvers.cuda.target import cuda
+
+Real = type[np.float32] | type[np.float64]
+
+
+class Kernels(NamedTuple):
+    """Of a precision: see each."""
+
+    anchor: Any
+    soften: Any
+    linearise: Any
+    project: Any
+
+
+@cache
+def kernels(real: Real) -> Kernels:
+    """Those that compute in `real`."""
+    zero, one, short = real(0.0), real(1.0), real(SHORT[real])
+
+    @cuda.jit
+    def anchor(places, target, force, pins, x, u, compliance):
+        """Write to x where the vertices would go without springs, y/held; u is 0 there."""
+        i = cuda.grid(1)
+        while i < x.shape[0]:
+            held, w, q = places.held[i], places.weight[i], places.pin[i]
+            for c in range(3):
+                away = force[i, c]
+                if q >= 0 and not math.isinf(w):
+                    away += w * (pins[q, c] - target[i, c])
+                x[i, c] = pins[q, c] if math.isinf(w) else target[i, c] + away / held
+                u[i, c] = zero
+            compliance[i] = real(1.0 / held)
+            i += cuda.gridsize(1)
+
+    @cuda.jit
+    def soften(places, h, u, compliance, gives):
+        """Write 1/held of a step of h [s], in `real` and in float64; u is 0."""
+        i = cuda.grid(1)
+        while i < gives.shape[0]:
+            gives[i] = 1.0 / (places.mass[i] / (h * h) + places.weight[i])
+            compliance[i] = real(gives[i])
+            for c in range(4):
+                u[i, c] = zero
+            i += cuda.gridsize(1)
+
+    @cuda.jit
+    def linearise(x, count, springs):
+        """Write D and |D| - r of `count` springs, and no tension."""
+        e = cuda.grid(1)
+        while e < count:
+            i, j = springs.ends[e, 0], springs.ends[e, 1]
+            v0, v1, v2 = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+            length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+            springs.arrows[0, e], springs.arrows[1, e], springs.arrows[2, e] = real(v0), real(v1), real(v2)
+            springs.arrows[3, e] = real(length - springs.rest[e])
+            springs.tension[e] = zero
+            e += cuda.gridsize(1)
+
+    @cuda.jit
+    def project(begin, end, springs, compliance, u):
+        """Move both ends of the springs from `begin` to `end`, all of one colour."""
+        e = begin + cuda.grid(1)
+        while e < end:
+            i, j = springs.ends[e, 0], springs.ends[e, 1]
+            d0, d1, d2 = springs.arrows[0, e], springs.arrows[1, e], springs.arrows[2, e]
+            w0, w1, w2 = u[i, 0] - u[j, 0], u[i, 1] - u[j, 1], u[i, 2] - u[j, 2]
+            v0, v1, v2 = d0 + w0, d1 + w1, d2 + w2
+            squared = v0 * v0 + v1 * v1 + v2 * v2
+            if squared <= short:
+                stretch = -real(springs.rest[e])
+                v0, v1 = real(springs.direction[e, 0]), real(springs.direction[e, 1])
+                v2 = real(springs.direction[e, 2])
+            else:
+                length = real(math.sqrt(squared))
+                both = length + real(math.sqrt(d0 * d0 + d1 * d1 + d2 * d2))
+                stretch = springs.arrows[3, e] + ((d0 + v0) * w0 + (d1 + v1) * w1 + (d2 + v2) * w2) / both
+                scale = one / length
+                v0, v1, v2 = scale * v0, scale * v1, scale * v2
+            k, gives, takes = springs.stiffness[e], compliance[i], compliance[j]
+            change = (k * stretch - springs.tension[e]) / (one + k * (gives + takes))
+            springs.tension[e] += change
+            a, b = gives * change, takes * change
+            u[i, 0], u[i, 1], u[i, 2] = u[i, 0] - a * v0, u[i, 1] - a * v1, u[i, 2] - a * v2
+            u[j, 0], u[j, 1], u[j, 2] = u[j, 0] + b * v0, u[j, 1] + b * v1, u[j, 2] + b * v2
+            e += cuda.gridsize(1)
+
+    return Kernels(anchor, soften, linearise, project)
+
+
+@cuda.jit
+def moved(x, u, out):
+    """Write x + u to `out`, (n, 3) [m]."""
+    i = cuda.grid(1)
+    while i < x.shape[0]:
+        for c in range(3):
+            out[i, c] = x[i, c] + np.float64(u[i, c])
+        i += cuda.gridsize(1)
+
+
+@cuda.jit
+def predict(h, left, places, start, pins, compliance, force, v, before, x, u):
+    """Write to x where the vertices would go without springs in a substep of h [s]; u is 0 there.
+
+    left: the part of the step that comes after it; start (n, 3), pins (q, 3): where pins move from, and to [m].
+    """
+    i = cuda.grid(1)
+    while i < x.shape[0]:
+        q, w = places.pin[i], places.weight[i]
+        for c in range(3):
+            here = x[i, c]
+            before[i, c], u[i, c] = here, 0.0
+            there = here + h * v[i, c] + compliance[i] * force[i, c]
+            if q >= 0:
+                target = pins[q, c] + left * (start[i, c] - pins[q, c])
+                if math.isinf(w):
+                    there = target
+                else:
+                    # What inertia alone would lead to, without the force that was added above.
+                    there += compliance[i] * w * (target - here - h * v[i, c])
+            x[i, c] = there
+        i += cuda.gridsize(1)
+
+
+@cuda.jit
+def settle(h, before, x, u, v):
+    """The end of a substep: x + u is where it ends, and by that the velocity."""
+    i = cuda.grid(1)
+    while i < x.shape[0]:
+        for c in range(3):
+            there = x[i, c] + np.float64(u[i, c])
+            v[i, c] = (there - before[i, c]) / h
+            x[i, c], u[i, c] = there, 0.0
+        i += cuda.gridsize(1)
