@@ -25,6 +25,7 @@ from solvers.cuda.resident import AT_ONCE, Minimising, MinimisingIterating, Resi
 from solvers.cuda.run import EVERY, Stream
 from solvers.cuda.steps import Begun, Step, Uploaded
 from solvers.cuda.target import cuda
+from solvers.cuda.traffic import Preconditioned, Sizes, jacobi, patches
 from solvers.kernels.line_search import falls
 from solvers.kernels.loop import EACH, ITERATIONS, LAST, STALLED, Limits, verdict
 from solvers.linear.schwarz import ordered
@@ -42,13 +43,19 @@ Real = type[np.float32] | type[np.float64]
 @dataclass(frozen=True, eq=False)
 class Base:
     """A system on the device. stiffness: Q, on the host, without a factor; least: what blocks get beside h (f,);
-    preconditioning: makes the preconditioner of a solve, of so many rows."""
+    preconditioning: makes the preconditioner of a solve, of so many rows; by: the bytes that it moves."""
 
     stiffness: Stiffness
     uploaded: Uploaded
     least: Any
     real: Real
     preconditioning: Callable[[Stream, int, Real], Jacobi]
+    by: Preconditioned
+
+    @property
+    def sizes(self) -> Sizes:
+        """By which bytes are counted."""
+        return self.uploaded.network.sizes(np.dtype(self.real).itemsize)
 
     @classmethod
     def of(cls, solver: str, system: System, preconditioner: Preconditioning, real: Real) -> Base:
@@ -74,17 +81,22 @@ class Base:
             least = stream.upload(LEAST * stiffness.diagonal[order])
             uploaded = [schwarz.UploadedLevel.of(stream, level) for level in levels]
             making = partial(schwarz.Schwarz, levels, uploaded) if levels else Jacobi
-            return cls(stiffness, Uploaded.of(network, stream), least, real, making)
+            sizes = network.sizes(size)
+            each = [(level.nodes, level.edges, level.patches) for level in levels]
+            by = patches(sizes, each) if levels else jacobi(sizes)
+            return cls(stiffness, Uploaded.of(network, stream), least, real, making, by)
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedDescent(Minimising):
-    """A method that is ready. columns: of the device; solving: memory for solves."""
+    """A method that is ready. columns: of the device; solving: memory for solves; moves: bytes that an iteration must
+    move at least."""
 
     base: Base
     columns: dict[str, Any]
     choice: str
     solving: Callable[[Base], Descending]
+    moves: float
 
     @property
     def uploaded(self) -> Uploaded:  # pyright: ignore[reportIncompatibleVariableOverride] the base's
@@ -94,7 +106,7 @@ class PreparedDescent(Minimising):
     @property
     def facts(self) -> dict[str, float]:
         """Exact counts of what was built."""
-        return self.base.stiffness.facts
+        return {**self.base.stiffness.facts, "sweep_bytes": self.moves}
 
     def iterating(self) -> ResidentIterating:
         """See Resident."""

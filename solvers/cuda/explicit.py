@@ -108,7 +108,7 @@ class PreparedExplicit(Substepping, Resident):
     def facts(self) -> dict[str, float]:
         """The bytes that a frame must move (`traffic`), of a method that chooses its steps in as many as are stable."""
         network, method = self.network, self.method
-        of = traffic.Sizes(len(network.order), network.free, len(network.entries.other), len(network.ends), 8)
+        of = network.sizes(8)
         if isinstance(method, Composition):
             return {"sweep_bytes": traffic.kicks(of, method, self.substeps.count, drags=bool(self.parts.drag.any()))}
         return {"sweep_bytes": self.substeps.count * traffic.stages(of, method, chosen=self.substeps.tolerance > 0.0)}

@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 from solvers.core.acceleration import Scheme, window_for
 from solvers.core.descent import Stiffness
 from solvers.core.driver import largest
-from solvers.cuda import device, objective_kernels, residual, sums
+from solvers.cuda import device, objective_kernels, residual, sums, traffic
 from solvers.cuda.descent import trial
 from solvers.cuda.lbfgs_kernels import Rows, kernels
 from solvers.cuda.network import Network, require_known
@@ -70,8 +70,10 @@ class PreparedLbfgs(Minimising):
 
     @property
     def facts(self) -> dict[str, float]:
-        """Exact counts of what was built."""
-        return self.stiffness.facts
+        """Exact counts of what was built, and the bytes that an iteration must move (`traffic`)."""
+        sizes = self.uploaded.network.sizes(np.dtype(self.real).itemsize)
+        moves = traffic.limited(sizes, len(self.S.other), self.scheme.pairs)
+        return {**self.stiffness.facts, "sweep_bytes": moves}
 
     def iterating(self) -> ResidentIterating:
         """See Resident."""

@@ -22,7 +22,8 @@ from solvers.contact.touching import without_contact
 from solvers.core.bounds import without_bounded
 from solvers.core.parts import Parts, split
 from solvers.cuda.run import Stream
-from solvers.problem import Positions, System, Unsupported
+from solvers.cuda.traffic import Sizes
+from solvers.problem import System, Unsupported
 
 WARP = 32
 """Rows whose entries are side by side."""
@@ -127,6 +128,10 @@ class Network:
         """What it takes on the device, beside vectors."""
         return 24.0 * len(self.entries.other) + 64.0 * len(self.ends)
 
+    def sizes(self, size: int) -> Sizes:
+        """By which bytes are counted, with numbers of so many bytes."""
+        return Sizes(len(self.order), self.free, len(self.entries.other), len(self.ends), size)
+
     def upload(self, stream: Stream) -> Edges:
         """Copy it to the device."""
         first, other, edge = self.entries
@@ -150,12 +155,6 @@ class Network:
         kept = self.ends[:, 0] != self.ends[:, 1]
         twice = np.repeat(self.stiffness[kept], 2)
         return self.hold + np.bincount(self.ends[kept].ravel(), twice, minlength=len(self.order))
-
-    def fetched(self, rows: Positions) -> Positions:
-        """Rows as vertices, (n, 3); rows that are not there are zero."""
-        out = np.zeros((len(self.order), 3))
-        out[self.order[: len(rows)]] = rows
-        return out
 
 
 def require_known(solver: str, system: System) -> None:

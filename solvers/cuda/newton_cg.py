@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from solvers.core.preconditioning import Preconditioning
-from solvers.cuda import device, sums
+from solvers.cuda import device, sums, traffic
 from solvers.cuda.conjugate import BEFORE, COUNT, CURVED, ENDED, GOING, LIMIT, PRODUCT, curve, judge, kernels
 from solvers.cuda.descent import Base, Descending, PreparedDescent, Real
 from solvers.cuda.steps import Step
@@ -30,7 +30,8 @@ def prepare(
     def solving(base: Base) -> Descending:
         return _Iterating(base, forcing, most)
 
-    return PreparedDescent(base, device.told(), f"kernels in {np.dtype(real)}, the gradient in float64", solving)
+    words = f"kernels in {np.dtype(real)}, the gradient in float64"
+    return PreparedDescent(base, device.told(), words, solving, traffic.newton(base.sizes, base.by))
 
 
 class _Iterating(Descending):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from solvers.core.preconditioning import Preconditioning
-from solvers.cuda import device, sums
+from solvers.cuda import device, sums, traffic
 from solvers.cuda.descent import Base, Descending, PreparedDescent, Real
 from solvers.cuda.steps import Step
 from solvers.cuda.target import cuda
@@ -15,7 +15,8 @@ from solvers.problem import System
 def prepare(system: System, preconditioner: Preconditioning, real: Real) -> PreparedDescent:
     """The method on the device, which is `ready`. Raises Unsupported, NotPositiveDefinite."""
     base = Base.of("pncg", system, preconditioner, real)
-    return PreparedDescent(base, device.told(), f"kernels in {np.dtype(real)}, the gradient in float64", _Iterating)
+    words = f"kernels in {np.dtype(real)}, the gradient in float64"
+    return PreparedDescent(base, device.told(), words, _Iterating, traffic.nonlinear(base.sizes, base.by))
 
 
 class _Iterating(Descending):

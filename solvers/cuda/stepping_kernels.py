@@ -32,7 +32,7 @@ class Weights(NamedTuple):
 
 
 class Gives(NamedTuple):
-    """What the kernel writes: target, guess (n, 3) [m], force (n, 3) [N], pins (q, 3): where they hold the unknown [m]."""
+    """What a step gives: target, guess (n, 3) [m], force (n, 3) [N], and where pins hold the unknown, (q, 3) [m]."""
 
     target: Any
     force: Any

@@ -1,16 +1,20 @@
 """Bytes that kernels on a device must move: of each launch each array that it reads or writes, once.
 
 By n rows, f of them free, m edges, E entries of them, and s bytes of a number of the kernels' type. What is small, read
-by few rows or counted per warp is left out, and so is what a cache does not hold: it is what must move, no more.
+by few rows or counted per warp is left out, and so is what a cache does not hold: it is what must move, no more. Of an
+iteration whose work depends on the point it is the least: one trial, one turn of conjugate gradients.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from solvers.core.explicit_tables import Composition, Tableau
+from solvers.cuda.schwarz_kernels import packed
+from solvers.linear import schwarz
 
 
 class Sizes(NamedTuple):
@@ -21,6 +25,81 @@ class Sizes(NamedTuple):
     entries: int
     edges: int
     size: int
+
+
+class Preconditioned(NamedTuple):
+    """Of a preconditioner: where the Hessian is linearised, and where it is applied."""
+
+    linearised: float
+    applied: float
+
+
+def jacobi(of: Sizes) -> Preconditioned:
+    """Blocks are written where the Hessian is; to apply them: they, r and z, 12 s f."""
+    return Preconditioned(0.0, 12.0 * of.size * of.free)
+
+
+def patches(of: Sizes, levels: Sequence[tuple[int, int, int]]) -> Preconditioned:
+    """Of additive Schwarz, of whose levels each has N nodes, m_l edges and P patches, h numbers in half of one.
+
+    Linearised: edges and p read, 24 m + 24 n, and of each level b written and read, 96 m_l, and s h P written.
+    Applied: those, r and z, s (h P + 6 N), r gathered for the next level, 3 s N, and r'z, 6 s f.
+    """
+    half, size = packed(schwarz.PATCH) * of.size, of.size
+    linearised = 24.0 * (of.edges + of.rows) + sum(96.0 * edges + half * there for _, edges, there in levels)
+    gathered = sum(3.0 * size * nodes for nodes, _, _ in levels[1:])
+    applied = sum(half * there + 6.0 * size * nodes for nodes, _, there in levels) + gathered
+    return Preconditioned(linearised, applied + 6.0 * size * of.free)
+
+
+def _trial(of: Sizes) -> float:
+    """p, d and g read and q written, (72 + 3 s) f; the rise: p and q, 48 n, what holds rows, 56 f, and edges, 24 m."""
+    return (72.0 + 3 * of.size) * of.free + 48.0 * of.rows + 56.0 * of.free + 24.0 * of.edges
+
+
+def _gradient(of: Sizes) -> float:
+    """Entries (other, stiffness, rest), 20 E, p, 24 n, and hold, centre and force read and g written, 80 f."""
+    return 20.0 * of.entries + 24.0 * of.rows + 80.0 * of.free
+
+
+def _multiply(of: Sizes) -> float:
+    """H x: entries, (4 + 4 s) E, hold, x and H x, (8 + 6 s) f."""
+    return (4.0 + 4 * of.size) * of.entries + (8.0 + 6 * of.size) * of.free
+
+
+def _dotted(of: Sizes) -> float:
+    """g'd: (24 + 3 s) f."""
+    return (24.0 + 3 * of.size) * of.free
+
+
+def _arrived(of: Sizes, by: Preconditioned) -> float:
+    """To a trial, its gradient, and the Hessian there: entries and p, 20 E + 24 n, hold and its least, 16 f, what
+    multiplies written, 4 s E, and blocks, 6 s f; then -g rounded, (24 + 3 s) f, and preconditioned."""
+    linearised = (20.0 + 4 * of.size) * of.entries + 24.0 * of.rows + (16.0 + 6 * of.size) * of.free
+    return _trial(of) + _gradient(of) + linearised + sum(by) + (24.0 + 3 * of.size) * of.free
+
+
+def newton(of: Sizes, by: Preconditioned) -> float:
+    """An iteration of Newton's method with one turn of conjugate gradients, of which each further one takes as much: a
+    direction, 9 s f, its product, d and r, 18 s f, and the preconditioner."""
+    return _arrived(of, by) + 27.0 * of.size * of.free + _multiply(of) + by.applied
+
+
+def nonlinear(of: Sizes, by: Preconditioned) -> float:
+    """An iteration of nonlinear conjugate gradients: two directions, 6 s f and 9 s f, each with its slope and its
+    product, and the scalar products of the next one, (48 + 9 s) f."""
+    directions = 15.0 * of.size * of.free + 2.0 * (_dotted(of) + _multiply(of))
+    return _arrived(of, by) + directions + (48.0 + 9 * of.size) * of.free
+
+
+def limited(of: Sizes, nonzeros: int, pairs: int) -> float:
+    """An iteration of L-BFGS with so many pairs, and S of so many entries: S times the new gradient, (4 + s) of each
+    and (24 + 3 s) f; a direction, (6 + 6 pairs) s f; a trial with its gradient and slope; the new pair, (96 + 12 s) f,
+    and products with all of them, (24 + 6 pairs s) f."""
+    f, size = of.free, of.size
+    product = (4.0 + size) * nonzeros + (24.0 + 3 * size) * f
+    pair = (96.0 + 12 * size) * f + (24.0 + 6 * pairs * size) * f
+    return product + (6.0 + 6 * pairs) * size * f + _trial(of) + _gradient(of) + _dotted(of) + pair
 
 
 def kicks(of: Sizes, method: Composition, count: int, *, drags: bool) -> float:

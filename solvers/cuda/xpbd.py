@@ -110,9 +110,9 @@ class PreparedXpbd(Resident):
 
     @property
     def facts(self) -> dict[str, float]:
-        """The bytes that a pass over m springs must move, m (8 + 25 s) with numbers of s bytes: of a spring its ends (8),
-        stiffness (s), D and |D| - r (4 s) and tension, read and written (2 s); of each of both ends a row of u, read and
-        written (8 s), and its compliance (s), which are read anew for each spring, for no two of a launch share one."""
+        """The bytes that a pass over m springs must move, m (8 + 25 s) with numbers of s bytes: of a spring its ends
+        (8), stiffness (s), D and |D| - r (4 s) and tension, read and written (2 s); of each of both ends a row of u,
+        read and written (8 s), and its compliance (s): no two springs of a launch share an end."""
         size = np.dtype(self.real).itemsize
         return {"sweep_bytes": float(self.first[-1] * (8 + 25 * size))}
 
