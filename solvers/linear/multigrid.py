@@ -154,7 +154,9 @@ def _coarsen(A: csr_array) -> tuple[Level, csr_array]:
 
 
 def largest_eigenvalue(A: csr_array, diagonal: NDArray[np.float64]) -> float:
-    """The largest eigenvalue of D^-1 A: the power method's, and no more than Gershgorin's bound."""
+    """The largest eigenvalue of D^-1 A: the power method's, and no more than Gershgorin's bound; 0 without rows."""
+    if not len(diagonal):
+        return 0.0
     bound = float(((abs(A) @ np.ones(len(diagonal))) / diagonal).max())
     v = np.random.default_rng(0).normal(size=len(diagonal))  # a bit of everything, and always the same
     for _ in range(20):

@@ -35,7 +35,7 @@ from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
 from solvers.problem import StopRule
 from tests.cuda import ahead
 from tests.cuda.near import PRECISIONS
-from tests.cuda.test_steps import DRAGS, staying
+from tests.cuda.test_steps import DRAGS, FILTERS, staying
 from tests.cuda.test_steps import cloth as moving
 from tests.effects import DASHPOTS
 from tests.scenes import cloth, first_problem, random_problem
@@ -62,7 +62,7 @@ MOST_THREADS = 256
 """Of a block, that kernels are launched with."""
 
 WITHOUT_DOUBLES = (
-    *("vbd_kernels.sweep", "vbd_kernels.extrapolate", "xpbd.project", "lbfgs_kernels.multiply"),
+    *("vbd_kernels.sweep", "vbd_kernels.extrapolate", "xpbd_kernels.project", "lbfgs_kernels.multiply"),
     *("schwarz_kernels.gather", "schwarz_kernels.multiply"),
 )
 """Kernels that in float32 compute nothing in float64: a literal in it would make all that it meets float64."""
@@ -104,10 +104,12 @@ def launch_all() -> None:
         for method in METHODS:
             for problem in problems:
                 method(device="cuda", precision=precision).prepare(problem.system).solve(problem, StopRule(8, 1e-3))
-    made = moving(*DRAGS, DASHPOTS)
-    on_it = staying(made, NonlinearCG(preconditioner="block-jacobi", device="cuda"))
-    for step in steps(made, on_it, Settings(StopRule(1), "current", 1, 1)):
-        on_it.keep(step)
+    by_itself, minimises = XpbdSmallSteps(device="cuda"), NonlinearCG(preconditioner="block-jacobi", device="cuda")
+    for solver, effects in (by_itself, FILTERS), (minimises, (*DRAGS, DASHPOTS)):
+        made = moving(*effects)
+        on_it = staying(made, solver)
+        for step in steps(made, on_it, Settings(StopRule(1), "current", 1, 1)):
+            on_it.keep(step)
     triad.run(*(cuda.device_array(1, np.float64) for _ in range(3)))
 
 

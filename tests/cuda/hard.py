@@ -1,0 +1,116 @@
+"""Hard cases on a device: what a method's first steps are there, beside the processor's.
+
+    NUMBA_ENABLE_CUDASIM=1 .venv/bin/python -m pytest -q -n 0 -s -m long tests/cuda/test_hard.py
+
+A case is right on a device where its positions are near to the processor's: by the kernels' precision, or within some
+times what the processor's own move by where its start is changed by round-off. In many hard cases that is much: springs
+that begin without a length point where round-off says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.scenes.bind import Scene
+from harness.simulation.on_device import Staying, on_device
+from harness.simulation.step import prepare, simulate, start
+from solvers.core.substeps import Substepping
+from solvers.cuda.resident import Resident
+from solvers.methods.explicit import RungeKutta4, VelocityVerlet
+from solvers.methods.lbfgs import Lbfgs
+from solvers.methods.newton_cg import NewtonCG
+from solvers.methods.pncg import NonlinearCG
+from solvers.methods.symplectic_euler import SymplecticEuler
+from solvers.methods.vbd import VertexBlockDescent
+from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
+from solvers.problem import StopRule, Unsupported
+
+METHODS: dict[str, Callable[..., Any]] = {
+    "vbd": VertexBlockDescent,
+    "newton-cg": lambda **on: NewtonCG(preconditioner="block-jacobi", **on),
+    "pncg": lambda **on: NonlinearCG(preconditioner="block-jacobi", **on),
+    "lbfgs": lambda **on: Lbfgs(preconditioner="a-jacobi", **on),
+    "xpbd": Xpbd,
+    "xpbd-small-steps": XpbdSmallSteps,
+    "symplectic-euler": SymplecticEuler,
+    "velocity-verlet": VelocityVerlet,
+    "runge-kutta-4": RungeKutta4,
+}
+
+FRAMES, STOP = 2, StopRule(4)
+SUBSTEPS = 60
+"""More of them are too many for the simulator, which takes some milliseconds for a launch."""
+
+Precision = Literal["float64", "float32"]
+ROUND_OFF: dict[Precision, tuple[float, float]] = {"float64": (4e-16, 1e-10), "float32": (1e-7, 1e-5)}
+"""By precision: what round-off changes at the start, in parts of the springs' mean length and, in float64, of the
+largest coordinate; and how near positions are, in parts of that length and of how far vertices moved."""
+
+TIMES = 10.0
+"""So many times what changes of the start make, for kernels round in each operation and not at the start alone."""
+
+Frames = NDArray[np.float64]
+
+
+class TooLong(Exception):
+    """For the simulator."""
+
+
+class Outcome(NamedTuple):
+    """word: right, refused, too long, or wrong; why, of all but the first; over: of what it is away from the processor,
+    over what it may be."""
+
+    word: Literal["right", "refused", "too long", "wrong"]
+    why: str = ""
+    over: float = 0.0
+
+
+def outcome(made: Scene, method: str, precision: Precision) -> Outcome:
+    """What becomes of a scene."""
+    solver = METHODS[method]
+    try:
+        found = ran(made, solver(device="cuda", precision=precision))
+    except TooLong as error:
+        return Outcome("too long", str(error))
+    except Unsupported as error:
+        return Outcome(*_refused(str(error), made, solver))
+    wanted, begun = ran(made, solver()), start(made).now.positions
+    if not np.isfinite(found).all():
+        return Outcome("wrong" if np.isfinite(wanted).all() else "right", "not finite")
+    length = float(made.springs.rest_length.mean()) if len(made.springs.rest_length) else 1.0
+    changes, near = ROUND_OFF[precision]
+    rounded = changes * (length + (np.abs(begun).max() if precision == "float64" else 0.0))
+    may = near * (length + np.abs(wanted - begun).max()) + rounded
+    away = np.abs(found - wanted).max()
+    for seed in range(3):
+        if away <= may:
+            break
+        change = rounded * np.random.default_rng(seed).uniform(-1.0, 1.0, begun.shape)
+        may = max(may, TIMES * np.abs(ran(made, solver(), change) - wanted).max())
+    return Outcome("right" if away <= may else "wrong", f"{away:.1e} m from the processor", float(away / may))
+
+
+def ran(made: Scene, solver: Any, change: Frames | float = 0.0) -> Frames:
+    """Where the first steps end, (frames, n, 3) [m]. change: of the start, which a device does not take."""
+    prepared = prepare(made, solver)
+    if isinstance(prepared, Resident) and isinstance(prepared, Substepping) and prepared.substeps.count > SUBSTEPS:
+        raise TooLong(prepared.substeps.choice)
+    there, state = on_device(made, prepared, "current"), start(made)
+    state = replace(state, now=state.now._replace(positions=state.now.positions + change))
+    stepped = there if isinstance(there, Staying) else prepared
+    run = simulate(made, stepped, STOP, first_guess="current", frames=FRAMES, state=state)
+    return np.array([step.positions for step in run])
+
+
+def _refused(why: str, made: Scene, solver: Any) -> tuple[Literal["refused", "wrong"], str]:
+    """As the processor does, or because of what a device does not take."""
+    try:
+        prepare(made, solver())
+    except Unsupported as error:
+        return ("refused" if str(error) == why else "wrong"), why
+    return ("refused" if "device" in why else "wrong"), why

@@ -1,0 +1,49 @@
+"""Hard cases by all methods on a device, in both precisions: right, or refused by name. Some of them here; all where
+`-m long` asks, which says of each what became of it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from tests.cuda.hard import METHODS, ROUND_OFF, Precision, outcome
+from tests.stability.test_hard_scenes import CASES, scene
+
+SOME = {
+    "geometry-collapsed": ("xpbd", "lbfgs"),
+    "geometry-zero-rest-lengths": ("vbd", "newton-cg", "pncg"),
+    "numbers-1e6-m-away": ("xpbd-small-steps", "velocity-verlet"),
+    "numbers-mass-ratio-1e8": ("vbd", "newton-cg", "xpbd"),
+    "numbers-massless-vertices": ("xpbd", "velocity-verlet", "newton-cg"),
+    "numbers-stiffness-ratio-1e12": ("xpbd",),
+    "scales-links-1e12": ("vbd", "lbfgs"),
+    "motion-pins-jump-exact": ("xpbd", "symplectic-euler", "runge-kutta-4"),
+    "topology-all-pins-exact": tuple(METHODS),
+    "topology-single-vertex": tuple(METHODS),
+    "effects-dashpots-1e12": ("pncg", "vbd"),
+    "contact-resting-block": ("newton-cg", "xpbd"),
+}
+"""What each of them is hard for."""
+
+precisions = pytest.mark.parametrize("precision", ROUND_OFF)
+
+
+@precisions
+@pytest.mark.parametrize(("case", "method"), [(case, method) for case, each in SOME.items() for method in each])
+def test_a_hard_case_is_right_or_refused(case: str, method: str, precision: Precision) -> None:
+    found = outcome(scene(case), method, precision)
+    assert found.word in ("right", "refused"), found
+
+
+@pytest.mark.long
+@precisions
+@pytest.mark.parametrize("method", METHODS)
+def test_every_hard_case_is_right_or_refused(method: str, precision: Precision) -> None:
+    found = {case: outcome(scene(case), method, precision) for case in CASES}
+    print(f"\n{method}, {precision}: {dict(Counter(one.word for one in found.values()))}")
+    for case, one in found.items():
+        if one.word != "right" or one.over > 0.1:
+            print(f"  {case}: {one.word}, {one.why}")
+    assert {case: one for case, one in found.items() if one.word == "wrong"} == {}
