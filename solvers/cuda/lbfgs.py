@@ -1,4 +1,4 @@
-"""L-BFGS on a device: the iterates of `solvers.methods.lbfgs`, whose Q^-1 is a sparse matrix S.
+"""L-BFGS on a device: the iterates of `solvers.methods.lbfgs`, by a sparse matrix S for Q^-1, or by cuDSS's factor.
 
     c = -S grad g(p),    d = scale c - sum over j of (a_j s_j + b_j w_j),    w_j = c_j - c_(j+1)
 
@@ -20,6 +20,7 @@ from solvers.core.acceleration import Scheme, window_for
 from solvers.core.descent import Stiffness
 from solvers.core.driver import largest
 from solvers.cuda import device, objective_kernels, residual, sums, traffic
+from solvers.cuda.cudss import Cudss
 from solvers.cuda.descent import trial
 from solvers.cuda.lbfgs_kernels import Rows, kernels
 from solvers.cuda.network import Network, require_known
@@ -38,31 +39,53 @@ _TRIED = 3
 
 
 def prepare(
-    system: System, stiffness: Stiffness, S: csr_array, scheme: Scheme, real: Real, choice: str
+    system: System, stiffness: Stiffness, S: csr_array | None, scheme: Scheme, real: Real, words: str
 ) -> PreparedLbfgs:
     """The method on the device, which is `ready`. S (f, f): in the place of Q^-1 of the free vertices, symmetric and
-    positive definite. Raises Unsupported for what kernels do not know, and for what the device has no room for."""
+    positive definite; None: Q^-1, by cuDSS. Raises Unsupported for what kernels do not know, and for what the device
+    has no room for, a factor apart."""
     require_known(scheme.name, system)
     order = ordered(stiffness.inner)
     network, size = Network.of(scheme.name, system, order), np.dtype(real).itemsize
-    rows = Rows.of(csr_array(csr_array(S[order])[:, order]))
+    rows = None if S is None else Rows.of(csr_array(csr_array(S[order])[:, order]))
     vectors = network.free * (3.0 * (12 * 8 + (2 * scheme.pairs + 3) * size) + 8.0 * (8 + residual.NUMBERS))
-    device.require_memory(scheme.name, network.bytes + AT_ONCE * vectors + (4.0 + size) * len(rows.other))
+    entries = len(rows.other) if rows else 0
+    device.require_memory(scheme.name, network.bytes + AT_ONCE * vectors + (4.0 + size) * entries)
     with device.guarded():
         stream = Stream()
-        S_there = Rows(stream.upload(rows.first), stream.upload(rows.other), stream.upload(rows.value, real))
-        uploaded = Uploaded.of(network, stream)
-        words = f"{choice}; kernels in {np.dtype(real)}, the gradient in float64"
-        return PreparedLbfgs(stiffness, uploaded, S_there, scheme, real, device.told(), words)
+        if rows is None:
+            inverse = Cudss(csr_array(csr_array(stiffness.inner[order])[:, order]), stream)
+            words = f"{inverse.choice}; "
+        else:
+            inverse = Product(stream, rows, real)
+        words += f"kernels in {np.dtype(real)}, the gradient in float64"
+        return PreparedLbfgs(stiffness, Uploaded.of(network, stream), inverse, scheme, real, device.told(), words)
+
+
+class Product:
+    """A sparse matrix S on the device, in the place of Q^-1."""
+
+    def __init__(self, stream: Stream, rows: Rows, real: Real) -> None:
+        there = stream.upload(rows.first), stream.upload(rows.other), stream.upload(rows.value, real)
+        self._stream, self._S, self._multiply = stream, Rows(*there), kernels(real).multiply
+
+    @property
+    def moves(self) -> float:
+        """The bytes that a product must move, beside vectors: 4 and those of a number, of each entry."""
+        return (4.0 + self._S.value.dtype.itemsize) * len(self._S.other)
+
+    def apply(self, g: Any, out: Any) -> None:
+        """Write -S g (f, 3) to `out`."""
+        self._multiply[sums.blocks(len(out)), sums.THREADS, self._stream.queue](self._S, g, out)
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedLbfgs(Minimising):
-    """stiffness: Q, on the host, without a factor; the rest is on the device."""
+    """stiffness: Q, on the host, without a factor; the rest is on the device: inverse, of Q or near to it."""
 
     stiffness: Stiffness
     uploaded: Uploaded
-    S: Rows
+    inverse: Product | Cudss
     scheme: Scheme
     real: Real
     columns: dict[str, Any]
@@ -72,7 +95,7 @@ class PreparedLbfgs(Minimising):
     def facts(self) -> dict[str, float]:
         """Exact counts of what was built, and the bytes that an iteration must move (`traffic`)."""
         sizes = self.uploaded.network.sizes(np.dtype(self.real).itemsize)
-        moves = traffic.limited(sizes, len(self.S.other), self.scheme.pairs)
+        moves = traffic.limited(sizes, self.inverse.moves, self.scheme.pairs)
         return {**self.stiffness.facts, "sweep_bytes": moves}
 
     def iterating(self) -> ResidentIterating:
@@ -154,7 +177,12 @@ class _Iterating(MinimisingIterating):
     def _look(self, p: Any, g: Any, c: Any) -> None:
         """The gradient at p, and -S of it."""
         objective_kernels.gradient[self._over](self._edges, self._given, p, g)
-        self._kernels.multiply[self._over](self._made.S, g, c)
+        self._invert(g, c)
+
+    def _invert(self, g: Any, c: Any) -> None:
+        """-S g, or -Q^-1 g."""
+        if len(c):
+            self._made.inverse.apply(g, c)
 
     def _collected(self, count: int) -> NDArray[np.float64]:
         """The first sums; waits for them."""
@@ -193,7 +221,7 @@ class _Iterating(MinimisingIterating):
         m = len(window.a)
         new = (int(now["newest"]) + 1) % m
         now["count"] = min(int(now["count"]) + 1, m)
-        self._kernels.multiply[self._over](self._made.S, self._there, self._after)
+        self._invert(self._there, self._after)
         self._kernels.keep[self._over](
             new, self._p, self._q, self._g, self._there, self._c, self._after, self._steps, self._images, self._partials
         )

@@ -43,6 +43,11 @@ class Stream:
     def __init__(self) -> None:
         self.queue: Any = cuda.stream()
 
+    @property
+    def pointer(self) -> int:
+        """What other libraries know the stream by; the simulator has none."""
+        return 0 if device.simulated() else int(self.queue)
+
     def upload(self, array: NDArray[Any], dtype: Any = None) -> Any:
         """A copy of a host's array on the device."""
         return cuda.to_device(np.ascontiguousarray(array, dtype), stream=self.queue)

@@ -57,7 +57,7 @@ def _trial(of: Sizes) -> float:
     return (72.0 + 3 * of.size) * of.free + 48.0 * of.rows + 56.0 * of.free + 24.0 * of.edges
 
 
-def _gradient(of: Sizes) -> float:
+def gradient(of: Sizes) -> float:
     """Entries (other, stiffness, rest), 20 E, p, 24 n, and hold, centre and force read and g written, 80 f."""
     return 20.0 * of.entries + 24.0 * of.rows + 80.0 * of.free
 
@@ -76,7 +76,7 @@ def _arrived(of: Sizes, by: Preconditioned) -> float:
     """To a trial, its gradient, and the Hessian there: entries and p, 20 E + 24 n, hold and its least, 16 f, what
     multiplies written, 4 s E, and blocks, 6 s f; then -g rounded, (24 + 3 s) f, and preconditioned."""
     linearised = (20.0 + 4 * of.size) * of.entries + 24.0 * of.rows + (16.0 + 6 * of.size) * of.free
-    return _trial(of) + _gradient(of) + linearised + sum(by) + (24.0 + 3 * of.size) * of.free
+    return _trial(of) + gradient(of) + linearised + sum(by) + (24.0 + 3 * of.size) * of.free
 
 
 def newton(of: Sizes, by: Preconditioned) -> float:
@@ -92,14 +92,14 @@ def nonlinear(of: Sizes, by: Preconditioned) -> float:
     return _arrived(of, by) + directions + (48.0 + 9 * of.size) * of.free
 
 
-def limited(of: Sizes, nonzeros: int, pairs: int) -> float:
-    """An iteration of L-BFGS with so many pairs, and S of so many entries: S times the new gradient, (4 + s) of each
-    and (24 + 3 s) f; a direction, (6 + 6 pairs) s f; a trial with its gradient and slope; the new pair, (96 + 12 s) f,
-    and products with all of them, (24 + 6 pairs s) f."""
+def limited(of: Sizes, product: float, pairs: int) -> float:
+    """An iteration of L-BFGS with so many pairs: Q^-1, or what is in its place, times the new gradient, `product` and
+    (24 + 3 s) f; a direction, (6 + 6 pairs) s f; a trial with its gradient and slope; the new pair, (96 + 12 s) f, and
+    products with all of them, (24 + 6 pairs s) f."""
     f, size = of.free, of.size
-    product = (4.0 + size) * nonzeros + (24.0 + 3 * size) * f
     pair = (96.0 + 12 * size) * f + (24.0 + 6 * pairs * size) * f
-    return product + (6.0 + 6 * pairs) * size * f + _trial(of) + _gradient(of) + _dotted(of) + pair
+    inverse = product + (24.0 + 3 * size) * f
+    return inverse + (6.0 + 6 * pairs) * size * f + _trial(of) + gradient(of) + _dotted(of) + pair
 
 
 def kicks(of: Sizes, method: Composition, count: int, *, drags: bool) -> float:

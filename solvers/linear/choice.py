@@ -18,7 +18,6 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from solvers.compiling import kept
-from solvers.linear import cudss
 from solvers.linear.conjugate_gradients import ConjugateGradients
 from solvers.linear.factors import Factor, SimplicialCholesky
 from solvers.linear.inverse import Inverse
@@ -125,14 +124,14 @@ def choose(
     """The solver for Q; `linear` forces one. Raises Unsupported where it does not fit in `memory` [bytes]."""
     if linear not in get_args(Linear):
         raise Unsupported(f"linear: {linear!r} is not known; it is one of {', '.join(get_args(Linear))}")
-    if linear in ("cholespy", "cudss") and precision != "float64":
+    if linear == "cholespy" and precision != "float64":
         raise Unsupported(f"{linear}: is used in float64 alone, not in {precision}; use supernodal")
     n = len(Q.indptr) - 1
     room = of_machine() if memory is None else memory
     if linear == "cholespy":
         return Choice(linear, "as asked; its factor is not estimated beforehand")
     if linear == "cudss":
-        return Choice(linear, f"as asked, on a device, by {cudss.installed()}; its factor is not estimated beforehand")
+        raise Unsupported("cudss: solves on a device; give `device: cuda` beside it, which numba and lbfgs know")
     if linear == "inverse" or (linear == "auto" and n <= SMALL):
         why = "as asked" if linear == "inverse" else f"{n} vertices, at most {SMALL}"
         return Choice("inverse", why) if _fits(_inverse(n), room) else _refuse(room, {"inverse": _inverse(n)})
@@ -211,5 +210,4 @@ _MAKERS: dict[str, Callable[[csr_array, Precision, Symbolic | None], Factor]] = 
     "cholespy": lambda Q, precision, _: SimplicialCholesky(Q),
     "supernodal": lambda Q, precision, symbolic: Supernodal(Q, precision=precision, symbolic=symbolic),
     "cg": lambda Q, precision, _: ConjugateGradients(Q),
-    "cudss": lambda Q, precision, _: cudss.Cudss(Q),
 }

@@ -77,11 +77,14 @@ class Lbfgs(Windowed, OnDevice):
             from solvers.cuda.device import ready  # for those who ask for it
 
             ready("lbfgs")
-            if self.preconditioner == "factor" or self.precision == "float16":
+            by_factor = self.preconditioner == "factor"
+            if self.precision == "float16" or (by_factor and (self.linear, self.precision) != ("cudss", "float64")):
                 raise Unsupported(
-                    "lbfgs, device: cuda: knows preconditioner: a-jacobi in float64 or float32, not "
-                    f"{self.preconditioner} in {self.precision}; take these, or device: cpu"
+                    "lbfgs, device: cuda: knows preconditioner: a-jacobi in float64 or float32, and factor by linear: "
+                    f"cudss in float64, not {self.preconditioner} by {self.linear} in {self.precision}; take these, or "
+                    "device: cpu"
                 )
+            return self._there(system)
         if self.preconditioner == "factor":
             return self.by_factor(system)
         if without_bounded(without_contact(system)) is not system:
@@ -89,17 +92,20 @@ class Lbfgs(Windowed, OnDevice):
                 "lbfgs, preconditioner: a-jacobi: its matrix, which is made once, has no rows for what begins to "
                 "touch; take preconditioner: factor"
             )
-        words, scheme = f"{self.sweeps} sweeps of Jacobi", self._scheme
-        if self.device == "cuda":
-            from solvers.cuda.lbfgs import prepare as on_device
-
-            stiffness, real = Stiffness(system), np.float32 if self.precision == "float32" else np.float64
-            S = Aggregated(stiffness.inner, self.sweeps)
-            return on_device(system, stiffness, S.matrix, scheme, real, words)
-        metric = Metric(system)
+        words, scheme, metric = f"{self.sweeps} sweeps of Jacobi", self._scheme, Metric(system)
         energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
         base = prepared(system, energies, lambda Q: (Aggregated(Q, self.sweeps), words))
         return _Prepared(base, metric, scheme, Objective(system))
+
+    def _there(self, system: System) -> Prepared:
+        """On a device."""
+        from solvers.cuda.lbfgs import prepare
+
+        scheme, stiffness = self._scheme, Stiffness(system)
+        if self.preconditioner == "factor":
+            return prepare(system, stiffness, None, scheme, np.float64, "")
+        S, real = Aggregated(stiffness.inner, self.sweeps), np.float32 if self.precision == "float32" else np.float64
+        return prepare(system, stiffness, S.matrix, scheme, real, f"{self.sweeps} sweeps of Jacobi; ")
 
     def by_factor(self, system: System) -> PreparedAccelerated:
         """With Q's factor. Raises as `prepare` does."""
