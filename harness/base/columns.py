@@ -222,7 +222,7 @@ COLUMNS = (
     Column("temperature_c", _REAL, "°C", "its temperature then"),
     Column("kernel_seconds", _REAL, "s", "of the step's kernels on the device, by events on its stream"),
     Column("transfer_seconds", _REAL, "s", "of what the step brings to the device and back, by events"),
-    Column("sweep_bytes", _INT, "", "bytes that an iteration on the device must read and write, by count"),
+    Column("sweep_bytes", _INT, "", "bytes that an iteration on the device must read and write at least, by count"),
     Column("apart", _REAL, "", "how far the precision of the factor moves converged positions, in the scene's size"),
     Column("bytes", _REAL, "", "bytes that the phase touches, vectors and springs included, by count"),
     Column("flops", _REAL, "", "additions and multiplications of the phase, by count"),

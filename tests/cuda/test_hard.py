@@ -44,6 +44,6 @@ def test_every_hard_case_is_right_or_refused(method: str, precision: Precision) 
     found = {case: outcome(scene(case), method, precision) for case in CASES}
     print(f"\n{method}, {precision}: {dict(Counter(one.word for one in found.values()))}")
     for case, one in found.items():
-        if one.word != "right" or one.over > 0.1:
+        if one.word != "right" or one.over > 0.3:
             print(f"  {case}: {one.word}, {one.why}")
     assert {case: one for case, one in found.items() if one.word == "wrong"} == {}
