@@ -19,7 +19,10 @@ from solvers.problem import Unsupported
 
 INSTALL = "`.venv/bin/pip install -e '.[cuda]'` in the checkout installs what it needs beside NVIDIA's driver"
 
-_PACKAGES = ("numba-cuda", "cuda-bindings", "cuda-core", "cuda-toolkit", "nvidia-ml-py", "nvmath-python", "cupy-cuda12x")
+_PACKAGES = (
+    *("numba-cuda", "cuda-bindings", "cuda-core", "cuda-toolkit", "nvidia-ml-py"),
+    *("nvmath-python", "cupy-cuda12x"),
+)
 _SIMULATED = "Numba's simulator, no device"
 _DRIVERS = ("cudadrv", "cuda.bindings", "cuda.core")
 """What errors of a driver come from, as parts of the names of modules."""

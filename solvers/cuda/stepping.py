@@ -10,12 +10,13 @@ unknown's velocity is taken from. A method that integrates a step by itself writ
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 from solvers.core.driver import Iterating, Iterative
 from solvers.cuda import device, sums
+from solvers.cuda.run import Stream
 from solvers.cuda.stepping_kernels import Gives, Motions, Weights, advance, arrive, decay, lag, predict, slow
 from solvers.cuda.steps import Step
 from solvers.device import Course, Marks, Rule
@@ -24,17 +25,34 @@ from solvers.energies.quadratic import Quadratic, Viscous, drag_of_vertices
 from solvers.filters import Decay, QuadraticDrag
 from solvers.problem import Positions, ResidualOf, Solution, StepProblem, StopRule, System, Unsupported, is_lagged
 
-if TYPE_CHECKING:
-    from solvers.cuda.resident import Resident
-
 GUESSES = {"assignment": 0, "current": 1, "inertial": 2}
 """First guesses that follow from a step's start alone: as it is; pins on their targets; where inertia alone leads."""
+
+
+class Method(Protocol):
+    """What of a method steps ask for: `solvers.cuda.resident.Resident`, which imports this."""
+
+    own: ClassVar[bool]
+    system: System
+    stream: Stream
+
+    def iterating(self) -> Any:
+        """Memory for solves, one after the other."""
+        ...
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """See Iterative."""
+        ...
+
+    def scale(self, problem: StepProblem) -> float:
+        """See Iterative."""
+        ...
 
 
 class _Turn:
     """What takes a step: a method, ready for a system, its memory, and the integrator's rule."""
 
-    def __init__(self, made: Resident, rule: Rule) -> None:
+    def __init__(self, made: Method, rule: Rule) -> None:
         self.made, self.run = made, made.iterating()
         self.system, self.stream = made.system, made.stream
         self.weights = Weights(*rule, self.system.rate)
@@ -45,7 +63,7 @@ class Stepping(Iterative):
     """Steps on the device, from the course's start on. Its `solve` does the next one, of which the host's problem is
     told to whoever judges where it ends, and is not computed with."""
 
-    def __init__(self, made: Resident, course: Course) -> None:
+    def __init__(self, made: Method, course: Course) -> None:
         """Raises Unsupported."""
         self._course, system = course, course.system
         constant, drag = _constant(system, course, own=made.own)

@@ -65,8 +65,9 @@ def prepared(name: str, scene: Scene, **parameters: Any) -> PreparedExplicit:
 def fixed(name: str, scene: Scene, substeps: int) -> PreparedExplicit:
     """With substeps of one length."""
     one: Any = prepared(name, scene)
-    method = replace(one.method, power=0.0) if hasattr(one.method, "power") and one.tolerance else one.method
-    return replace(one, substeps=substeps, tolerance=0.0, method=method)
+    taken = replace(one.substeps, count=substeps, tolerance=0.0)
+    method = replace(one.method, power=0.0) if hasattr(one.method, "power") and one.substeps.tolerance else one.method
+    return replace(one, substeps=taken, method=method)
 
 
 def run(scene: Scene, ready: Any, frames: int = 1, state: State | None = None) -> list[Motion]:
