@@ -92,6 +92,7 @@ class PreparedDescent(Minimising):
     """A method that is ready. columns: of the device; solving: memory for solves; moves: bytes that an iteration must
     move at least."""
 
+    system: System
     base: Base
     columns: dict[str, Any]
     choice: str

@@ -59,7 +59,9 @@ def prepare(
         else:
             inverse = Product(stream, rows, real)
         words += f"kernels in {np.dtype(real)}, the gradient in float64"
-        return PreparedLbfgs(stiffness, Uploaded.of(network, stream), inverse, scheme, real, device.told(), words)
+        return PreparedLbfgs(
+            system, stiffness, Uploaded.of(network, stream), inverse, scheme, real, device.told(), words
+        )
 
 
 class Product:
@@ -83,6 +85,7 @@ class Product:
 class PreparedLbfgs(Minimising):
     """stiffness: Q, on the host, without a factor; the rest is on the device: inverse, of Q or near to it."""
 
+    system: System
     stiffness: Stiffness
     uploaded: Uploaded
     inverse: Product | Cudss

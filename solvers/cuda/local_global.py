@@ -36,13 +36,14 @@ def prepare(system: System) -> PreparedLocalGlobal:
     with device.guarded():
         stream = Stream()
         factor = Cudss(stiffness.inner, stream)
-        return PreparedLocalGlobal(stiffness, Uploaded.of(network, stream), factor, device.told())
+        return PreparedLocalGlobal(system, stiffness, Uploaded.of(network, stream), factor, device.told())
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedLocalGlobal(Minimising):
     """stiffness: Q, on the host, without a factor; the rest is on the device."""
 
+    system: System
     stiffness: Stiffness
     uploaded: Uploaded
     factor: Cudss

@@ -31,7 +31,7 @@ def prepare(
         return _Iterating(base, forcing, most)
 
     words = f"kernels in {np.dtype(real)}, the gradient in float64"
-    return PreparedDescent(base, device.told(), words, solving, traffic.newton(base.sizes, base.by))
+    return PreparedDescent(system, base, device.told(), words, solving, traffic.newton(base.sizes, base.by))
 
 
 class _Iterating(Descending):

@@ -16,7 +16,7 @@ def prepare(system: System, preconditioner: Preconditioning, real: Real) -> Prep
     """The method on the device, which is `ready`. Raises Unsupported, NotPositiveDefinite."""
     base = Base.of("pncg", system, preconditioner, real)
     words = f"kernels in {np.dtype(real)}, the gradient in float64"
-    return PreparedDescent(base, device.told(), words, _Iterating, traffic.nonlinear(base.sizes, base.by))
+    return PreparedDescent(system, base, device.told(), words, _Iterating, traffic.nonlinear(base.sizes, base.by))
 
 
 class _Iterating(Descending):

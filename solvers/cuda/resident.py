@@ -102,11 +102,6 @@ class Minimising(Resident):
     uploaded: Uploaded
 
     @property
-    def system(self) -> System:  # pyright: ignore[reportIncompatibleVariableOverride] the network's
-        """See Resident."""
-        return self.uploaded.network.system
-
-    @property
     def stream(self) -> Stream:  # pyright: ignore[reportIncompatibleVariableOverride] the network's
         """See Resident."""
         return self.uploaded.stream

@@ -49,6 +49,7 @@ def prepare(system: System, parts: Parts, made: VertexBlocks, radius: float, rea
     with device.guarded():
         stream = Stream()
         return PreparedVertexBlockDescent(
+            system,
             parts,
             made,
             radius,
@@ -65,6 +66,7 @@ def prepare(system: System, parts: Parts, made: VertexBlocks, radius: float, rea
 class PreparedVertexBlockDescent(Minimising):
     """parts, made: as on the processor; the rest is on the device: lanes; held, majorant, of each lane [N/m]."""
 
+    system: System
     parts: Parts
     made: VertexBlocks
     radius: float

@@ -84,14 +84,15 @@ class Lbfgs(Windowed, OnDevice):
                     f"cudss in float64, not {self.preconditioner} by {self.linear} in {self.precision}; take these, or "
                     "device: cpu"
                 )
-            return self._there(system)
-        if self.preconditioner == "factor":
-            return self.by_factor(system)
-        if without_bounded(without_contact(system)) is not system:
+        if self.preconditioner == "a-jacobi" and without_bounded(without_contact(system)) is not system:
             raise Unsupported(
                 "lbfgs, preconditioner: a-jacobi: its matrix, which is made once, has no rows for what begins to "
                 "touch; take preconditioner: factor"
             )
+        if self.device == "cuda":
+            return self._there(system)
+        if self.preconditioner == "factor":
+            return self.by_factor(system)
         words, scheme, metric = f"{self.sweeps} sweeps of Jacobi", self._scheme, Metric(system)
         energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
         base = prepared(system, energies, lambda Q: (Aggregated(Q, self.sweeps), words))

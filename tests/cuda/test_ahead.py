@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from harness.simulation.measure import Settings, steps
-from solvers.cuda import device, triad, vbd
+from solvers.cuda import cudss, device, local_global, triad, vbd
 from solvers.cuda.target import cuda
 from solvers.linear import schwarz
 from solvers.methods.explicit import BlanesMoan4, Tsitouras5, VelocityVerlet
@@ -111,6 +111,10 @@ def launch_all() -> None:
         for step in steps(made, on_it, Settings(StopRule(1), "current", 1, 1)):
             on_it.keep(step)
     triad.run(*(cuda.device_array(1, np.float64) for _ in range(3)))
+    rows, columns = (cuda.device_array(shape, np.float64) for shape in ((1, 3), (3, 1)))  # of cuDSS, which is not there
+    cudss.to_columns[1, 1](rows, columns)
+    cudss.from_columns[1, 1](columns, rows)
+    local_global.moved[1, 1](rows, rows)
 
 
 @pytest.mark.long

@@ -13,19 +13,18 @@ from tests.stability.test_hard_scenes import CASES, scene
 
 SOME = {
     "geometry-collapsed": ("xpbd", "lbfgs"),
-    "geometry-zero-rest-lengths": ("vbd", "newton-cg", "pncg"),
+    "geometry-zero-rest-lengths": ("vbd", "pncg"),
     "numbers-1e6-m-away": ("xpbd-small-steps", "velocity-verlet"),
-    "numbers-mass-ratio-1e8": ("vbd", "newton-cg", "xpbd"),
-    "numbers-massless-vertices": ("xpbd", "velocity-verlet", "newton-cg"),
-    "numbers-stiffness-ratio-1e12": ("xpbd",),
-    "scales-links-1e12": ("vbd", "lbfgs"),
-    "motion-pins-jump-exact": ("xpbd", "symplectic-euler", "runge-kutta-4"),
-    "topology-all-pins-exact": tuple(METHODS),
+    "numbers-mass-ratio-1e8": ("xpbd", "newton-cg"),
+    "numbers-massless-vertices": ("xpbd", "newton-cg"),
+    "scales-links-1e12": ("lbfgs",),
+    "motion-pins-jump-exact": ("symplectic-euler", "runge-kutta-4"),
+    "topology-all-pins-exact": ("newton-cg", "lbfgs", "xpbd-small-steps", "velocity-verlet"),
     "topology-single-vertex": tuple(METHODS),
-    "effects-dashpots-1e12": ("pncg", "vbd"),
+    "effects-dashpots-1e12": ("lbfgs", "vbd"),
     "contact-resting-block": ("newton-cg", "xpbd"),
 }
-"""What each of them is hard for."""
+"""A few of each kind, and the methods that are asked."""
 
 precisions = pytest.mark.parametrize("precision", ROUND_OFF)
 
