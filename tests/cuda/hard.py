@@ -4,7 +4,7 @@
 
 A case is right on a device where its positions are near to the processor's: by the kernels' precision, or within some
 times what the processor's own move by where its start is changed by round-off. In many hard cases that is much: springs
-that begin without a length point where round-off says.
+that begin without a length point where round-off says. In float32 a minimiser may go elsewhere, if as far down.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 
 from harness.scenes.bind import Scene
 from harness.simulation.on_device import Staying, on_device
-from harness.simulation.step import prepare, simulate, start
+from harness.simulation.step import prepare, problem, simulate, start
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
 from solvers.core.substeps import Substepping
 from solvers.cuda.resident import Resident
 from solvers.integrators import Motion
@@ -29,7 +31,7 @@ from solvers.methods.pncg import NonlinearCG
 from solvers.methods.symplectic_euler import SymplecticEuler
 from solvers.methods.vbd import VertexBlockDescent
 from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
-from solvers.problem import StopRule, Unsupported
+from solvers.problem import Positions, StopRule, Unsupported
 
 METHODS: dict[str, Callable[..., Any]] = {
     "vbd": VertexBlockDescent,
@@ -54,6 +56,10 @@ largest coordinate; and how near positions are, in parts of that length and of h
 
 TIMES = 100.0
 """So many times what changes of the start make: a vertex is moved by dozens of springs, each of which rounds."""
+
+LESS = 0.01
+"""Of the processor's fall of the objective, what a step in float32 may fall by less where it leads elsewhere: where
+stiffnesses lie far apart, conjugate gradients in float32 end elsewhere, and as far down."""
 
 Frames = NDArray[np.float64]
 
@@ -93,7 +99,11 @@ def outcome(made: Scene, method: str, precision: Precision) -> Outcome:
             break
         changes = rounded * np.random.default_rng(seed).uniform(-1.0, 1.0, (2, *begun.shape))
         may = max(may, TIMES * np.abs(ran(made, solver(), changes) - wanted).max())
-    return Outcome("right" if away <= may else "wrong", f"{away:.1e} m from the processor", float(away / may))
+    why = f"{away:.1e} m from the processor"
+    if away > may and precision == "float32" and solver().minimises:
+        part = _fall(made, found[0]) / _fall(made, wanted[0])
+        away, why = may * (1.0 - part) / LESS, f"{why}, its first step falling by {part:.4f} of what that one's does"
+    return Outcome("right" if away <= may else "wrong", why, float(away / may))
 
 
 def ran(made: Scene, solver: Any, changes: Frames | tuple[float, float] = (0.0, 0.0)) -> Frames:
@@ -108,6 +118,12 @@ def ran(made: Scene, solver: Any, changes: Frames | tuple[float, float] = (0.0, 
     stepped = there if isinstance(there, Staying) else prepared
     run = simulate(made, stepped, STOP, first_guess="current", frames=FRAMES, state=state)
     return np.array([step.positions for step in run])
+
+
+def _fall(made: Scene, p: Positions) -> float:
+    """What the objective of the first step falls by to p [J]."""
+    stated = problem(made, start(made), "current")
+    return -StepObjective(Objective(made.system), stated).rise(p, stated.first_guess)[0]
 
 
 def _refused(why: str, made: Scene, solver: Any) -> tuple[Literal["refused", "wrong"], str]:

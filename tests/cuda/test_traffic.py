@@ -39,8 +39,8 @@ def given(argument: Any) -> Iterator[int]:
 @pytest.mark.skipif(not device.simulated(), reason="launches are seen in the simulator")
 @pytest.mark.parametrize("name", METHODS)
 def test_an_iteration_moves_about_what_its_launches_are_given(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of what they are given, each array once, from a fifth to three fifths are not read: axes of dashpots and of springs
-    without length, numbers of edges, stages that others are made of. What is read and written counts twice."""
+    """Of what they are given, each array once, from a fifth to three fifths are not read: axes of dashpots and of
+    springs without length, numbers of edges, other stages. What is read and written counts twice."""
     monkeypatch.setattr(schwarz, "PATCH", 4)
     problem = first_problem(cloth(8, "exact"))
     prepared = METHODS[name](device="cuda", precision="float64").prepare(problem.system)
