@@ -1,0 +1,224 @@
+"""How many times as long as the fastest of all methods one of them takes, by frozen step and accuracy.
+
+    ratio = q(t) / min_m q(t_m)     q the lower quartile over the rounds, m the other methods
+
+    python -m tests.bench.fastest [CONFIG] [--solver hybrid] [--only WORDS] [--rounds 15] [--results FOLDER]
+
+The steps, the first guesses and the methods are those of an accuracy config. An accuracy is a gap,
+(g - g*)/(g0 - g*), g* of the lowest minimum known, and is reached with the first iterate that has it. A first pass
+grades all iterates; then all that may be the fastest take turns in one process, round after round, with a clock of the
+thread's own processor time, and no one looks at what they find. The interval holds 95 % of the ratios of rounds that
+were drawn with replacement. A ratio whose interval reaches above `LIMIT` is marked by >, where the step takes so long
+that it counts. `--config` of one's own tells of other steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from time import thread_time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from harness.base.machine import pinned_threads
+from harness.config.accuracy import CurveSpec
+from harness.config.accuracy_load import load_accuracy
+from harness.experiments.accuracy.solves import GradedStep
+from harness.experiments.accuracy.units import references
+from solvers.problem import Prepared, StepProblem, Unsupported
+from solvers.registry import EVERY, load
+
+ROOT = Path(__file__).resolve().parents[2]
+TARGETS = (1e-3, 1e-4, 1e-6)
+LIMIT = 1.5
+COUNTS = 1e-3
+"""Seconds of the fastest method's, below which a step counts for nothing."""
+HOPELESS = 3.0
+"""Times the least time of the first pass, from which on a method takes no turns."""
+DRAWS, SHARE = 2000, 0.95
+
+
+class Racer(NamedTuple):
+    """A method on a step: its name, what solves, after how many iterations it is at which gap, and seconds of that."""
+
+    name: str
+    prepared: Prepared
+    needs: dict[float, int]
+    seconds: dict[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Ratio:
+    """One accuracy of a step: the fastest method's name and time [s], the ratio to it, and its interval."""
+
+    step: str
+    target: float
+    fastest: str
+    seconds: float
+    ratio: float
+    low: float
+    high: float
+
+    @property
+    def counts(self) -> bool:
+        """Whether the step takes so long."""
+        return self.seconds > COUNTS
+
+
+def steps(config: Path, only: str) -> Iterator[tuple[GradedStep, list[CurveSpec]]]:
+    """The frozen steps of a config whose words are among their names, each once, and who is to solve them."""
+    store = references(ROOT / "results")
+    asked: dict[tuple[object, ...], list[CurveSpec]] = {}
+    for spec in load_accuracy(config).curves:
+        asked.setdefault((spec.case.title, spec.case.integrator, spec.moment), []).append(spec)
+    known: set[str] = set()
+    for (title, _, moment), specs in asked.items():
+        if all(word in f"{title} {moment}" for word in only.split()):
+            step = GradedStep.find(specs[0].case, moment, store)
+            if step.frozen.digest not in known and step.reference.minima:
+                known.add(step.frozen.digest)
+                yield step, specs
+
+
+def racer(spec: CurveSpec, problem: StepProblem, lowest: float) -> Racer | None:
+    """The first pass of a method, up to the last of the accuracies; None where it takes no such scene."""
+    try:
+        prepared = load(EVERY[spec.solver.name])(**spec.solver.parameters).prepare(problem.system)
+        next(prepared.iterates(problem))  # compiles
+    except Unsupported:
+        return None
+    scale, needs, seconds = problem.value(problem.current) - lowest, dict[float, int](), dict[float, float]()
+    iterates, spent = prepared.iterates(problem), 0.0
+    for number in range(1, spec.iterations + 1):
+        began = thread_time()
+        p = next(iterates)
+        spent += thread_time() - began
+        gap = (problem.value(p) - lowest) / scale
+        for target in TARGETS:
+            if gap <= target and target not in needs:
+                needs[target], seconds[target] = number, spent
+        if len(needs) == len(TARGETS) or spent > spec.how.time_limit or not np.isfinite(gap):
+            break
+    return Racer(spec.solver.name, prepared, needs, seconds)
+
+
+def timed(prepared: Prepared, problem: StepProblem, stamps: Sequence[int]) -> list[float]:
+    """Seconds of the thread's processor time to each of these iterates, ascending."""
+    wanted, found = set(stamps), dict[int, float]()
+    gc.disable()  # a collection in the middle would be counted as the solver's
+    try:
+        began = thread_time()
+        for number, _ in enumerate(islice(prepared.iterates(problem), stamps[-1]), 1):
+            if number in wanted:
+                found[number] = thread_time() - began
+    finally:
+        gc.enable()
+    return [found[number] for number in stamps]
+
+
+def raced(racers: Sequence[Racer], problem: StepProblem, rounds: int) -> dict[str, dict[float, NDArray[np.float64]]]:
+    """Seconds (rounds,) to each accuracy, of each method, in turns, one way and then the other."""
+    times: dict[str, dict[float, list[float]]] = {one.name: {target: [] for target in one.needs} for one in racers}
+    for turn in range(-1, rounds):  # the first one warms up
+        for one in racers if turn % 2 else racers[::-1]:
+            stamps = sorted(set(one.needs.values()))
+            by_stamp = dict(zip(stamps, timed(one.prepared, problem, stamps), strict=True))
+            for target, number in one.needs.items() if turn >= 0 else ():
+                times[one.name][target].append(by_stamp[number])
+    return {name: {target: np.array(values) for target, values in of.items()} for name, of in times.items()}
+
+
+def quartile(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The lower one, over the last axis."""
+    return np.quantile(times, 0.25, axis=-1)
+
+
+def ratio(
+    step: str, target: float, name: str, times: dict[str, dict[float, NDArray[np.float64]]], draws: NDArray[np.int64]
+) -> Ratio | None:
+    """Of one method, None where it and all others miss the accuracy; infinite where it does alone."""
+    others = {other: of[target] for other, of in times.items() if other != name and target in of}
+    if not others:
+        return None
+    fastest = min(others, key=lambda other: quartile(others[other]))
+    least = float(quartile(others[fastest]))
+    if target not in times[name]:
+        return Ratio(step, target, fastest, least, np.inf, np.inf, np.inf)
+    mine = times[name][target]
+    best = np.min([quartile(of[draws]) for of in others.values()], axis=0)
+    low, high = np.quantile(quartile(mine[draws]) / best, ((1 - SHARE) / 2, (1 + SHARE) / 2))
+    return Ratio(step, target, fastest, least, float(quartile(mine)) / least, float(low), float(high))
+
+
+def ratios(step: GradedStep, specs: Sequence[CurveSpec], name: str, rounds: int) -> Iterator[Ratio]:
+    """Of one step, from each first guess."""
+    rng = np.random.default_rng(0)
+    draws = rng.integers(rounds, size=(DRAWS, rounds))
+    for guess in specs[0].first_guesses:
+        problem = step.frozen.stated(guess)
+        lowest = step.reference.best.g
+        racers = [found for spec in specs if (found := racer(spec, problem, lowest))]
+        least = {t: min((one.seconds[t] for one in racers if t in one.seconds), default=np.inf) for t in TARGETS}
+        near = [
+            one
+            for one in racers
+            if one.needs and (one.name == name or any(s <= HOPELESS * least[t] for t, s in one.seconds.items()))
+        ]
+        if not any(one.name == name for one in near):
+            near += [Racer(name, one.prepared, {}, {}) for one in racers if one.name == name]
+        times = raced([one for one in near if one.needs], problem, rounds) | {
+            one.name: {} for one in near if not one.needs
+        }
+        words = f"{step.case.title} {step.moment} {guess}"
+        found = (ratio(words, target, name, times, draws) for target in TARGETS)
+        yield from (one for one in found if one is not None)
+
+
+def cell(one: Ratio) -> str:
+    """Its words."""
+    over = one.counts and one.high > LIMIT
+    return f"{'>' if over else ''}{one.ratio:.2f} [{one.low:.2f}, {one.high:.2f}] {one.fastest} {1e3 * one.seconds:.2f}"
+
+
+def table(found: Iterable[Ratio]) -> Table:
+    """A row for each step and first guess."""
+    made = Table("step, first guess", *(f"{target:g}" for target in TARGETS), box=SIMPLE_HEAD)
+    rows: dict[str, dict[float, str]] = {}
+    for one in found:
+        rows.setdefault(one.step, {})[one.target] = cell(one)
+    for step, cells in rows.items():
+        made.add_row(step, *(cells.get(target, "") for target in TARGETS))
+    return made
+
+
+def main() -> None:
+    """Print the table: ratio, interval, the fastest other method and its milliseconds."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("config", nargs="?", type=Path, default=ROOT / "configs" / "accuracy.yaml")
+    parser.add_argument("--solver", default="hybrid", help="whose ratios")
+    parser.add_argument("--only", default="", help="words that the step's name must have")
+    parser.add_argument("--rounds", type=int, default=15)
+    given = parser.parse_args()
+    found = list[Ratio]()
+    with pinned_threads(1):
+        for step, specs in steps(given.config, given.only):
+            found += ratios(step, specs, given.solver, given.rounds)
+            print(f"{step.case.title} {step.moment}", file=sys.stderr)
+    Console(width=180).print(table(found))
+    counted = [one for one in found if one.counts]
+    worse = [one for one in counted if one.high > LIMIT]
+    print(f"{len(worse)} of {len(counted)} accuracies that take above {1e3 * COUNTS:g} ms are not below {LIMIT}")
+
+
+if __name__ == "__main__":
+    main()
