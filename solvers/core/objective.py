@@ -177,11 +177,11 @@ class StepObjective:
 
 
 class Hessian:
-    """The Hessian [N/m] at a point, over the coordinates of free vertices. curvature: see `StepObjective.curvature`."""
+    """The Hessian [N/m] at a point, over the free vertices' coordinates. free: these; curvature: of `StepObjective`."""
 
     def __init__(self, step: StepObjective, p: Positions) -> None:
         self._step, self._p = step, p
-        self._terms, self._free = step.whole.terms, step.whole.system.free
+        self._terms, self.free = step.whole.terms, step.whole.system.free
         parts = [low_rank.sparse_part(energy, p) for energy in step.own if energy not in step.bounded]
         self._columns = low_rank.columns(step.own, p) if step.own else None
         self._others = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
@@ -249,10 +249,10 @@ class Hessian:
     ) -> Positions | None:
         """Both at once, sooner than one after the other; None if it is not positive definite."""
         out = np.zeros_like(b)
-        x = self._factor.solve_anew(self._assembled(keep, shift, tension).values, b[self._free])
+        x = self._factor.solve_anew(self._assembled(keep, shift, tension).values, b[self.free])
         if x is None:
             return None
-        out[self._free] = x
+        out[self.free] = x
         return out
 
     def _assembled(
@@ -293,13 +293,13 @@ class Hessian:
     def solve(self, b: Positions) -> Positions:
         """Its inverse, as it was factorised last, times b (n, 3); zero at vertices that are not free."""
         out = np.zeros_like(b)
-        out[self._free] = self._factor.solve(b[self._free])
+        out[self.free] = self._factor.solve(b[self.free])
         return out
 
     @cached_property
     def _factor(self) -> BlockCholesky | low_rank.Woodbury:
         matrix = self._placed[0]
-        return matrix.factor if self._columns is None else low_rank.Woodbury(matrix, self._columns[self._free])
+        return matrix.factor if self._columns is None else low_rank.Woodbury(matrix, self._columns[self.free])
 
     @cached_property
     def _tension(self) -> NDArray[np.float64]:
@@ -328,5 +328,5 @@ class Hessian:
             product += self._columns @ np.einsum("nik,ni->k", self._columns, x)
         for pairs in self.pairs:
             pairs.add_product(x, product)
-        out[self._free] = product[self._free]
+        out[self.free] = product[self.free]
         return out

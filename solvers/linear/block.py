@@ -14,8 +14,7 @@ from scipy.sparse import csr_array
 
 from solvers import memory
 from solvers.linear.block_factor import Fronts, Scratch, factorise, solve, whole
-from solvers.linear.ordering import nested_dissection
-from solvers.linear.symbolic import Symbolic, analyse
+from solvers.linear.symbolic import Symbolic, structure
 from solvers.problem import Unsupported
 from solvers.vectors.block import ROWS, TILE
 
@@ -35,7 +34,7 @@ class BlockCholesky:
         Raises Unsupported where the factor does not fit in memory.
         """
         pointers, neighbours = np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int32)
-        symbolic = analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
+        symbolic = structure(pointers, neighbours)
         self.nonzeros = 9 * symbolic.nonzeros - 3 * (len(pointers) - 1)
         self._fronts = _fronts(pointers, neighbours, symbolic)
         f = self._fronts

@@ -21,9 +21,8 @@ from solvers.compiling import kept
 from solvers.linear.conjugate_gradients import ConjugateGradients
 from solvers.linear.factors import Factor, SimplicialCholesky
 from solvers.linear.inverse import Inverse
-from solvers.linear.ordering import nested_dissection
 from solvers.linear.supernodal import Supernodal, stored
-from solvers.linear.symbolic import Symbolic, analyse
+from solvers.linear.symbolic import Symbolic, structure
 from solvers.matrices import energy_norm
 from solvers.memory import in_words, of_machine
 from solvers.problem import Unsupported
@@ -140,7 +139,7 @@ def choose(
         found = Choice("cg", f"as asked; {iterative.words}")
         return found if _fits(iterative, room) else _refuse(room, {"cg": iterative})
     pointers, neighbours = np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32)
-    symbolic = analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
+    symbolic = structure(pointers, neighbours)
     direct = estimate(symbolic, precision)
     if linear == "supernodal":
         found = Choice("supernodal", f"as asked; {direct.words}", symbolic)

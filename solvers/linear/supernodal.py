@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from solvers.linear.ordering import nested_dissection
 from solvers.linear.supernodal_factor import Matrix, Panels, factorise, keep_sums
 from solvers.linear.supernodal_solve import Factor, solve_by
 from solvers.linear.supernodes import LANES, WIDTH
-from solvers.linear.symbolic import Symbolic, analyse
+from solvers.linear.symbolic import Symbolic, structure
 from solvers.linear.team import Team
 from solvers.memory import aligned
 from solvers.problem import NotPositiveDefinite, Positions
@@ -153,7 +152,7 @@ class Supernodal:
             raise NotPositiveDefinite(f"Q is not finite in row {v}: a stiffness, a mass or a pin weight there is not")
         pointers = np.asarray(Q.indptr, np.int64)
         neighbours = np.asarray(Q.indices, np.int32)
-        s = symbolic or analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
+        s = symbolic or structure(pointers, neighbours)
         layout = Layout.of(s)
         squares, panels = aligned(layout.squares), aligned(layout.panels)
         into = Panels(layout.chunk_of, layout.chunks, squares, panels)

@@ -5,12 +5,16 @@ Elimination tree and column counts (Liu 1990; Davis 2006, chapter 4), and the ro
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiling import kept
+from solvers.linear.ordering import nested_dissection
 from solvers.linear.supernodes import GROUPS, LANES, amalgamate, groups
 
 
@@ -36,6 +40,33 @@ class Symbolic(NamedTuple):
     sequence: NDArray[np.int32]
     group_start: NDArray[np.int64]
     nonzeros: int
+
+
+_Known = list[tuple[NDArray[np.int64], NDArray[np.int32], Symbolic]]
+
+_known: ContextVar[_Known | None] = ContextVar("_known", default=None)
+
+
+@contextmanager
+def analysed_once() -> Iterator[None]:
+    """Within this, `structure` orders and analyses a graph once, however many matrices have it."""
+    token = _known.set([])
+    try:
+        yield
+    finally:
+        _known.reset(token)
+
+
+def structure(pointers: NDArray[np.int64], neighbours: NDArray[np.int32]) -> Symbolic:
+    """The structure of the factor of a graph in CSR form, in the order of nested dissection; not to be written to."""
+    known = _known.get()
+    for p, n, found in known or ():
+        if np.array_equal(p, pointers) and np.array_equal(n, neighbours):
+            return found
+    found = analyse(pointers, neighbours, nested_dissection(pointers, neighbours))
+    if known is not None:
+        known.append((pointers, neighbours, found))
+    return found
 
 
 def analyse(pointers: NDArray[np.int64], neighbours: NDArray[np.int32], order: NDArray[np.int32]) -> Symbolic:

@@ -8,12 +8,17 @@ unstable, where they are neither. Here tensions are unknowns of their own. Newto
 of both (primal-dual, as in interior point methods: Nocedal and Wright 2006, chapter 19; tensions that outlive an
 iteration stabilise stiff springs in Tournier et al. 2015, "Stable Constrained Dynamics") comes down to a Hessian with
 predicted tensions, and its steps are longer by as much. What such a step stretches at second order is local: a few
-iterations of L-BFGS take it back. The first one starts where the step before ended, from smooth positions.
+iterations of L-BFGS take it back. The first one starts where the step before ended, from smooth positions. Where H(t)
+has no factor a multiple of inertia is added, as small a one as leaves a factor: a step along what is unstable is the
+longer the nearer that multiple is to the least (More and Sorensen 1983).
 
 L-BFGS comes first, over a factor of Q in float32: it is the memory that its iterations wait for, and its directions
-need no more digits. Once it gets slow, whichever brought the greater descent for its cost the last time goes on. The
-exact method takes over when the Hessian is positive definite as it is and the slope falls as it does where Newton's
-method converges quadratically. The start is the lower one of first guess and free fall.
+need no more digits. Once it gets slow, or has so little left that a saddle is as likely as a minimum, one step goes by
+the true tensions, and aside where the curvature there is negative: symmetric starts lead to saddles, near which all
+methods are slow. If the objective fell as the quadratic model promised, these tensions are the prediction. Then
+whichever brought the greater descent for its cost the last time goes on. The exact method takes over when the Hessian
+is positive definite as it is and the slope falls as it does where Newton's method converges quadratically. The start
+is the lower one of first guess and free fall.
 
 Where something is touched, the exact method does it all: contact is in no Q, so that L-BFGS begins anew whenever
 another vertex is touched, and its stiffness is beyond what tensions predict. What a mesh may touch of itself L-BFGS is
@@ -28,22 +33,28 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from solvers.about import About, Reference
 from solvers.core.acceleration import Accelerating
 from solvers.core.bounds import without_bounded
-from solvers.core.descent import Metric, Point, PreparedDescent, dot, lower, near, search
+from solvers.core.descent import Metric, Point, PreparedDescent, lower, near
 from solvers.core.fixed_objective import Objective
-from solvers.core.objective import Hessian, StepObjective
-from solvers.kernels.line_search import falls
+from solvers.core.objective import StepObjective
+from solvers.core.predicting import Predicting, gained
 from solvers.kernels.loop import NEVER, STALLED, Limits, at_most
+from solvers.linear.symbolic import analysed_once
 from solvers.methods.lbfgs import Lbfgs
 from solvers.methods.newton import NewtonMethod
 from solvers.methods.quasi_newton import PreparedAccelerated
 from solvers.problem import Positions, System
 
-_PROBE, _ROUND, _RELAXED = 4, 10, 5
-"""Iterations of L-BFGS at the very first, in a round (the first one's are among them), and after a Newton step."""
+_ROUND, _FIRST = 10, ((2, 2, 3, 3), (5, 5))
+"""Iterations of L-BFGS in a round, and what lies between the iterates of the first rounds: of the few that an easy step
+takes a third at most is too many."""
+
+_PROBE, _RELAXED = 4, 5
+"""Iterations after which it is known whether L-BFGS suits a problem, and those after a Newton step."""
 
 _QUICK = 0.5
 """The part of the residual that the very first iterations leave at most where L-BFGS suits a problem."""
@@ -52,15 +63,8 @@ _SLOW = 0.8
 """Convergence counts as slow, and a Newton step is tried, where a round still lowers the objective by more than this
 part of what the round before it did."""
 
-_KEPT = 0.25
-"""The quadratic model counts as right where a full step lowers the objective by this part of what the slope alone
-promises; of a quadratic function it is one half."""
-
-_QUADRATIC = 0.1
-"""Near a minimum a step of Newton's method leaves at most this part of the slope."""
-
-_LEVELS = ((1.0, 0.0), (1.0, 0.1), (1.0, 1.0), (1.0, 10.0), (0.0, 0.0))
-"""What is kept of negative lateral parts, and what multiple of inertia is added. The last one is positive definite."""
+_LITTLE = 1e-6
+"""Of the descent from the start: what brings no more in a round is at a saddle or a minimum."""
 
 _FLOPS_PER_ENTRY = 270.0
 """Flops of a factorisation that take as long as one entry of Q's factor takes in a round of L-BFGS, both measured with
@@ -86,10 +90,10 @@ class Hybrid:
 
     def prepare(self, system: System) -> PreparedDescent:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported where Q fits nowhere."""
-        metric, objective = Metric(system), Objective(system)
-        lbfgs = Lbfgs(precision="float32").by_factor(without_bounded(system))
-        method = HybridMethod(objective, metric, lbfgs)
-        factor = objective.matrix.factor
+        with analysed_once():
+            metric, objective = Metric(system), Objective(system)
+            lbfgs = Lbfgs(precision="float32").by_factor(without_bounded(system))
+            method, factor = HybridMethod(objective, metric, lbfgs), objective.matrix.factor
         facts = metric.facts | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {lbfgs.choice}"
         choice += objective.interpreted
@@ -101,7 +105,8 @@ class HybridMethod:
 
     def __init__(self, objective: Objective, metric: Metric, lbfgs: PreparedAccelerated) -> None:
         self.metric, self._newton, self._lbfgs = metric, NewtonMethod(metric), lbfgs
-        self.inertia = np.repeat(objective.system.inertia[objective.system.free], 3)
+        self.diagonal: NDArray[np.float64] = np.repeat(metric.diagonal, 3)
+        self.inertia: NDArray[np.float64] = np.repeat(objective.system.inertia[objective.system.free], 3)
         factor = objective.matrix.factor
         self._cost = 9.0 * max(1.0, factor.flops) / (_FLOPS_PER_ENTRY * max(1, factor.nonzeros))
 
@@ -122,31 +127,45 @@ class HybridMethod:
 
     def _approach(self, step: StepObjective, start: Point) -> Iterator[Point]:
         """The points after `start`, until the exact method does better."""
-        point = start
-        predicting = _Predicting(self, step, start)
+        point, rounds = start, iter(_FIRST)
+        predicting: Predicting | None = None
         run: Accelerating | None = self._begun(step, point.positions)
-        before = run.residual()
-        _, residual, _ = run.iterate(at_most(_PROBE))
-        gain, newton_gain = (np.inf, 0.0) if residual <= _QUICK * before else (0.0, np.inf)
-        iterations, fallen, ended = _ROUND - _PROBE, 0.0, False
+        before, done = run.residual(), 0
+        gain, newton_gain, fallen = np.inf, 0.0, 0.0
+        ended = unsuited = False
         while not ended:
             if gain > newton_gain:
+                last, began = gain, point
                 if run is None:
                     run, fallen = self._begun(step, point.positions), 0.0
-                _, residual, verdict = run.iterate(at_most(iterations))
-                following, iterations = _reached(run), _ROUND
-                ended = verdict == STALLED or residual**2 <= self.metric.round_off(following.positions)
-                last, gain, fallen = gain, run.fallen - fallen or _gain(step, point, following), run.fallen
-                if newton_gain == 0.0 and (gain == 0.0 or gain > _SLOW * last):
+                for count in next(rounds, (_ROUND,)):
+                    _, residual, verdict = run.iterate(at_most(count))
+                    point, done = _reached(run), done + count
+                    yield point
+                    ended = verdict == STALLED or residual**2 <= self.metric.round_off(point.positions)
+                    unsuited = done == _PROBE and residual > _QUICK * before
+                    if ended or unsuited:
+                        break
+                gain, fallen = run.fallen - fallen or gained(step, began, point), run.fallen
+                if unsuited:
+                    predicting, gain = Predicting(self, step, start), 0.0
+                little = _LITTLE * fallen if predicting is None else 0.0
+                if newton_gain == 0.0 and (gain <= little or gain > _SLOW * last or unsuited):
                     newton_gain = np.inf
             else:
                 run = None
-                following, fall, ended = predicting.next(point)
+                if predicting is None:
+                    predicting = Predicting(self, step, start)
+                    following, fall, beside = predicting.begin(point)
+                    gain = np.inf if beside else gain
+                    fall = 0.0 if beside else fall
+                else:
+                    following, fall, ended = predicting.next(point)
                 newton_gain = fall / self._cost
-                gain = gain or newton_gain  # until it is known
-            if following is not point:
-                point = following
-                yield point
+                gain = gain or newton_gain
+                if following is not point:
+                    point = following
+                    yield point
 
     def _begun(self, step: StepObjective, p: Positions) -> Accelerating:
         """L-BFGS from p, which knows of nothing that a step may not pass through."""
@@ -168,72 +187,6 @@ class HybridMethod:
         run = self._begun(step, p)
         run.iterate(Limits(_RELAXED, 0.0, 0.0, NEVER))
         return _reached(run)
-
-
-class _Predicting:
-    """Newton's method with predicted tensions, in one solve."""
-
-    def __init__(self, method: HybridMethod, step: StepObjective, origin: Point) -> None:
-        """origin: where the first step starts."""
-        self._method, self._step = method, step
-        self._origin: Point | None = origin
-        self._tension = np.zeros(len(step.whole.springs.stiffness))
-        self._level, self._slope, self._bold = len(_LEVELS), -np.inf, True
-
-    def next(self, point: Point) -> tuple[Point, float, bool]:
-        """A lower point, or the same one; by how much [J]; whether the exact method does better from there."""
-        step, at = self._step, self._origin or point
-        self._origin = None
-        hessian = step.hessian(at.positions)
-        descent = self._solved(hessian, at.gradient)
-        if descent is None:
-            return point, 0.0, True
-        direction = -descent
-        slope, before = dot(at.gradient, direction), self._slope
-        self._slope = slope
-        if not -slope > self._method.metric.round_off(at.positions):
-            return point, 0.0, True
-        predicted = step.tensions(at.positions, direction)
-        length, following, kept = self._along(at, direction, slope)
-        if following is None:
-            return point, 0.0, True
-        self._bold = kept
-        self._tension += length * (predicted - self._tension)
-        gain = _gain(step, point, following)
-        if gain == 0.0:
-            return point, 0.0, at is point
-        return following, gain, self._level == 0 and kept and slope >= _QUADRATIC * before
-
-    def _solved(self, hessian: Hessian, b: Positions) -> Positions | None:
-        """The product of b and the inverse on the first level that has one, from that before the last one's on."""
-        for level in range(max(0, self._level - self._bold), len(_LEVELS)):
-            keep, by = _LEVELS[level]
-            solution = hessian.solve_anew(b, keep, by * self._method.inertia, self._tension)
-            if solution is not None:
-                self._level = level
-                return solution
-        return None
-
-    def _along(self, at: Point, direction: Positions, slope: float) -> tuple[float, Point | None, bool]:
-        """How much of the direction is gone, to where, and whether the objective falls as its model promises."""
-        step = self._step
-        p = step.placed(at.positions + direction)
-        if step.rise(at.positions, p)[0] <= _KEPT * slope:
-            return 1.0, Point(p, step.gradient(p)), True
-        relaxed = self._method.relaxed(step, p)
-        if falls(step.rise(at.positions, relaxed.positions)[0], 1.0, slope, 0.0):
-            return 1.0, relaxed, False
-        found = search(step, at, direction)
-        if found is None:
-            return 0.0, None, False
-        length = dot(found.positions - at.positions, direction) / dot(direction, direction)
-        return length, self._method.relaxed(step, found.positions), False
-
-
-def _gain(step: StepObjective, before: Point, after: Point) -> float:
-    """By how much the objective falls [J], 0 where it rises or round-off hides it."""
-    rise, noise = step.rise(before.positions, after.positions)
-    return -rise if -rise > noise else 0.0
 
 
 def _clear(step: StepObjective, before: Point, after: Point) -> bool:
