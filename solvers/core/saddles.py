@@ -10,6 +10,8 @@ always gives the same direction.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,11 +67,19 @@ def aside(step: StepObjective, at: Point, hessian: Hessian, diagonal: NDArray[np
     return search(step, at, x, first=way, curvature=curvature)
 
 
+@lru_cache(maxsize=1)
+def _random(count: int) -> Positions:
+    """The same directions (count, 3) each time, without any order or symmetry."""
+    x = np.random.default_rng(0).normal(size=(count, 3))
+    x.flags.writeable = False
+    return x
+
+
 def _curved(at: Point, hessian: Hessian, diagonal: NDArray[np.float64], powers: int) -> tuple[Positions, float] | None:
     """A direction of negative curvature that does not rise, its largest entry 1, and that curvature [N/m]."""
     free = hessian.free
     x = np.zeros_like(at.positions)
-    x[free] = np.random.default_rng(0).normal(size=(len(free), 3))
+    x[free] = _random(len(free))
     for _ in range(powers):
         x -= hessian.solve(hessian.multiply(x))
         x /= np.abs(x).max(initial=0.0) or 1.0

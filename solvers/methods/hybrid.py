@@ -59,12 +59,12 @@ _PROBE, _RELAXED = 4, 5
 _QUICK = 0.5
 """The part of the residual that the very first iterations leave at most where L-BFGS suits a problem."""
 
-_SLOW = 0.8
+_SLOW = 0.7
 """Convergence counts as slow, and a Newton step is tried, where a round still lowers the objective by more than this
 part of what the round before it did."""
 
-_LITTLE = 1e-6
-"""Of the descent from the start: what brings no more in a round is at a saddle or a minimum."""
+_LITTLE = 2e-6
+"""Of the descent from the start: a round that brings no more leaves about a millionth, to a saddle or a minimum."""
 
 _FLOPS_PER_ENTRY = 270.0
 """Flops of a factorisation that take as long as one entry of Q's factor takes in a round of L-BFGS, both measured with
