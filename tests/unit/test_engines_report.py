@@ -71,7 +71,7 @@ def test_the_page_has_a_line_for_each_program_on_each_mesh(tmp_path: Path) -> No
 
 
 def test_and_nothing_is_told_where_no_engine_was_tried(tmp_path: Path) -> None:
-    rows: list[dict[str, Any]] = made.work("net", 10)
+    rows: list[dict[str, Any]] = list(made.work("net", 10))
     told = findings(read(made.write(tmp_path, rows)))
     assert not [title for title in told if "engine" in title]
     assert not engines(tmp_path)
