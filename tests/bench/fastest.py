@@ -2,21 +2,20 @@
 
     ratio = q(t) / min_m q(t_m)     q the lower quartile over the rounds, m the other methods
 
-    python -m tests.bench.fastest [CONFIG] [--solver hybrid] [--only WORDS] [--rounds 15] [--results FOLDER]
+    python -m tests.bench.fastest [CONFIG] [--solver hybrid] [--only WORDS] [--rounds 15]
 
 The steps, the first guesses and the methods are those of an accuracy config. An accuracy is a gap,
 (g - g*)/(g0 - g*), g* of the lowest minimum known, and is reached with the first iterate that has it. A first pass
 grades all iterates; then all that may be the fastest take turns in one process, round after round, with a clock of the
 thread's own processor time, and no one looks at what they find. The interval holds 95 % of the ratios of rounds that
 were drawn with replacement. A ratio whose interval reaches above `LIMIT` is marked by >, where the step takes so long
-that it counts. `--config` of one's own tells of other steps.
+that it counts; `inf` is one that is not reached. `configs/fastest.yaml` has other steps than `configs/accuracy.yaml`.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -26,9 +25,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
 
 from harness.base.machine import pinned_threads
 from harness.config.accuracy import CurveSpec
@@ -174,11 +170,7 @@ def ratios(step: GradedStep, specs: Sequence[CurveSpec], name: str, rounds: int)
             for one in racers
             if one.needs and (one.name == name or any(s <= HOPELESS * least[t] for t, s in one.seconds.items()))
         ]
-        if not any(one.name == name for one in near):
-            near += [Racer(name, one.prepared, {}, {}) for one in racers if one.name == name]
-        times = raced([one for one in near if one.needs], problem, rounds) | {
-            one.name: {} for one in near if not one.needs
-        }
+        times = {name: {}} | raced(near, problem, rounds)
         words = f"{step.case.title} {step.moment} {guess}"
         found = (ratio(words, target, name, times, draws) for target in TARGETS)
         yield from (one for one in found if one is not None)
@@ -190,19 +182,22 @@ def cell(one: Ratio) -> str:
     return f"{'>' if over else ''}{one.ratio:.2f} [{one.low:.2f}, {one.high:.2f}] {one.fastest} {1e3 * one.seconds:.2f}"
 
 
-def table(found: Iterable[Ratio]) -> Table:
-    """A row for each step and first guess."""
-    made = Table("step, first guess", *(f"{target:g}" for target in TARGETS), box=SIMPLE_HEAD)
+def lines(found: Iterable[Ratio]) -> Iterator[str]:
+    """One for each first guess of a step."""
     rows: dict[str, dict[float, str]] = {}
     for one in found:
         rows.setdefault(one.step, {})[one.target] = cell(one)
     for step, cells in rows.items():
-        made.add_row(step, *(cells.get(target, "") for target in TARGETS))
-    return made
+        yield row(step, [cells.get(target, "") for target in TARGETS])
+
+
+def row(first: str, cells: Sequence[str]) -> str:
+    """In columns."""
+    return f"{first:<40}" + "".join(f"{cell:<38}" for cell in cells).rstrip()
 
 
 def main() -> None:
-    """Print the table: ratio, interval, the fastest other method and its milliseconds."""
+    """Print ratio, interval, the fastest other method and its milliseconds, step by step."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("config", nargs="?", type=Path, default=ROOT / "configs" / "accuracy.yaml")
     parser.add_argument("--solver", default="hybrid", help="whose ratios")
@@ -210,11 +205,12 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=15)
     given = parser.parse_args()
     found = list[Ratio]()
+    print(row("step, first guess", [f"{target:g}" for target in TARGETS]))
     with pinned_threads(1):
         for step, specs in steps(given.config, given.only):
-            found += ratios(step, specs, given.solver, given.rounds)
-            print(f"{step.case.title} {step.moment}", file=sys.stderr)
-    Console(width=180).print(table(found))
+            of_step = list(ratios(step, specs, given.solver, given.rounds))
+            print(*lines(of_step), sep="\n", flush=True)
+            found += of_step
     counted = [one for one in found if one.counts]
     worse = [one for one in counted if one.high > LIMIT]
     print(f"{len(worse)} of {len(counted)} accuracies that take above {1e3 * COUNTS:g} ms are not below {LIMIT}")
