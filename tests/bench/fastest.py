@@ -74,7 +74,7 @@ class Ratio:
 def steps(config: Path, only: str) -> Iterator[tuple[GradedStep, list[CurveSpec]]]:
     """The frozen steps of a config whose words are among their names, each once, and who is to solve them."""
     store = references(ROOT / "results")
-    asked: dict[tuple[object, ...], list[CurveSpec]] = {}
+    asked: dict[tuple[str, str, str | int], list[CurveSpec]] = {}
     for spec in load_accuracy(config).curves:
         asked.setdefault((spec.case.title, spec.case.integrator, spec.moment), []).append(spec)
     known: set[str] = set()
