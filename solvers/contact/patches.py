@@ -103,7 +103,7 @@ class Patches:
             there=np.empty((eights, 6, 8)),
             found=np.empty((_FEW, 4), np.int64),
         )
-        bare = cls(at_rest, tree, *owned, looked, scratch.met[:0], scratch.apart[:0], scratch)
+        bare = cls(at_rest, tree, owned[0], owned[1], owned[2], looked, scratch.met[:0], scratch.apart[:0], scratch)
         return bare._knowing(rest)
 
     def clear(self, p: Positions, q: Positions, reach: float, share: float) -> bool:

@@ -30,7 +30,7 @@ class Made:
         n, edges = len(mesh.rest), sides(mesh.triangles)
         self.rest, corners = mesh.rest, mesh.triangles
         self.trees = [Tree.of(self.rest, x) for x in (np.arange(n)[:, None], edges, corners)]
-        self.patches = Patches.of(self.rest, *self.trees, 4 * REACH)
+        self.patches = Patches.of(self.rest, self.trees[0], self.trees[1], self.trees[2], 4 * REACH)
         one = [(i, *t) for i in range(n) for t in corners.tolist() if i not in t]
         two = [(*e, *f) for e, f in combinations(edges.tolist(), 2) if not set(e) & set(f)]
         none = np.empty(0)
