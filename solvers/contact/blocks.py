@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
 
 from solvers.compiling import inner, kernel
 from solvers.problem import Positions
@@ -69,6 +70,14 @@ class Blocks(NamedTuple):
         end = self.starts[-1]
         starts, packed = np.append(self.starts, end + other.starts[1:]), np.append(self.packed[:end], other.packed)
         return Blocks(np.concatenate([self.vertices, other.vertices]), starts, packed)
+
+    def matrix(self, n: int) -> csr_array:
+        """Their sum, (3n, 3n) [N/m]."""
+        values = self.values.ravel()
+        at = (3 * self.vertices[:, :, None] + np.arange(3)).reshape(-1, 12)
+        rows, columns = np.repeat(at, 12, axis=1).ravel(), np.tile(at, 12).ravel()
+        own = (rows >= 0) & (columns >= 0)
+        return csr_array(coo_array((values[own], (rows[own], columns[own])), shape=(3 * n, 3 * n)))
 
     def add_product(self, x: Positions, out: Positions) -> None:
         """Add their product with x (n, 3) to `out`."""

@@ -18,6 +18,7 @@ from solvers.compiling import inner, kernel
 from solvers.contact.barrier import law, length, pushing
 from solvers.contact.blocks import NUMBERS, Blocks, Room, add_at, row
 from solvers.contact.contacts import EDGES, POINT_EDGE, POINT_TRIANGLE, Contacts
+from solvers.contact.grip import Grip
 from solvers.contact.mollifier import add_turning, bending, crossed, mollifier
 from solvers.vectors.eights import loaded, stored
 
@@ -30,23 +31,39 @@ _G, _DC, _FIRST, _SECOND = range(4)
 """The rows of scratch, by what is in them."""
 
 
-def curvature(contacts: Contacts, p: Array, keep: float, room: Room) -> Blocks:
-    """The second derivatives [N/m] of contacts at p (n, 3); keep: of what bends downwards; room: for them."""
+def curvature(contacts: Contacts, grip: Grip, p: Array, n: int, keep: float, room: Room) -> Blocks:
+    """The second derivatives [N/m] of contacts at p (N, 3), and of what grips, of n vertices that move; keep: of what
+    bends downwards; room: for them."""
     width = np.minimum(contacts.kind, 4)
     starts = np.concatenate([[0], np.cumsum(9 * width * (width + 1) // 2)])
     packed = room.take(int(starts[-1]) + _SPARE)
     curve(contacts, p, keep, starts, np.zeros((4, _WORK)), packed)
-    return Blocks(coupled(contacts), starts, packed)
+    blocks = Blocks(contacts.vertices, starts, packed)
+    if len(grip.vertices):
+        blocks = blocks.followed(grip.blocks(p))
+    return blocks._replace(vertices=coupled(contacts, grip, n))
 
 
-def coupled(contacts: Contacts) -> NDArray[np.int64]:
-    """The vertices of contacts (a, 4), -1 for none."""
-    return np.where(np.arange(4) < contacts.kind[:, None], contacts.vertices, -1)
+def coupled(contacts: Contacts, grip: Grip, n: int) -> NDArray[np.int64]:
+    """The vertices (a, 4) of contacts, and of what grips; -1 for none and for those beyond the first n."""
+    met = np.where(np.arange(4) < contacts.kind[:, None], contacts.vertices, -1)
+    return moving(met, grip, n)
 
 
-def add_curvature(contacts: Contacts, p: Array, keep: float, places: NDArray[np.int64], values: Array) -> None:
-    """Add the second derivatives [N/m] at p (n, 3) to blocks `values` (b, 3, 3), at places (a, 16); -1 for none."""
-    enter(contacts, p, keep, places, np.zeros((4, _WORK)), np.empty(NUMBERS + _SPARE), values)
+def moving(met: NDArray[np.int64], grip: Grip, n: int) -> NDArray[np.int64]:
+    """Vertices (a, 4), followed by those of what grips; -1 for those beyond the first n."""
+    both = np.concatenate([met, grip.vertices])
+    return np.where(both < n, both, -1)
+
+
+def add_curvature(
+    contacts: Contacts, grip: Grip, p: Array, keep: float, places: NDArray[np.int64], values: Array
+) -> None:
+    """Add the second derivatives [N/m] at p (N, 3) to blocks `values` (b, 3, 3), at places (a, 16); -1 for none."""
+    many = len(contacts.vertices)
+    enter(contacts, p, keep, places[:many], np.zeros((4, _WORK)), np.empty(NUMBERS + _SPARE), values)
+    if len(grip.vertices):
+        grip.blocks(p).add(places[many:], values)
 
 
 @kernel

@@ -15,12 +15,12 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 
 from solvers.contact import barrier, contacts, known
 from solvers.contact.blocks import Blocks, Room
 from solvers.contact.contacts import Contacts, Pairs, padded
-from solvers.contact.curvature import add_curvature, coupled, curvature
+from solvers.contact.curvature import add_curvature, coupled, curvature, moving
 from solvers.contact.grip import NO_GRIP, Grip
 from solvers.contact.known import Kept, Surfaces
 from solvers.problem import Positions, Start
@@ -117,31 +117,20 @@ class PairContact:
     def blocks(self, p: Positions, keep: float = 1.0) -> Blocks:
         """The second derivatives of each contact in range at p (n, 3); keep: of what bends downwards."""
         n, p = len(p), self.whole(p)
-        blocks = curvature(self._at(p).contacts, p, keep, self.room)
-        if len(self.grip.vertices):
-            blocks = blocks.followed(self.grip.blocks(p))
-        return blocks._replace(vertices=np.where(blocks.vertices < n, blocks.vertices, -1)) if len(p) > n else blocks
-
-    def neighbours(self, p: Positions) -> NDArray[np.int64]:
-        """See `solvers.core.bounds.Bounded`. What was found before has no say in it."""
-        n, p = len(p), self.whole(p)
-        near = np.concatenate([self.surface.within(p, _NEAR * self.range).vertices, self.grip.vertices])
-        return np.where(near < n, near, -1)
+        return curvature(self._at(p).contacts, self.grip, p, n, keep, self.room)
 
     def coupled(self, p: Positions) -> NDArray[np.int64]:
         """See `solvers.core.bounds.Bounded`."""
-        n, p = len(p), self.whole(p)
-        met = np.concatenate([coupled(self._at(p).contacts), self.grip.vertices])
-        return np.where(met < n, met, -1)
+        return coupled(self._at(self.whole(p)).contacts, self.grip, len(p))
+
+    def neighbours(self, p: Positions) -> NDArray[np.int64]:
+        """See `solvers.core.bounds.Bounded`. What was found before has no say in it."""
+        return moving(self.surface.within(self.whole(p), _NEAR * self.range).vertices, self.grip, len(p))
 
     def add_curvature(self, p: Positions, keep: float, places: NDArray[np.int64], values: Array) -> None:
         """See `solvers.core.bounds.Bounded`."""
         p = self.whole(p)
-        near = self._at(p).contacts
-        many = len(near.vertices)
-        add_curvature(near, p, keep, places[:many], values)
-        if len(self.grip.vertices):
-            self.grip.blocks(p).add(places[many:], values)
+        add_curvature(self._at(p).contacts, self.grip, p, keep, places, values)
 
     def _at(self, p: Positions) -> _Met:
         """What is in range at p, all vertices' (N, 3)."""
@@ -163,12 +152,7 @@ class PairContact:
 
     def hessian(self, p: Positions) -> csr_array:
         """The Hessian [N/m], shape (3n, 3n)."""
-        blocks = self.blocks(p)
-        vertices, values = blocks.vertices, blocks.values
-        at = (3 * vertices[:, :, None] + np.arange(3)).reshape(len(vertices), 12)
-        rows, columns, values = np.repeat(at, 12, axis=1).ravel(), np.tile(at, 12).ravel(), values.ravel()
-        own = (rows >= 0) & (columns >= 0)
-        return csr_array(coo_array((values[own], (rows[own], columns[own])), shape=(p.size, p.size)))
+        return self.blocks(p).matrix(len(p))
 
     def largest_step(self, p: Positions, direction: Positions) -> float:
         """The largest t up to 1 by which p may go along a direction, both (n, 3), with all gaps open; 0 where one is

@@ -3,9 +3,7 @@
 All springs are one compiled pass, all constant quadratic forms another, and so is each energy that states the law of
 its elements (`solvers.energies.elements`); what states none brings its own value, gradient and Hessian. The unknowns
 are the free vertices: exactly pinned ones stay on their targets. The Hessian's blocks lie in a matrix that is analysed
-once (`solvers.core.pattern`); what does not change in a run or in a step is added up once. What energies need beyond
-that, and may need near the positions where they first do, is analysed once too: for as long as that suffices, which is
-most often to the end of the step.
+once, or once a step (`core.pattern`, `core.pairs_matrix`); what does not change in a run or a step is added up once.
 """
 
 from __future__ import annotations
@@ -21,13 +19,12 @@ from solvers.core import low_rank
 from solvers.core.bounds import Bounded, PairBlocks, is_bounded, reach
 from solvers.core.eigenvalues import Filtered, Filtering
 from solvers.core.fixed_objective import Objective, Stated
-from solvers.core.pattern import Matrix
+from solvers.core.pairs_matrix import PairsAt, StepMatrix
+from solvers.core.pattern import Indices, Matrix
 from solvers.energies.elements import Joined, add_blocks
 from solvers.kernels import forms, hessian, objective
 from solvers.linear.block import BlockCholesky
 from solvers.problem import Energy, Positions, StepProblem
-
-Indices = NDArray[np.int64]
 
 _ROUND_OFF = 4.0 * np.finfo(np.float64).eps
 """Of an energy's value, beside its size."""
@@ -40,7 +37,7 @@ class StepObjective:
     """The objective g of one step: all positions are (n, 3) [m], exactly pinned vertices on their targets.
 
     stated: energies by their elements, less those that have none in this step; own: those that state nothing; bounded:
-    of these, what no step may pass through.
+    of these, what no step may pass through; matrix: that of its Hessians.
     """
 
     def __init__(self, whole: Objective, problem: StepProblem) -> None:
@@ -61,7 +58,7 @@ class StepObjective:
             self.own = [begun[k] for k in whole.own]
             self.bounded = [energy for energy in self.own if is_bounded(energy)]
         self._constant: tuple[Matrix, NDArray[np.float64]] | None = None
-        self._matrix: Matrix | None = None
+        self.matrix = StepMatrix(whole, self.bounded)
         pins = problem.system.pins
         self._exact, self._held = pins.vertices[pins.exact], problem.pin_targets[pins.exact]
 
@@ -160,16 +157,6 @@ class StepObjective:
             self._constant = matrix, blocks
         return self._constant[1]
 
-    def matrix_for(self, p: Positions, i: Indices, j: Indices, met: list[Indices]) -> Matrix:
-        """A matrix with places for blocks (i, j) of free vertices, and for those that each bounded energy has at p,
-        between vertices `met` (a, k)."""
-        known = self._matrix or self.whole.matrix
-        if not (known.has(i, j) and all(known.holds(-1 - k, vertices) for k, vertices in enumerate(met))):
-            near = (self.whole.between(energy.neighbours(p)) for energy in self.bounded)
-            i, j = (np.concatenate(side) for side in zip(known.blocks, (i, j), *near, strict=True))
-            known = self._matrix = self.whole.matrix_for(i, j)
-        return known
-
     @cached_property
     def joined(self) -> Joined | None:
         """The elements of all energies, None for none."""
@@ -186,29 +173,24 @@ class Hessian:
         self._columns = low_rank.columns(step.own, p) if step.own else None
         self._others = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
         self.curvature = step.curvature(p)
-        self._ends: dict[float, NDArray[np.float64]] = {}
+        self._met = PairsAt(step.bounded, p)
 
-    @cached_property
+    @property
     def pairs(self) -> list[PairBlocks]:
         """The second derivatives of each bounded energy."""
-        return [energy.blocks(self._p) for energy in self._step.bounded]
-
-    @cached_property
-    def _coupled(self) -> list[Indices]:
-        return [energy.coupled(self._p) for energy in self._step.bounded]
+        return self._met.blocks
 
     @cached_property
     def _placed(self) -> tuple[Matrix, Indices, NDArray[np.float64]]:
         """The matrix, and where in it which entries of the energies that state nothing go."""
         step, whole = self._step, self._step.whole
-        rows = columns = np.empty(0, np.int64)
-        entries = np.empty(0)
+        rows, columns, entries = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
         if self._others is not None:
             total = self._others.tocoo()
             rows, columns = (3 * whole.number[x // 3] + x % 3 for x in total.coords)
             inside = (rows >= 0) & (columns >= 0)
             rows, columns, entries = rows[inside], columns[inside], np.asarray(total.data[inside], np.float64)
-        matrix = step.matrix_for(self._p, rows // 3, columns // 3, self._coupled)
+        matrix = step.matrix.at(self._p, rows // 3, columns // 3, self._met.coupled)
         return matrix, matrix.entries(rows, columns), entries
 
     def factorise(
@@ -273,22 +255,12 @@ class Hessian:
                 add_blocks(one.elements, at, curvature, matrix.values)
         for k, blocks in enumerate(filtered.pairs if filtered else []):
             blocks.add(matrix.of_elements(-1 - k, blocks.vertices), matrix.values)
-        if not filtered and any(map(len, self._coupled)):
-            for end, share in ((1.0, keep), (0.0, 1.0 - keep)):
-                if share:
-                    matrix.values += share * self._pressed(end, matrix)
+        if not filtered:
+            self._met.add(keep, matrix)
         values = matrix.values.reshape(-1)
         values[places] += entries
         values[matrix.diagonal] += shift
         return matrix
-
-    def _pressed(self, keep: float, matrix: Matrix) -> NDArray[np.float64]:
-        """What bounded energies add to the matrix's blocks (b, 3, 3); it is linear in `keep`."""
-        if keep not in self._ends:
-            out = self._ends[keep] = np.zeros_like(matrix.values)
-            for k, (energy, vertices) in enumerate(zip(self._step.bounded, self._coupled, strict=True)):
-                energy.add_curvature(self._p, keep, matrix.of_elements(-1 - k, vertices), out)
-        return self._ends[keep]
 
     def solve(self, b: Positions) -> Positions:
         """Its inverse, as it was factorised last, times b (n, 3); zero at vertices that are not free."""

@@ -1,7 +1,7 @@
 """The matrix of a Hessian: 3 x 3 blocks between free vertices, where each energy's go, and its factorisation.
 
 The blocks lie where springs, projective energies and elements have theirs, known before the first step. Where another
-energy needs more, a step takes a pattern with those (`solvers.core.objective`), and the last one is kept for a step
+energy needs more, a step takes a pattern with those (`core.pairs_matrix`), and the last one is kept for a step
 that needs the same: so a result depends on its problem alone and not on what came before.
 """
 
