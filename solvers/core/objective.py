@@ -26,6 +26,8 @@ from solvers.kernels import forms, hessian, objective
 from solvers.linear.block import BlockCholesky
 from solvers.problem import Energy, Positions, StepProblem
 
+Values = NDArray[np.float64]
+
 _ROUND_OFF = 4.0 * np.finfo(np.float64).eps
 """Of an energy's value, beside its size."""
 
@@ -57,7 +59,7 @@ class StepObjective:
             self.stated = [one for one in found if len(one.elements.vertices)]
             self.own = [begun[k] for k in whole.own]
             self.bounded = [energy for energy in self.own if is_bounded(energy)]
-        self._constant: tuple[Matrix, NDArray[np.float64]] | None = None
+        self._constant: tuple[Matrix, Values] | None = None
         self.matrix = StepMatrix(whole, self.bounded)
         pins = problem.system.pins
         self._exact, self._held = pins.vertices[pins.exact], problem.pin_targets[pins.exact]
@@ -124,7 +126,7 @@ class StepObjective:
                 noise += _ROUND_OFF * scale
         return change, noise
 
-    def tensions(self, p: Positions, d: Positions) -> NDArray[np.float64]:
+    def tensions(self, p: Positions, d: Positions) -> Values:
         """The springs' tensions [N], (m,), at p, linearised for a step d."""
         out = np.empty(len(self.whole.terms.stiffness))
         hessian.tensions(self.whole.terms, p, d, out)
@@ -134,17 +136,17 @@ class StepObjective:
         """The Hessian at p, to be factorised."""
         return Hessian(self, p)
 
-    def curvature(self, p: Positions) -> list[NDArray[np.float64]]:
+    def curvature(self, p: Positions) -> list[Values]:
         """The second derivatives of the elements at p, of each energy (m, 6) [N/m]."""
         return [self._curve(one, p) for one in self.stated]
 
     @staticmethod
-    def _curve(one: Stated, p: Positions) -> NDArray[np.float64]:
+    def _curve(one: Stated, p: Positions) -> Values:
         out = np.empty((len(one.elements.vertices), 6))
         one.law.curve(one.elements, p, out)
         return out
 
-    def constant(self, matrix: Matrix, p: Positions) -> NDArray[np.float64] | None:
+    def constant(self, matrix: Matrix, p: Positions) -> Values | None:
         """The blocks of a matrix that are the same at all points p of this step; None for springs alone."""
         steady = [one for one in self.stated if one.law.constant]
         if not steady:
@@ -181,7 +183,7 @@ class Hessian:
         return self._met.blocks
 
     @cached_property
-    def _placed(self) -> tuple[Matrix, Indices, NDArray[np.float64]]:
+    def _placed(self) -> tuple[Matrix, Indices, Values]:
         """The matrix, and where in it which entries of the energies that state nothing go."""
         step, whole = self._step, self._step.whole
         rows, columns, entries = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
@@ -193,12 +195,7 @@ class Hessian:
         matrix = step.matrix.at(self._p, rows // 3, columns // 3, self._met.coupled)
         return matrix, matrix.entries(rows, columns), entries
 
-    def factorise(
-        self,
-        keep: float = 1.0,
-        shift: NDArray[np.float64] | float = 0.0,
-        tension: NDArray[np.float64] | None = None,
-    ) -> bool:
+    def factorise(self, keep: float = 1.0, shift: Values | float = 0.0, tension: Values | None = None) -> bool:
         """Whether it is positive definite, and then ready for `solve`; without arguments it is the exact Hessian.
 
         keep: of the negative lateral part of springs; shift: added to the diagonal [N/m]; tension (m,): of springs [N].
@@ -218,16 +215,12 @@ class Hessian:
         clamped = self.filtered(Filtering())
         return self._assembled(clamped.keep, 0.0, clamped.tension, clamped)
 
-    def factorise_filtered(self, filtered: Filtered, shift: NDArray[np.float64] | float = 0.0) -> bool:
+    def factorise_filtered(self, filtered: Filtered, shift: Values | float = 0.0) -> bool:
         """Whether what was filtered, and `shift` added to its diagonal [N/m], is positive definite; see `factorise`."""
         return self._factor.factorise(self._assembled(filtered.keep, shift, filtered.tension, filtered).values)
 
     def solve_anew(
-        self,
-        b: Positions,
-        keep: float = 1.0,
-        shift: NDArray[np.float64] | float = 0.0,
-        tension: NDArray[np.float64] | None = None,
+        self, b: Positions, keep: float = 1.0, shift: Values | float = 0.0, tension: Values | None = None
     ) -> Positions | None:
         """Both at once, sooner than one after the other; None if it is not positive definite."""
         out = np.zeros_like(b)
@@ -238,11 +231,7 @@ class Hessian:
         return out
 
     def _assembled(
-        self,
-        keep: float,
-        shift: NDArray[np.float64] | float,
-        tension: NDArray[np.float64] | None,
-        filtered: Filtered | None = None,
+        self, keep: float, shift: Values | float, tension: Values | None, filtered: Filtered | None = None
     ) -> Matrix:
         matrix, places, entries = self._placed
         step, tension = self._step, self._tension if tension is None else tension
@@ -274,11 +263,11 @@ class Hessian:
         return matrix.factor if self._columns is None else low_rank.Woodbury(matrix, self._columns[self.free])
 
     @cached_property
-    def _tension(self) -> NDArray[np.float64]:
+    def _tension(self) -> Values:
         return self._step.tensions(self._p, np.zeros_like(self._p))
 
     @cached_property
-    def _linear(self) -> NDArray[np.float64]:
+    def _linear(self) -> Values:
         linear = np.empty((len(self._terms.stiffness), 4))
         hessian.linearise(self._terms, self._p, linear)
         return linear
