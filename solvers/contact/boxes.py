@@ -158,6 +158,9 @@ def apart(one: tuple[int, int], other: tuple[int, int], p: Positions, q: Positio
     for k, x in enumerate((p, q)):
         for j, (first, last) in enumerate((one, other)):
             hull(x, first, last, low[k, j], high[k, j])
+    begin, end = low.min(axis=0), high.max(axis=0)
+    if max(float((begin[0] - end[1]).max()), float((begin[1] - end[0]).max())) > reach:
+        return True  # no way leads so near, and what no way leads to bounds no step
     wide = reach + share * float((high[0].max(axis=0) - low[0].min(axis=0)).sum())
     gap = np.array([low[:, 0] - high[:, 1], low[:, 1] - high[:, 0]])
     return bool((gap > wide).all(axis=1).any())
