@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers.core import low_rank
-from solvers.core.bounds import Bounded, PairBlocks, is_bounded, reach
+from solvers.core.bounds import Bounded, is_bounded, reach
 from solvers.core.eigenvalues import Filtered, Filtering
 from solvers.core.fixed_objective import Objective, Stated
 from solvers.core.pairs_matrix import PairsAt, StepMatrix
@@ -166,7 +166,7 @@ class StepObjective:
 
 
 class Hessian:
-    """The Hessian [N/m] at a point, over the free vertices' coordinates. free: these; curvature: of `StepObjective`."""
+    """The Hessian [N/m] at a point, over the free vertices' coordinates. free: these; curvature, met: of elements, of pairs."""
 
     def __init__(self, step: StepObjective, p: Positions) -> None:
         self._step, self._p = step, p
@@ -175,12 +175,7 @@ class Hessian:
         self._columns = low_rank.columns(step.own, p) if step.own else None
         self._others = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
         self.curvature = step.curvature(p)
-        self._met = PairsAt(step.bounded, p)
-
-    @property
-    def pairs(self) -> list[PairBlocks]:
-        """The second derivatives of each bounded energy."""
-        return self._met.blocks
+        self.met = PairsAt(step.bounded, p)
 
     @cached_property
     def _placed(self) -> tuple[Matrix, Indices, Values]:
@@ -192,7 +187,7 @@ class Hessian:
             rows, columns = (3 * whole.number[x // 3] + x % 3 for x in total.coords)
             inside = (rows >= 0) & (columns >= 0)
             rows, columns, entries = rows[inside], columns[inside], np.asarray(total.data[inside], np.float64)
-        matrix = step.matrix.at(self._p, rows // 3, columns // 3, self._met.coupled)
+        matrix = step.matrix.at(self._p, rows // 3, columns // 3, self.met.coupled)
         return matrix, matrix.entries(rows, columns), entries
 
     def factorise(self, keep: float = 1.0, shift: Values | float = 0.0, tension: Values | None = None) -> bool:
@@ -207,7 +202,7 @@ class Hessian:
         keep, tension = by.springs(self._terms.edges, self._tension)
         stated = zip(self._step.stated, self.curvature, strict=True)
         curvature = [c if one.law.constant else by.packed(one.elements.vertices, c) for one, c in stated]
-        pairs = [by.pairs(blocks) for blocks in self.pairs]
+        pairs = [by.pairs(blocks) for blocks in self.met.blocks]
         return Filtered(keep, tension, curvature, pairs, by.looked, by.changed)
 
     def convex(self) -> Matrix:
@@ -245,7 +240,7 @@ class Hessian:
         for k, blocks in enumerate(filtered.pairs if filtered else []):
             blocks.add(matrix.of_elements(-1 - k, blocks.vertices), matrix.values)
         if not filtered:
-            self._met.add(keep, matrix)
+            self.met.add(keep, matrix)
         values = matrix.values.reshape(-1)
         values[places] += entries
         values[matrix.diagonal] += shift
@@ -287,7 +282,7 @@ class Hessian:
             product += (self._others @ x.ravel()).reshape(-1, 3)
         if self._columns is not None:
             product += self._columns @ np.einsum("nik,ni->k", self._columns, x)
-        for pairs in self.pairs:
+        for pairs in self.met.blocks:
             pairs.add_product(x, product)
         out[self.free] = product[self.free]
         return out

@@ -66,7 +66,7 @@ class _Factor:
 
     def __call__(self, step: StepObjective, p: Positions) -> tuple[Hessian, Preconditioner]:
         hessian = step.hessian(p)
-        beyond = step.touched or any(len(blocks.vertices) for blocks in hessian.pairs)
+        beyond = step.touched or any(len(blocks.vertices) for blocks in hessian.met.blocks)
         return hessian, Scaled(self._metric, *_beyond(step, hessian, len(p))) if beyond else self._metric.solve
 
 
@@ -177,7 +177,7 @@ def _beyond(step: StepObjective, hessian: Hessian, n: int) -> tuple[NDArray[np.i
         if not one.projective:
             add_blocks(one.elements, _on_diagonal(number, one.elements.vertices), curvature, blocks)
             acted[one.elements.vertices] = True
-    for pairs in hessian.pairs:
+    for pairs in hessian.met.blocks:
         pairs.add(_on_diagonal(number, pairs.vertices), blocks)
         acted[pairs.vertices] = True
     acted &= blocks.any(axis=(1, 2))
