@@ -166,7 +166,7 @@ class StepObjective:
 
 
 class Hessian:
-    """The Hessian [N/m] at a point, over the free vertices' coordinates. free: these; curvature, met: of elements, of pairs."""
+    """The Hessian [N/m] at a point, over the free vertices (f,). curvature, met: those of elements, and of pairs."""
 
     def __init__(self, step: StepObjective, p: Positions) -> None:
         self._step, self._p = step, p
