@@ -16,7 +16,7 @@ from harness.report.style import OLDER, Mark
 
 _NOTE = (
     "Each line is what no other setting of the same program beats in both time and error; "
-    f"{OURS}: of all its methods that were tried. Errors are relative to the "
+    f"{OURS}: of all its methods that were tried. Errors are of positions, relative to the "
     "way from the start; those of 100 % and more are left out."
 )
 
@@ -34,7 +34,7 @@ def engines(folder: Path) -> list[Entry]:
             Plot(
                 *(("engines",), (one.scene, str(one.size)), "", f"{mesh}, {quantity(one.horizon)} s"),
                 Scale("wall time a simulated second", "log", "time"),
-                Scale("error of the positions at the end", "log", "percent"),
+                Scale("error at the end", "log", "percent"),
                 [_series(name, looks[name], front) for name, front in best.items() if front],
                 notes=[_NOTE, *by_self_converged(here), *hollow],
                 machine=", ".join(table.machine),
