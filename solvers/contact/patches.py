@@ -70,7 +70,8 @@ class Scratch(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class Patches:
     """Those of a surface. known (k, 2): pairs that are near each other at rest, sorted, and apart (k,): by how much
-    [m]; looked [m]: all others are farther apart; seen: how patches lay at the last two positions."""
+    [m]; looked [m]: all others are farther apart; seen: how patches lay at the last two positions; crowded: whether so
+    many are near each other at rest, as in a stack of sheets, that patches tell nothing."""
 
     rest: Rest
     tree: Tree
@@ -82,6 +83,7 @@ class Patches:
     apart: Array
     scratch: Scratch
     seen: list[_Seen] = field(default_factory=list["_Seen"])
+    crowded: bool = False
 
     @classmethod
     def of(cls, rest: Positions, points: Tree, edges: Tree, triangles: Tree, looked: float) -> Patches:
@@ -109,6 +111,8 @@ class Patches:
     def clear(self, p: Positions, q: Positions, reach: float, share: float) -> bool:
         """Whether no two primitives that share no vertex come nearer than `reach` [m], and `share` of their distance at
         p, on the straight way from p to q, (n, 3) both. False does not say that some do."""
+        if self.crowded:
+            return False
         begin, end, memory = self._lies(p), self._lies(q), self.scratch
         count = self._met(begin, end, reach, share)
         if count > len(memory.met):
@@ -163,6 +167,8 @@ class Patches:
         """The same with pairs known that are near each other at rest (n, 3)."""
         many, at = len(self.tree.corners), self._lies(rest)
         others = self._met(at, at, self.looked, 0.0)
+        if others > len(self.scratch.met) // 2:
+            return replace(self, seen=[], crowded=True)
         each = np.arange(many)
         met = np.concatenate([np.column_stack([each, each]), self.scratch.met[:others]])
         met = np.ascontiguousarray(met[np.lexsort((met[:, 1], met[:, 0]))])

@@ -128,3 +128,14 @@ def test_unevenness_is_the_diagonal_of_the_box_of_all_ways(n):
     for bad in (np.nan, np.inf):
         q[n - 1, 1] = bad
         assert unevenness(p, q) == np.inf
+
+
+def test_patches_of_a_stack_tell_nothing():
+    sheet = Grid().build(5)
+    layers = [sheet.rest + 0.5 * REACH * k * np.eye(3)[1] for k in range(30)]
+    rest, each = np.concatenate(layers), len(sheet.rest)
+    triangles = np.concatenate([sheet.triangles + each * k for k in range(30)])
+    trees = [Tree.of(rest, x) for x in (np.arange(len(rest))[:, None], sides(triangles), triangles)]
+    patches = Patches.of(rest, trees[0], trees[1], trees[2], 20 * REACH)
+    assert patches.crowded
+    assert not patches.clear(rest, rest + 5.0, REACH, LEFT)
