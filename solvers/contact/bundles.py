@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,13 +19,13 @@ def half_spaces(contacts: list[ContactEnergy], row: NDArray[np.int64], bundles: 
     known = [contact for contact in contacts if isinstance(contact, Contact)]
     fields = [np.concatenate(field) for field in zip(*(contact.planes for contact in known), strict=True)]
     slip = np.concatenate([np.full(len(contact.planes.vertices), contact.slip) for contact in known])
-    return of_planes(Planes(*fields), slip, row, bundles, unknowns)
+    return of_planes(Planes(*fields), slip, row, bundles, unknowns, both=False)
 
 
 def of_planes(
-    planes: Planes, slip: NDArray[np.float64], row: NDArray[np.int64], bundles: Bundles, unknowns: int
+    planes: Planes, slip: NDArray[np.float64], row: NDArray[np.int64], bundles: Bundles, unknowns: int, *, both: bool
 ) -> HalfSpaces:
-    """Half-spaces, and what they slip by in a step (k,) [m]."""
+    """Half-spaces, and what they slip by in a step (k,) [m]; both: whether they hold from both sides."""
     vertices, normal, offset, anchor, stiffness, grip = planes
     rows = row[vertices]
     order = np.argsort(rows, kind="stable")
@@ -31,6 +33,5 @@ def of_planes(
     count = np.bincount(rows[order], minlength=len(row) + 2)
     near = count[bundles.own // 4].reshape(-1, LANES).max(axis=1, initial=0) > 0
     first = np.concatenate([[0], np.cumsum(count)])
-    return HalfSpaces(
-        first, near, *(np.ascontiguousarray(x[order]) for x in (normal, anchor, offset, stiffness, grip, slip))
-    )
+    ordered: Any = (np.ascontiguousarray(x[order]) for x in (normal, anchor, offset, stiffness, grip, slip))
+    return HalfSpaces(first, near, *ordered, both=both)

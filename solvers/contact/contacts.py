@@ -94,7 +94,7 @@ def gather(pairs, x, tile, slots, out):
                 lane = lowest(left)
                 left &= left - 1
                 if first + lane < end:
-                    count = _take(pairs, first + lane, edges, tile, lane, slots, out, count)
+                    count = take(pairs, first + lane, edges, tile, lane, slots, out, count)
         edges = True
     return count
 
@@ -124,7 +124,7 @@ def eight(vertices, x, first, last, edges, limit, tile):
 
 
 @inner
-def _take(pairs, e, edges, tile, lane, slots, out, count):
+def take(pairs, e, edges, tile, lane, slots, out, count):
     """Add a pair that may be in range; how many there are then."""
     scale = pairs.scale[e]
     if scale < 1.0 and not tile[7, lane] < (scale * (pairs.thickness + pairs.reach)) ** 2:

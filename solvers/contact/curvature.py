@@ -11,6 +11,8 @@ are positive semidefinite, and never less than exact ones. A contact of k vertic
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -82,8 +84,26 @@ def enter(contacts, p, keep, places, work, block, values):
         add_at(block[: 9 * many * (many + 1) // 2], places[k], values)
 
 
+class Terms(NamedTuple):
+    """The weights in the block of a contact, with m = grad |u x v|^2 of edges and the columns b of B, orthogonal by G,
+
+    along g g' + mixed (g m' + m g') + bent m m' - lag b1 b1' - hold b2 b2' + side c c' (x) I,
+
+    and that of how edges turn (`contact.mollifier`).
+    """
+
+    along: float
+    mixed: float
+    bent: float
+    lag: float
+    hold: float
+    side: float
+    turn: float
+
+
 @inner
-def _curve(contacts, k, p, keep, work, H):
+def terms(contacts, k, p, keep, work):
+    """Of contact k at p (n, 3); what they weigh, g, m, b1 and b2, goes to the rows of work, of 12 numbers or more."""
     x, kind = contacts.vertices[k], contacts.kind[k]
     many = min(kind, 4)
     z0, z1, z2 = contacts.between[k, 0], contacts.between[k, 1], contacts.between[k, 2]
@@ -112,6 +132,27 @@ def _curve(contacts, k, p, keep, work, H):
         first[:] = 0.0
     if hold == 0.0:
         second[:] = 0.0
+    return Terms(along, mixed, bent, lag, hold, side, 2.0 * f * m1)
+
+
+@inner
+def weighed(terms, work, r):
+    """What row r of the block takes of g, m, b1 and b2."""
+    g, dc = work[_G, r], work[_DC, r]
+    lag, hold = terms.lag * work[_FIRST, r], terms.hold * work[_SECOND, r]
+    return terms.along * g + terms.mixed * dc, terms.mixed * g + terms.bent * dc, lag, hold
+
+
+@inner
+def summed(weights, g, dc, first, second):
+    """An entry of the row, or eight that follow each other."""
+    along, mixed, lag, hold = weights
+    return (along * g + mixed * dc) - (lag * first + hold * second)
+
+
+@inner
+def _curve(contacts, k, p, keep, work, H):
+    found, c, many = terms(contacts, k, p, keep, work), contacts.weights[k], min(contacts.kind[k], 4)
     g_low, dc_low = loaded(work, _G * _WORK), loaded(work, _DC * _WORK)
     g_high, dc_high = loaded(work, _G * _WORK + 8), loaded(work, _DC * _WORK + 8)
     first_low, second_low = loaded(work, _FIRST * _WORK), loaded(work, _SECOND * _WORK)
@@ -120,16 +161,15 @@ def _curve(contacts, k, p, keep, work, H):
         for a in range(3):
             at, r = row(i, a), 3 * i + a
             # What is written beyond the row's end is written over by the rows that follow.
-            one, two, three = along * g[r] + mixed * dc[r], lag * first[r], hold * second[r]
-            four = mixed * g[r] + bent * dc[r]
-            stored((one * g_low + four * dc_low) - (two * first_low + three * second_low), H, at)
+            weights = weighed(found, work, r)
+            stored(summed(weights, g_low, dc_low, first_low, second_low), H, at)
             if i > 1:
-                stored((one * g_high + four * dc_high) - (two * first_high + three * second_high), H, at + 8)
-            if side != 0.0:
+                stored(summed(weights, g_high, dc_high, first_high, second_high), H, at + 8)
+            if found.side != 0.0:
                 for j in range(i + 1):
-                    H[at + 3 * j + a] += side * c[i] * c[j]
-    if m1 != 0.0:
-        add_turning(crossed(p, x), 2.0 * f * m1, keep, H)
+                    H[at + 3 * j + a] += found.side * c[i] * c[j]
+    if found.turn != 0.0:
+        add_turning(crossed(p, contacts.vertices[k]), found.turn, keep, H)
 
 
 @inner

@@ -107,7 +107,7 @@ class Contact:
         reach = np.array([[one.radius + self.thickness + self.margin] for one in self.obstacles])
         return np.array([o.low for o in self.obstacles]) - reach, np.array([o.high for o in self.obstacles]) + reach
 
-    def _frames(self, time: float) -> Array:
+    def frames(self, time: float) -> Array:
         """The obstacles' frames at a step's start and end, (o, 2, 4, 3)."""
         return np.array([(one.frame(time), one.frame(time + self.time_step)) for one in self.obstacles])
 
@@ -115,12 +115,12 @@ class Contact:
     def _resting(self) -> Array | None:
         """Their frames in all steps where none moves."""
         rest = all(one.frame(0.0) is one.frame(1.0) for one in self.obstacles)
-        return self._frames(0.0) if rest else None
+        return self.frames(0.0) if rest else None
 
     def begin_step(self, start: Start) -> Contact:
         """The energy of a step; idle after one test of a box while nothing is near."""
         p, v = (x if x.flags.carray else np.array(x, order="C") for x in (start.positions, start.velocity))
-        frames = self._frames(start.time) if self._resting is None else self._resting
+        frames = self.frames(start.time) if self._resting is None else self._resting
         touched = np.empty(len(frames), np.bool_)
         way = contact_planes.near(p, v, self.time_step, frames, *self._near, touched)
         if way < 0.0:

@@ -61,7 +61,7 @@ class Grip(NamedTuple):
 
 
 @inner
-def _slipped(grip, p, e):
+def slipped(grip, p, e):
     """u and |u| [m] of contact e."""
     x, c, n = grip.vertices[e], grip.weights[e], grip.normal[e]
     u0 = c[0] * p[x[0], 0] + c[1] * p[x[1], 0] + c[2] * p[x[2], 0] + c[3] * p[x[3], 0] - grip.anchor[e, 0]
@@ -73,9 +73,31 @@ def _slipped(grip, p, e):
 
 
 @inner
-def _rate(length, slip):
+def rate(length, slip):
     """h'(u)/u [1/m]."""
     return (2.0 - length / slip) / slip if length < slip else 1.0 / length
+
+
+@inner
+def rounded(length, slip):
+    """h [m] of a length."""
+    y = min(length / slip, 1.0)
+    return slip * (y * y - y * y * y / 3.0) + max(length - slip, 0.0)
+
+
+@inner
+def bends(u0, u1, u2, length, slip):
+    """h'(u)/u, h''(u) less that [1/m], and u/|u|."""
+    flat, least = rate(length, slip), max(length, 1e-300)
+    return flat, max(2.0 * (1.0 - length / slip) / slip, 0.0) - flat, (u0 / least, u1 / least, u2 / least)
+
+
+@inner
+def bent(n, second, a, b):
+    """Entry (a, b) of the second derivatives of h by u [1/m], across the direction n (3,); second: of `bends`."""
+    flat, more, u = second
+    same = 1.0 if a == b else 0.0
+    return flat * (same - n[a] * n[b]) + more * u[a] * u[b]
 
 
 @kernel
@@ -83,9 +105,8 @@ def hold(grip, p):
     """The energy [J] at p (n, 3)."""
     total, s = 0.0, grip.slip
     for e in range(len(grip.vertices)):
-        length = _slipped(grip, p, e)[3]
-        y = min(length / s, 1.0)
-        total += grip.force[e] * (s * (y * y - y * y * y / 3.0) + max(length - s, 0.0))
+        length = slipped(grip, p, e)[3]
+        total += grip.force[e] * rounded(length, s)
     return total
 
 
@@ -93,8 +114,8 @@ def hold(grip, p):
 def pull(grip, p, out):
     """Add the gradient [N] at p (n, 3) to `out`."""
     for e in range(len(grip.vertices)):
-        u0, u1, u2, length = _slipped(grip, p, e)
-        w = grip.force[e] * _rate(length, grip.slip)
+        u0, u1, u2, length = slipped(grip, p, e)
+        w = grip.force[e] * rate(length, grip.slip)
         for i in range(4):
             v, c = grip.vertices[e, i], grip.weights[e, i]
             out[v, 0] += c * (w * u0)
@@ -107,14 +128,11 @@ def curve(grip, p, out):
     """Write the rows of each contact's block at p (n, 3) to `out`."""
     for e in range(len(grip.vertices)):
         n, c, H = grip.normal[e], grip.weights[e], out[NUMBERS * e : NUMBERS * (e + 1)]
-        u0, u1, u2, length = _slipped(grip, p, e)
-        rate, least = _rate(length, grip.slip), max(length, 1e-300)
-        bent = max(2.0 * (1.0 - length / grip.slip) / grip.slip, 0.0) - rate
-        u = u0 / least, u1 / least, u2 / least
+        u0, u1, u2, length = slipped(grip, p, e)
+        second = bends(u0, u1, u2, length, grip.slip)
         for a in range(3):
             for b in range(3):
-                same = 1.0 if a == b else 0.0
-                h = grip.force[e] * (rate * (same - n[a] * n[b]) + bent * u[a] * u[b])
+                h = grip.force[e] * bent(n, second, a, b)
                 for i in range(4):
                     for j in range(i + 1):
                         H[row(i, a) + 3 * j + b] = c[i] * c[j] * h

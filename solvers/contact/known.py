@@ -17,11 +17,11 @@ from solvers.contact.contacts import Pairs, padded
 from solvers.contact.ways import LEFT, unevenness
 from solvers.problem import Positions
 
-_ROUND = 8.0 * np.finfo(np.float64).eps
+ROUND = 8.0 * np.finfo(np.float64).eps
 """Of the largest coordinate: by so much boxes are made wider."""
 
 
-_WIDE = 1.5
+WIDE = 1.5
 """Of the range: so far pairs are looked up. More would be looked at each time for longer than it takes to look them up
 anew now and then."""
 _MANY = 3
@@ -102,7 +102,7 @@ def pairs(surface: Surfaces, kept: list[Kept], p: Positions) -> Pairs:
     for one in kept:
         if one.covers(p, limit):
             return one.pairs
-    reach = _WIDE * limit + _round(p)
+    reach = WIDE * limit + _round(p)
     if all(one.far for one in kept) and surface.clear(p, p, reach, 0.0):
         found = Kept.nothing(surface, p.copy(), reach)
     else:
@@ -119,7 +119,7 @@ def largest_step(surface: Surfaces, kept: list[Kept], p: Positions, way: Positio
     if not np.isfinite(way).all():
         return 0.0
     rounded = _round(p)
-    reach = _WIDE * (surface.thickness + surface.reach) + rounded
+    reach = WIDE * (surface.thickness + surface.reach) + rounded
     if all(one.far for one in kept) and surface.clear(p, q, reach, LEFT):
         _keep(kept, Kept.nothing(surface, q, reach), kept)
         return 1.0
@@ -141,7 +141,7 @@ def _keep(before: list[Kept], found: Kept, kept: list[Kept]) -> None:
 
 def _round(p: Positions) -> float:
     """By how much boxes are made wider [m]."""
-    return _ROUND * float(np.abs(p).max(initial=0.0))
+    return ROUND * float(np.abs(p).max(initial=0.0))
 
 
 def _apart(p: Positions, q: Positions) -> float:

@@ -83,17 +83,23 @@ def add_turning(edges, weight, keep, H):
 
     4 w (du x dv) <= 2 |w| (|du|^2 |v|/|u| + |dv|^2 |u|/|v|),     w = u x v.
     """
-    u, v, uu, uv, vv, c = edges
-    w, rest = np.sqrt(c), 1.0 - keep
-    more_u, more_v = rest * w * np.sqrt(vv / uu), rest * w * np.sqrt(uu / vv)
+    u, v, _, uv, _, _ = edges
     for a in range(3):
         for b in range(3):
             same = 1.0 if a == b else 0.0
-            huu = weight * ((vv + more_u) * same - v[a] * v[b])
-            hvv = weight * ((uu + more_v) * same - u[a] * u[b])
+            huu, hvv = turned(edges, weight, keep, a, b)
             hvu = weight * ((1.0 + keep) * u[b] * v[a] - uv * same - keep * v[b] * u[a])
             # By edges, in the blocks of their ends.
             for i, j, h in ((0, 0, huu), (1, 0, -huu), (1, 1, huu), (2, 2, hvv), (3, 2, -hvv), (3, 3, hvv)):
                 H[row(i, a) + 3 * j + b] += h
             for i, j, h in ((2, 0, hvu), (2, 1, -hvu), (3, 0, -hvu), (3, 1, hvu)):
                 H[row(i, a) + 3 * j + b] += h
+
+
+@inner
+def turned(edges, weight, keep, a, b):
+    """Of the same, entry (a, b) of the blocks of the first edge's ends, each with itself, and of the second's."""
+    u, v, uu, _, vv, c = edges
+    w, rest, same = np.sqrt(c), 1.0 - keep, 1.0 if a == b else 0.0
+    more_u, more_v = rest * w * np.sqrt(vv / uu), rest * w * np.sqrt(uu / vv)
+    return weight * ((vv + more_u) * same - v[a] * v[b]), weight * ((uu + more_v) * same - u[a] * u[b])

@@ -31,8 +31,8 @@ from solvers.problem import Positions
 
 Array = NDArray[np.float64]
 
-_LEAST = 1e-6
-"""Of what holds a vertex: so much resists it in every direction."""
+LEAST = 1e-6
+"""Of what holds a vertex: so much more resists it in every direction."""
 
 
 class Separable(NamedTuple):
@@ -44,17 +44,14 @@ class Separable(NamedTuple):
     block: Array
 
     def planes(self, p: Positions, held: Array) -> Planes:
-        """The same as half-spaces: along each of three axes, from both sides; p (n, 3) [m]: where it was made; held
-        (n,) [N/m]: what holds the vertices."""
+        """The same as planes across each of three axes, which hold from both sides; p (n, 3) [m]: where it was made;
+        held (n,) [N/m]: what holds the vertices."""
         curve, axes = np.linalg.eigh(self.block)
-        k = np.maximum(curve, _LEAST * held[self.vertices, None])
+        k = np.maximum(curve, 0.0) + LEAST * held[self.vertices, None]
         normal = np.swapaxes(axes, 1, 2)
         offset = np.einsum("vai,vi->va", normal, p[self.vertices]) - np.einsum("vai,vi->va", normal, self.gradient) / k
-        both = np.concatenate([normal, -normal], axis=1).reshape(-1, 3)
-        ends = np.concatenate([offset, -offset], axis=1).ravel()
-        none = np.zeros(len(both))
-        vertices = np.repeat(self.vertices, 6)
-        return Planes(vertices, both, ends, np.zeros_like(both), np.concatenate([k, k], axis=1).ravel(), none)
+        normal, none = normal.reshape(-1, 3), np.zeros(k.size)
+        return Planes(np.repeat(self.vertices, 3), normal, offset.ravel(), np.zeros_like(normal), k.ravel(), none)
 
 
 class Sweeps(Protocol):
@@ -66,7 +63,7 @@ class Sweeps(Protocol):
         ...
 
     def pushed(self, p: Positions, planes: Planes) -> Positions:
-        """Where a sweep leads from p with half-spaces, extrapolated by nothing."""
+        """Where a sweep leads from p with planes, extrapolated by nothing."""
         ...
 
 

@@ -82,32 +82,39 @@ def planes(p, v, dt, frames, obstacle, margin, out, work):
     frames (2, 4, 3) as in `near`; obstacle: Rounded, in its frame; margin [m]: a vertex farther away than that and
     twice its way has none; out: HalfSpaces of n rows; work: (5, 3).
     """
-    vertices, normal, offset, carried = out
     count = 0
-    a, b, x, c, n = work[0], work[1], work[2], work[3], work[4]
-    first, second = frames[0], frames[1]
     for i in range(len(p)):
-        way = 0.0
-        for k in range(3):
-            a[k] = b[k] = 0.0
-            for j in range(3):
-                a[k] += first[1 + k, j] * (p[i, j] - first[0, j])
-                b[k] += second[1 + k, j] * (p[i, j] + dt * v[i, j] - second[0, j])
-            way += (b[k] - a[k]) ** 2
-        far = _nearest(a, obstacle, c, n)
-        if not far <= obstacle.radius + margin + 2.0 * np.sqrt(way):
-            continue
-        _separate(a, b, obstacle, far, x, c, n)
-        vertices[count], offset[count] = i, obstacle.radius
-        for j in range(3):
-            normal[count, j], carried[count, j] = 0.0, second[0, j]
-            for k in range(3):
-                normal[count, j] += n[k] * second[1 + k, j]
-                carried[count, j] += a[k] * second[1 + k, j]
-        for k in range(3):
-            offset[count] += n[k] * c[k] + normal[count, k] * second[0, k]
-        count += 1
+        if plane(p, v, i, dt, frames, obstacle, margin, out, count, work):
+            out.vertices[count] = i
+            count += 1
     return count
+
+
+@inner
+def plane(p, v, i, dt, frames, obstacle, margin, out, at, work):
+    """Whether a vertex may come near an obstacle; then its half-space is in the row `at` of `out`. See `planes`."""
+    _, normal, offset, carried = out
+    a, b, x, c, n = work[0], work[1], work[2], work[3], work[4]
+    first, second, way = frames[0], frames[1], 0.0
+    for k in range(3):
+        a[k] = b[k] = 0.0
+        for j in range(3):
+            a[k] += first[1 + k, j] * (p[i, j] - first[0, j])
+            b[k] += second[1 + k, j] * (p[i, j] + dt * v[i, j] - second[0, j])
+        way += (b[k] - a[k]) ** 2
+    far = _nearest(a, obstacle, c, n)
+    if not far <= obstacle.radius + margin + 2.0 * np.sqrt(way):
+        return False
+    _separate(a, b, obstacle, far, x, c, n)
+    offset[at] = obstacle.radius
+    for j in range(3):
+        normal[at, j], carried[at, j] = 0.0, second[0, j]
+        for k in range(3):
+            normal[at, j] += n[k] * second[1 + k, j]
+            carried[at, j] += a[k] * second[1 + k, j]
+    for k in range(3):
+        offset[at] += n[k] * c[k] + normal[at, k] * second[0, k]
+    return True
 
 
 @inner

@@ -41,7 +41,7 @@ def largest(pairs, p, direction, most, four, corners, way):
                 e = first + lowest(left)
                 left &= left - 1
                 if e < end:
-                    most = min(most, _free(pairs, e, p, direction, most, edges, four, corners, way))
+                    most = min(most, free(pairs, e, p, direction, most, edges, four, corners, way))
             if most == 0.0:
                 return 0.0
         edges = True
@@ -80,7 +80,7 @@ def _more(a, b):
 
 
 @inner
-def _free(pairs, e, p, direction, most, edges, four, corners, way):
+def free(pairs, e, p, direction, most, edges, four, corners, way):
     """The same of one pair."""
     x = pairs.vertices[e]
     speed = _relative(p, direction, x, edges, corners, way)

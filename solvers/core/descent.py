@@ -24,7 +24,7 @@ from solvers.linear.choice import factorise
 from solvers.linear.factors import DenseCholesky
 from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
 
-_HALVINGS = 60
+HALVINGS = 60
 """A step so often halved has no digit left."""
 
 
@@ -72,7 +72,7 @@ def search(
     """
     slope = dot(at.gradient, direction)
     t = step.reach(at.positions, direction, first)
-    for _ in range(_HALVINGS if slope + curvature < 0.0 < t else 0):
+    for _ in range(HALVINGS if slope + curvature < 0.0 < t else 0):
         p = step.placed(at.positions + t * direction)
         lower = settled(p) if settled else p
         if lower is not p and step.rise(at.positions, lower)[0] <= DECREASE * t * (slope + 0.5 * t * curvature):

@@ -28,10 +28,10 @@ from solvers.problem import Energy, Positions, StepProblem
 
 Values = NDArray[np.float64]
 
-_ROUND_OFF = 4.0 * np.finfo(np.float64).eps
+ROUND_OFF = 4.0 * np.finfo(np.float64).eps
 """Of an energy's value, beside its size."""
 
-_NEAR = 1e-10
+NEAR = 1e-10
 """Of that size, the change from which on its values tell less than its slopes do."""
 
 
@@ -118,12 +118,12 @@ class StepObjective:
             slope = np.zeros_like(q)
             energy.add_gradient(q, slope)
             scale = abs(before) + abs(after) + float(np.abs(slope * q).sum())
-            if abs(after - before) <= _NEAR * scale < np.inf:
+            if abs(after - before) <= NEAR * scale < np.inf:
                 energy.add_gradient(p, slope)
                 change += 0.5 * float((slope * (q - p)).sum())
             else:
                 change += after - before
-                noise += _ROUND_OFF * scale
+                noise += ROUND_OFF * scale
         return change, noise
 
     def tensions(self, p: Positions, d: Positions) -> Values:

@@ -20,7 +20,7 @@ from solvers.kernels.springs import TINY_SQUARED
 from solvers.vectors.springs import LANES, RIGHT
 
 _PASSES = 4
-_EXACT, _GRIPPED, _MAJORANT, _EVERYTHING = range(4)
+EXACT, _GRIPPED, MAJORANT, _EVERYTHING = range(4)
 """The blocks: exact, but for compressed springs; with a majorant of friction; of springs too; of what may press too."""
 
 _ROUND_OFF = 1e-14
@@ -31,7 +31,8 @@ class HalfSpaces(NamedTuple):
     """Half-spaces by the rows of their vertices.
 
     first (rows + 1,): of each row; near (b,): whether a bundle has a vertex with any; of each half-space normal n and
-    anchor a (k, 3), offset d [m], stiffness k [N/m], grip F [N] and slip [m], (k,).
+    anchor a (k, 3), offset d [m], stiffness k [N/m], grip F [N] and slip [m], (k,); both: whether they hold from both
+    sides, as planes do.
     """
 
     first: NDArray[np.int64]
@@ -42,6 +43,12 @@ class HalfSpaces(NamedTuple):
     stiffness: NDArray[np.float64]
     grip: NDArray[np.float64]
     slip: NDArray[np.float64]
+    both: bool
+
+
+@inner
+def _depth(s, gap):
+    return gap if s.both else min(0.0, gap)
 
 
 @inner
@@ -68,7 +75,7 @@ def pressed(s, p):
     for i in range(len(s.first) - 1):
         x = p[4 * i], p[4 * i + 1], p[4 * i + 2]
         for k in range(s.first[i], s.first[i + 1]):
-            depth = min(0.0, s.normal[k, 0] * x[0] + s.normal[k, 1] * x[1] + s.normal[k, 2] * x[2] - s.offset[k])
+            depth = _depth(s, s.normal[k, 0] * x[0] + s.normal[k, 1] * x[1] + s.normal[k, 2] * x[2] - s.offset[k])
             total += 0.5 * s.stiffness[k] * depth * depth
             if s.grip[k] > 0.0:
                 total += s.grip[k] * _rounded(_across(s, k, x)[3], s.slip[k])
@@ -115,16 +122,16 @@ def _add(block, weight, n0, n1, n2):
 
 
 @inner
-def _pushed(s, i, x, d, level, gradient, block):
+def pushed(s, i, x, d, level, gradient, block):
     """The gradient and the block with what presses and grips at x and after a step d; and which those are, as bits."""
     who = 0
     for k in range(s.first[i], s.first[i + 1]):
         n0, n1, n2, weight = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2], s.stiffness[k]
         gap = n0 * x[0] + n1 * x[1] + n2 * x[2] - s.offset[k]
-        if gap < 0.0 or level == _EVERYTHING or gap + n0 * d[0] + n1 * d[1] + n2 * d[2] < 0.0:
+        if s.both or gap < 0.0 or level == _EVERYTHING or gap + n0 * d[0] + n1 * d[1] + n2 * d[2] < 0.0:
             who |= 1 << (k - s.first[i])
             block = _add(block, weight, n0, n1, n2)
-            force = weight * (min(0.0, gap) if level == _EVERYTHING else gap)
+            force = weight * (_depth(s, gap) if level == _EVERYTHING else gap)
             gradient = gradient[0] + force * n0, gradient[1] + force * n1, gradient[2] + force * n2
         if s.grip[k] > 0.0:
             u0, u1, u2, length = _across(s, k, x)
@@ -132,13 +139,13 @@ def _pushed(s, i, x, d, level, gradient, block):
             gradient = gradient[0] + weight * u0, gradient[1] + weight * u1, gradient[2] + weight * u2
             a00, a01, a02, a11, a12, a22 = _add(block, -weight, n0, n1, n2)
             block = a00 + weight, a01, a02, a11 + weight, a12, a22 + weight
-            if level == _EXACT and length > s.slip[k]:
+            if level == EXACT and length > s.slip[k]:
                 block = _add(block, -weight, u0 / length, u1 / length, u2 / length)
     return gradient, block, who
 
 
 @inner
-def _solved(block, g):
+def solved(block, g):
     """-B^-1 g, and whether B is positive definite."""
     a, b, c, d, e, f = block
     least = _ROUND_OFF * (a + d + f)
@@ -159,8 +166,9 @@ def _solved(block, g):
 
 
 @inner
-def _rise(bundles, s, b, lane, i, p, x, d, held, load):
-    """By how much a step d of row i raises the energy [J], from differences, which do not cancel."""
+def _rise(bundles, b, lane, p, x, d, held, load):
+    """By how much a step d of a vertex raises the energy of its springs and of what holds it [J], from differences,
+    which do not cancel."""
     total = 0.0
     for c in range(3):
         total += d[c] * (0.5 * held * d[c] - load[c])
@@ -177,11 +185,17 @@ def _rise(bundles, s, b, lane, i, p, x, d, held, load):
         both = np.sqrt(before) + np.sqrt(after)
         if both > 0.0:
             total += change * (0.5 * stiffness - bundles.weights[w] / both)
+    return total
+
+
+@inner
+def deeper(s, i, x, d, total):
+    """A rise, and by how much a step d of row i from x raises the energy of its half-spaces [J]."""
     end = x[0] + d[0], x[1] + d[1], x[2] + d[2]
     for k in range(s.first[i], s.first[i + 1]):
         n0, n1, n2 = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2]
         gap = n0 * x[0] + n1 * x[1] + n2 * x[2] - s.offset[k]
-        depth, deep = min(0.0, gap), min(0.0, gap + n0 * d[0] + n1 * d[1] + n2 * d[2])
+        depth, deep = _depth(s, gap), _depth(s, gap + n0 * d[0] + n1 * d[1] + n2 * d[2])
         total += 0.5 * s.stiffness[k] * (deep - depth) * (deep + depth)
         if s.grip[k] > 0.0:
             u0, u1, u2, length = _across(s, k, x)
@@ -196,11 +210,45 @@ def _rise(bundles, s, b, lane, i, p, x, d, held, load):
     return total
 
 
+def trying(risen: Any) -> Any:
+    """Finds a step of row i from x that lowers its energy, the first of those by ever larger blocks; none is a step of
+    length zero. A device compiles it for itself.
+
+    risen(d, where): by how much a step raises what acts on the row beside half-spaces; where: whatever that reads.
+    """
+
+    @inner_closure
+    def lowering(s, i, x, majorant, first, gradient, block, where):
+        """first: the block to begin with; majorant, gradient, block: of all but half-spaces."""
+        for level in range(first, _EVERYTHING + 1):
+            if level == MAJORANT:
+                block = majorant
+            d, definite, before = (0.0, 0.0, 0.0), True, -1
+            for _ in range(_PASSES):
+                slope, whole, who = pushed(s, i, x, d, level, gradient, block)
+                if who == before:
+                    break
+                before = who
+                d, definite = solved(whole, slope)
+            if definite and deeper(s, i, x, d, risen(d, where)) <= 0.0:
+                return d
+        return 0.0, 0.0, 0.0
+
+    return lowering
+
+
 def moving(felt: Any, risen: Any) -> Any:
     """Moves the vertices of a bundle to lower energies, one after another: none is joined to another.
 
     felt(beside, i, p, gradient, block) adds what else row i feels, risen(beside, i, p, d) tells its rise by a step d.
     """
+
+    @inner_closure
+    def rise(d, where):
+        bundles, beside, b, lane, i, p, x, held, load = where
+        return _rise(bundles, b, lane, p, x, d, held, load) + risen(beside, i, p, d)
+
+    lowering = trying(rise)
 
     @inner_closure
     def move(bundles, s, beside, b, unknowns, p, right, majorant):
@@ -214,20 +262,8 @@ def moving(felt: Any, risen: Any) -> Any:
             load = right[at] - h * x[0], right[at + LANES] - h * x[1], right[at + 2 * LANES] - h * x[2]
             gradient, block = _springs(bundles, b, lane, p, x, h, load)
             gradient, block = felt(beside, i, p, gradient, block)
-            for level in range(_EXACT, _EVERYTHING + 1):
-                if level == _MAJORANT:
-                    block = most, 0.0, 0.0, most, 0.0, most
-                d, definite, before = (0.0, 0.0, 0.0), True, -1
-                for _ in range(_PASSES):
-                    slope, whole, who = _pushed(s, i, x, d, level, gradient, block)
-                    if who == before:
-                        break
-                    before = who
-                    d, definite = _solved(whole, slope)
-                if not definite:
-                    continue
-                if _rise(bundles, s, b, lane, i, p, x, d, h, load) + risen(beside, i, p, d) <= 0.0:
-                    p[4 * i], p[4 * i + 1], p[4 * i + 2] = x[0] + d[0], x[1] + d[1], x[2] + d[2]
-                    break
+            majorant_block, where = (most, 0.0, 0.0, most, 0.0, most), (bundles, beside, b, lane, i, p, x, h, load)
+            d = lowering(s, i, x, majorant_block, EXACT, gradient, block, where)
+            p[4 * i], p[4 * i + 1], p[4 * i + 2] = x[0] + d[0], x[1] + d[1], x[2] + d[2]
 
     return move

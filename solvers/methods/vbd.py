@@ -222,7 +222,7 @@ class Sweeps(Iterating):
         made = self._prepared
         self._begin_at(p)
         self._spaces = of_planes(
-            planes, np.ones(len(planes.vertices)), made.row, made.blocks.bundles, made.blocks.unknowns
+            planes, np.ones(len(planes.vertices)), made.row, made.blocks.bundles, made.blocks.unknowns, both=True
         )
         self.sweep(1)
         self._spaces = None
