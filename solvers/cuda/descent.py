@@ -6,7 +6,6 @@ what a direction missed. The host reads a few numbers: those of a trial, once ea
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -21,13 +20,13 @@ from solvers.core.preconditioning import LEAST, Preconditioning
 from solvers.cuda import device, objective_kernels, residual, schwarz, sums
 from solvers.cuda.network import Network, require_known
 from solvers.cuda.preconditioning import Jacobi
-from solvers.cuda.resident import AT_ONCE, Minimising, MinimisingIterating, ResidentIterating
-from solvers.cuda.run import EVERY, Stream
+from solvers.cuda.resident import AT_ONCE, Minimising, ResidentIterating
+from solvers.cuda.run import Stream
+from solvers.cuda.stalling import StallingIterating
 from solvers.cuda.steps import Begun, Step, Uploaded
 from solvers.cuda.target import cuda
 from solvers.cuda.traffic import Preconditioned, Sizes, jacobi, patches
 from solvers.kernels.line_search import falls
-from solvers.kernels.loop import EACH, ITERATIONS, LAST, STALLED, Limits, verdict
 from solvers.linear.schwarz import ordered
 from solvers.problem import StepProblem, System, Unsupported
 
@@ -118,7 +117,7 @@ class PreparedDescent(Minimising):
         return largest(problem) * self.base.stiffness.trace**0.5
 
 
-class Descending(MinimisingIterating):
+class Descending(StallingIterating):
     """From point to point. p, q (n, 3): where it is and a trial, in rows; g: the gradient at p (f, 3); z: what the
     preconditioner makes of -g; floor: g H^-1 g [J] of round-off."""
 
@@ -137,7 +136,7 @@ class Descending(MinimisingIterating):
         self.idle, self._largest = stream.zeros(1, np.float64), stream.zeros(1, np.float64)
         self.launch_over = sums.blocks(rows), sums.THREADS, stream.queue
         self.over_all = sums.blocks(max(rows, len(network.ends))), sums.THREADS, stream.queue
-        self.floor, self.stalled, self.moves = 0.0, False, 0
+        self.floor = 0.0
 
     def take(self, step: Step) -> None:
         """See ResidentIterating; waits for the largest coordinate, by which round-off is told."""
@@ -150,38 +149,6 @@ class Descending(MinimisingIterating):
     def settled(self) -> Any:
         """See ResidentIterating."""
         return self.p
-
-    @abstractmethod
-    def one(self) -> bool:
-        """An iteration; False where nothing descends."""
-
-    def sweep(self, count: int) -> None:
-        """See DeviceIterating; each iteration waits for the numbers of its trial."""
-        for _ in range(count):
-            if self.stalled or not self.one():
-                self.stalled = True
-                return
-            self.moves += 1
-
-    def advance(self) -> bool:
-        """See Iterating."""
-        self.launch(1)
-        return not self.stalled
-
-    def iterate(self, limits: Limits) -> tuple[int, float, int]:
-        """See Iterating; a residual after each EVERY iterations where it may end them."""
-        first, found, ended = self.moves, float("nan"), ITERATIONS
-        while self.moves - first < limits.iterations and ended == ITERATIONS:
-            left = limits.iterations - (self.moves - first)
-            self.launch(min(EVERY - self.moves % EVERY, left) if limits.wanted == EACH else left)
-            if limits.wanted == EACH:
-                found = self.residual()
-                ended = verdict(found, limits)
-            if ended == ITERATIONS and self.stalled:
-                ended = STALLED
-        if limits.wanted == LAST or (limits.wanted == EACH and self.moves == first):
-            found = self.residual()
-        return self.moves - first, found, ended
 
     def residual(self) -> float:
         """See Iterating; on the device, of its gradient."""

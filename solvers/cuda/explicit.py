@@ -122,7 +122,7 @@ class PreparedExplicit(Substepping, Resident):
         """See Resident; the guess is not used."""
         up, start = self.stream.upload, problem.start
         force, p, v = up(problem.force + self.parts.load), up(start.positions), up(start.velocity)
-        return Step(p, force, p, pins_of(problem, self.stream), p, p, p, v)
+        return Step(p, force, p, pins_of(problem, self.stream), p, p, p, v, (start.time, start.until))
 
     def iterating(self) -> Frame:
         """See Resident."""

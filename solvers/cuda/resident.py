@@ -97,9 +97,11 @@ class MinimisingIterating(ResidentIterating):
 
 
 class Minimising(Resident):
-    """One whose rows are those of a network. uploaded: that."""
+    """One whose rows are those of a network. uploaded: that; touches: whether it knows contact, and so asks for where a
+    step starts."""
 
     uploaded: Uploaded
+    touches: ClassVar[bool] = False
 
     @property
     def stream(self) -> Stream:  # pyright: ignore[reportIncompatibleVariableOverride] the network's
@@ -108,4 +110,4 @@ class Minimising(Resident):
 
     def stated(self, problem: StepProblem, guess: Positions) -> Step:
         """See Resident."""
-        return self.uploaded.step(problem, guess)
+        return self.uploaded.step(problem, guess, touches=self.touches)

@@ -14,6 +14,8 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
+from solvers.contact.energy import Contact
+from solvers.contact.self_contact import PairContact
 from solvers.core.driver import Iterating, Iterative
 from solvers.cuda import device, sums
 from solvers.cuda.run import Stream
@@ -145,6 +147,13 @@ class Stepping(Iterative):
         there = self._course.pins_at(frame * self._course.system.time_step)
         return there if len(there) else np.zeros((1, 3))
 
+    @property
+    def _times(self) -> tuple[float, float]:
+        """Where the step that is done starts, and of its unknown [s]."""
+        dt = self._course.system.time_step
+        begun = (self._frame - 1) * dt
+        return begun, begun + self._course.rule.when * dt
+
     def _begin(self) -> None:
         self._frame += 1
         self._turn = turn = self._first if self._frame == 1 else self._usual
@@ -161,7 +170,7 @@ class Stepping(Iterative):
         predict[over](motions, turn.weights, self._load, self._drag, self._pin, self._wanted, kind, gives)
         if turn.lags:
             lag[over](motions, turn.weights, self._origin, self._lagged)
-        run.take(Step(*gives, self._origin, self._lagged, self._p, self._v))
+        run.take(Step(*gives, self._origin, self._lagged, self._p, self._v, self._times))
 
     def _end(self) -> None:
         run, speeds, over = self._turn.run, self._turn.run.speeds(), self._over()
@@ -191,7 +200,7 @@ def _constant(system: System, course: Course, *, own: bool) -> tuple[Positions, 
             if damps is None:
                 raise Unsupported(f"the host states {name} before each step: it couples velocities of vertices")
             drag += 0.0 if own else damps
-        elif is_lagged(energy) and not isinstance(energy, Dashpots):
+        elif is_lagged(energy) and not isinstance(energy, Dashpots | Contact | PairContact):
             raise Unsupported(f"the host states {name} before each step")
         elif isinstance(energy, Quadratic):
             energy.add_projection(course.positions, constant)

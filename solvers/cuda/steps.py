@@ -28,7 +28,7 @@ class Step(NamedTuple):
     """On the device, by vertices. target, guess (n, 3) [m]; force (n, 3) [N], with that of forms; pins (q, 3): where
     they want their vertices [m], one row where there are none; origin, lagged (n, 3) [m]: of the unknown's velocity,
     and where dashpots take their directions, any of a network without these; positions [m], velocity [m/s]: at the
-    step's start (n, 3), any for a method that minimises."""
+    step's start (n, 3), any where a method that minimises touches nothing; times: of that, and of the unknown [s]."""
 
     target: Any
     force: Any
@@ -38,6 +38,7 @@ class Step(NamedTuple):
     lagged: Any
     positions: Any
     velocity: Any
+    times: tuple[float, float]
 
 
 class Places(NamedTuple):
@@ -85,12 +86,13 @@ class Uploaded:
         """What tells residuals, made where one is asked for."""
         return Residuals(self.stream, self.network, self.edges, self.hold)
 
-    def step(self, problem: StepProblem, guess: Positions) -> Step:
-        """A host's problem, from a first guess (n, 3) [m]."""
+    def step(self, problem: StepProblem, guess: Positions, *, touches: bool = False) -> Step:
+        """A host's problem, from a first guess (n, 3) [m]; touches: whether the method asks for its start."""
         force, up = self.network.parts.force(problem), self.stream.upload
         target, pins, start = up(problem.target), pins_of(problem, self.stream), problem.start
         lagged = (up(start.origin), up(start.expected)) if self.network.parts.dashpots else (target, target)
-        return Step(target, up(force), up(guess), pins, *lagged, target, target)
+        begun = (up(start.positions), up(start.velocity)) if touches else (target, target)
+        return Step(target, up(force), up(guess), pins, *lagged, *begun, (start.time, start.until))
 
 
 def pins_of(problem: StepProblem, stream: Stream) -> Any:

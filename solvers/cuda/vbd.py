@@ -1,27 +1,44 @@
 """Vertex block descent on a device: the iterates of `solvers.methods.vbd`, a colour a launch.
 
-Colours, their order, bundles and sums are the processor's. Springs and quadratic forms are taken; elements of other
-energies and contact are refused. Every REBASE iterations the displacement is added to the reference in float64, and the
-gradient computed there: in float32 too iterates tend to the minimum in float64.
+Colours, their order, bundles and sums are the processor's. Springs, quadratic forms and contact are taken;
+elements of other energies are refused. Every REBASE iterations the displacement is added to the
+reference in float64, and the gradient computed there: in float32 too iterates tend to the minimum in float64.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
+from solvers.contact.energy import Contact
+from solvers.contact.self_contact import ObstacleContact
+from solvers.contact.touching import is_contact, without_contact
+from solvers.core.bounds import is_bounded, without_bounded
 from solvers.core.driver import largest
 from solvers.core.parts import Parts
 from solvers.core.vertex_blocks import VertexBlocks
-from solvers.cuda import device, objective_kernels, residual, springs, sums
+from solvers.cuda import (
+    device,
+    half_space_kernels,
+    half_spaces,
+    objective_kernels,
+    pairs,
+    residual,
+    springs,
+    sums,
+    vbd_pair_kernels,
+)
 from solvers.cuda.network import Network
 from solvers.cuda.resident import AT_ONCE, Minimising, MinimisingIterating, ResidentIterating
 from solvers.cuda.run import THREADS, Stream, blocks
 from solvers.cuda.springs import Lanes
+from solvers.cuda.stepping import Stepping
 from solvers.cuda.steps import Begun, Step, Uploaded
 from solvers.cuda.vbd_kernels import ASKED, CONTROLS, KNOWN, WEIGHT, kernels
+from solvers.cuda.vbd_pairs import Guarded
+from solvers.device import Course
 from solvers.energies.quadratic import Quadratic
 from solvers.energies.springs import Springs
 from solvers.problem import StepProblem, System, Unsupported
@@ -34,17 +51,24 @@ REBASE = 16
 def prepare(system: System, parts: Parts, made: VertexBlocks, radius: float, real: Any) -> PreparedVertexBlockDescent:
     """The method on the device, which is `ready`. radius: rho of the acceleration; real: what kernels compute in.
     Raises Unsupported."""
-    taken = Springs, Quadratic
+    taken = Springs, Quadratic, Contact, *pairs.Known
     others = sorted({type(energy).__name__ for energy in system.energies if not isinstance(energy, taken)})
     if others:
         raise Unsupported(
-            f"vbd: on a device it takes springs and quadratic forms alone, not {', '.join(others)}; "
+            f"vbd: on a device it takes springs, quadratic forms and contact alone, not {', '.join(others)}; "
             "without `device: cuda` it takes these too"
         )
+    if any(map(is_contact, system.energies)) and any(map(is_bounded, system.energies)):
+        raise Unsupported(
+            "vbd: on a device contact of single vertices (Contact) is no part of the sweeps beside barriers of pairs; "
+            "state surface-contact"
+        )
     order = np.searchsorted(system.free, np.argsort(made.row)[: made.free])
-    network = Network.of("vbd", system, order)  # in the rows of the colours
+    network = Network.of("vbd", without_bounded(without_contact(system)), order)  # in the rows of the colours
     rows, size = system.vertices + 2, np.dtype(real).itemsize
     solves = len(made.bundles.own) * 6 * size + rows * (4 * 8 + 12 * size + 8 * (18 + residual.NUMBERS))
+    obstacles = sum(len(energy.obstacles) for energy in system.energies if isinstance(energy, Contact))
+    solves += 8 * half_spaces.NUMBERS * obstacles * made.free
     device.require_memory("vbd", springs.needed(made.bundles, real) + network.bytes + AT_ONCE * solves)
     with device.guarded():
         stream = Stream()
@@ -77,6 +101,7 @@ class PreparedVertexBlockDescent(Minimising):
     held: Any
     majorant: Any
     facts: dict[str, float] = field(default_factory=dict[str, float])
+    touches: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         self.facts["sweep_bytes"] = _sweep_bytes(self.made, np.dtype(self.real).itemsize, self.radius > 0.0)
@@ -88,7 +113,14 @@ class PreparedVertexBlockDescent(Minimising):
 
     def iterating(self) -> ResidentIterating:
         """See Resident."""
-        return _Iterating(self)
+        sweeps = Sweeps(self)
+        return Guarded(self, sweeps) if any(map(is_bounded, self.system.energies)) else sweeps
+
+    def stepping(self, course: Course) -> Stepping:
+        """See Resident."""
+        if any(isinstance(e, ObstacleContact) and e.place(0.0) is not e.place(1.0) for e in self.system.energies):
+            raise Unsupported("the host makes way for obstacles' surfaces that move, before each step")
+        return super().stepping(course)
 
     def scale(self, problem: StepProblem) -> float:
         """See Iterative."""
@@ -96,7 +128,7 @@ class PreparedVertexBlockDescent(Minimising):
         return largest(problem) * float(stiffness.sum()) ** 0.5
 
 
-class _Iterating(MinimisingIterating):
+class Sweeps(MinimisingIterating):
     """x (n + 2, 4), the reference in float64; u, the displacement from it; older, the iterate before, and before, the
     one where the sweep began, from it too [m]. force (3, lanes): minus the gradient at it [N]; rows (n, 3): where it
     is, and gradient (f, 3) there, both where somebody asks for them."""
@@ -109,17 +141,26 @@ class _Iterating(MinimisingIterating):
         self._u, self._older, self._before = (stream.empty((n + 2, 4), made.real) for _ in range(3))
         self._force = stream.empty((3, max(1, lanes)), made.real)
         self._rows, self._gradient = stream.empty((n, 3), np.float64), stream.empty((n, 3), np.float64)
-        self._sums = [stream.zeros(blocks(lanes), np.float64) for _ in range(2)]
-        self._begun, self._control = Begun(made.uploaded), stream.zeros(CONTROLS, np.float64)
+        self._spaces = None
+        if any(map(is_contact, made.system.energies)):
+            of, self._pushing = made.uploaded, half_space_kernels.kernels(made.real)
+            self._spaces = half_spaces.Spaces(stream, made.system, of.network.order, of.places.vertex, made.made.free)
+        more = self._spaces.over[0] if self._spaces else 0
+        self._sums = [stream.zeros(blocks(lanes) + more, np.float64) for _ in range(2)]
+        self.loaded, self._control = Begun(made.uploaded), stream.zeros(CONTROLS, np.float64)
         fresh = np.zeros(CONTROLS)
         fresh[[KNOWN, WEIGHT]] = np.nan, 1.0
         self._fresh = stream.upload(fresh)
+        self._since = 0
+        self._launch(self._springs.clear, len(self._x), self._x, self._u, self._older, self._before)
 
     def take(self, step: Step) -> None:
         """See ResidentIterating."""
         self._launch(self._springs.clear, len(self._x), self._x, self._u, self._older, self._before)
         self.stream.copy(self._fresh, self._control)
-        self._begun.take(step, self._x)
+        self.loaded.take(step, self._x)
+        if self._spaces:
+            self._spaces.take(step)
 
     def settled(self) -> Any:
         """See ResidentIterating."""
@@ -132,7 +173,10 @@ class _Iterating(MinimisingIterating):
             made, free = self._made.uploaded, self._made.made.free
             launch = sums.blocks(free), sums.THREADS, self.stream.queue
             g = self._gradient[:free]
-            objective_kernels.gradient[launch](self._begun.edges, self._begun.given, self.settled(), g)
+            rows = self.settled()
+            objective_kernels.gradient[launch](self.loaded.edges, self.loaded.given, rows, g)
+            if self._spaces:
+                self._spaces.add_gradient(rows, g)
             return made.residuals.of(g)
 
     def sweep(self, count: int) -> None:
@@ -148,26 +192,60 @@ class _Iterating(MinimisingIterating):
         if moved:
             self._launch(self._kernels.rebase, len(self._x), self._x, self._u, self._older, self._control)
         self._launch(
-            self._springs.linearise, len(lanes.own), *lanes.written, lanes.nobody, lanes.far, self._begun.given,
+            self._springs.linearise, len(lanes.own), *lanes.written, lanes.nobody, lanes.far, self.loaded.given,
             self._x, self._force,
         )  # fmt: skip
 
     def _once(self) -> None:
         made, run = self._made, self._kernels
-        lanes, rows, first = made.lanes, len(self._x), made.made.first
+        rows = len(self._x)
         accelerated = made.radius > 0.0
         if accelerated:
             self._level(self._u, ASKED, self._sums[0])
-        for begin, end in zip(LANES * first[:-1], LANES * first[1:], strict=True):
-            self._launch(
-                run.sweep, end - begin, begin, end, *lanes.read, lanes.nobody, lanes.far, made.held, made.majorant,
-                self._force, self._u, self._before,
-            )  # fmt: skip
+        self._colours()
         if accelerated:
             self._launch(run.extrapolate, rows, self._u, self._older, self._control)
             self._level(self._older, WEIGHT, self._sums[1])
             self._launch(run.decide, THREADS, made.radius, *self._sums, self._control)
             self._launch(run.finish, rows, self._u, self._before, self._older, self._control)
+
+    def _colours(self, push: Any = None, *others: Any) -> None:
+        """A sweep; push: moves the vertices of a colour anew that touch something, with what else it takes."""
+        made = self._made
+        lanes, first = made.lanes, made.made.first
+        if self._spaces:
+            push, others = self._pushing.push, (self._x, self._spaces.given)
+        for begin, end in zip(LANES * first[:-1], LANES * first[1:], strict=True):
+            colour = (
+                begin, end, *lanes.read, lanes.nobody, lanes.far, made.held, made.majorant, self._force, self._u,
+                self._before,
+            )  # fmt: skip
+            self._launch(self._kernels.sweep, end - begin, *colour)
+            if push:
+                self._launch(push, end - begin, *colour, *others)
+
+    def alone(self, p: Any, q: Any, *, fresh: bool) -> None:
+        """Write where a sweep leads from rows p to q, with what is extrapolated from sweeps before; fresh: whether
+        these are forgotten."""
+        if fresh:
+            self._begin_at(p)
+        if self._since % REBASE == 0:
+            self._rebase(moved=self._since > 0)
+        self._once()
+        self._since += 1
+        self._launch(vbd_pair_kernels.end, len(self._x), self._x, self._u, q)
+
+    def pushed(self, p: Any, q: Any, push: Any, *others: Any) -> None:
+        """Write where a sweep leads from rows p to q, with what pushes, extrapolated by nothing."""
+        self._begin_at(p)
+        self._rebase(moved=False)
+        self._colours(push, *others)
+        self._launch(vbd_pair_kernels.end, len(self._x), self._x, self._u, q)
+
+    def _begin_at(self, p: Any) -> None:
+        self._launch(vbd_pair_kernels.begin, len(self._x), p, self._x, self._u, self._older, self._before)
+        self.stream.copy(self._fresh, self._control)
+        self._since = 0
 
     def _level(self, u: Any, asked: int, sums: Any) -> None:
         made = self._made
@@ -176,6 +254,9 @@ class _Iterating(MinimisingIterating):
             self._kernels.level, len(lanes.own), *lanes.read, lanes.nobody, lanes.far, made.made.free, made.held,
             self._force, u, asked, self._control, sums,
         )  # fmt: skip
+        if self._spaces:
+            press, over = self._pushing.press, self._spaces.over
+            press[over](self._spaces.given, self._x, u, asked, self._control, blocks(len(lanes.own)), sums)
 
     def _launch(self, kernel: Any, threads: int, *arguments: Any) -> None:
         kernel[blocks(threads), THREADS, self.stream.queue](*arguments)

@@ -30,8 +30,10 @@ _ROUND_OFF = {np.float32: 1e-6, np.float64: 1e-14}
 
 
 class Kernels(NamedTuple):
-    """Kernels in one type of numbers."""
+    """Device functions and kernels in one type of numbers."""
 
+    gathered: Any
+    risen: Any
     sweep: Any
     extrapolate: Any
     level: Any
@@ -48,22 +50,13 @@ def kernels(real: Any) -> Kernels:
     change, unit_exact = springs.kernels(real).change, springs.kernels(np.float64).unit
     tiny = TINY_SQUARED
 
-    @cuda.jit
-    def sweep(
-        begin, end, own, start, neighbour, kind, weights, spring, direction, arrows,
-        nobody, far, held, majorant, force, u, before,
+    @cuda.jit(device=True)
+    def gathered(
+        t, first, last, u0, u1, u2, neighbour, kind, weights, spring, direction, arrows, far, held, force, u,
     ):  # fmt: skip
-        """Move the vertices of a colour, lanes `begin` to `end`, each to a lower energy; `before` keeps where it was.
-
-        held, majorant (lanes,) [N/m]; force (3, lanes) [N]: minus the gradient at the reference.
-        """
-        t = begin + cuda.grid(1)
-        if t >= end or own[t] == nobody:
-            return
-        i, b, lane = own[t], t // LANES, t % LANES
-        first, last = start[b], start[b + 1]
-        u0, u1, u2, h = u[i, 0], u[i, 1], u[i, 2], held[t]
-        before[i, 0], before[i, 1], before[i, 2] = u0, u1, u2
+        """The force [N] on a lane's vertex at the displacement u0, u1, u2, the upper triangle of its block [N/m], and
+        whether one of its springs has no length, and so no share in the block."""
+        lane, h = t % LANES, held[t]
         f0, f1, f2 = force[0, t] - h * u0, force[1, t] - h * u1, force[2, t] - h * u2
         b00, b01, b02, b11, b12, b22 = h, zero, zero, h, zero, h
         lengthless = False
@@ -89,6 +82,53 @@ def kernels(real: Any) -> Kernels:
             a0, a1 = axial * v0, axial * v1
             b00, b01, b02 = b00 + a0 * v0 + lateral, b01 + a0 * v1, b02 + a0 * v2
             b11, b12, b22 = b11 + a1 * v1 + lateral, b12 + a1 * v2, b22 + axial * v2 * v2 + lateral
+        return f0, f1, f2, b00, b01, b02, b11, b12, b22, lengthless
+
+    @cuda.jit(device=True)
+    def risen(
+        t, first, last, u0, u1, u2, x0, x1, x2, f0, f1, f2, neighbour, kind, weights, arrows, far, held, u,
+    ):  # fmt: skip
+        """By how much a step x0, x1, x2 of a lane's vertex raises the energy [J], from where the force is f0, f1, f2;
+        no spring has no length."""
+        lane = t % LANES
+        moved = x0 * x0 + x1 * x1 + x2 * x2
+        rise = half * held[t] * moved - (f0 * x0 + f1 * x1 + f2 * x2)
+        for entry in range(first, last):
+            e = LANES * entry + lane
+            j = neighbour[e]
+            if j == far:
+                continue
+            pull, k = weights[kind[entry] + lane], weights[kind[entry] + LANES + lane]
+            v0 = arrows[0, e] + (u0 - u[j, 0])
+            v1 = arrows[1, e] + (u1 - u[j, 1])
+            v2 = arrows[2, e] + (u2 - u[j, 2])
+            was = real(math.sqrt(v0 * v0 + v1 * v1 + v2 * v2))
+            m0, m1, m2 = v0 + x0, v1 + x1, v2 + x2
+            both = was + real(math.sqrt(m0 * m0 + m1 * m1 + m2 * m2))
+            longer = ((v0 + m0) * x0 + (v1 + m1) * x1 + (v2 + m2) * x2) / both
+            along = (v0 * x0 + v1 * x1 + v2 * x2) / was
+            rise += half * k * moved - pull * (moved - along * longer) / both
+        return rise
+
+    @cuda.jit
+    def sweep(
+        begin, end, own, start, neighbour, kind, weights, spring, direction, arrows,
+        nobody, far, held, majorant, force, u, before,
+    ):  # fmt: skip
+        """Move the vertices of a colour, lanes `begin` to `end`, each to a lower energy; `before` keeps where it was.
+
+        held, majorant (lanes,) [N/m]; force (3, lanes) [N]: minus the gradient at the reference.
+        """
+        t = begin + cuda.grid(1)
+        if t >= end or own[t] == nobody:
+            return
+        i, b = own[t], t // LANES
+        first, last = start[b], start[b + 1]
+        u0, u1, u2 = u[i, 0], u[i, 1], u[i, 2]
+        before[i, 0], before[i, 1], before[i, 2] = u0, u1, u2
+        f0, f1, f2, b00, b01, b02, b11, b12, b22, lengthless = gathered(
+            t, first, last, u0, u1, u2, neighbour, kind, weights, spring, direction, arrows, far, held, force, u
+        )
         scale = one / majorant[t]
         s0, s1, s2 = scale * f0, scale * f1, scale * f2
         l1, l2 = b01 / b00, b02 / b00
@@ -103,23 +143,9 @@ def kernels(real: Any) -> Kernels:
             x2 = (f2 - l2 * f0 - l3 * y1) / third
             x1 = y1 / second - l3 * x2
             x0 = f0 / b00 - l1 * x1 - l2 * x2
-            moved = x0 * x0 + x1 * x1 + x2 * x2
-            rise = half * h * moved - (f0 * x0 + f1 * x1 + f2 * x2)
-            for entry in range(first, last):
-                e = LANES * entry + lane
-                j = neighbour[e]
-                if j == far:
-                    continue
-                pull, k = weights[kind[entry] + lane], weights[kind[entry] + LANES + lane]
-                v0 = arrows[0, e] + (u0 - u[j, 0])
-                v1 = arrows[1, e] + (u1 - u[j, 1])
-                v2 = arrows[2, e] + (u2 - u[j, 2])
-                was = real(math.sqrt(v0 * v0 + v1 * v1 + v2 * v2))
-                m0, m1, m2 = v0 + x0, v1 + x1, v2 + x2
-                both = was + real(math.sqrt(m0 * m0 + m1 * m1 + m2 * m2))
-                longer = ((v0 + m0) * x0 + (v1 + m1) * x1 + (v2 + m2) * x2) / both
-                along = (v0 * x0 + v1 * x1 + v2 * x2) / was
-                rise += half * k * moved - pull * (moved - along * longer) / both
+            rise = risen(
+                t, first, last, u0, u1, u2, x0, x1, x2, f0, f1, f2, neighbour, kind, weights, arrows, far, held, u
+            )
             if rise <= zero:
                 s0, s1, s2 = x0, x1, x2
         u[i, 0], u[i, 1], u[i, 2] = u0 + s0, u1 + s1, u2 + s2
@@ -253,4 +279,4 @@ def kernels(real: Any) -> Kernels:
                 older[i, c] -= u[i, c]
                 u[i, c] = zero
 
-    return Kernels(sweep, extrapolate, level, decide, finish, rebase)
+    return Kernels(gathered, risen, sweep, extrapolate, level, decide, finish, rebase)

@@ -121,7 +121,7 @@ class PreparedXpbd(Resident):
         up, start = self.stream.upload, problem.start
         target, force, pins = up(problem.target), up(problem.force), pins_of(problem, self.stream)
         here = (up(start.positions), up(start.velocity)) if self.own else (target, target)
-        return Step(target, force, target, pins, target, target, *here)
+        return Step(target, force, target, pins, target, target, *here, (start.time, start.until))
 
     def iterating(self) -> ResidentIterating:
         """See Resident."""

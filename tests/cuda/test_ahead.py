@@ -35,8 +35,11 @@ from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
 from solvers.problem import StopRule
 from tests.cuda import ahead
 from tests.cuda.near import PRECISIONS
+from tests.cuda.test_pairs import PROBLEMS as PAIRED
+from tests.cuda.test_pairs import every_other_search_fails
 from tests.cuda.test_steps import DRAGS, FILTERS, staying
 from tests.cuda.test_steps import cloth as moving
+from tests.cuda.test_touching import touching
 from tests.effects import DASHPOTS
 from tests.scenes import cloth, first_problem, random_problem
 
@@ -104,6 +107,9 @@ def launch_all() -> None:
         for method in METHODS:
             for problem in problems:
                 method(device="cuda", precision=precision).prepare(problem.system).solve(problem, StopRule(8, 1e-3))
+        for touched in (touching("sphere"), *(make() for make in PAIRED.values())):
+            method = VertexBlockDescent(device="cuda", precision=precision)
+            method.prepare(touched.system).solve(touched, StopRule(2))
     by_itself, minimises = XpbdSmallSteps(device="cuda"), NonlinearCG(preconditioner="block-jacobi", device="cuda")
     for solver, effects in (by_itself, FILTERS), (minimises, (*DRAGS, DASHPOTS)):
         made = moving(*effects)
@@ -124,6 +130,7 @@ def test_every_kernel_compiles_as_it_is_launched(tmp_path: Path, monkeypatch: py
     with monkeypatch.context() as patch:
         patch.setattr(schwarz, "PATCH", 3)  # small scenes have levels, and the reference changes soon
         patch.setattr(vbd, "REBASE", 3)
+        every_other_search_fails(patch)
         launches = recorded(patch)
         launch_all()
         assert set(launches) == set(ahead.kernels())

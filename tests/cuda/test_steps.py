@@ -30,6 +30,7 @@ from solvers.methods.symplectic_euler import SymplecticEuler
 from solvers.methods.vbd import VertexBlockDescent
 from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
 from solvers.problem import StopRule
+from tests.contacts import contact
 from tests.cuda.near import PRECISIONS
 from tests.effects import ATTACHED, BEND, DASHPOTS, MOVES, RAYLEIGH, integrated
 from tests.scenes import scene
@@ -54,6 +55,8 @@ OWN = {"xpbd-small-steps", "symplectic-euler", "velocity-verlet", "runge-kutta-4
 ASKED = {"newton-cg", "pncg", "lbfgs", "tsitouras-5"}
 """Methods of which a few numbers go to the host and back within a step, of a search or of steps that are chosen."""
 
+UP = {"keys": [{"time": 0}, {"time": 1, "offset": (0, 3, 0)}]}
+RISING = contact({"kind": "sphere", "center": (0.0, -0.46, 0.2), "radius": 0.43, "motion": UP}, friction=0.3)
 FILTERS = EtherDrag(rate=0.5), AirDrag(law="quadratic", coefficient=0.3)
 DRAGS = *FILTERS, AirDrag(coefficient=0.3)
 
@@ -112,6 +115,7 @@ def timed(on_it: Staying, moved: dict[str, list[int]]) -> list[int]:
     ("method", "effects", "first_guess", "integrator"),
     [
         ("vbd", DRAGS, "inertial", "midpoint"),
+        ("vbd", (RISING,), "current", "bdf2"),
         ("newton-cg", (*DRAGS, DASHPOTS), "current", "bdf2"),
         ("newton-cg", (*DRAGS, DASHPOTS), "current", "midpoint"),
         ("pncg", (BEND, *DRAGS), "assignment", "implicit-euler"),

@@ -1,0 +1,165 @@
+"""Half-spaces that keep vertices out of obstacles, on a device: found where a step starts, and swept with.
+
+The functions are the processor's: which half-space a vertex has (`solvers.contact.planes`), what it adds to the
+vertex's gradient and block, and the steps that are tried (`solvers.kernels.half_spaces`). They compute in float64, for
+few vertices touch; what springs do comes from the kernels of `solvers.cuda.vbd_kernels` in their type.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import float64
+
+from solvers.contact import planes
+from solvers.cuda import sums, vbd_kernels
+from solvers.cuda.shared import shared
+from solvers.cuda.target import cuda
+from solvers.cuda.vbd_kernels import ASKED, WEIGHT
+from solvers.kernels import half_spaces
+from solvers.kernels.half_spaces import EXACT, MAJORANT
+
+_plane, _pushed, _deeper = shared(planes.plane), shared(half_spaces.pushed), shared(half_spaces.deeper)
+_Rounded = planes.Rounded
+
+
+class Bodies(NamedTuple):
+    """Of each obstacle: low, high (o, 3) and radius (o,) of its rounded box, thickness included [m]; margin (o,) [m],
+    friction (o,); stiffness (o, n) of each row [N/m]."""
+
+    low: Any
+    high: Any
+    radius: Any
+    margin: Any
+    friction: Any
+    stiffness: Any
+
+
+@cuda.jit
+def fastest(v, out):
+    """The largest |v|^2, if it is larger than out[0]; which it is depends on no order."""
+    most, i = 0.0, cuda.grid(1)
+    while i < v.shape[0]:
+        most = max(most, v[i, 0] * v[i, 0] + v[i, 1] * v[i, 1] + v[i, 2] * v[i, 2])
+        i += cuda.gridsize(1)
+    cuda.atomic.max(out, 0, most)
+
+
+@cuda.jit
+def find(vertex, p, v, dt, when, square, frames, bodies, found, spaces):
+    """Write the half-spaces of the free rows, one for each obstacle; where a vertex comes near none of them it is
+    empty. See `solvers.contact.energy.Contact`.
+
+    p [m], v [m/s]: at the step's start, by vertices; when: the unknown's time within the step, 1 at its end; square: of
+    the largest speed; frames (o, 2, 4, 3): of obstacles; found: a view of `spaces`.
+    """
+    work = cuda.local.array((5, 3), np.float64)
+    i, many = cuda.grid(1), bodies.radius.shape[0]
+    way = dt * math.sqrt(square[0])
+    while i < spaces.near.shape[0]:
+        spaces.near[i] = False
+        x = vertex[i]
+        for o in range(many):
+            k, body = many * i + o, _Rounded(bodies.low[o], bodies.high[o], bodies.radius[o])
+            if _plane(p, v, x, dt, frames[o], body, bodies.margin[o] + way, found, k, work):
+                before, lagged, stiffness = 0.0, 0.0, bodies.stiffness[o, i]
+                for c in range(3):
+                    n, here, carried = spaces.normal[k, c], p[x, c], spaces.anchor[k, c]
+                    before += n * here
+                    lagged += n * carried
+                    spaces.anchor[k, c] = here + when * (carried - here)
+                depth = max(0.0, spaces.offset[k] - lagged)
+                spaces.offset[k] = before + when * (spaces.offset[k] - before)
+                spaces.stiffness[k], spaces.grip[k] = stiffness, bodies.friction[o] * stiffness * when * depth
+                spaces.near[i] = True
+            else:
+                for c in range(3):
+                    spaces.normal[k, c], spaces.anchor[k, c] = 0.0, 0.0
+                spaces.offset[k], spaces.stiffness[k], spaces.grip[k] = -1.0, 0.0, 0.0
+        i += cuda.gridsize(1)
+
+
+@cuda.jit
+def add_gradient(spaces, p, out):
+    """Add their gradient [N] at rows p (n, 3) to `out` (f, 3)."""
+    i = cuda.grid(1)
+    while i < out.shape[0]:
+        if spaces.near[i]:
+            g, none = (out[i, 0], out[i, 1], out[i, 2]), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            g, _, _ = _pushed(spaces, i, (p[i, 0], p[i, 1], p[i, 2]), (0.0, 0.0, 0.0), EXACT, g, none)
+            out[i, 0], out[i, 1], out[i, 2] = g
+        i += cuda.gridsize(1)
+
+
+class Kernels(NamedTuple):
+    """Kernels in one type of numbers."""
+
+    push: Any
+    press: Any
+
+
+@cache
+def kernels(real: Any) -> Kernels:
+    """Those of a type, that of displacements."""
+    gathered, springs_rise = vbd_kernels.kernels(real).gathered, vbd_kernels.kernels(real).risen
+
+    @cuda.jit(device=True)
+    def risen(d, where):
+        t, first, last, at, pull, neighbour, kind, weights, arrows, far, held, u = where
+        return float64(
+            springs_rise(
+                t, first, last, at[0], at[1], at[2], real(d[0]), real(d[1]), real(d[2]), pull[0], pull[1], pull[2],
+                neighbour, kind, weights, arrows, far, held, u,
+            )
+        )  # fmt: skip
+
+    lowering = shared(half_spaces.trying(risen))
+
+    @cuda.jit
+    def push(
+        begin, end, own, start, neighbour, kind, weights, spring, direction, arrows,
+        nobody, far, held, majorant, force, u, before, x, spaces,
+    ):  # fmt: skip
+        """Move those vertices of a colour anew that have half-spaces, from where they were before its sweep; x: the
+        reference, in rows of four [m]. See `solvers.cuda.vbd_kernels` for all else."""
+        t = begin + cuda.grid(1)
+        if t >= end or own[t] == nobody or not spaces.near[own[t]]:
+            return
+        i, b = own[t], t // vbd_kernels.LANES
+        first, last = start[b], start[b + 1]
+        u0, u1, u2 = before[i, 0], before[i, 1], before[i, 2]
+        f0, f1, f2, b00, b01, b02, b11, b12, b22, lengthless = gathered(
+            t, first, last, u0, u1, u2, neighbour, kind, weights, spring, direction, arrows, far, held, force, u
+        )
+        at = x[i, 0] + u0, x[i, 1] + u1, x[i, 2] + u2
+        gradient = -float64(f0), -float64(f1), -float64(f2)
+        block = float64(b00), float64(b01), float64(b02), float64(b11), float64(b12), float64(b22)
+        where = t, first, last, (u0, u1, u2), (f0, f1, f2), neighbour, kind, weights, arrows, far, held, u
+        # Where a spring has no length there is no Hessian: the majorant's step takes it apart.
+        level = MAJORANT if lengthless else EXACT
+        most = float64(majorant[t])
+        d = lowering(spaces, i, at, (most, 0.0, 0.0, most, 0.0, most), level, gradient, block, where)
+        u[i, 0], u[i, 1], u[i, 2] = real(u0 + d[0]), real(u1 + d[1]), real(u2 + d[2])
+
+    @cuda.jit
+    def press(spaces, x, u, asked, control, first, out):
+        """Write by how much half-spaces' energy rises from the reference to u, to `out` from `first` on, a number a
+        block [J]; see `solvers.cuda.vbd_kernels.level`."""
+        if asked == ASKED and not control[ASKED] > 0.0:
+            return
+        if asked == WEIGHT and not control[WEIGHT] > 1.0:
+            return
+        total, i = 0.0, cuda.grid(1)
+        while i < spaces.near.shape[0]:
+            if spaces.near[i]:
+                d = float64(u[i, 0]), float64(u[i, 1]), float64(u[i, 2])
+                total = _deeper(spaces, i, (x[i, 0], x[i, 1], x[i, 2]), d, total)
+            i += cuda.gridsize(1)
+        total = sums.of_block(total)
+        if cuda.threadIdx.x == 0:
+            out[first + cuda.blockIdx.x] = total
+
+    return Kernels(push, press)
