@@ -1,4 +1,4 @@
-"""Newton (Warp): springs of its particles, stepped by three of its solvers on the CPU, in float32.
+"""Newton (Warp): springs of its particles, stepped by three of its solvers in float32, on the CPU or a CUDA device.
 
 - `vbd`, vertex block descent (Chen et al. 2024), and `xpbd`: implicit Euler in substeps, of some iterations each.
   Newton's `ModelBuilder.color` sees triangles, tetrahedra and bending edges, and no springs: a net of springs is one
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from solvers.about import About, Reference
 from solvers.core.colouring import of_vertices
+from solvers.device import OnDevice
 from solvers.engines.base import Engine, Network, Package, PreparedEngine, evenly
 from solvers.problem import Positions, StepProblem, System, Unsupported
 
@@ -44,7 +45,7 @@ for i, (p, v, m) in enumerate(zip(net["positions"], net["velocities"], net["mass
 for (i, j), k in zip(net["ends"].tolist(), net["stiffness"]):
     builder.add_spring(i, j, k, 0.0, control=0.0)
 builder.spring_rest_length = net["rest_length"].tolist()
-{colouring}model = builder.finalize(device="cpu")
+{colouring}model = builder.finalize(device="{device}")
 solver, now, then = newton.solvers.{solver}, model.state(), model.state()
 began = time.perf_counter()  # the first step compiles
 for _ in range({steps}):
@@ -57,9 +58,9 @@ print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of t
 
 
 @dataclass(frozen=True)
-class NewtonPhysics(Engine):
+class NewtonPhysics(Engine, OnDevice):
     """method: one of Newton's solvers. iterations: in each substep; an explicit method has none. colours: whose
-    vertices move at the same time by `vbd`."""
+    vertices move at the same time by `vbd`. device: as it is for ours."""
 
     name: ClassVar[str] = "newton-physics"
     package: ClassVar[Package] = Package("newton", "newton", "newton")
@@ -85,6 +86,11 @@ class NewtonPhysics(Engine):
         """See Engine."""
         if not self.iterations >= 1:
             raise Unsupported(f"newton-physics: iterations came as {self.iterations}; wanted 1 or more")
+        warp = import_module("warp")
+        if self.device == "cuda" and not warp.is_cuda_available():
+            raise Unsupported(
+                "newton-physics: device: cuda: Warp finds no CUDA device, or no driver for it"
+            )
         builder = library.ModelBuilder(gravity=(0.0, 0.0, 0.0))
         fixed = np.isin(np.arange(len(network.mass)), network.pinned)
         for m in np.where(fixed, 0.0, network.mass).tolist():
@@ -97,10 +103,11 @@ class NewtonPhysics(Engine):
             told = f"{self.iterations} iterations a substep"
         if self.method == "vbd":
             told += f", {self._colour(builder, network)} colours"
-        model = builder.finalize(device="cpu")
+        model = builder.finalize(device=self.device)
         solver, explicit = self._solver(library.solvers, model), self.method == "semi-implicit"
-        made = _Model(import_module("warp"), model, solver, network, explicit=explicit)
-        return made, f"{self.method}, {told}, in float32 on the CPU, on one thread"
+        made = _Model(warp, model, solver, network, explicit=explicit)
+        where = f"the device {model.device.name}" if self.device == "cuda" else "the CPU, on one thread"
+        return made, f"{self.method}, {told}, in float32 on {where}"
 
     def _colour(self, builder: Any, network: Network) -> int:
         """Set the colours; how many there are."""
@@ -133,6 +140,7 @@ class NewtonPhysics(Engine):
         text = _SCRIPT.format(
             name=name,
             colouring=colouring,
+            device=self.device,
             solver=made[self.method],
             steps=substeps * frames,
             h=network.time_step / substeps,
@@ -155,14 +163,14 @@ class _Model:
         _set(self._now.particle_q, start.positions)
         _set(self._now.particle_qd, start.velocity)
         for state in (self._now, self._then):
-            state.particle_qd.numpy()[net.pinned] = 0.0  # a particle without mass would go on with what it has
+            _set(state.particle_qd, 0.0, net.pinned)  # a particle without mass would go on with what it has
         _set(self._load, problem.force)
         begin, end = start.positions[net.pinned], problem.pin_targets
         places = evenly(begin, end, substeps)
         ahead = 0.0 if self._explicit else (end - begin) / substeps  # implicit steps have pins where they will be
         for k in range(substeps):
             if places is not None:
-                self._now.particle_q.numpy()[net.pinned] = places[k] + ahead
+                _set(self._now.particle_q, places[k] + ahead, net.pinned)
             self._warp.copy(self._now.particle_f, self._load)  # an explicit step adds the springs' forces to it
             self._solver.step(self._now, self._then, None, None, h)
             self._now, self._then = self._then, self._now
@@ -171,6 +179,12 @@ class _Model:
         return p, v
 
 
-def _set(array: Any, values: NDArray[np.float64]) -> None:
-    """Write values (n, 3) to an array of Warp's."""
-    array.numpy()[:] = values
+def _set(array: Any, values: NDArray[np.float64] | float, rows: NDArray[np.int64] | None = None) -> None:
+    """Write values to an array of Warp's (n, 3), or to some of its rows."""
+    if rows is None and array.device.is_cuda:
+        array.assign(np.asarray(values, np.float32))
+        return
+    host = array.numpy()  # on the CPU the array itself
+    host[slice(None) if rows is None else rows] = values
+    if array.device.is_cuda:
+        array.assign(host)

@@ -209,6 +209,13 @@ def test_all_of_a_net_is_one_colour_to_newton_physics_which_sees_no_springs():
         assert told in prepared.choice
 
 
+def test_newton_physics_says_where_there_is_no_device():
+    warp = pytest.importorskip("warp", reason="the extra `newton` is not installed")
+    if not warp.is_cuda_available():
+        with pytest.raises(Unsupported, match="Warp finds no CUDA device"):
+            ready("newton-physics", made(*HANGING).system, device="cuda")
+
+
 @engines
 @pytest.mark.parametrize("weight", [1e10, "exact"])
 def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_number(name: str, weight: float | str):
