@@ -119,14 +119,27 @@ def refit(tree, x, boxes):
     boxes[:, :3], boxes[:, 3:] = np.inf, -np.inf
     size, last = len(tree.corners), len(boxes) - (len(tree.corners) + 7) // 8
     for e in range(size):
-        box, slot = boxes[last + e // 8], e % 8
-        for axis in range(3):
-            low, high = np.inf, -np.inf
-            for a in range(tree.corners.shape[1]):
-                at = x[tree.corners[e, a], axis]
-                low, high = min(low, at), max(high, at)
-            box[axis, slot], box[3 + axis, slot] = low, high
+        enclose(tree.corners, e, x, boxes[last + e // 8], e % 8)
     _lift(boxes)
+
+
+@inner
+def enclose(corners, e, x, boxes, slot):
+    """Write the box of a primitive at x, in rows of three or more, to one of eight (6, 8)."""
+    low, high = box(corners, e, x)
+    for axis in range(3):
+        boxes[axis, slot], boxes[3 + axis, slot] = low[axis], high[axis]
+
+
+@inner
+def box(corners, e, x):
+    """The least and the largest corner of a primitive's box at x, in rows of three or more."""
+    l0, l1, l2, h0, h1, h2 = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
+    for a in range(corners.shape[1]):
+        i = corners[e, a]
+        l0, l1, l2 = min(l0, x[i, 0]), min(l1, x[i, 1]), min(l2, x[i, 2])
+        h0, h1, h2 = max(h0, x[i, 0]), max(h1, x[i, 1]), max(h2, x[i, 2])
+    return (l0, l1, l2), (h0, h1, h2)
 
 
 @kernel

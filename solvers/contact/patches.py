@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from solvers.compiling import inner, kernel
 from solvers.contact import boxes, flat, ways
 from solvers.contact.barrier import distances
-from solvers.contact.boxes import Indices, Tree, met, share_vertex
+from solvers.contact.boxes import Indices, Tree, box, enclose, met, share_vertex
 from solvers.contact.contacts import Pairs, padded
 from solvers.contact.flat import Lie, Rest
 from solvers.contact.ways import unevenness
@@ -240,13 +240,11 @@ def _against(one, a, other, b, x, y, reach, share, here, there, out, count):
     begin, end, wide = other.starts[b], other.starts[b + 1], one.corners.shape[1]
     for f in range(begin, end):
         node, slot = (f - begin) // 8, (f - begin) % 8
-        for around, z in ((here, x), (there, y)):
-            low, high = _box(other.corners, f, z)
-            for axis in range(3):
-                around[node, axis, slot], around[node, 3 + axis, slot] = low[axis], high[axis]
+        enclose(other.corners, f, x, here[node], slot)
+        enclose(other.corners, f, y, there[node], slot)
     for e in range(one.starts[a], one.starts[a + 1]):
-        low, high = _box(one.corners, e, x)
-        lower, upper = _box(one.corners, e, y)
+        low, high = box(one.corners, e, x)
+        lower, upper = box(one.corners, e, y)
         for first in range(begin, end, 8):
             left = met(here, there, (first - begin) // 8, low, high, lower, upper, reach, share)
             while left != 0:
@@ -261,15 +259,3 @@ def _against(one, a, other, b, x, y, reach, share, here, there, out, count):
                             out[count, wide + c] = other.corners[f, c]
                     count += 1
     return count
-
-
-@inner
-def _box(corners, e, x):
-    i = corners[e, 0]
-    l0, l1, l2 = x[i, 0], x[i, 1], x[i, 2]
-    h0, h1, h2 = l0, l1, l2
-    for a in range(1, corners.shape[1]):
-        i = corners[e, a]
-        l0, l1, l2 = min(l0, x[i, 0]), min(l1, x[i, 1]), min(l2, x[i, 2])
-        h0, h1, h2 = max(h0, x[i, 0]), max(h1, x[i, 1]), max(h2, x[i, 2])
-    return (l0, l1, l2), (h0, h1, h2)
