@@ -17,7 +17,7 @@ a diagonal.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal, Protocol
 
 import numpy as np
@@ -44,10 +44,17 @@ _HALVINGS = 60
 """Of the threshold; then all elements are filtered."""
 
 
-def factorised(hessian: Hessian, diagonal: NDArray[np.float64], shift: NDArray[np.float64] | float = 0.0) -> int | None:
-    """The level at which a Hessian with `shift` on its diagonal [N/m] was factorised, 0 for the exact one; None for
-    none. diagonal: what is added multiples of, (3 f,) [N/m]."""
-    return next((k for k, (keep, by) in enumerate(LEVELS) if hessian.factorise(keep, shift + by * diagonal)), None)
+def factorised(
+    hessian: Hessian,
+    diagonal: NDArray[np.float64],
+    shift: NDArray[np.float64] | float = 0.0,
+    levels: Sequence[tuple[float, float]] = LEVELS,
+    first: int = 0,
+) -> int | None:
+    """The level at which a Hessian with `shift` on its diagonal [N/m] was factorised, from the first one that is tried
+    on, 0 for the exact one; None for none. diagonal: what is added multiples of, (3 f,) [N/m]."""
+    tried = enumerate(levels[first:], first)
+    return next((k for k, (keep, by) in tried if hessian.factorise(keep, shift + by * diagonal)), None)
 
 
 class Rule(Protocol):
@@ -83,12 +90,9 @@ class Close(Graded):
 
     def factorised(self, hessian: Hessian, at: Point, diagonal: NDArray[np.float64]) -> int | None:
         """See Rule."""
-        for level in range(max(0, self._level - 1), len(_CLOSE)):
-            keep, by = _CLOSE[level]
-            if hessian.factorise(keep, by * diagonal):
-                self._level = level
-                return level
-        return None
+        level = factorised(hessian, diagonal, levels=_CLOSE, first=max(0, self._level - 1))
+        self._level = self._level if level is None else level
+        return level
 
 
 class Clamped(Graded):
