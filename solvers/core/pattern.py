@@ -79,8 +79,10 @@ class Matrix:
 
     def of_elements(self, energy: int, vertices: Indices) -> Indices:
         """Where the blocks of an energy's elements lie, every vertex of (m, k) with every one, (m, k^2); -1 where one
-        is not free. They are found once for the same array of vertices."""
-        self.holds(energy, vertices)
+        is not free. They are found once for the same array of vertices. Raises LookupError where a block is missing.
+        """
+        if not self.holds(energy, vertices):
+            raise LookupError("the matrix has no place for some blocks of these elements")
         return self._elements[energy][1]
 
     def holds(self, energy: int, vertices: Indices) -> bool:
