@@ -104,19 +104,8 @@ class Kernels(NamedTuple):
 @cache
 def kernels(real: Any) -> Kernels:
     """Those of a type, that of displacements."""
-    gathered, springs_rise = vbd_kernels.kernels(real).gathered, vbd_kernels.kernels(real).risen
-
-    @cuda.jit(device=True)
-    def risen(d, where):
-        t, first, last, at, pull, neighbour, kind, weights, arrows, far, held, u = where
-        return float64(
-            springs_rise(
-                t, first, last, at[0], at[1], at[2], real(d[0]), real(d[1]), real(d[2]), pull[0], pull[1], pull[2],
-                neighbour, kind, weights, arrows, far, held, u,
-            )
-        )  # fmt: skip
-
-    lowering = shared(half_spaces.trying(risen))
+    of_springs = vbd_kernels.kernels(real)
+    gathered, lowering = of_springs.gathered, shared(half_spaces.trying(of_springs.risen_there))
 
     @cuda.jit
     def push(
@@ -137,11 +126,11 @@ def kernels(real: Any) -> Kernels:
         at = x[i, 0] + u0, x[i, 1] + u1, x[i, 2] + u2
         gradient = -float64(f0), -float64(f1), -float64(f2)
         block = float64(b00), float64(b01), float64(b02), float64(b11), float64(b12), float64(b22)
-        where = t, first, last, (u0, u1, u2), (f0, f1, f2), neighbour, kind, weights, arrows, far, held, u
+        lane = t, first, last, (u0, u1, u2), (f0, f1, f2), neighbour, kind, weights, arrows, far, held, u
         # Where a spring has no length there is no Hessian: the majorant's step takes it apart.
         level = MAJORANT if lengthless else EXACT
         most = float64(majorant[t])
-        d = lowering(spaces, i, at, (most, 0.0, 0.0, most, 0.0, most), level, gradient, block, where)
+        d = lowering(spaces, i, at, (most, 0.0, 0.0, most, 0.0, most), level, gradient, block, lane)
         u[i, 0], u[i, 1], u[i, 2] = real(u0 + d[0]), real(u1 + d[1]), real(u2 + d[2])
 
     @cuda.jit

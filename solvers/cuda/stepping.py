@@ -20,7 +20,7 @@ from solvers.core.driver import Iterating, Iterative
 from solvers.cuda import device, sums
 from solvers.cuda.run import Stream
 from solvers.cuda.stepping_kernels import Gives, Motions, Weights, advance, arrive, decay, lag, predict, slow
-from solvers.cuda.steps import Step
+from solvers.cuda.steps import Step, pin_numbers
 from solvers.device import Course, Marks, Rule
 from solvers.energies.dashpots import Dashpots
 from solvers.energies.quadratic import Quadratic, Viscous, drag_of_vertices
@@ -84,9 +84,7 @@ class Stepping(Iterative):
             self._first = _Turn(*ready) if ready else self._usual
             self._load, self._drag = up(constant), up(drag)
             self._filters = [_on_device(one, up) for one in course.filters]
-            pin = np.full(system.vertices, -1, np.int32)
-            pin[system.pins.vertices] = np.arange(len(system.pins.vertices))
-            self._pin, self._wanted = up(pin), up(self._targets(1))
+            self._pin, self._wanted = up(pin_numbers(system)), up(self._targets(1))
             self._p, self._v, self._target, self._force, self._guess = (
                 stream.zeros(shape, np.float64) for _ in range(5)
             )

@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from solvers.cuda import sums
 from solvers.cuda.network import Edges, Given, Network
@@ -21,7 +22,7 @@ from solvers.cuda.residual import Residuals
 from solvers.cuda.run import Stream
 from solvers.cuda.target import cuda
 from solvers.energies.edges import TINY
-from solvers.problem import Positions, StepProblem
+from solvers.problem import Positions, StepProblem, System
 
 
 class Step(NamedTuple):
@@ -67,8 +68,7 @@ class Uploaded:
     def of(cls, network: Network, stream: Stream) -> Uploaded:
         """Copy a network to the device."""
         system, order = network.system, network.order
-        pin, weight = np.full(system.vertices, -1, np.int32), np.zeros(system.vertices)
-        pin[system.pins.vertices] = np.arange(len(system.pins.vertices))
+        pin, weight = pin_numbers(system), np.zeros(system.vertices)
         _, pinned, weights = system.penalty
         weight[pinned] = weights
         places = Places(
@@ -93,6 +93,13 @@ class Uploaded:
         lagged = (up(start.origin), up(start.expected)) if self.network.parts.dashpots else (target, target)
         begun = (up(start.positions), up(start.velocity)) if touches else (target, target)
         return Step(target, up(force), up(guess), pins, *lagged, *begun, (start.time, start.until))
+
+
+def pin_numbers(system: System) -> NDArray[np.int32]:
+    """The number of each vertex's pin (n,), -1 for none."""
+    numbers = np.full(system.vertices, -1, np.int32)
+    numbers[system.pins.vertices] = np.arange(len(system.pins.vertices))
+    return numbers
 
 
 def pins_of(problem: StepProblem, stream: Stream) -> Any:

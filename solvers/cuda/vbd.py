@@ -164,8 +164,12 @@ class Sweeps(MinimisingIterating):
 
     def settled(self) -> Any:
         """See ResidentIterating."""
-        self._launch(self._springs.settle, len(self._rows), self._x, self._u, self._rows)
+        self._settle(self._rows)
         return self._rows
+
+    def _settle(self, out: Any) -> None:
+        """Write where it is, in rows of the mesh (n, 3)."""
+        self._launch(self._springs.settle, len(out), self._x, self._u, out)
 
     def residual(self) -> float:
         """See Iterating; on the device."""
@@ -233,14 +237,14 @@ class Sweeps(MinimisingIterating):
             self._rebase(moved=self._since > 0)
         self._once()
         self._since += 1
-        self._launch(vbd_pair_kernels.end, len(self._x), self._x, self._u, q)
+        self._settle(q[: len(self._rows)])
 
     def pushed(self, p: Any, q: Any, push: Any, *others: Any) -> None:
         """Write where a sweep leads from rows p to q, with what pushes, extrapolated by nothing."""
         self._begin_at(p)
         self._rebase(moved=False)
         self._colours(push, *others)
-        self._launch(vbd_pair_kernels.end, len(self._x), self._x, self._u, q)
+        self._settle(q[: len(self._rows)])
 
     def _begin_at(self, p: Any) -> None:
         self._launch(vbd_pair_kernels.begin, len(self._x), p, self._x, self._u, self._older, self._before)

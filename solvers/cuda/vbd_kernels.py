@@ -33,7 +33,7 @@ class Kernels(NamedTuple):
     """Device functions and kernels in one type of numbers."""
 
     gathered: Any
-    risen: Any
+    risen_there: Any
     sweep: Any
     extrapolate: Any
     level: Any
@@ -109,6 +109,17 @@ def kernels(real: Any) -> Kernels:
             along = (v0 * x0 + v1 * x1 + v2 * x2) / was
             rise += half * k * moved - pull * (moved - along * longer) / both
         return rise
+
+    @cuda.jit(device=True)
+    def risen_there(d, lane):
+        """The same in float64, of a step d; lane: which it is, its displacement and force, and the arrays."""
+        t, first, last, at, pull, neighbour, kind, weights, arrows, far, held, u = lane
+        return float64(
+            risen(
+                t, first, last, at[0], at[1], at[2], real(d[0]), real(d[1]), real(d[2]), pull[0], pull[1], pull[2],
+                neighbour, kind, weights, arrows, far, held, u,
+            )
+        )  # fmt: skip
 
     @cuda.jit
     def sweep(
@@ -279,4 +290,4 @@ def kernels(real: Any) -> Kernels:
                 older[i, c] -= u[i, c]
                 u[i, c] = zero
 
-    return Kernels(gathered, risen, sweep, extrapolate, level, decide, finish, rebase)
+    return Kernels(gathered, risen_there, sweep, extrapolate, level, decide, finish, rebase)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from numba import float64
 
 from solvers.contact.pairs_vbd import LEAST
-from solvers.cuda import sums, vbd_kernels
+from solvers.cuda import vbd_kernels
 from solvers.cuda.shared import shared
 from solvers.cuda.target import cuda
 from solvers.kernels import half_spaces
@@ -87,16 +87,6 @@ def begin(p, x, u, older, before):
 
 
 @cuda.jit
-def end(x, u, out):
-    """Write x + u to the mesh's rows of `out`."""
-    i = cuda.grid(1)
-    while i < x.shape[0] - 2:
-        for c in range(3):
-            out[i, c] = x[i, c] + float64(u[i, c])
-        i += cuda.gridsize(1)
-
-
-@cuda.jit
 def between(p, q, out):
     """Write q - p."""
     i = cuda.grid(1)
@@ -114,16 +104,6 @@ def go(p, t, way, out):
         for c in range(3):
             out[i, c] = p[i, c] + t * way[i, c]
         i += cuda.gridsize(1)
-
-
-@cuda.jit
-def dot(a, b, which, partials):
-    """The first stage of a b, over the rows of a."""
-    total, i = 0.0, cuda.grid(1)
-    while i < a.shape[0]:
-        total += a[i, 0] * b[i, 0] + a[i, 1] * b[i, 1] + a[i, 2] * b[i, 2]
-        i += cuda.gridsize(1)
-    sums.keep(total, which, partials)
 
 
 @cuda.jit
@@ -150,17 +130,12 @@ class Kernels(NamedTuple):
 @cache
 def kernels(real: Any) -> Kernels:
     """Those of a type, that of displacements."""
-    gathered, springs_rise = vbd_kernels.kernels(real).gathered, vbd_kernels.kernels(real).risen
+    gathered, springs_rise = vbd_kernels.kernels(real).gathered, vbd_kernels.kernels(real).risen_there
 
     @cuda.jit(device=True)
     def risen(d, where):
-        t, first, last, at, pull, neighbour, kind, weights, arrows, far, held, u, i, model = where
-        rise = float64(
-            springs_rise(
-                t, first, last, at[0], at[1], at[2], real(d[0]), real(d[1]), real(d[2]), pull[0], pull[1], pull[2],
-                neighbour, kind, weights, arrows, far, held, u,
-            )
-        )  # fmt: skip
+        lane, i, model = where
+        rise = springs_rise(d, lane)
         b00, b01, b02, b11, b12, b22 = blocked(model, i, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
         h0, h1, h2 = b00 * d[0] + b01 * d[1] + b02 * d[2], b01 * d[0] + b11 * d[1] + b12 * d[2], b02 * d[0] + b12 * d[1]
         h2 += b22 * d[2]
@@ -191,8 +166,8 @@ def kernels(real: Any) -> Kernels:
         most, level = float64(majorant[t]), MAJORANT if lengthless else EXACT
         bound = blocked(model, i, (most, 0.0, 0.0, most, 0.0, most))
         at = float64(u0), float64(u1), float64(u2)
-        where = t, first, last, (u0, u1, u2), (f0, f1, f2), neighbour, kind, weights, arrows, far, held, u, i, model
-        d = lowering(spaces, i, at, bound, level, gradient, blocked(model, i, block), where)
+        lane = t, first, last, (u0, u1, u2), (f0, f1, f2), neighbour, kind, weights, arrows, far, held, u
+        d = lowering(spaces, i, at, bound, level, gradient, blocked(model, i, block), (lane, i, model))
         u[i, 0], u[i, 1], u[i, 2] = real(u0 + d[0]), real(u1 + d[1]), real(u2 + d[2])
 
     return Kernels(push)

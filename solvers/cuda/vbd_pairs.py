@@ -15,6 +15,7 @@ from solvers.core.objective import NEAR, ROUND_OFF
 from solvers.cuda import device, objective_kernels, pair_kernels, pairs
 from solvers.cuda import vbd_pair_kernels as kernels
 from solvers.cuda.pairs import At
+from solvers.cuda.pncg import dotted
 from solvers.cuda.stalling import StallingIterating
 from solvers.cuda.steps import Step
 from solvers.cuda.vbd_pair_kernels import Model
@@ -135,7 +136,7 @@ class Guarded(StallingIterating):
             pair.add_model(self._p, model.near, model.block)
 
     def _dot(self, g: Any) -> float:
-        kernels.dot[self._sums.over](g, self._way, 0, self._sums.partials)
+        dotted[self._sums.over](self._way, g, 0, self._sums.partials)
         return float(self._sums.read(1)[0])
 
     def _rise(self, p: Any, q: Any, there: list[At]) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from solvers.core import vertex_terms
 from solvers.cuda import device, sums
 from solvers.cuda.resident import AT_ONCE, Resident, ResidentIterating
 from solvers.cuda.run import Stream
-from solvers.cuda.steps import Step, pins_of
+from solvers.cuda.steps import Step, pin_numbers, pins_of
 from solvers.cuda.target import cuda
 from solvers.cuda.xpbd_kernels import kernels, moved, predict, settle
 from solvers.kernels.xpbd import Constraints
@@ -87,9 +87,9 @@ class Places(NamedTuple):
     def of(cls, stream: Stream, system: System) -> Places:
         """Those of a system."""
         n, pins = system.vertices, system.pins
-        pin, weight = np.full(n, -1, np.int32), np.zeros(n)
-        pin[pins.vertices], weight[pins.vertices] = np.arange(len(pins.vertices)), pins.weight
-        arrays = np.arange(n, dtype=np.int32), pin, weight, vertex_terms.held(system), system.mass
+        weight = np.zeros(n)
+        weight[pins.vertices] = pins.weight
+        arrays = np.arange(n, dtype=np.int32), pin_numbers(system), weight, vertex_terms.held(system), system.mass
         return cls(*map(stream.upload, arrays))
 
 

@@ -22,15 +22,11 @@ from harness.simulation.measure import Settings, steps
 from harness.simulation.on_device import Replayed, Staying, on_device
 from harness.simulation.step import prepare
 from solvers.cuda.run import Stream
-from solvers.methods.explicit import RungeKutta4, Tsitouras5, VelocityVerlet
-from solvers.methods.lbfgs import Lbfgs
-from solvers.methods.newton_cg import NewtonCG
-from solvers.methods.pncg import NonlinearCG
-from solvers.methods.symplectic_euler import SymplecticEuler
-from solvers.methods.vbd import VertexBlockDescent
-from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
+from solvers.methods.explicit import Tsitouras5
+from solvers.methods.xpbd import Xpbd
 from solvers.problem import StopRule
 from tests.contacts import contact
+from tests.cuda import hard
 from tests.cuda.near import PRECISIONS
 from tests.effects import ATTACHED, BEND, DASHPOTS, MOVES, RAYLEIGH, integrated
 from tests.scenes import scene
@@ -38,18 +34,7 @@ from tests.scenes import scene
 STOP, FRAMES = StopRule(3), 3
 """So many iterations that the processor does the same, whatever residuals say; BDF2's third step recalls its own."""
 
-METHODS: dict[str, Callable[..., Any]] = {
-    "vbd": VertexBlockDescent,
-    "newton-cg": lambda **more: NewtonCG(preconditioner="block-jacobi", **more),
-    "pncg": lambda **more: NonlinearCG(preconditioner="block-jacobi", **more),
-    "lbfgs": lambda **more: Lbfgs(preconditioner="a-jacobi", **more),
-    "xpbd": Xpbd,
-    "xpbd-small-steps": XpbdSmallSteps,
-    "symplectic-euler": SymplecticEuler,
-    "velocity-verlet": VelocityVerlet,
-    "runge-kutta-4": RungeKutta4,
-    "tsitouras-5": lambda **more: Tsitouras5(error=1e-4, **more),
-}
+METHODS = {**hard.METHODS, "tsitouras-5": lambda **more: Tsitouras5(error=1e-4, **more)}
 OWN = {"xpbd-small-steps", "symplectic-euler", "velocity-verlet", "runge-kutta-4", "tsitouras-5"}
 """Methods that have a velocity of their own."""
 ASKED = {"newton-cg", "pncg", "lbfgs", "tsitouras-5"}
