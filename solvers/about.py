@@ -7,6 +7,9 @@ from dataclasses import dataclass
 LOCAL_GLOBAL = "local-global"
 """The family of the method of Liu et al. 2013, by whose iterations others are measured."""
 
+ENGINE = "engine"
+"""The family of other people's programs."""
+
 
 @dataclass(frozen=True, slots=True)
 class Reference:

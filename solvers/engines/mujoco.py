@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.about import About, Reference
+from solvers.about import ENGINE, About, Reference
 from solvers.engines.base import Engine, Network, Package, evenly
 from solvers.problem import Positions, StepProblem, Unsupported
 
@@ -50,7 +50,7 @@ class Mujoco(Engine):
     package: ClassVar[Package] = Package("mujoco", "mujoco", "mujoco")
     damps: ClassVar[bool] = True
     about: ClassVar[About] = About(
-        "engine",
+        ENGINE,
         Reference(
             "Todorov, Emanuel and Erez, Tom and Tassa, Yuval",
             2012,

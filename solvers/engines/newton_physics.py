@@ -24,7 +24,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.about import About, Reference
+from solvers.about import ENGINE, About, Reference
 from solvers.core.colouring import of_vertices
 from solvers.device import OnDevice
 from solvers.engines.base import Engine, Network, Package, PreparedEngine, evenly
@@ -65,7 +65,7 @@ class NewtonPhysics(Engine, OnDevice):
     name: ClassVar[str] = "newton-physics"
     package: ClassVar[Package] = Package("newton", "newton", "newton")
     about: ClassVar[About] = About(
-        "engine",
+        ENGINE,
         Reference("{Newton Contributors}", 2025, "Newton: an open-source, GPU-accelerated physics simulation engine"),
         own_steps=True,
         package="newton",
@@ -88,9 +88,7 @@ class NewtonPhysics(Engine, OnDevice):
             raise Unsupported(f"newton-physics: iterations came as {self.iterations}; wanted 1 or more")
         warp = import_module("warp")
         if self.device == "cuda" and not warp.is_cuda_available():
-            raise Unsupported(
-                "newton-physics: device: cuda: Warp finds no CUDA device, or no driver for it"
-            )
+            raise Unsupported("newton-physics: device: cuda: Warp finds no CUDA device, or no driver for it")
         builder = library.ModelBuilder(gravity=(0.0, 0.0, 0.0))
         fixed = np.isin(np.arange(len(network.mass)), network.pinned)
         for m in np.where(fixed, 0.0, network.mass).tolist():

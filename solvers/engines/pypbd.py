@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from threadpoolctl import ThreadpoolController  # pyright: ignore[reportMissingTypeStubs]
 
-from solvers.about import About, Reference
+from solvers.about import ENGINE, About, Reference
 from solvers.engines.base import Engine, Network, Package, evenly
 from solvers.problem import Positions, StepProblem, Unsupported
 
@@ -52,7 +52,7 @@ class PyPbd(Engine):
     name: ClassVar[str] = "pypbd"
     package: ClassVar[Package] = Package("pypbd", "pyPBD", "pypbd")
     about: ClassVar[About] = About(
-        "engine",
+        ENGINE,
         Reference(
             "Bender, Jan and Müller, Matthias and Macklin, Miles",
             2017,

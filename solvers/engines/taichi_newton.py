@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
-from solvers.about import About, Reference
+from solvers.about import ENGINE, About, Reference
 from solvers.engines import taichi_program
 from solvers.engines.base import Engine, Network, Package, PreparedEngine, evenly
 from solvers.problem import Positions, StepProblem, System, Unsupported
@@ -47,7 +47,7 @@ class TaichiNewton(Engine):
     name: ClassVar[str] = "taichi"
     package: ClassVar[Package] = Package("taichi", "taichi", "taichi")
     about: ClassVar[About] = About(
-        "engine",
+        ENGINE,
         Reference(
             "Hu, Yuanming and Li, Tzu-Mao and Anderson, Luke and Ragan-Kelley, Jonathan and Durand, Frédo",
             2019,

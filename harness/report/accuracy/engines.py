@@ -15,9 +15,8 @@ from harness.report.accuracy.times import duration, power
 from harness.report.accuracy.work_plot import front
 from harness.report.page import factor
 from harness.report.style import INK, Mark, numbered
+from solvers.about import ENGINE
 
-ENGINE = "engine"
-"""The family of solvers that are others' programs."""
 OURS = "springbench"
 ERRORS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
 """Relative errors of the positions at the horizon."""
