@@ -221,11 +221,12 @@ class Sweeps(Iterating):
 
         made = self._prepared
         self._begin_at(p)
+        touched = self._spaces
         self._spaces = of_planes(
             planes, np.ones(len(planes.vertices)), made.row, made.blocks.bundles, made.blocks.unknowns, both=True
         )
         self.sweep(1)
-        self._spaces = None
+        self._spaces = touched
         return self.positions
 
     def _begin_at(self, p: Positions) -> None:

@@ -2,10 +2,11 @@
 
     ratio = q(t) / min_m q(t_m)     q the lower quartile over the rounds, m the other methods
 
-    python -m tests.bench.fastest [CONFIG] [--solver hybrid] [--only WORDS] [--rounds 15]
+    python -m tests.bench.fastest [CONFIG] [--solver hybrid] [--only WORDS] [--rounds 15] [--measure error]
 
 The steps, the first guesses and the methods are those of an accuracy config. An accuracy is a gap,
-(g - g*)/(g0 - g*), g* of the lowest minimum known, and is reached with the first iterate that has it. A first pass
+(g - g*)/(g0 - g*), g* of the lowest minimum known, or an error, the largest distance of a vertex from its place in that
+minimum over the largest there at the step's start, and is reached with the first iterate that has it. A first pass
 grades all iterates; then all that may be the fastest take turns in one process, round after round, with a clock of the
 thread's own processor time, and no one looks at what they find. The interval holds 95 % of the ratios of rounds that
 were drawn with replacement. A ratio whose interval reaches above `LIMIT` is marked by >, where the step takes so long
@@ -16,7 +17,7 @@ from __future__ import annotations
 
 import argparse
 import gc
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -29,13 +30,14 @@ from numpy.typing import NDArray
 from harness.base.machine import pinned_threads
 from harness.config.accuracy import CurveSpec
 from harness.config.accuracy_load import load_accuracy
+from harness.experiments.accuracy.scales import distances
 from harness.experiments.accuracy.solves import GradedStep
 from harness.experiments.accuracy.units import references
-from solvers.problem import Prepared, StepProblem, Unsupported
+from solvers.problem import Positions, Prepared, StepProblem, Unsupported
 from solvers.registry import EVERY, load
 
 ROOT = Path(__file__).resolve().parents[2]
-TARGETS = (1e-3, 1e-4, 1e-6)
+TARGETS = {"gap": (1e-3, 1e-4, 1e-6), "error": (1e-3, 1e-6)}
 LIMIT = 1.5
 COUNTS = 1e-3
 """Seconds of the fastest method's, below which a step counts for nothing."""
@@ -86,24 +88,36 @@ def steps(config: Path, only: str) -> Iterator[tuple[GradedStep, list[CurveSpec]
                 yield step, specs
 
 
-def racer(spec: CurveSpec, problem: StepProblem, lowest: float) -> Racer | None:
+def grading(step: GradedStep, problem: StepProblem, measure: str) -> Callable[[Positions], float]:
+    """What tells the gap or the error of positions."""
+    lowest, system = step.reference.best, problem.system
+    if measure == "error":
+        start = distances(system, problem.current, lowest.positions)[0]
+        return lambda p: distances(system, p, lowest.positions)[0] / start
+    scale = problem.value(problem.current) - lowest.g
+    return lambda p: (problem.value(p) - lowest.g) / scale
+
+
+def racer(
+    spec: CurveSpec, problem: StepProblem, graded: Callable[[Positions], float], targets: Sequence[float]
+) -> Racer | None:
     """The first pass of a method, up to the last of the accuracies; None where it takes no such scene."""
     try:
         prepared = load(EVERY[spec.solver.name])(**spec.solver.parameters).prepare(problem.system)
         next(prepared.iterates(problem))  # compiles
     except Unsupported:
         return None
-    scale, needs, seconds = problem.value(problem.current) - lowest, dict[float, int](), dict[float, float]()
+    needs, seconds = dict[float, int](), dict[float, float]()
     iterates, spent = prepared.iterates(problem), 0.0
     for number in range(1, spec.iterations + 1):
         began = thread_time()
         p = next(iterates)
         spent += thread_time() - began
-        gap = (problem.value(p) - lowest) / scale
-        for target in TARGETS:
-            if gap <= target and target not in needs:
+        left = graded(p)
+        for target in targets:
+            if left <= target and target not in needs:
                 needs[target], seconds[target] = number, spent
-        if len(needs) == len(TARGETS) or spent > spec.how.time_limit or not np.isfinite(gap):
+        if len(needs) == len(targets) or spent > spec.how.time_limit or not np.isfinite(left):
             break
     return Racer(spec.solver.name, prepared, needs, seconds)
 
@@ -156,15 +170,15 @@ def ratio(
     return Ratio(step, target, fastest, least, float(quartile(mine)) / least, float(low), float(high))
 
 
-def ratios(step: GradedStep, specs: Sequence[CurveSpec], name: str, rounds: int) -> Iterator[Ratio]:
+def ratios(step: GradedStep, specs: Sequence[CurveSpec], name: str, rounds: int, measure: str) -> Iterator[Ratio]:
     """Of one step, from each first guess."""
-    rng = np.random.default_rng(0)
+    rng, targets = np.random.default_rng(0), TARGETS[measure]
     draws = rng.integers(rounds, size=(DRAWS, rounds))
     for guess in specs[0].first_guesses:
         problem = step.frozen.stated(guess)
-        lowest = step.reference.best.g
-        racers = [found for spec in specs if (found := racer(spec, problem, lowest))]
-        least = {t: min((one.seconds[t] for one in racers if t in one.seconds), default=np.inf) for t in TARGETS}
+        graded = grading(step, problem, measure)
+        racers = [found for spec in specs if (found := racer(spec, problem, graded, targets))]
+        least = {t: min((one.seconds[t] for one in racers if t in one.seconds), default=np.inf) for t in targets}
         near = [
             one
             for one in racers
@@ -172,7 +186,7 @@ def ratios(step: GradedStep, specs: Sequence[CurveSpec], name: str, rounds: int)
         ]
         times = {name: {}} | raced(near, problem, rounds)
         words = f"{step.case.title} {step.moment} {guess}"
-        found = (ratio(words, target, name, times, draws) for target in TARGETS)
+        found = (ratio(words, target, name, times, draws) for target in targets)
         yield from (one for one in found if one is not None)
 
 
@@ -182,13 +196,13 @@ def cell(one: Ratio) -> str:
     return f"{'>' if over else ''}{one.ratio:.2f} [{one.low:.2f}, {one.high:.2f}] {one.fastest} {1e3 * one.seconds:.2f}"
 
 
-def lines(found: Iterable[Ratio]) -> Iterator[str]:
+def lines(found: Iterable[Ratio], targets: Sequence[float]) -> Iterator[str]:
     """One for each first guess of a step."""
     rows: dict[str, dict[float, str]] = {}
     for one in found:
         rows.setdefault(one.step, {})[one.target] = cell(one)
     for step, cells in rows.items():
-        yield row(step, [cells.get(target, "") for target in TARGETS])
+        yield row(step, [cells.get(target, "") for target in targets])
 
 
 def row(first: str, cells: Sequence[str]) -> str:
@@ -203,13 +217,14 @@ def main() -> None:
     parser.add_argument("--solver", default="hybrid", help="whose ratios")
     parser.add_argument("--only", default="", help="words that the step's name must have")
     parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--measure", choices=list(TARGETS), default="gap", help="what an accuracy is of")
     given = parser.parse_args()
-    found = list[Ratio]()
-    print(row("step, first guess", [f"{target:g}" for target in TARGETS]))
+    found, targets = list[Ratio](), TARGETS[given.measure]
+    print(row(f"step, first guess; {given.measure}", [f"{target:g}" for target in targets]))
     with pinned_threads(1):
         for step, specs in steps(given.config, given.only):
-            of_step = list(ratios(step, specs, given.solver, given.rounds))
-            print(*lines(of_step), sep="\n", flush=True)
+            of_step = list(ratios(step, specs, given.solver, given.rounds, given.measure))
+            print(*lines(of_step, targets), sep="\n", flush=True)
             found += of_step
     counted = [one for one in found if one.counts]
     worse = [one for one in counted if one.high > LIMIT]

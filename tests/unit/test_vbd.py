@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 from harness.simulation.step import FIRST_GUESSES
+from solvers.contact.energy import Planes
+from solvers.contact.touching import without_contact
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.methods.vbd import VertexBlockDescent
+from solvers.methods.vbd import Sweeps, VertexBlockDescent
 from solvers.problem import NotPositiveDefinite, StepProblem, StopRule, Unsupported
+from tests.contacts import OBSTACLES, contact, sheet, steps
 from tests.scenes import SCENES, cloth, first_problem, random_problem
 from tests.unit.test_xpbd import Other
 
@@ -151,3 +154,17 @@ def test_what_it_cannot_do_is_said_before_any_work():
         VertexBlockDescent().prepare(replace(system, energies=(*system.energies, Other())))
     with pytest.raises(NotPositiveDefinite, match="nothing determines"):
         VertexBlockDescent().prepare(replace(system, energies=(), mass=0.0 * system.mass))
+
+
+def test_a_push_by_pairs_leaves_the_half_spaces_of_obstacles_where_they_were():
+    problem = steps(sheet(contact(OBSTACLES["plane"])), 8)[-1].problem
+    p, none = problem.first_guess, np.empty(0)
+
+    def sweeps(problem: StepProblem) -> Sweeps:
+        return Sweeps(VertexBlockDescent().prepare(problem.system), problem, p)
+
+    swept = sweeps(problem).alone(p)
+    assert np.any(sweeps(replace(problem, system=without_contact(problem.system))).alone(p) != swept)
+    after = sweeps(problem)
+    after.pushed(p, Planes(none.astype(int), np.empty((0, 3)), none, np.empty((0, 3)), none, none))
+    np.testing.assert_array_equal(after.alone(p), swept)
