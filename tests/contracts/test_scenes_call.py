@@ -31,6 +31,7 @@ TOUCH: dict[str, int | None] = {
     "garment": 9,
     "knot": 60,
     "net-on-block": 7,
+    "poncho": 24,
     "ten-sheets": 4,
     "touching-curtain": 13,
     "touching-flag": 12,
