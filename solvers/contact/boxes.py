@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 from solvers.problem import Positions
-from solvers.vectors.eights import bits, loaded, lowest, where
+from solvers.vectors.eights import bits, loaded, lowest, root, where
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -28,6 +28,22 @@ _ROOM = 24
 """For pairs of each primitive; where more are found, all are looked for again. Four layers that touch have some 14."""
 _NUMBERS = 48
 """Numbers of a node: six coordinates of eight boxes."""
+
+
+class Limits(NamedTuple):
+    """What no pair may come to on a way: nearer than `reach` [m], or than `share` of its distance where the way begins
+    and `closed` [m] more."""
+
+    reach: float
+    closed: float
+    share: float
+
+
+class Gaps(NamedTuple):
+    """How far pairs are apart at least [m]: near of what is near each other at rest, and far of all else."""
+
+    near: float
+    far: float
 
 
 class Tree(NamedTuple):
@@ -91,10 +107,10 @@ def found(one: Tree, other: Tree, p: Positions, q: Positions, reach: float, shar
         return np.empty((0, 2), np.int64)
     begin = _boxes(one, other, p)
     end = begin if q is p else _boxes(one, other, q)
-    room, ways = _ROOM * len(one.corners) + 64, stack()
+    room, ways, limits = _ROOM * len(one.corners) + 64, stack(), Limits(reach, reach, share)
     while True:
         out = np.empty((room, 2), np.int64)
-        count = look(one, other, begin, end, reach, share, one is other, ways, out)
+        count = look(one, other, begin, end, limits, one is other, ways, out)
         if count <= room:
             return out[:count]
         room = count
@@ -164,23 +180,24 @@ def _lift(boxes):
             above[axis, slot], above[3 + axis, slot] = low, high
 
 
-def apart(one: tuple[int, int], other: tuple[int, int], p: Positions, q: Positions, reach: float, share: float) -> bool:
-    """Whether one box around vertices from a first to a last one, and one around others, tell that all is farther apart
-    than `reach` [m], and `share` of its distance at p, on the straight way from p to q, (n, 3) both."""
+def apart(one: tuple[int, int], other: tuple[int, int], p: Positions, q: Positions, limits: Limits) -> bool:
+    """Whether one box around vertices from a first to a last one, and one around others, tell that nothing comes to its
+    limits on the straight way from p to q, (n, 3) both."""
     low, high = np.empty((2, 2, 3)), np.empty((2, 2, 3))
     for k, x in enumerate((p, q)):
         for j, (first, last) in enumerate((one, other)):
-            hull(x, first, last, low[k, j], high[k, j])
+            extent(x, first, last, low[k, j], high[k, j])
     begin, end = low.min(axis=0), high.max(axis=0)
-    if max(float((begin[0] - end[1]).max()), float((begin[1] - end[0]).max())) > reach:
+    if max(float((begin[0] - end[1]).max()), float((begin[1] - end[0]).max())) > limits.reach:
         return True  # no way leads so near, and what no way leads to bounds no step
-    wide = reach + share * float((high[0].max(axis=0) - low[0].min(axis=0)).sum())
+    wide = float(np.linalg.norm(high[0].max(axis=0) - low[0].min(axis=0)))
+    wide = max(limits.reach, limits.closed + limits.share * wide)
     gap = np.array([low[:, 0] - high[:, 1], low[:, 1] - high[:, 0]])
     return bool((gap > wide).all(axis=1).any())
 
 
 @kernel
-def hull(x, first, last, low, high):
+def extent(x, first, last, low, high):
     """Write the least and the largest coordinates (3,) of rows of x (n, 3)."""
     low[:], high[:] = np.inf, -np.inf
     for i in range(first, last):
@@ -189,22 +206,23 @@ def hull(x, first, last, low, high):
 
 
 @kernel
-def look(one, other, begin, end, reach, share, same, stack, out):
-    """Write the pairs of two trees, with their boxes at the begin of a way and at its end, to `out`, as far as there is
-    room; how many there are. same: whether both are one tree, of which each pair is wanted once; stack: scratch."""
+def look(one, other, begin, end, limits, same, stack, out):
+    """Write the pairs of two trees that may come to their limits, with their boxes at the begin of a way and at its
+    end, to `out`, as far as there is room; how many there are. same: whether both are one tree, of which each pair is
+    wanted once; stack: scratch."""
     (mine, boxes), (yours, there) = begin, end
     count, leaf = 0, len(mine) - (len(one.corners) + 7) // 8
     for first_of_eight in range(0, len(one.corners), 8):
         around, after = mine[leaf + first_of_eight // 8], yours[leaf + first_of_eight // 8]
-        low, high = _hull(around)
-        lower, upper = _hull(after)
+        low, high = hull(around, 8)
+        lower, upper = hull(after, 8)
         # A node, its first primitive, and how many lie in each of its boxes.
         stack[0, 0], stack[0, 1], stack[0, 2], top = 0, 0, 8 ** (other.levels - 1), 1
         while top > 0:
             top -= 1
             node, first, each = stack[top, 0], stack[top, 1], stack[top, 2]
             if each > 1:
-                left = met(boxes, there, node, low, high, lower, upper, reach, share)
+                left = met(boxes, there, node, low, high, lower, upper, limits)
                 if same:
                     left &= -1 << max(0, (first_of_eight - first) // each)  # nothing that comes before these eight
                 for slot in range(7, -1, -1):  # the first one comes out first
@@ -220,7 +238,7 @@ def look(one, other, begin, end, reach, share, same, stack, out):
                 left = met(
                     boxes, there, node,
                     (around[0, k], around[1, k], around[2, k]), (around[3, k], around[4, k], around[5, k]),
-                    (after[0, k], after[1, k], after[2, k]), (after[3, k], after[4, k], after[5, k]), reach, share,
+                    (after[0, k], after[1, k], after[2, k]), (after[3, k], after[4, k], after[5, k]), limits,
                 )  # fmt: skip
                 if same:
                     left &= -1 << max(0, first_of_eight + k - first + 1)
@@ -234,27 +252,28 @@ def look(one, other, begin, end, reach, share, same, stack, out):
 
 
 @inner
-def _hull(boxes):
-    """The least and the largest corner of eight boxes (6, 8)."""
+def hull(boxes, many):
+    """The least and the largest corner of the first of eight boxes (6, 8)."""
     l0, l1, l2, h0, h1, h2 = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
-    for k in range(8):
+    for k in range(many):
         l0, l1, l2 = min(l0, boxes[0, k]), min(l1, boxes[1, k]), min(l2, boxes[2, k])
         h0, h1, h2 = max(h0, boxes[3, k]), max(h1, boxes[4, k]), max(h2, boxes[5, k])
     return (l0, l1, l2), (h0, h1, h2)
 
 
 @inner
-def met(boxes, there, node, low, high, lower, upper, reach, share):
-    """Which boxes of a node may come nearer to another box than `reach`, and `share` of their distance at the begin, as
-    bits: not those that lie apart along one axis, on the same side, at the begin and at the end of their ways."""
+def met(boxes, there, node, low, high, lower, upper, limits):
+    """Which boxes of a node may come to their limits with another box, as bits: not those that lie so far apart along
+    one axis, on the same side, at the begin and at the end of their ways."""
     at = _NUMBERS * node
     x0, x1, x2 = loaded(boxes, at), loaded(boxes, at + 8), loaded(boxes, at + 16)
     y0, y1, y2 = loaded(boxes, at + 24), loaded(boxes, at + 32), loaded(boxes, at + 40)
     s0, s1, s2 = loaded(there, at), loaded(there, at + 8), loaded(there, at + 16)
     t0, t1, t2 = loaded(there, at + 24), loaded(there, at + 32), loaded(there, at + 40)
-    # No two points of both are farther apart at the begin than this over the share.
-    wide = _width(x0, y0, low[0], high[0]) + _width(x1, y1, low[1], high[1]) + _width(x2, y2, low[2], high[2])
-    wide = reach + share * wide
+    # No two points of both are farther apart at the begin than the diagonal of the box around both.
+    w0, w1, w2 = _width(x0, y0, low[0], high[0]), _width(x1, y1, low[1], high[1]), _width(x2, y2, low[2], high[2])
+    wide = limits.closed + limits.share * root(w0 * w0 + w1 * w1 + w2 * w2)
+    wide = where(wide > limits.reach, wide, limits.reach + 0.0 * wide)
     return bits(
         ((x0 <= high[0] + wide) | (s0 <= upper[0] + wide)) & ((y0 >= low[0] - wide) | (t0 >= lower[0] - wide))
         & ((x1 <= high[1] + wide) | (s1 <= upper[1] + wide)) & ((y1 >= low[1] - wide) | (t1 >= lower[1] - wide))

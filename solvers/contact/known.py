@@ -3,7 +3,8 @@
 What is near is looked up for a point, and kept for as long as the vertices stay close to it (their common motion
 apart). It changes no bit of what is computed: pairs out of range add nothing, and all others come in one order. Steps
 are bounded by what they may meet on the way (`solvers.contact.ways`). Where that is nothing, patches tell
-(`solvers.contact.patches`), and what is kept is that nothing is near where the way ends.
+(`solvers.contact.patches`), and what is kept is how far all is apart where the way ends: other ways are free while no
+vertices move beside each other by more than that, neighbours at rest among themselves, and all others.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from solvers.contact import ways
+from solvers.contact.boxes import Gaps, Limits
 from solvers.contact.contacts import Pairs, padded
 from solvers.contact.ways import LEFT, unevenness
 from solvers.problem import Positions
@@ -41,9 +43,14 @@ class Surfaces(Protocol):
         """So far beyond that they feel each other [m]."""
         ...
 
-    def clear(self, p: Positions, q: Positions, reach: float, share: float) -> bool:
-        """Whether no pair comes nearer than `reach` [m], and `share` of its distance at p, on the straight way from p
-        to q, (n, 3) [m] both; False where that would take long to say."""
+    def clear(self, p: Positions, q: Positions, limits: Limits) -> Gaps | None:
+        """How far pairs are apart at q, where none comes to its limits on the straight way from p to q, (n, 3) [m]
+        both; None where some does, or that would take long to say."""
+        ...
+
+    def unevenness(self, p: Positions, q: Positions) -> float:
+        """How far any two vertices of what is near each other at rest have moved from p to q, contiguous (n, 3) both,
+        beside each other, at most [m]."""
         ...
 
     def within(self, p: Positions, reach: float) -> Pairs:
@@ -57,20 +64,23 @@ class Surfaces(Protocol):
 
 
 class Kept(NamedTuple):
-    """Pairs that are nearer than `reach` [m] at p (n, 3)."""
+    """Pairs that are nearer than `reach` [m] at p (n, 3); far [m]: what is not near each other at rest is farther apart
+    than this, where that is known to be more."""
 
     p: Positions
     reach: float
     pairs: Pairs
+    far: float = 0.0
 
     @classmethod
-    def nothing(cls, surface: Surfaces, p: Positions, reach: float) -> Kept:
+    def nothing(cls, surface: Surfaces, p: Positions, gaps: Gaps) -> Kept:
         """No pairs."""
         none = np.empty(0)
-        return cls(p, reach, Pairs(np.empty((0, 4), np.int64), 0, none, none, none, surface.thickness, surface.reach))
+        pairs = Pairs(np.empty((0, 4), np.int64), 0, none, none, none, surface.thickness, surface.reach)
+        return cls(p, min(gaps), pairs, gaps.far)
 
     @property
-    def far(self) -> bool:
+    def idle(self) -> bool:
         """Whether nothing is so near."""
         return not len(self.pairs.vertices)
 
@@ -78,22 +88,40 @@ class Kept(NamedTuple):
         """Whether all pairs nearer than a limit [m] at p (n, 3) are among these."""
         if self.p.shape != p.shape:
             return False
-        moved = unevenness(self.p, p) if self.far else 2.0 * _apart(self.p, p)
+        moved = unevenness(self.p, p) if self.idle else 2.0 * _apart(self.p, p)
         return moved <= self.reach - limit
 
-    def passed(self, p: Positions, q: Positions, closed: float) -> bool:
-        """Whether all other pairs keep more of their gap beyond `closed` [m] from p to q, (n, 3) both, than they have
-        to."""
-        if self.p.shape != p.shape:
-            return False
-        most, before = (1.0 - LEFT) * (self.reach - closed), unevenness(self.p, p)
-        return (1.0 + LEFT) * before <= most and unevenness(self.p, q) + LEFT * before <= most
+    def followed(self, surface: Surfaces, p: Positions, q: Positions, moved: tuple[float, float]) -> Kept | None:
+        """What is then known at q (n, 3), where all that is not kept stays open on the way from p and nothing is in
+        range at q; None where that is not known. moved: how uneven p and q are to where it is kept [m]."""
+        if _idle(surface, self.reach, moved):
+            return self
+        if self.far <= self.reach or not _idle(surface, self.far, moved):
+            return None
+        before, after = moved[0], surface.unevenness(self.p, q)
+        if before > after:
+            before = surface.unevenness(self.p, p)
+        if not _idle(surface, self.reach, (before, after)):
+            return None
+        return self._replace(p=q, reach=min(self.reach - after, self.far - moved[1]), far=0.0)
+
+
+def _idle(surface: Surfaces, gap: float, moved: tuple[float, float]) -> bool:
+    """Whether gaps of at least so much [m] stay open, and nothing is in range at the end, where vertices have moved so
+    far beside each other at the begin of a way and at its end."""
+    return moved[1] <= gap - surface.thickness - surface.reach and _open(gap - surface.thickness, moved)
+
+
+def _open(gap: float, moved: tuple[float, float]) -> bool:
+    """Whether that leaves of a gap [m] more than it has to."""
+    most = (1.0 - LEFT) * gap
+    return (1.0 + LEFT) * moved[0] <= most and moved[1] + LEFT * moved[0] <= most
 
 
 def idle(surface: Surfaces, kept: list[Kept], p: Positions) -> bool:
     """Whether it is known that nothing is in range at p (n, 3)."""
     limit = surface.thickness + surface.reach
-    return any(one.far and one.covers(p, limit) for one in kept)
+    return any(one.idle and one.covers(p, limit) for one in kept)
 
 
 def pairs(surface: Surfaces, kept: list[Kept], p: Positions) -> Pairs:
@@ -103,35 +131,44 @@ def pairs(surface: Surfaces, kept: list[Kept], p: Positions) -> Pairs:
         if one.covers(p, limit):
             return one.pairs
     reach = WIDE * limit + _round(p)
-    if all(one.far for one in kept) and surface.clear(p, p, reach, 0.0):
-        found = Kept.nothing(surface, p.copy(), reach)
+    if all(one.idle for one in kept) and (gaps := surface.clear(p, p, Limits(reach, surface.thickness, 0.0))):
+        found = Kept.nothing(surface, p.copy(), gaps)
     else:
         found = Kept(p.copy(), reach, surface.within(p, reach))
-    _keep([one for one in kept if one.far], found, kept)
+    _keep([one for one in kept if one.idle], found, kept)
     return found.pairs
 
 
 def largest_step(surface: Surfaces, kept: list[Kept], p: Positions, way: Positions) -> float:
     """The largest t up to 1 by which p may go along a way, (n, 3) both, with all gaps open; 0 where one is closed."""
-    q = p + way
-    if any(one.far and one.passed(p, q, surface.thickness) for one in kept):
+    q, closed, free = p + way, surface.thickness, False
+    alone = all(one.idle for one in kept)
+    for one in kept:
+        if one.idle and one.p.shape == p.shape and (after := unevenness(one.p, q)) <= max(one.reach, one.far):
+            moved = unevenness(one.p, p), after
+            free = free or _open(one.reach - closed, moved)
+            if alone and (found := one.followed(surface, p, q, moved)):
+                kept[:] = kept if found is one else [found, one]
+                return 1.0
+    if free and not alone:
         return 1.0
     if not np.isfinite(way).all():
         return 0.0
     rounded = _round(p)
-    reach = WIDE * (surface.thickness + surface.reach) + rounded
-    if all(one.far for one in kept) and surface.clear(p, q, reach, LEFT):
-        _keep(kept, Kept.nothing(surface, q, reach), kept)
+    reach = WIDE * (closed + surface.reach) + rounded
+    if alone and (gaps := surface.clear(p, q, Limits(reach, closed, LEFT))):
+        kept[:] = [Kept.nothing(surface, q, gaps), *kept[:1]]
+        return 1.0
+    if free:
         return 1.0
     way = way - way.mean(axis=0)
-    fast, found = float(np.sqrt(np.einsum("ij,ij->i", way, way)).max(initial=0.0)), None
+    fast, near = float(np.sqrt(np.einsum("ij,ij->i", way, way)).max(initial=0.0)), None
     for one in kept:
-        if one.p.shape == p.shape and 2.0 * (_apart(one.p, p) + fast) <= one.reach - surface.thickness:
-            found = one.pairs
-    if found is None:
-        found = surface.on_way(p, q, surface.thickness + rounded, LEFT)
-    scratch = np.empty(4, np.int64), np.empty((4, 3)), np.empty((4, 3))
-    return ways.largest(found, padded(p), padded(way), 1.0, *scratch)
+        if one.p.shape == p.shape and 2.0 * (_apart(one.p, p) + fast) <= one.reach - closed:
+            near = one.pairs
+    if near is None:
+        near = surface.on_way(p, q, closed + rounded, LEFT)
+    return ways.largest(near, padded(p), padded(way), 1.0, *ways.scratch())
 
 
 def _keep(before: list[Kept], found: Kept, kept: list[Kept]) -> None:

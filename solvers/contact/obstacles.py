@@ -8,9 +8,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from solvers.contact import boxes
+from solvers.contact import boxes, ways
 from solvers.contact.barrier import distances
-from solvers.contact.boxes import Tree
+from solvers.contact.boxes import Gaps, Limits, Tree
 from solvers.contact.contacts import Pairs
 from solvers.contact.mollifier import MOLLIFIED
 from solvers.problem import Positions
@@ -48,10 +48,14 @@ class Against:
     thickness: float
     reach: float
 
-    def clear(self, p: Positions, q: Positions, reach: float, share: float) -> bool:
+    def clear(self, p: Positions, q: Positions, limits: Limits) -> Gaps | None:
         """See `solvers.contact.known.Surfaces`; by one box around each of both."""
         n = len(self.stiffness)
-        return boxes.apart((0, n), (n, len(p)), p, q, reach, share)
+        return Gaps(limits.reach, limits.reach) if boxes.apart((0, n), (n, len(p)), p, q, limits) else None
+
+    def unevenness(self, p: Positions, q: Positions) -> float:
+        """See `solvers.contact.known.Surfaces`; of all."""
+        return ways.unevenness(p, q)
 
     def within(self, p: Positions, reach: float) -> Pairs:
         """See `solvers.contact.known.Surfaces`."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from solvers.compiling import inner, kernel
 from solvers.contact import boxes
 from solvers.contact.barrier import distances
-from solvers.contact.boxes import Indices, Tree
+from solvers.contact.boxes import Gaps, Indices, Limits, Tree
 from solvers.contact.closest import dot, edge_edge_way, point_triangle_way
 from solvers.contact.contacts import Pairs, padded
 from solvers.contact.mollifier import MOLLIFIED
@@ -76,9 +76,13 @@ class Surface:
     def _patches(self) -> Patches:
         return Patches.of(self.rest, self.points, self.edges, self.triangles, _LOOKED * (self.thickness + self.reach))
 
-    def clear(self, p: Positions, q: Positions, reach: float, share: float) -> bool:
+    def clear(self, p: Positions, q: Positions, limits: Limits) -> Gaps | None:
         """See `solvers.contact.known.Surfaces`."""
-        return self._patches.clear(p, q, reach, share)
+        return self._patches.clear(p, q, limits)
+
+    def unevenness(self, p: Positions, q: Positions) -> float:
+        """See `solvers.contact.known.Surfaces`."""
+        return self._patches.unevenness(p, q)
 
     def within(self, p: Positions, reach: float) -> Pairs:
         """Pairs that are nearer than `reach` [m] at p (n, 3) [m]."""

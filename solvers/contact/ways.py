@@ -10,6 +10,7 @@ than a twentieth of the gap that it began with: all gaps stay open, by far more 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 from solvers.contact.closest import distance, dot, edge_edge_way, minus, point_triangle_way
@@ -24,6 +25,11 @@ _WIDER = 1.0 + 1e-12
 
 _LOOKS = 500
 """Of one pair; where they do not suffice the last one is taken, which is safe."""
+
+
+def scratch() -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """That of `largest`."""
+    return np.empty(4, np.int64), np.empty((4, 3)), np.empty((4, 3))
 
 
 @kernel
@@ -165,6 +171,17 @@ def _unevenness(p, q, tile):
             least, most, known = min(least, d), max(most, d), known + 0.0 * d
         square += (most - least) ** 2 if most > least else 0.0
     return np.sqrt(square) if known == 0.0 else np.inf
+
+
+@kernel
+def alike(x, p, most):
+    """Whether all vertices are moved alike from x (n, 4) to p (n, 3), but for so much along each axis [m]."""
+    a, b, c = p[0, 0] - x[0, 0], p[0, 1] - x[0, 1], p[0, 2] - x[0, 2]
+    for i in range(len(p)):
+        d, e, f = p[i, 0] - x[i, 0] - a, p[i, 1] - x[i, 1] - b, p[i, 2] - x[i, 2] - c
+        if not (abs(d) <= most and abs(e) <= most and abs(f) <= most):
+            return False
+    return True
 
 
 @inner

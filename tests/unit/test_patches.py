@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -12,9 +13,11 @@ from harness.scenes.mesh.grid import Grid
 from harness.scenes.mesh.surfaces import Balloon
 from solvers.contact import boxes, flat
 from solvers.contact.barrier import distances
-from solvers.contact.boxes import Tree
+from solvers.contact.boxes import Limits, Tree
 from solvers.contact.contacts import Pairs
 from solvers.contact.patches import Patches
+from solvers.contact.self_contact import SelfContact
+from solvers.contact.surface import Surface
 from solvers.contact.ways import LEFT, unevenness
 from solvers.problem import Positions
 from tests.self_contacts import sides
@@ -36,12 +39,30 @@ class Made:
         none = np.empty(0)
         self.pairs = Pairs(np.array(one + two), len(one), none, none, none, 0.0, 0.0)
 
-    def met(self, p: Positions, q: Positions, share: float) -> np.ndarray:
-        """Which pairs come nearer than the reach or the share of their distance at p, at one of some times."""
+    def met(self, p: Positions, q: Positions, limits: Limits) -> np.ndarray:
+        """Which pairs come to their limits at one of some times."""
         first, least = distances(self.pairs, p), np.full(len(self.pairs.vertices), np.inf)
         for t in np.linspace(0.0, 1.0, 13):
             least = np.minimum(least, distances(self.pairs, p + t * (q - p)))
-        return least < np.maximum(REACH, share * first)
+        return least < np.maximum(limits.reach, limits.closed + limits.share * first)
+
+    def owners(self) -> dict[tuple[int, ...], int]:
+        """The patch of each primitive, by its vertices."""
+        found = {}
+        for one in (self.patches.points, self.patches.edges, self.patches.triangles):
+            of = np.repeat(np.arange(len(one.starts) - 1), np.diff(one.starts))
+            found |= {tuple(x): k for x, k in zip(one.corners.tolist(), of.tolist(), strict=True)}
+        return found
+
+    @cached_property
+    def near_at_rest(self) -> np.ndarray:
+        """Which pairs are of patches that are known."""
+        owner, known = self.owners(), {tuple(x) for x in self.patches.pairs.patches[: self.patches.known].tolist()}
+        cut = np.where(np.arange(len(self.pairs.vertices)) < self.pairs.points, 1, 2).tolist()
+        both = [
+            (owner[tuple(x[:c])], owner[tuple(x[c:])]) for x, c in zip(self.pairs.vertices.tolist(), cut, strict=True)
+        ]
+        return np.array([(min(x), max(x)) in known for x in both])
 
 
 @pytest.fixture(scope="module", params=["sheet", "balloon"])
@@ -63,36 +84,92 @@ def moved(rest: Positions, seed: int) -> Positions:
 
 @pytest.mark.parametrize("share", [0.0, LEFT])
 def test_nothing_is_near_where_patches_say_so_however_fast_it_moves(made, share):
-    said = 0
+    said, limits, near = 0, Limits(REACH, 0.3 * REACH, share), made.near_at_rest
     for seed in range(24):
         p = moved(made.rest, seed)
         q = moved(made.rest, 100 + seed) if seed % 2 else p + 0.4 * (moved(p - p.mean(axis=0), 200 + seed) - p)
-        clear = made.patches.clear(p, q, REACH, share)
-        assert not (clear and made.met(p, q, share).any())
-        said += clear
+        gaps = made.patches.clear(p, q, limits)
+        if gaps:
+            assert not made.met(p, q, limits).any()
+            apart = distances(made.pairs, q)
+            assert REACH <= gaps.near <= apart[near].min()
+            assert gaps.far <= apart[~near].min(initial=np.inf)
+            said += 1
     assert 0 < said < 24
 
 
+def test_what_patches_remember_of_ways_before_says_nothing_that_is_not_so(made):
+    # From each way's end, or from its begin, go on by steps long and short; far things were looked at long before.
+    said, skipped, limits, near = 0, 0, Limits(REACH, 0.3 * REACH, LEFT), made.near_at_rest
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        p = made.rest @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        made.patches.seen.clear()
+        for _ in range(8):
+            size = 10.0 ** rng.uniform(-2.5, 0.0)
+            q = p + size * np.sin(made.rest @ rng.normal(size=3) * 2.0)[:, None] * rng.normal(size=3)
+            looked = list(made.patches.apart)
+            gaps = made.patches.clear(p, q, limits)
+            if gaps:
+                assert not made.met(p, q, limits).any()
+                apart = distances(made.pairs, q)
+                assert gaps.near <= apart[near].min()
+                assert gaps.far <= apart[~near].min(initial=np.inf)
+                said += 1
+                skipped += any(one is other for one in looked for other in made.patches.apart)
+                p = q if rng.uniform() < 0.7 else p
+    assert said > 0
+    assert skipped > 0 or made.rest[:, 1].any()  # a balloon of few patches has nothing that is far
+
+
+def test_a_way_that_begins_where_one_before_began_is_looked_at_from_there(made):
+    limits, patches = Limits(REACH, 0.0, LEFT), made.patches
+    p = 2.0 * made.rest
+    q, r = 1.02 * p, 1.04 * p @ np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    patches.seen.clear()
+    patches.apart.clear()
+    wanted = patches.clear(p, r, limits)
+    patches.seen.clear()
+    patches.apart.clear()
+    patches.clear(p, q, limits)
+    begin, end = patches._lies(p, limits), patches._lies(r, limits)
+    np.testing.assert_array_equal(begin.x[:, :3], p)
+    np.testing.assert_array_equal(end.x[:, :3], r)
+    found = patches.clear(p, r, limits)
+    assert (found is None) == (wanted is None)
+    assert found is None or wanted is None or found.near == wanted.near
+
+
 def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
-    told, patches = 0, made.patches
-    owner = {}
-    for one in (patches.points, patches.edges, patches.triangles):
-        of = np.repeat(np.arange(len(one.starts) - 1), np.diff(one.starts))
-        owner |= {tuple(x): k for x, k in zip(one.corners.tolist(), of.tolist(), strict=True)}
+    told, patches, owner, limits = 0, made.patches, made.owners(), Limits(REACH, 0.3 * REACH, LEFT)
     for seed in range(8):
         p = moved(made.rest, 300 + seed)
         q = p + 1e-3 * moved(p, 400 + seed)
-        lies = [patches._lies(x) for x in (p, q)]
-        doubted = np.empty_like(patches.known)
-        apart = np.append(patches.apart, np.zeros(8))  # read by eights
-        count = len(patches.known)
-        count = flat.doubtful(patches.rest, lies[0].lie, lies[1].lie, patches.known, count, apart, REACH, LEFT, doubted)
-        clear = {tuple(x) for x in patches.known.tolist()} - {tuple(x) for x in doubted[:count].tolist()}
+        lies = [patches._lies(x, limits).lie for x in (p, q)]
+        memory = patches.scratch
+        doubted = np.empty((patches.known, 2), np.int64)
+        count, near = flat.doubtful(
+            *lies, patches.pairs, patches.known, limits, REACH, memory.sight, memory.tile, doubted
+        )
+        known = {tuple(x) for x in patches.pairs.patches[: patches.known].tolist()}
+        clear, apart = known - {tuple(x) for x in doubted[:count].tolist()}, distances(made.pairs, q)
         told += len(clear)
-        for k in np.flatnonzero(made.met(p, q, LEFT)):
+        bad = made.met(p, q, limits) | (apart < near)
+        for k in np.flatnonzero(bad):
             x, cut = made.pairs.vertices[k].tolist(), 1 if k < made.pairs.points else 2
             assert tuple(sorted((owner[tuple(x[:cut])], owner[tuple(x[cut:])]))) not in clear
     assert told > 0 or made.rest[:, 1].any()  # a coarse balloon has no flat patch
+
+
+def test_what_is_near_at_rest_moves_beside_itself_by_no_more_than_the_unevenness(made):
+    near = made.pairs.vertices[made.near_at_rest]
+    for seed in range(3):
+        p, q = moved(made.rest, seed), moved(made.rest, 50 + seed)
+        way = q - p
+        beside = np.linalg.norm(way[near[:, :, None]] - way[near[:, None, :]], axis=-1).max()
+        found = made.patches.unevenness(p, q)
+        assert beside <= found <= unevenness(p, q) * (1.0 + 1e-12)
+        assert made.patches.unevenness(p, p + 3.0) <= 1e-14
 
 
 def test_boxes_leave_out_no_pair_that_comes_near(made):
@@ -102,8 +179,8 @@ def test_boxes_leave_out_no_pair_that_comes_near(made):
         found, first = boxes.near(points, triangles, edges, p, q, REACH, LEFT)
         names = {(*points.corners[i], *triangles.corners[j]) for i, j in found[:first]}
         names |= {frozenset((tuple(edges.corners[i]), tuple(edges.corners[j]))) for i, j in found[first:]}
-        wanted = made.pairs.vertices[made.met(p, q, LEFT)].tolist()
-        many = int(made.met(p, q, LEFT)[: made.pairs.points].sum())
+        met = made.met(p, q, Limits(REACH, REACH, LEFT))
+        wanted, many = made.pairs.vertices[met].tolist(), int(met[: made.pairs.points].sum())
         assert {tuple(x) for x in wanted[:many]} <= names
         assert {frozenset((tuple(x[:2]), tuple(x[2:]))) for x in wanted[many:]} <= names
 
@@ -115,8 +192,9 @@ def test_a_sheet_that_swings_as_one_piece_is_clear_however_far():
     p = sheet.rest @ turn
     angle = 0.7
     about = np.array([[1, 0, 0], [0, np.cos(angle), np.sin(angle)], [0, -np.sin(angle), np.cos(angle)]])
-    assert sheet.patches.clear(p, p @ about + 50.0, REACH, LEFT)
-    assert not sheet.patches.clear(p, 1e-3 * p, REACH, LEFT)
+    limits = Limits(REACH, 0.0, LEFT)
+    assert sheet.patches.clear(p, p @ about + 50.0, limits)
+    assert not sheet.patches.clear(p, 1e-3 * p, limits)
 
 
 @pytest.mark.parametrize("n", [1, 7, 8, 30])
@@ -138,4 +216,25 @@ def test_patches_of_a_stack_tell_nothing():
     trees = [Tree.of(rest, x) for x in (np.arange(len(rest))[:, None], sides(triangles), triangles)]
     patches = Patches.of(rest, trees[0], trees[1], trees[2], 20 * REACH)
     assert patches.crowded
-    assert not patches.clear(rest, rest + 5.0, REACH, LEFT)
+    assert not patches.clear(rest, rest + 5.0, Limits(REACH, 0.0, LEFT))
+
+
+def test_contact_that_is_idle_goes_only_ways_that_are_free_and_mostly_without_a_look(monkeypatch):
+    mesh, asked, ways = Grid().build(17), [], 0
+    surface = Surface.of(mesh.rest, sides(mesh.triangles), mesh.triangles, np.ones(len(mesh.rest)), 0.006, 0.006)
+    contact, clear = SelfContact(surface), Patches.clear
+    monkeypatch.setattr(Patches, "clear", lambda *given: asked.append(given) or clear(*given))
+    rng = np.random.default_rng(0)
+    p = mesh.rest @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    for k in range(14):
+        size = 0.2 if k % 8 == 0 else 0.004
+        way = size * np.sin(mesh.rest @ rng.normal(size=3) * 2.0)[:, None] * rng.normal(size=3) + rng.normal(size=3)
+        if contact.largest_step(p, way) == 1.0:
+            before = surface.within(p, 0.1)
+            for t in np.linspace(0.0, 1.0, 5):
+                gap = distances(before, p + t * way) - 0.006
+                assert (gap >= 0.5 * LEFT * (distances(before, p) - 0.006)).all()
+            p, ways = p + way, ways + 1
+            assert (contact.value(p) == 0.0) == (len(surface.within(p, 0.012).vertices) == 0)
+    assert ways > 10
+    assert len(asked) < ways
