@@ -268,14 +268,17 @@ def met(boxes, there, node, low, high, lower, upper, limits):
     at = _NUMBERS * node
     x0, x1, x2 = loaded(boxes, at), loaded(boxes, at + 8), loaded(boxes, at + 16)
     y0, y1, y2 = loaded(boxes, at + 24), loaded(boxes, at + 32), loaded(boxes, at + 40)
+    if there is boxes and limits.share == 0.0:  # nothing moves: half the tests say the other half
+        near = max(limits.reach, limits.closed)
+        return bits((x0 <= high[0] + near) & (y0 >= low[0] - near) & (x1 <= high[1] + near) & (y1 >= low[1] - near)
+                    & (x2 <= high[2] + near) & (y2 >= low[2] - near))  # fmt: skip
     s0, s1, s2 = loaded(there, at), loaded(there, at + 8), loaded(there, at + 16)
     t0, t1, t2 = loaded(there, at + 24), loaded(there, at + 32), loaded(there, at + 40)
     # No two points of both are farther apart at the begin than the diagonal of the box around both.
     w0, w1, w2 = _width(x0, y0, low[0], high[0]), _width(x1, y1, low[1], high[1]), _width(x2, y2, low[2], high[2])
     wide = limits.closed + limits.share * root(w0 * w0 + w1 * w1 + w2 * w2)
     wide = where(wide > limits.reach, wide, limits.reach + 0.0 * wide)
-    return bits(
-        ((x0 <= high[0] + wide) | (s0 <= upper[0] + wide)) & ((y0 >= low[0] - wide) | (t0 >= lower[0] - wide))
+    return bits(((x0 <= high[0] + wide) | (s0 <= upper[0] + wide)) & ((y0 >= low[0] - wide) | (t0 >= lower[0] - wide))
         & ((x1 <= high[1] + wide) | (s1 <= upper[1] + wide)) & ((y1 >= low[1] - wide) | (t1 >= lower[1] - wide))
         & ((x2 <= high[2] + wide) | (s2 <= upper[2] + wide)) & ((y2 >= low[2] - wide) | (t2 >= lower[2] - wide))
     )  # fmt: skip

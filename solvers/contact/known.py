@@ -2,9 +2,9 @@
 
 What is near is looked up for a point, and kept for as long as the vertices stay close to it (their common motion
 apart). It changes no bit of what is computed: pairs out of range add nothing, and all others come in one order. Steps
-are bounded by what they may meet on the way (`solvers.contact.ways`). Where that is nothing, patches tell
-(`solvers.contact.patches`), and what is kept is how far all is apart where the way ends: other ways are free while no
-vertices move beside each other by more than that, neighbours at rest among themselves, and all others.
+are bounded by what they may meet on the way (`solvers.contact.ways`). Where that was nothing the last time, patches
+tell first (`solvers.contact.patches`), and what is kept is how far all is apart where the way ends: other ways are free
+while no vertices move beside each other by more than that, neighbours at rest among themselves, and all others.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def pairs(surface: Surfaces, kept: list[Kept], p: Positions) -> Pairs:
         if one.covers(p, limit):
             return one.pairs
     reach = WIDE * limit + _round(p)
-    if all(one.idle for one in kept) and (gaps := surface.clear(p, p, Limits(reach, surface.thickness, 0.0))):
+    if kept and all(one.idle for one in kept) and (gaps := surface.clear(p, p, Limits(reach, surface.thickness, 0.0))):
         found = Kept.nothing(surface, p.copy(), gaps)
     else:
         found = Kept(p.copy(), reach, surface.within(p, reach))
@@ -142,7 +142,7 @@ def pairs(surface: Surfaces, kept: list[Kept], p: Positions) -> Pairs:
 def largest_step(surface: Surfaces, kept: list[Kept], p: Positions, way: Positions) -> float:
     """The largest t up to 1 by which p may go along a way, (n, 3) both, with all gaps open; 0 where one is closed."""
     q, closed, free = p + way, surface.thickness, False
-    alone = all(one.idle for one in kept)
+    alone = bool(kept) and all(one.idle for one in kept)
     for one in kept:
         if one.idle and one.p.shape == p.shape and (after := unevenness(one.p, q)) <= max(one.reach, one.far):
             moved = unevenness(one.p, p), after
