@@ -12,7 +12,7 @@ from harness.simulation.step import FIRST_GUESSES
 from solvers.contact.energy import Planes
 from solvers.contact.touching import without_contact
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
-from solvers.methods.vbd import Sweeps, VertexBlockDescent
+from solvers.methods.vbd import PreparedVertexBlockDescent, Sweeps, VertexBlockDescent
 from solvers.problem import NotPositiveDefinite, StepProblem, StopRule, Unsupported
 from tests.contacts import OBSTACLES, contact, sheet, steps
 from tests.scenes import SCENES, cloth, first_problem, random_problem
@@ -161,7 +161,9 @@ def test_a_push_by_pairs_leaves_the_half_spaces_of_obstacles_where_they_were():
     p, none = problem.first_guess, np.empty(0)
 
     def sweeps(problem: StepProblem) -> Sweeps:
-        return Sweeps(VertexBlockDescent().prepare(problem.system), problem, p)
+        prepared = VertexBlockDescent().prepare(problem.system)
+        assert isinstance(prepared, PreparedVertexBlockDescent)  # on no device
+        return Sweeps(prepared, problem, p)
 
     swept = sweeps(problem).alone(p)
     assert np.any(sweeps(replace(problem, system=without_contact(problem.system))).alone(p) != swept)
