@@ -33,17 +33,21 @@ class Owned(NamedTuple):
 @kernel
 def among(owned, patches, x, y, limits, here, there, out):
     """Write the vertices of primitives of pairs of patches (k, 2) that may come to their limits, by their boxes on the
-    way from x to y, (n, 4) both, to `out` (room, 4), as far as there is room: points and triangles, then edges. How
-    many are of the first kind, and of both. here, there: scratch."""
+    way from x to y, (n, 4) both, to `out` (room, 4): points and triangles, then edges. How many are of the first
+    kind, and of both; more than there is room for where that does not suffice. here, there: scratch."""
     points, edges, triangles = owned
     count = 0
     for k in range(len(patches)):
+        if count > len(out):
+            break
         a, b = patches[k, 0], patches[k, 1]
         count = _against(points, a, triangles, b, x, y, limits, here, there, out, count)
         if a != b:
             count = _against(points, b, triangles, a, x, y, limits, here, there, out, count)
     first = count
     for k in range(len(patches)):
+        if count > len(out):
+            break
         count = _against(edges, patches[k, 0], edges, patches[k, 1], x, y, limits, here, there, out, count)
     return first, count
 
