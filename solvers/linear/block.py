@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from solvers import memory
-from solvers.linear.block_factor import Fronts, Scratch, factorise, solve, whole
+from solvers.linear.block_factor import Fronts, Scratch, factorise, solve
+from solvers.linear.block_front import DEPTH, whole
 from solvers.linear.symbolic import Symbolic, structure
 from solvers.problem import Unsupported
 from solvers.vectors.block import ROWS, TILE
@@ -52,8 +53,8 @@ class BlockCholesky:
         self._panels = np.zeros(f.panel[-1] + ROWS)
         waiting, filled, runs = (np.zeros(k, np.int64) for k in ((2, supernodes + 1), 2, (2, n + 1)))
         front = np.zeros(int((whole(3 * f.own) + whole(3 * below)).max(initial=0)) + ROWS)
-        stacks, triangle = np.zeros((2, room)), np.zeros((TILE, TILE))
-        self._scratch = Scratch(front, stacks, waiting, filled, np.zeros(TILE), triangle, runs)
+        stacks, triangles = np.zeros((2, room)), np.zeros((DEPTH // TILE, TILE, TILE))
+        self._scratch = Scratch(front, stacks, waiting, filled, np.zeros(TILE), triangles, runs)
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
         """Factorise H with these blocks (b, 3, 3), in the order of the graph; False if it is not positive definite."""

@@ -1,9 +1,8 @@
 """The multifrontal Cholesky factorisation (Duff and Reid 1983) of a matrix of 3 x 3 blocks, and a solve with it.
 
 A front is the dense matrix of a supernode's columns and of the rows below. Its columns are a panel of L in the end, the
-rest is an update of its parent. It is factorised from left to right, a tile of columns at a time: the product of all
-columns to the left is subtracted at once, then the tile is divided by its own triangle. Updates wait on two stacks that
-take turns from level to level of the tree, so that each is made where it waits, while those of its children are read.
+rest is an update of its parent (`solvers.linear.block_front`). Updates wait on two stacks that take turns from level to
+level of the tree, so that each is made where it waits, while those of its children are read.
 
 Rows begin at whole vectors: those of a panel's columns, and those below, which is all the padding there is. What lies
 above the diagonal is never read; on it are the inverses of L's entries.
@@ -11,16 +10,14 @@ above the diagonal is never read; on it are the inverses of L's entries.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
-from solvers.vectors.block import ROWS, TILE, add, divide, factorise_corner, solve_columns, solve_rows, subtract_product
-
-_NO_DIGITS = 4.0 * np.finfo(np.float64).eps
-"""A pivot this small beside its entry of the matrix is round-off."""
+from solvers.linear.block_front import Dense, eliminate, rows_of, update
+from solvers.vectors.block import ROWS, TILE, add, solve_columns, solve_rows
 
 
 class Fronts(NamedTuple):
@@ -49,8 +46,8 @@ class Scratch(NamedTuple):
     """What a factorisation writes to beside its panels, for n vertices and s supernodes.
 
     front: a vector longer than the largest front; stacks (2, room): of updates, the numbers in use counted in filled
-    (2,); waiting (2, s + 1): supernodes on each, their count first; least (TILE,), triangle (TILE, TILE), runs
-    (2, n + 1).
+    (2,); waiting (2, s + 1): supernodes on each, their count first; least (TILE,), triangles (., TILE, TILE) of so many
+    columns as are multiplied together, runs (2, n + 1).
     """
 
     front: NDArray[np.float64]
@@ -58,30 +55,8 @@ class Scratch(NamedTuple):
     waiting: NDArray[np.int64]
     filled: NDArray[np.int64]
     least: NDArray[np.float64]
-    triangle: NDArray[np.float64]
+    triangles: NDArray[np.float64]
     runs: NDArray[np.int64]
-
-
-class Dense(NamedTuple):
-    """The front of a supernode: own columns of vertices in panels, from base on, `stride` numbers each, rows below from
-    `head` on; the update of its parent, from begin on, in columns of `size`."""
-
-    own: int
-    head: int
-    stride: int
-    panels: NDArray[np.float64]
-    base: int
-    update: NDArray[np.float64]
-    begin: int
-    size: int
-
-
-def whole(rows: Any) -> Any:
-    """The rows of so many whole vectors as hold these."""
-    return (rows + ROWS - 1) // ROWS * ROWS
-
-
-_whole = inner(whole)
 
 
 @kernel
@@ -105,13 +80,13 @@ def factorise(fronts, values, panels, x, scratch):
             c = waiting[other, waiting[other, 0]]
             waiting[other, 0] -= 1
             rows = fronts.start[c + 1] - fronts.start[c] - fronts.own[c]
-            filled[other] -= 3 * rows * _whole(3 * rows)
+            filled[other] -= 3 * rows * rows_of(3 * rows)
             _extend(fronts, c, stacks[other], filled[other], to, scratch.runs)
-        if not _eliminate(fronts, s, values, panels, stride, scratch.least, scratch.triangle):
+        if not eliminate(fronts, s, values, panels, stride, scratch.least, scratch.triangles):
             return False
         if len(x) > 0:
             _forwards(fronts, s, panels, x, scratch.front)
-        _update(to, 3 * below)
+        update(to, 3 * below)
         if fronts.parent[s] >= 0:
             waiting[side, 0] += 1
             waiting[side, waiting[side, 0]] = s
@@ -135,7 +110,7 @@ def _extend(fronts, c, source, at, to, runs):
     neighbours in both."""
     own, first = to.own, fronts.start[c] + fronts.own[c]
     rows = fronts.start[c + 1] - first
-    height = _whole(3 * rows)
+    height = rows_of(3 * rows)
     count = 0
     for k in range(rows):
         q = fronts.within[first + k]
@@ -165,52 +140,6 @@ def _add_runs(runs, run, count, b, source, start, target, column):
         a = max(b, runs[0, k])
         to = column + runs[1, k] + 3 * (a - runs[0, k])
         add(source, start + 3 * a, target, to, 3 * (runs[0, k + 1] - a))
-
-
-@inner
-def _eliminate(fronts, s, values, panels, stride, least, triangle):
-    """Factorise the panel of a supernode; False at a pivot that is not positive."""
-    base, width = fronts.panel[s], 3 * fronts.own[s]
-    for tile in range(0, width, TILE):
-        columns = min(TILE, width - tile)
-        corner = base + tile * stride
-        above = tile // ROWS * ROWS
-        strips = (stride - above) // ROWS
-        left, row, here = base + above, base + tile, corner + above
-        if columns == 6:
-            subtract_product(panels, left, row, stride, tile, panels, here, stride, strips, 6)
-        else:
-            subtract_product(panels, left, row, stride, tile, panels, here, stride, strips, 3)
-        for j in range(columns):
-            v = fronts.members[fronts.start[s] + (tile + j) // 3]
-            least[j] = _NO_DIGITS * values[fronts.diagonal[v], j % 3, j % 3]
-        if columns == 6:
-            positive = factorise_corner(panels, corner + tile, stride, least, triangle, 6)
-        else:
-            positive = factorise_corner(panels, corner + tile, stride, least, triangle, 3)
-        if not positive:
-            return False
-        if columns == 6:
-            divide(panels, here, stride, triangle, strips, 6)
-        else:
-            divide(panels, here, stride, triangle, strips, 3)
-        for j in range(columns):
-            panels[corner + j * stride + tile + j] = triangle[j, j]
-    return True
-
-
-@inner
-def _update(to, columns):
-    """Subtract the product of a panel's rows below from the update."""
-    panels, stride, update, size = to.panels, to.stride, to.update, to.size
-    row, width = to.base + to.head, 3 * to.own
-    for tile in range(0, columns, TILE):
-        above = tile // ROWS * ROWS
-        here, strips = to.begin + tile * size + above, (size - above) // ROWS
-        if columns - tile >= 6:
-            subtract_product(panels, row + above, row + tile, stride, width, update, here, size, strips, 6)
-        else:
-            subtract_product(panels, row + above, row + tile, stride, width, update, here, size, strips, 3)
 
 
 @inner
@@ -260,8 +189,8 @@ def solve(fronts, panels, x, front, begun):
 def _sizes(fronts, s):
     """The first member of a supernode, its columns and rows below in vertices, and where those rows begin and end."""
     first, own = fronts.start[s], fronts.own[s]
-    below, head = fronts.start[s + 1] - first - own, _whole(3 * own)
-    return first, own, below, head, head + _whole(3 * below)
+    below, head = fronts.start[s + 1] - first - own, rows_of(3 * own)
+    return first, own, below, head, head + rows_of(3 * below)
 
 
 @inner

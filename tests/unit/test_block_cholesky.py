@@ -50,6 +50,7 @@ MATRICES = {
     "a solid": blocks(343, grid_springs(7, 7, 7)),
     "many parts": blocks(300, random_pairs(300, 200)),
     "nearly full": blocks(60, random_pairs(60, 900)),
+    "more columns than are multiplied together": blocks(150, random_pairs(150, 6000)),
 }
 matrices = pytest.mark.parametrize("A", MATRICES.values(), ids=list(MATRICES))
 
