@@ -20,7 +20,8 @@ SCENES = {path.stem: path for path in sorted((Path(__file__).resolve().parents[2
 SMALL = {"knot": 60, "net-on-block": 5}
 SOLVE = TAKE_SURFACES
 FRAMES = {"hybrid": 1000}
-"""Sixty of all others."""
+OTHERS = {"twisted-cloth": 120}
+"""Sixty of all others, where more are not named: by its short steps this cloth first touches itself at frame 79."""
 
 
 def free(scene: str, solver: Solver, size: int | None, frames: int, tolerance: float = 1e-3) -> np.ndarray:
@@ -47,7 +48,7 @@ def test_nothing_passes_through_anything_in_small(scene: str):
 @pytest.mark.parametrize("solver", SOLVE)
 @pytest.mark.parametrize("scene", SCENES)
 def test_nothing_passes_through_anything(scene: str, solver: str):
-    free(scene, SOLVE[solver], None, FRAMES.get(solver, 60))
+    free(scene, SOLVE[solver], None, FRAMES.get(solver, OTHERS.get(scene, 60)))
 
 
 @pytest.mark.long
