@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
+from solvers.contact.boxes import larger, smaller
 from solvers.contact.closest import cross, dot, minus
 from solvers.contact.contacts import padded
 from solvers.vectors.eights import loaded, ratio, root, rows, stored, where
@@ -94,7 +95,7 @@ def lie(known, x, leaf, boxes, tile, out):
             at = 2 * many * k + first
             centre = centre[0] + p[0], centre[1] + p[1], centre[2] + p[2]
             f1, f2 = added(f1, loaded(known.plane, at), p), added(f2, loaded(known.plane, at + many), p)
-            low, high = _smaller(low, p), _larger(high, p)
+            low, high = smaller(low, p), larger(high, p)
         # A vertex that is there again is where p is zero.
         centre = _times(loaded(known.weights, first), centre)
         f1, f2 = _times(loaded(known.weights, many + first), f1), _times(loaded(known.weights, 2 * many + first), f2)
@@ -131,28 +132,18 @@ def spread(vertices, pairs, known, p, q, way, tile, low, high):
         least, most = x, x
         for k in range(1, vertices.shape[1]):
             x = rows(way, vertices, first, first + 7, k)
-            least, most = _smaller(x, least), _larger(x, most)
+            least, most = smaller(x, least), larger(x, most)
         put(least, tile, first, low)
         put(most, tile, first, high)
     square = 0.0
     for first in range(0, known, 8):
         a, b = rows(low, pairs, first, known - 1, 0), rows(low, pairs, first, known - 1, 1)
         c, d = rows(high, pairs, first, known - 1, 0), rows(high, pairs, first, known - 1, 1)
-        wide = minus(_larger(c, d), _smaller(a, b))
+        wide = minus(larger(c, d), smaller(a, b))
         stored(dot(wide, wide), tile, 0)
         for lane in range(8):
             square = max(square, tile[0, lane])
     return np.sqrt(square)
-
-
-@inner
-def _smaller(a, b):
-    return where(a[0] < b[0], a[0], b[0]), where(a[1] < b[1], a[1], b[1]), where(a[2] < b[2], a[2], b[2])
-
-
-@inner
-def _larger(a, b):
-    return _most(a[0], b[0]), _most(a[1], b[1]), _most(a[2], b[2])
 
 
 @inner

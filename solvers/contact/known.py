@@ -12,12 +12,15 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from solvers.contact import ways
 from solvers.contact.boxes import Gaps, Limits
 from solvers.contact.contacts import Pairs, padded
 from solvers.contact.ways import LEFT, unevenness
 from solvers.problem import Positions
+
+Array = NDArray[np.float64]
 
 ROUND = 8.0 * np.finfo(np.float64).eps
 """Of the largest coordinate: by so much boxes are made wider."""
@@ -57,9 +60,9 @@ class Surfaces(Protocol):
         """Pairs that are nearer than `reach` [m] at p (n, 3) [m]."""
         ...
 
-    def on_way(self, p: Positions, q: Positions, reach: float, share: float) -> Pairs:
-        """Pairs that may come nearer than `reach` [m], and `share` of their distance at p, on the straight way from p
-        to q, (n, 3) [m] both; with what they press with or without."""
+    def on_way(self, x: Array, y: Array, limits: Limits, edges: bool) -> Pairs:
+        """Pairs of edges, or of points and triangles, that may come to their limits on the straight way from x to y,
+        (n, 4) [m] both, positions with a column more; with what they press with or without."""
         ...
 
 
@@ -162,13 +165,16 @@ def largest_step(surface: Surfaces, kept: list[Kept], p: Positions, way: Positio
     if free:
         return 1.0
     way = way - way.mean(axis=0)
-    fast, near = float(np.sqrt(np.einsum("ij,ij->i", way, way)).max(initial=0.0)), None
+    fast = float(np.sqrt(np.einsum("ij,ij->i", way, way)).max(initial=0.0))
+    x, along, scratch, most = padded(p), padded(way), ways.scratch(), 1.0
     for one in kept:
         if one.p.shape == p.shape and 2.0 * (_apart(one.p, p) + fast) <= one.reach - closed:
-            near = one.pairs
-    if near is None:
-        near = surface.on_way(p, q, closed + rounded, LEFT)
-    return ways.largest(near, padded(p), padded(way), 1.0, *ways.scratch())
+            return ways.largest(one.pairs, x, along, most, *scratch)
+    for edges in (False, True):  # edges are looked up along what points leave of the way
+        limits = Limits(closed + rounded, closed, LEFT, 2.0 * most * fast)
+        near = surface.on_way(x, x + most * along, limits, edges)
+        most = ways.largest(near, x, along, most, *scratch)
+    return most
 
 
 def _keep(before: list[Kept], found: Kept, kept: list[Kept]) -> None:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from solvers.contact import boxes, ways
 from solvers.contact.barrier import distances
-from solvers.contact.boxes import Gaps, Limits, Tree
-from solvers.contact.contacts import Pairs
+from solvers.contact.boxes import Gaps, Limits
+from solvers.contact.contacts import Pairs, padded
 from solvers.contact.mollifier import MOLLIFIED
+from solvers.contact.trees import Tree, found
 from solvers.problem import Positions
 
 Array = NDArray[np.float64]
@@ -59,7 +60,14 @@ class Against:
 
     def within(self, p: Positions, reach: float) -> Pairs:
         """See `solvers.contact.known.Surfaces`."""
-        pairs = self._pairs(p, p, reach)
+        x, limits = padded(p), Limits(reach, reach, 0.0, 0.0)
+        one, two = (self.on_way(x, x, limits, edges) for edges in (False, True))
+        pairs = one._replace(
+            vertices=np.concatenate([one.vertices, two.vertices]),
+            scale=np.concatenate([one.scale, two.scale]),
+            stiffness=np.concatenate([one.stiffness, two.stiffness]),
+            parallel=np.concatenate([one.parallel, two.parallel]),
+        )
         close = distances(pairs, p) < reach
         return pairs._replace(
             vertices=pairs.vertices[close],
@@ -69,24 +77,22 @@ class Against:
             parallel=pairs.parallel[close],
         )
 
-    def on_way(self, p: Positions, q: Positions, reach: float, share: float) -> Pairs:
+    def on_way(self, x: Array, y: Array, limits: Limits, edges: bool) -> Pairs:
         """See `solvers.contact.known.Surfaces`."""
-        return self._pairs(p, q, reach, share)
-
-    def _pairs(self, p: Positions, q: Positions, reach: float, share: float = 0.0) -> Pairs:
         a, b = self.mesh, self.others
-        one, two = (boxes.found(x.points, y.triangles, p, q, reach, share).T for x, y in ((a, b), (b, a)))
-        e, f = boxes.found(a.edges, b.edges, p, q, reach, share).T
-        vertices = np.concatenate(
-            [
-                np.column_stack([a.points.corners[one[0]], b.triangles.corners[one[1]]]),
-                np.column_stack([b.points.corners[two[0]], a.triangles.corners[two[1]]]),
-                np.column_stack([a.edges.corners[e], b.edges.corners[f]]),
-            ]
-        )
-        points = one.shape[1] + two.shape[1]
-        own = vertices < len(self.stiffness)
+        if edges:
+            e, f = found(a.edges, b.edges, x, y, limits).T
+            vertices = np.column_stack([a.edges.corners[e], b.edges.corners[f]])
+            parallel = MOLLIFIED * (a.length[e] * b.length[f]) ** 2
+        else:
+            one, two = (found(i.points, j.triangles, x, y, limits).T for i, j in ((a, b), (b, a)))
+            vertices = np.concatenate(
+                [
+                    np.column_stack([a.points.corners[one[0]], b.triangles.corners[one[1]]]),
+                    np.column_stack([b.points.corners[two[0]], a.triangles.corners[two[1]]]),
+                ]
+            )
+            parallel = np.zeros(len(vertices))
+        own, points = vertices < len(self.stiffness), 0 if edges else len(vertices)
         stiffness = np.where(own, self.stiffness[np.where(own, vertices, 0)], 0.0).sum(axis=1) / own.sum(axis=1)
-        parallel = np.zeros(len(vertices))
-        parallel[points:] = MOLLIFIED * (a.length[e] * b.length[f]) ** 2
         return Pairs(vertices, points, np.ones(len(vertices)), stiffness, parallel, self.thickness, self.reach)

@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiling import kernel
-from solvers.contact import affine, boxes, flat, ways
+from solvers.contact import affine, flat, trees, ways
 from solvers.contact.affine import Lie, Rest
 from solvers.contact.barrier import distances
-from solvers.contact.boxes import Gaps, Indices, Limits, Tree
+from solvers.contact.boxes import Gaps, Indices, Limits
 from solvers.contact.contacts import Pairs, pad
 from solvers.contact.flat import Beside, Sight
 from solvers.contact.owned import Owned, among
+from solvers.contact.trees import Tree
 from solvers.contact.ways import unevenness
 from solvers.problem import Positions
 
@@ -97,7 +98,7 @@ class Patches:
         patches = len(at_rest.centre)
         scratch = Scratch(
             tile=np.empty((3 * at_rest.vertices.shape[1], 8)),
-            stack=boxes.stack(),
+            stack=trees.stack(),
             sight=Sight.room(patches),
             doubtful=np.empty((room, 2), np.int64),
             here=np.empty((eights, 6, 8)),
@@ -115,6 +116,7 @@ class Patches:
         straight way from p to q, (n, 3) both. None does not say that some do."""
         if self.crowded:
             return None
+        limits = limits._replace(moved=unevenness(p, q))
         begin, end, memory = self._lies(p, limits), self._lies(q, limits), self.scratch
         wide = limits._replace(reach=_WIDER * limits.reach)
         far, others = self._far(p, q, limits), 0
@@ -175,8 +177,8 @@ class Patches:
         known, pairs = self.known, self.pairs
         here, there = begin.boxes, end.boxes
         for around in (here, there):
-            boxes.lift(around, len(self.tree.corners))
-        many = boxes.look(
+            trees.lift(around, len(self.tree.corners))
+        many = trees.look(
             self.tree, self.tree, (here, here), (there, there), limits, True, self.scratch.stack, pairs.patches[known:]
         )
         if known + many > len(pairs.patches):
@@ -199,7 +201,7 @@ class Patches:
 
     def _knowing(self, rest: Positions) -> Patches:
         """The same with pairs known that are near each other at rest (n, 3)."""
-        limits = Limits(self.looked, self.looked, 0.0)
+        limits = Limits(self.looked, self.looked, 0.0, 0.0)
         many, at, pairs = len(self.tree.corners), self._lies(rest, limits), self.pairs
         others = self._met(at, at, limits)
         if not 0 <= others <= len(pairs.patches) // 2:

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
-from solvers.contact import boxes
 from solvers.contact.barrier import distances
-from solvers.contact.boxes import Gaps, Indices, Limits, Tree
+from solvers.contact.boxes import Gaps, Indices, Limits
 from solvers.contact.closest import dot, edge_edge_way, point_triangle_way
 from solvers.contact.contacts import Pairs, padded
 from solvers.contact.mollifier import MOLLIFIED
 from solvers.contact.patches import Patches
+from solvers.contact.trees import Tree, found
 from solvers.problem import Positions
 from solvers.vectors.eights import bits, lowest, rows
 
@@ -61,16 +61,20 @@ class Surface:
         trees = Tree.of(rest, points[:, None]), Tree.of(rest, edges), Tree.of(rest, triangles)
         lengths = _lengths(rest, trees[1].corners)
         bare = cls(rest, *trees, lengths, np.array(stiffness), thickness, reach, none)
-        found, first = bare._near(rest, rest, thickness + reach)
-        apart = distances(bare._bare(found, first), rest)
+        near, first = bare._near(padded(rest), thickness + reach)
+        apart = distances(bare._bare(near, first), rest)
         close = apart < thickness + reach
-        keys, share = bare._keys(found, first)[close], _LESS * apart[close] / (thickness + reach)
+        keys, share = bare._keys(near, first)[close], _LESS * apart[close] / (thickness + reach)
         order = np.argsort(keys)
         near = keys[order], share[order]
         return cls(rest, *trees, lengths, np.array(stiffness), thickness, reach, near)
 
-    def _near(self, p: Positions, q: Positions, reach: float, share: float = 0.0) -> tuple[Indices, int]:
-        return boxes.near(self.points, self.triangles, self.edges, p, q, reach, share)
+    def _near(self, x: Array, reach: float) -> tuple[Indices, int]:
+        """Pairs that may be nearer than `reach` [m] at x (n, 4), by their numbers (k, 2): of points and triangles, so
+        many, then of edges."""
+        limits = Limits(reach, reach, 0.0, 0.0)
+        one = found(self.points, self.triangles, x, x, limits)
+        return np.concatenate([one, found(self.edges, self.edges, x, x, limits)]), len(one)
 
     @cached_property
     def _patches(self) -> Patches:
@@ -86,12 +90,13 @@ class Surface:
 
     def within(self, p: Positions, reach: float) -> Pairs:
         """Pairs that are nearer than `reach` [m] at p (n, 3) [m]."""
-        found, first = self._near(p, p, reach)
-        many = len(found)
+        x = padded(p)
+        met, first = self._near(x, reach)
+        many = len(met)
         vertices, numbers = np.empty((many, 4), np.int64), (np.empty(many), np.empty(many))
         pairs = Pairs(vertices, first, _NOTHING, *numbers, self.thickness, self.reach)
-        points, count = nearer(pairs, found, self._parts, self.length, self.stiffness, padded(p), reach)
-        scale = self._scale(found[:count], points)
+        points, count = nearer(pairs, met, self._parts, self.length, self.stiffness, x, reach)
+        scale = self._scale(met[:count], points)
         return pairs._replace(
             vertices=pairs.vertices[:count],
             points=points,
@@ -104,30 +109,32 @@ class Surface:
     def _parts(self) -> tuple[Indices, Indices, Indices]:
         return self.points.corners, self.triangles.corners, self.edges.corners
 
-    def on_way(self, p: Positions, q: Positions, reach: float, share: float) -> Pairs:
+    def on_way(self, x: Array, y: Array, limits: Limits, edges: bool) -> Pairs:
         """See `solvers.contact.known.Surfaces`; without what they press with."""
-        found, first = self._near(p, q, reach, share)
-        return self._bare(found, first)._replace(scale=self._scale(found, first))
+        one, other = (self.edges, self.edges) if edges else (self.points, self.triangles)
+        met = found(one, other, x, y, limits)
+        first = 0 if edges else len(met)
+        return self._bare(met, first)._replace(scale=self._scale(met, first))
 
-    def _bare(self, found: Indices, first: int) -> Pairs:
+    def _bare(self, met: Indices, first: int) -> Pairs:
         """Pairs by their numbers (k, 2), the first ones of points and triangles; no more than where they are."""
-        vertices = np.empty((len(found), 4), np.int64)
-        name(found, first, self._parts, vertices)
+        vertices = np.empty((len(met), 4), np.int64)
+        name(met, first, self._parts, vertices)
         return Pairs(vertices, first, _NOTHING, _NOTHING, _NOTHING, self.thickness, self.reach)
 
-    def _scale(self, found: Indices, first: int) -> Array:
+    def _scale(self, met: Indices, first: int) -> Array:
         """The proportion (k,) in which pairs keep thickness and range."""
         keys, share = self.near
-        if not (len(keys) and len(found)):
-            return np.ones(len(found))
-        wanted = self._keys(found, first)
+        if not (len(keys) and len(met)):
+            return np.ones(len(met))
+        wanted = self._keys(met, first)
         at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
         return np.where(keys[at] == wanted, share[at], 1.0)
 
-    def _keys(self, found: Indices, first: int) -> Indices:
+    def _keys(self, met: Indices, first: int) -> Indices:
         """A number of each pair."""
         many = max(len(self.triangles.corners), len(self.edges.corners), 1)
-        key = found[:, 0] * many + found[:, 1]
+        key = met[:, 0] * many + met[:, 1]
         key[first:] += len(self.points.corners) * many
         return key
 

@@ -11,13 +11,14 @@ import pytest
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.grid import Grid
 from harness.scenes.mesh.surfaces import Balloon
-from solvers.contact import boxes, flat
+from solvers.contact import flat
 from solvers.contact.barrier import distances
-from solvers.contact.boxes import Limits, Tree
-from solvers.contact.contacts import Pairs
+from solvers.contact.boxes import Limits
+from solvers.contact.contacts import Pairs, padded
 from solvers.contact.patches import Patches
 from solvers.contact.self_contact import SelfContact
 from solvers.contact.surface import Surface
+from solvers.contact.trees import Tree, found
 from solvers.contact.ways import LEFT, unevenness
 from solvers.problem import Positions
 from tests.self_contacts import sides
@@ -172,17 +173,30 @@ def test_what_is_near_at_rest_moves_beside_itself_by_no_more_than_the_unevenness
         assert made.patches.unevenness(p, p + 3.0) <= 1e-14
 
 
-def test_boxes_leave_out_no_pair_that_comes_near(made):
+def ways(p: Positions) -> list[Positions]:
+    """By less than primitives are long, and by more: two halves past each other, and all as it likes; the second ones
+    while all moves alike."""
+    rng = np.random.default_rng(0)
+    half = np.where((p - p.mean(axis=0)) @ rng.normal(size=3) > 0.0, 1.0, -1.0)[:, None] * rng.normal(size=3)
+    return [0.02 * half, half + 3.0, 0.01 * rng.normal(size=p.shape), moved(p, 1) - p + 3.0]
+
+
+@pytest.mark.parametrize("share", [LEFT, 0.9])
+def test_boxes_leave_out_no_pair_that_comes_to_its_limits(made, share):
     points, edges, triangles = made.trees
-    for seed in range(4):
-        p, q = moved(made.rest, 500 + seed), moved(made.rest, 600 + seed)
-        found, first = boxes.near(points, triangles, edges, p, q, REACH, LEFT)
-        names = {(*points.corners[i], *triangles.corners[j]) for i, j in found[:first]}
-        names |= {frozenset((tuple(edges.corners[i]), tuple(edges.corners[j]))) for i, j in found[first:]}
-        met = made.met(p, q, Limits(REACH, REACH, LEFT))
+    p, bound = 0.3 * moved(made.rest, 504), 0
+    for way in ways(p):
+        limits = Limits(0.5 * REACH, 0.2 * REACH, share, unevenness(p, p + way))
+        x, y = padded(p), padded(p + way)
+        one, two = found(points, triangles, x, y, limits), found(edges, edges, x, y, limits)
+        names = {(*points.corners[i], *triangles.corners[j]) for i, j in one}
+        names |= {frozenset((tuple(edges.corners[i]), tuple(edges.corners[j]))) for i, j in two}
+        met = made.met(p, p + way, limits)
         wanted, many = made.pairs.vertices[met].tolist(), int(met[: made.pairs.points].sum())
         assert {tuple(x) for x in wanted[:many]} <= names
         assert {frozenset((tuple(x[:2]), tuple(x[2:]))) for x in wanted[many:]} <= names
+        bound += len(wanted)
+    assert bound > 0
 
 
 def test_a_sheet_that_swings_as_one_piece_is_clear_however_far():
