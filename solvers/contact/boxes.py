@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
 from solvers.problem import Positions
-from solvers.vectors.eights import bits, loaded, root, where
+from solvers.vectors.eights import bits, loaded, root, rows, stored, where
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -45,22 +45,23 @@ class Gaps(NamedTuple):
 
 
 @inner
-def enclose(corners, e, x, boxes, slot):
-    """Write the box of a primitive at x, in rows of three or more, to one of eight (6, 8)."""
-    low, high = box(corners, e, x)
-    for axis in range(3):
-        boxes[axis, slot], boxes[3 + axis, slot] = low[axis], high[axis]
+def hulls(corners, first, last, x):
+    """The least and the largest corners of the boxes at x (n, 4) of eight primitives from `first` on; beyond the last,
+    of that one."""
+    low = rows(x, corners, first, last, 0)
+    high = low
+    for a in range(1, corners.shape[1]):
+        v = rows(x, corners, first, last, a)
+        low, high = smaller(low, v), larger(high, v)
+    return low, high
 
 
 @inner
-def box(corners, e, x):
-    """The least and the largest corner of a primitive's box at x, in rows of three or more."""
-    l0, l1, l2, h0, h1, h2 = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
-    for a in range(corners.shape[1]):
-        i = corners[e, a]
-        l0, l1, l2 = min(l0, x[i, 0]), min(l1, x[i, 1]), min(l2, x[i, 2])
-        h0, h1, h2 = max(h0, x[i, 0]), max(h1, x[i, 1]), max(h2, x[i, 2])
-    return (l0, l1, l2), (h0, h1, h2)
+def put_boxes(low, high, boxes, node):
+    """Write eight boxes to a node."""
+    for axis in range(3):
+        stored(low[axis], boxes, _NUMBERS * node + 8 * axis)
+        stored(high[axis], boxes, _NUMBERS * node + 24 + 8 * axis)
 
 
 def apart(one: tuple[int, int], other: tuple[int, int], p: Positions, q: Positions, limits: Limits) -> bool:

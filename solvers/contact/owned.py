@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from solvers.compiling import inner, kernel
-from solvers.contact.boxes import Indices, box, enclose, hull, met, share_vertex
+from solvers.contact.boxes import Indices, hull, hulls, met, one_of, put_boxes, share_vertex
 from solvers.vectors.eights import lowest
 
 
@@ -54,45 +54,70 @@ def among(owned, patches, x, y, limits, here, there, out):
 
 @inner
 def _against(one, a, other, b, x, y, limits, here, there, out, count):
-    """Those of a kind of patch a with another kind of patch b; how many there are then."""
-    begin, end, wide = other.starts[b], other.starts[b + 1], one.corners.shape[1]
-    eights = (end - begin + 7) // 8
-    for f in range(begin, end):
-        node, slot = (f - begin) // 8, (f - begin) % 8
-        enclose(other.corners, f, x, here[node], slot)
-        enclose(other.corners, f, y, there[node], slot)
-    _above(here, eights, end - begin)
-    _above(there, eights, end - begin)
-    for e in range(one.starts[a], one.starts[a + 1]):
-        low, high = box(one.corners, e, x)
-        lower, upper = box(one.corners, e, y)
-        for above in range(0, eights, 8):
-            near = met(here, there, eights + above // 8, low, high, lower, upper, limits)
-            while near != 0:
-                node = above + lowest(near)
-                near &= near - 1
-                first = begin + 8 * node
-                own = node < eights and (wide == 1 or a != b or first + 7 > e)
-                left = met(here, there, node, low, high, lower, upper, limits) if own else 0
-                while left != 0:
-                    f = first + lowest(left)
-                    left &= left - 1
-                    own = f < end and (wide == 1 or a != b or f > e)
-                    if own and not share_vertex(one.corners, e, other.corners, f):
-                        if count < len(out):
-                            for c in range(wide):
-                                out[count, c] = one.corners[e, c]
-                            for c in range(4 - wide):
-                                out[count, wide + c] = other.corners[f, c]
-                        count += 1
+    """Those of a kind of patch a, eight by eight in the last node of the scratch, with another kind of patch b; how
+    many there are then."""
+    begin, end, last = other.starts[b], other.starts[b + 1], one.starts[a + 1]
+    for first in range(begin, end, 8):
+        _around(other.corners, first, end, x, here, (first - begin) // 8)
+        _around(other.corners, first, end, y, there, (first - begin) // 8)
+    low, high = _above(here, (end - begin + 7) // 8)
+    lower, upper = _above(there, (end - begin + 7) // 8)
+    for first in range(one.starts[a], last, 8):
+        _around(one.corners, first, last, x, here, len(here) - 1)
+        _around(one.corners, first, last, y, there, len(here) - 1)
+        mine = met(here, there, len(here) - 1, low, high, lower, upper, limits) & ((1 << min(8, last - first)) - 1)
+        while mine != 0:  # what comes near anything there
+            slot = lowest(mine)
+            mine &= mine - 1
+            count = _of_one(one, first + slot, slot, other, begin, end, a == b, limits, here, there, out, count)
     return count
 
 
 @inner
-def _above(boxes, eights, many):
-    """Write the boxes of eights of so many boxes, eight by eight, after them."""
+def _of_one(one, e, slot, other, begin, end, same, limits, here, there, out, count):
+    """Those of primitive e, of a slot of the last node, with others from a first to a last one; same: whether both are
+    of one patch, of which each pair of edges is wanted once."""
+    eights, wide, own = (end - begin + 7) // 8, one.corners.shape[1], len(here) - 1
+    low, high = one_of(here[own], slot)
+    lower, upper = one_of(there[own], slot)
+    later = same and wide == 2
+    for above in range(0, eights, 8):
+        near = met(here, there, eights + above // 8, low, high, lower, upper, limits)
+        while near != 0:
+            node = above + lowest(near)
+            near &= near - 1
+            first = begin + 8 * node
+            new = node < eights and (not later or first + 7 > e)
+            left = met(here, there, node, low, high, lower, upper, limits) if new else 0
+            while left != 0:
+                f = first + lowest(left)
+                left &= left - 1
+                new = f < end and (not later or f > e)
+                if new and not share_vertex(one.corners, e, other.corners, f):
+                    if count < len(out):
+                        for c in range(wide):
+                            out[count, c] = one.corners[e, c]
+                        for c in range(4 - wide):
+                            out[count, wide + c] = other.corners[f, c]
+                    count += 1
+    return count
+
+
+@inner
+def _around(corners, first, end, x, boxes, node):
+    """Write the boxes at x of eight primitives from `first` on to a node; beyond the end, of the last one."""
+    put_boxes(*hulls(corners, first, end - 1, x), boxes, node)
+
+
+@inner
+def _above(boxes, eights):
+    """Write the boxes of so many eights, eight by eight, after them; the box around all of them."""
+    l0, l1, l2, h0, h1, h2 = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
     for node in range(eights):
-        low, high = hull(boxes[node], min(8, many - 8 * node))
+        low, high = hull(boxes[node], 8)
         above, slot = boxes[eights + node // 8], node % 8
         for axis in range(3):
             above[axis, slot], above[3 + axis, slot] = low[axis], high[axis]
+        l0, l1, l2 = min(l0, low[0]), min(l1, low[1]), min(l2, low[2])
+        h0, h1, h2 = max(h0, high[0]), max(h1, high[1]), max(h2, high[2])
+    return (l0, l1, l2), (h0, h1, h2)

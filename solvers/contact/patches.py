@@ -94,7 +94,7 @@ class Patches:
         )
         at_rest = affine.rest(rest, np.concatenate([one.members() for one in owned]), many)
         tree, most = Tree.over(many), max(int(np.diff(one.starts).max()) for one in owned)
-        room, eights = 24 * many + 8, -(-most // 8) + -(-most // 64)
+        room, eights = 24 * many + 8, -(-most // 8) + -(-most // 64) + 1
         patches = len(at_rest.centre)
         scratch = Scratch(
             tile=np.empty((3 * at_rest.vertices.shape[1], 8)),

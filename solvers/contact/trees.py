@@ -14,9 +14,21 @@ from typing import NamedTuple
 import numpy as np
 
 from solvers.compiling import inner, kernel
-from solvers.contact.boxes import Array, Indices, Limits, hull, larger, met, one_of, share_vertex, smaller
+from solvers.contact.boxes import (
+    Array,
+    Indices,
+    Limits,
+    hull,
+    hulls,
+    larger,
+    met,
+    one_of,
+    put_boxes,
+    share_vertex,
+    smaller,
+)
 from solvers.problem import Positions
-from solvers.vectors.eights import lowest, rows, stored
+from solvers.vectors.eights import lowest
 
 _BITS = 10
 _DEPTH = 8 * 22
@@ -112,26 +124,12 @@ def refit(tree, x, y, boxes):
     many = len(tree.corners)
     leaf = len(boxes) - (many + 7) // 8
     for first in range(0, many, 8):
-        low, high = _hulls(tree.corners, first, many - 1, x)
+        low, high = hulls(tree.corners, first, many - 1, x)
         if x is not y:
-            lower, upper = _hulls(tree.corners, first, many - 1, y)
+            lower, upper = hulls(tree.corners, first, many - 1, y)
             low, high = smaller(low, lower), larger(high, upper)
-        at = 6 * (8 * leaf + first)
-        for axis in range(3):
-            stored(low[axis], boxes, at + 8 * axis)
-            stored(high[axis], boxes, at + 24 + 8 * axis)
+        put_boxes(low, high, boxes, leaf + first // 8)
     lift(boxes, many)
-
-
-@inner
-def _hulls(corners, first, last, x):
-    """The least and the largest corners of eight primitives from `first` on."""
-    low = rows(x, corners, first, last, 0)
-    high = low
-    for a in range(1, corners.shape[1]):
-        v = rows(x, corners, first, last, a)
-        low, high = smaller(low, v), larger(high, v)
-    return low, high
 
 
 @kernel
