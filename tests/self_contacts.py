@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.scenes.mesh.stack import Stack
+from solvers.contact import ways
+from solvers.contact.contacts import padded
 from solvers.contact.self_contact import SelfContact
 from solvers.contact.surface import Surface
 from solvers.methods.anderson import Anderson
@@ -47,3 +49,9 @@ def touching(seed: int = 0, *, size: int = 5, noise: float = 0.004) -> tuple[Sel
 
 def way(seed: int, p: Positions, size: float) -> Positions:
     return size * np.random.default_rng(seed).normal(size=p.shape)
+
+
+def largest_of_all(contact: SelfContact, p: Positions, d: Positions) -> float:
+    """The largest step that all pairs allow, those that nothing brings near each other too."""
+    every = contact.surface.within(p, 1e3)
+    return ways.largest(every, padded(p), padded(d - d.mean(axis=0)), 1.0, *ways.scratch())

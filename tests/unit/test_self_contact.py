@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from harness.scenes.intersections import crossings
-from solvers.contact import ways
 from solvers.contact.barrier import distances, press
 from solvers.contact.blocks import Room
 from solvers.contact.contacts import Pairs, in_range, padded, room
@@ -17,8 +16,8 @@ from solvers.contact.self_contact import SelfContact
 from solvers.contact.surface import Surface
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
-from solvers.problem import Positions, Start, StepProblem, System
-from tests.self_contacts import RANGE, THICKNESS, sides, touching, way
+from solvers.problem import Start, StepProblem, System
+from tests.self_contacts import RANGE, THICKNESS, largest_of_all, sides, touching, way
 
 
 def pair(edges: bool) -> Pairs:
@@ -204,12 +203,6 @@ def test_no_gap_closes_within_the_largest_step_and_none_would_be_much_larger(fas
             assert not crossings(p + t * d, edges, triangles)
         # It leaves a tenth of the gap, where the search ends: twice as far something is nearer than the thickness.
         assert most == 1.0 or any(contact.closed(p + t * most * d) for t in np.linspace(1.0, 2.0, 40))
-
-
-def largest_of_all(contact: SelfContact, p: Positions, d: Positions) -> float:
-    """The largest step that all pairs allow, those that nothing brings near each other too."""
-    every = contact.surface.within(p, 1e3)
-    return ways.largest(every, padded(p), padded(d - d.mean(axis=0)), 1.0, *ways.scratch())
 
 
 def test_a_common_motion_bounds_no_step():
