@@ -3,14 +3,17 @@ run in the process's own thread.
 
 As it is, it makes a thread of Python of each and asks all of them all the time whether they are done, looks through all
 names of NumPy's arrays for an array's shape, and through all callers for a block's shared memory. What kernels are
-given and compute does not change.
+given and compute does not change. Threads that ought to wait for each other and do not are found out: who goes first
+changes from block to block and from turn to turn, and shared memory begins with no number.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from functools import cache, partial
 from importlib import import_module
+from itertools import cycle
 from threading import Lock, current_thread
 from typing import Any
 
@@ -24,8 +27,13 @@ cuda: Any = import_module("numba.cuda")
 Array, Kernel, usual = arrays.FakeWithinKernelCUDAArray, kernel.FakeCUDAKernel, kernel.FakeCUDAKernel.__call__
 
 
+forwards: Iterator[bool] = cycle((True, False))
+"""Whether a block's first thread begins, of those to come."""
+
+
 def hasten(monkeypatch: pytest.MonkeyPatch) -> None:
     """From now on."""
+    monkeypatch.setattr(sys.modules[__name__], "forwards", cycle((True, False)))
     monkeypatch.setattr(kernel.BlockManager, "run", run)
     monkeypatch.setattr(Kernel, "__call__", call)
     monkeypatch.setattr(Array, "__getattr__", attribute)
@@ -91,7 +99,8 @@ class Thread(kernel.BlockThread):
 
 
 def together(threads: list[Thread]) -> None:
-    """Each in its turn; every other time the last one first, so that whoever does not wait is found out."""
+    """Each in its turn."""
+    threads = threads if next(forwards) else threads[::-1]
     while threads:
         for thread in threads:
             thread.turn()
@@ -126,5 +135,6 @@ def shared(self: Any, shape: Any, dtype: Any) -> Any:
     caller = sys._getframe(1)
     line = caller.f_code.co_filename, caller.f_lineno
     if line not in self._allocations:
-        self._allocations[line] = api.FakeCUDALocal().array(shape, dtype)
+        made = self._allocations[line] = api.FakeCUDALocal().array(shape, dtype)
+        made.fill(np.nan if made.dtype.kind == "f" else np.iinfo(made.dtype).max)
     return self._allocations[line]
