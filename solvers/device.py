@@ -15,6 +15,8 @@ import numpy as np
 from solvers.problem import Positions, Solution, StepProblem, StopRule, System
 
 Device = Literal["cpu", "cuda"]
+SIMULATED = "Numba's simulator, no device"
+"""What rows call Numba's simulator."""
 
 
 _MORE = 100.0

@@ -17,7 +17,7 @@ LIST = ROOT / "slow.txt"
 
 KINDS = (
     *("float16", "float32", "eigen", "cholmod"),  # kernels of their own, and programs in C++
-    "cuda/",  # in a simulator: a thread of the processor for each of the device
+    "cuda/",  # in a simulator, which is Python
     *("newton, absolute", "newton, trust-region", "newton, progressive"),  # what `newton, clamp` does, but for a rule
     *("bench/test_exact.py", "unit/test_speed.py", "unit/test_second_opinion_"),
     *(

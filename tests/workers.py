@@ -11,6 +11,7 @@ from pathlib import Path
 from time import sleep
 
 from harness.base.worker import Tick
+from solvers.device import broken
 
 
 def double(number: int, tick: Tick) -> int:
@@ -65,6 +66,11 @@ def loop(tick: Tick) -> None:
 
 def swell(tick: Tick) -> int:
     return len([bytes(2**20) for _ in range(2**11)])
+
+
+def lose_the_device(tick: Tick) -> int:
+    broken("an illegal address")
+    return os.getpid()
 
 
 def leave_a_thread(tick: Tick) -> int:

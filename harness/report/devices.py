@@ -3,8 +3,8 @@
     time(errors, vertices) = least over solvers of the median wall seconds of a step, of runs whose every step got there
     share of bandwidth     = bytes that iterations must move / seconds of kernels / the device's own in a triad
 
-Times are compared within one computer. Where no run on a device ended well nothing is said of what one saves, but why
-there is none, and the command that fills it in.
+Times are compared within one computer. Where no run on a device ended well, in the simulator none, nothing is said of
+what one saves, but why there is none, and the command that fills it in.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from harness.report.page import count, factor, quantity
 from harness.report.sql import answer
+from solvers.device import SIMULATED
 
 ALIKE = 1.05
 """Times within this factor are alike, and neither side pays."""
@@ -83,8 +84,13 @@ Panel = tuple[str, float]
 def runs(table: pa.Table) -> list[Run]:
     """The runs of a sweep, from its rows (schema: `harness.base.columns.SCHEMA`); none where no run asked for a
     device."""
-    found = [Run(*row) for row in answer(_RUNS, table)]
+    found = [_on_one(Run(*row)) for row in answer(_RUNS, table)]
     return found if any(run.asked for run in found) else []
+
+
+def _on_one(run: Run) -> Run:
+    """The run, of the simulator's a refusal: its times are no device's."""
+    return run._replace(status="unsupported", reason=SIMULATED) if run.device == SIMULATED else run
 
 
 def pairs(found: Sequence[Run]) -> dict[Panel, list[Pair]]:

@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, tril
 
-from solvers.cuda import sums
+from solvers.cuda import device, sums
 from solvers.cuda.run import Stream
 from solvers.cuda.target import cuda
 from solvers.problem import NotPositiveDefinite, Unsupported
 
 _PACKAGES = {"nvmath-python": "nvmath-python", "cupy": "cupy-cuda12x"}
 """What is imported, by the distribution that has it."""
-_INSTALL = "`.venv/bin/pip install -e '.[cuda,cudss]'` in the checkout installs what it needs beside NVIDIA's driver"
+_INSTALL = device.INSTALL.format("cuda,cudss")
 
 
 def installed() -> str:

@@ -13,17 +13,17 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from solvers.device import broken
+from solvers.device import SIMULATED, broken
 from solvers.memory import in_words
 from solvers.problem import Unsupported
 
-INSTALL = "`.venv/bin/pip install -e '.[cuda]'` in the checkout installs what it needs beside NVIDIA's driver"
+INSTALL = "`.venv/bin/pip install -e '.[{}]'` in the checkout installs what it needs beside NVIDIA's driver"
+"""Of which extras."""
 
 _PACKAGES = (
     *("numba-cuda", "cuda-bindings", "cuda-core", "cuda-toolkit", "nvidia-ml-py"),
     *("nvmath-python", "cupy-cuda12x"),
 )
-_SIMULATED = "Numba's simulator, no device"
 _DRIVERS = ("cudadrv", "cuda.bindings", "cuda.core")
 """What errors of a driver come from, as parts of the names of modules."""
 
@@ -38,8 +38,10 @@ def simulated() -> bool:
     return bool(config.ENABLE_CUDASIM)
 
 
-def ready(solver: str) -> Any:
-    """The module `numba.cuda` with a device. Raises Unsupported with the reason where there is none."""
+def ready(solver: str, extras: str = "cuda") -> Any:
+    """The module `numba.cuda` with a device. Raises Unsupported with the reason where there is none, and the command
+    that installs the extras that the method needs there."""
+    remedy = INSTALL.format(extras)
     if simulated():
         return import_module("numba.cuda")
     if broken():
@@ -47,13 +49,13 @@ def ready(solver: str) -> Any:
     try:
         version("numba-cuda")
     except PackageNotFoundError as error:
-        raise Unsupported(f"{solver}: `device: cuda` needs numba-cuda, which is not installed; {INSTALL}") from error
+        raise Unsupported(f"{solver}: `device: cuda` needs numba-cuda, which is not installed; {remedy}") from error
     try:
         cuda = import_module("numba.cuda")
         cuda.current_context()
     except Exception as error:  # without a driver, without a device, with one that another holds: each has its own
         why = " ".join(str(error).split()).rstrip(":. ")
-        raise Unsupported(f"{solver}: there is no CUDA device ({why}); {INSTALL}") from error
+        raise Unsupported(f"{solver}: there is no CUDA device ({why}); {remedy}") from error
     return cuda
 
 
@@ -70,7 +72,7 @@ def told() -> dict[str, Any]:
     """The columns of rows that tell of the device: its name, its memory, its driver and versions."""
     versions = json.dumps(dict(_versions()), sort_keys=True)
     if simulated():
-        return {"device": _SIMULATED, "device_versions": versions}
+        return {"device": SIMULATED, "device_versions": versions}
     cuda = import_module("numba.cuda")
     device = cuda.get_current_device()
     name = device.name.decode() if isinstance(device.name, bytes) else str(device.name)

@@ -76,8 +76,8 @@ class Lbfgs(Windowed, OnDevice):
         if self.device == "cuda":
             from solvers.cuda.device import ready  # for those who ask for it
 
-            ready("lbfgs")
             by_factor = self.preconditioner == "factor"
+            ready("lbfgs", "cuda,cudss" if by_factor else "cuda")
             if self.precision == "float16" or (by_factor and (self.linear, self.precision) != ("cudss", "float64")):
                 raise Unsupported(
                     "lbfgs, device: cuda: knows preconditioner: a-jacobi in float64 or float32, and factor by linear: "

@@ -47,7 +47,7 @@ class CompiledLocalGlobal(OnDevice):
         if self.device == "cuda":
             from solvers.cuda.device import ready  # for those who ask for it
 
-            ready("numba")
+            ready("numba", "cuda,cudss")
             if (self.linear, self.precision) != ("cudss", "float64"):
                 raise Unsupported(
                     "numba, device: cuda: solves by linear: cudss in float64 alone, not by "

@@ -46,8 +46,8 @@ METHODS: dict[str, Callable[..., Any]] = {
 }
 
 FRAMES, STOP = 2, StopRule(4)
-SUBSTEPS = 60
-"""More of them are too many for the simulator, which takes some milliseconds for a launch."""
+SUBSTEPS = 1200
+"""More of them are too many for the simulator, which takes some milliseconds for a launch; the next case has 4,000."""
 
 Precision = Literal["float64", "float32"]
 ROUND_OFF: dict[Precision, tuple[float, float]] = {"float64": (4e-16, 1e-10), "float32": (1e-7, 1e-5)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice, pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
 from solvers.cuda import vbd
 from solvers.cuda.run import EVERY, DeviceIterative
+from solvers.cuda.vbd_kernels import KNOWN
 from solvers.energies.springs import Springs
 from solvers.methods.vbd import VertexBlockDescent
 from solvers.problem import Positions, StepProblem, StopRule, Unsupported
@@ -107,6 +108,18 @@ def test_bits_do_not_depend_on_who_looks() -> None:
     np.testing.assert_array_equal(copied(), looked_at)
     np.testing.assert_array_equal(prepared.replay(problem, 7)[0].positions, looked_at)
     np.testing.assert_array_equal(prepared.solve(problem, StopRule(7)).positions, looked_at)
+
+
+@pytest.mark.parametrize("iterations", [1, 2])
+def test_the_objective_is_summed_over_all_vertices(iterations: int) -> None:
+    """By threads that wait for each other, from the reference on; elsewhere it but decides whether to extrapolate."""
+    problem = random_problem(1, weights=())
+    run: Any = on_device(problem).begin(problem, problem.first_guess)
+    run.launch(iterations)
+    run._level(run._u, KNOWN, run._sums[0])
+    found, step = run.stream.download(run._sums[0]).sum(), StepObjective(Objective(problem.system), problem)
+    assert len(run._sums[0]) > 1
+    assert found == pytest.approx(step.rise(problem.first_guess, run.positions)[0], rel=1e-5)
 
 
 def test_a_residual_may_end_it_after_each_few_iterations() -> None:

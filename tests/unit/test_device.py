@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +18,10 @@ from harness.experiments.plan import Files
 from harness.simulation.on_device import bandwidth, seconds
 from solvers.cuda import device
 from solvers.device import Marks
-from tests.scenes import CLOTH_FILE
+from solvers.methods.lbfgs import Lbfgs
+from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.problem import Solver, Unsupported
+from tests.scenes import CLOTH_FILE, cloth
 
 SWEEP = """
 scenes: [cloth.yaml]
@@ -48,6 +53,26 @@ def test_without_a_device_a_run_is_refused_and_the_others_are_done(sweep: Path) 
     assert here["reason"].startswith("vbd: ")
     assert "`.venv/bin/pip install -e '.[cuda]'`" in here["reason"]
     assert (there["status"], there["device"], there["parameters"]) == ("ok", None, '{"spectral_radius": 0.999}')
+
+
+@pytest.mark.parametrize(
+    ("solver", "extras"),
+    [
+        (CompiledLocalGlobal(linear="cudss", device="cuda"), "cuda,cudss"),
+        (Lbfgs(linear="cudss", device="cuda"), "cuda,cudss"),
+        (Lbfgs(preconditioner="a-jacobi", device="cuda"), "cuda"),
+    ],
+    ids=["numba, cudss", "lbfgs, cudss", "lbfgs, a-jacobi"],
+)
+def test_the_command_installs_all_that_a_method_needs(
+    solver: Solver, extras: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(package: str) -> str:
+        raise PackageNotFoundError(package)
+
+    monkeypatch.setattr(device, "version", missing)
+    with pytest.raises(Unsupported, match=re.escape(f"`.venv/bin/pip install -e '.[{extras}]'`")):
+        solver.prepare(cloth(3).system)
 
 
 def test_runs_on_the_processor_are_named_as_before_there_were_devices(sweep: Path) -> None:

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from harness.base import rows
 from harness.cli import app
 from harness.report.devices import pairs, pays_from, runs, words
+from solvers.device import SIMULATED
 from tests.unit.test_machines import table_of
 
 ON = '{"device": "cuda", "spectral_radius": 0.999}'
@@ -85,6 +86,14 @@ def test_without_a_device_nothing_is_claimed_and_the_command_is_told() -> None:
     assert "`.venv/bin/springbench run configs/gpu.yaml` fills this in" in said
     assert "times as fast" not in said
     assert told(made(0, "hybrid", 10_000, 0.1)) == "", "of sweeps that ask for none nothing is said"
+
+
+def test_times_of_the_simulator_are_no_devices() -> None:
+    some = made(0, "vbd", 10_000, 0.1, on=True, device=SIMULATED) + made(1, "hybrid", 10_000, 0.2)
+    said = told(some)
+    assert f"nothing is said of what one saves ({SIMULATED})" in said
+    assert "pays" not in said
+    assert pairs(runs(table_of(some))) == {}
 
 
 def test_what_has_no_time_and_what_went_through_the_host_are_told() -> None:

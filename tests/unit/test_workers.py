@@ -83,6 +83,12 @@ def test_a_piece_that_leaves_threads_behind_costs_its_worker(workers: Workers):
     assert workers.do(does.name, quiet, NONE) != first
 
 
+def test_a_piece_that_loses_the_device_costs_its_worker(workers: Workers):
+    """A process does not get it back: the next runs on it need another one."""
+    first = workers.do(does.lose_the_device, quiet, NONE)
+    assert workers.do(does.name, quiet, NONE) != first
+
+
 def test_a_copy_that_a_piece_makes_of_its_process_answers_nothing(workers: Workers):
     first = workers.do(does.copy, quiet, NONE)
     assert workers.do(does.name, quiet, NONE) == first
