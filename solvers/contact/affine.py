@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
-from solvers.contact.boxes import larger, smaller
+from solvers.contact.boxes import larger, put_boxes, smaller
 from solvers.contact.closest import cross, dot, minus
 from solvers.contact.contacts import padded
 from solvers.vectors.eights import loaded, ratio, root, rows, stored, where
@@ -115,10 +115,8 @@ def lie(known, x, leaf, boxes, tile, out):
         put(f2, tile, first, out.f2)
         put(n, tile, first, out.normal)
         put((root(along), root(across), zero), tile, first, out.rest)
-        at = 48 * (leaf + first // 8)
-        for axis in range(3):
-            stored(low[axis] + o[axis], boxes, at + 8 * axis)
-            stored(high[axis] + o[axis], boxes, at + 24 + 8 * axis)
+        low, high = (low[0] + o[0], low[1] + o[1], low[2] + o[2]), (high[0] + o[0], high[1] + o[1], high[2] + o[2])
+        put_boxes(low, high, boxes, leaf + first // 8)
 
 
 @kernel

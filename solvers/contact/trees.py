@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from solvers.compiling import inner, kernel
+from solvers.compiling import kernel
 from solvers.contact.boxes import (
     Array,
     Indices,
@@ -139,12 +139,6 @@ def lift(boxes, many):
     boxes[:last, :3], boxes[:last, 3:] = np.inf, -np.inf
     for k in range(many, 8 * ((many + 7) // 8)):
         boxes[last + k // 8, :3, k % 8], boxes[last + k // 8, 3:, k % 8] = np.inf, -np.inf
-    _lift(boxes)
-
-
-@inner
-def _lift(boxes):
-    """The same, with all others nowhere."""
     for node in range(len(boxes) - 1, 0, -1):
         above, slot = boxes[(node - 1) // 8], (node - 1) % 8
         for axis in range(3):

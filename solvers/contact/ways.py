@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.compiling import inner, kernel
+from solvers.contact.boxes import larger, smaller
 from solvers.contact.closest import distance, dot, edge_edge_way, minus, point_triangle_way
 from solvers.problem import Positions
 from solvers.vectors.eights import bits, loaded, lowest, root, rows, stored, where
@@ -153,8 +154,7 @@ def _unevenness(p, q, tile):
                 loaded(q, k + 8) - loaded(p, k + 8),
                 loaded(q, k + 16) - loaded(p, k + 16),
             )
-            low = _less(x, low[0]), _less(y, low[1]), _less(z, low[2])
-            high = _more(x, high[0]), _more(y, high[1]), _more(z, high[2])
+            low, high = smaller((x, y, z), low), larger((x, y, z), high)
             nothing = nothing[0] + 0.0 * x, nothing[1] + 0.0 * y, nothing[2] + 0.0 * z
         for k in range(3):
             stored(low[k], tile, 8 * k)
@@ -182,8 +182,3 @@ def alike(x, p, most):
         if not (abs(d) <= most and abs(e) <= most and abs(f) <= most):
             return False
     return True
-
-
-@inner
-def _less(a, b):
-    return where(a < b, a, b)

@@ -52,13 +52,13 @@ def eliminate(fronts, s, values, panels, stride, least, triangles):
     base, width = fronts.panel[s], 3 * fronts.own[s]
     for first in range(0, width, DEPTH):
         end = min(first + DEPTH, width)
+        left = base + first * stride
         row, stop = first, min(rows_of(end), stride)  # the triangle of these columns, and then the rows below
         while row < stride:
             for tile in range(first, end, TILE):
                 columns, triangle = min(TILE, end - tile), triangles[(tile - first) // TILE]
                 above = max(row, tile // ROWS * ROWS)
                 column, strips = base + tile * stride, (stop - above) // ROWS
-                left = base + first * stride
                 _subtract(
                     panels, left, above, tile, stride, tile - first, panels, column + above, stride, strips, columns
                 )
@@ -81,7 +81,7 @@ def eliminate(fronts, s, values, panels, stride, least, triangles):
                     for j in range(columns):
                         panels[column + j * stride + tile + j] = triangle[j, j]
             row, stop = stop, min(stop + HEIGHT, stride)
-        _product(panels, base + first * stride, stride, end - first, 0, panels, base, stride, end, width)
+        _product(panels, left, stride, end - first, 0, panels, base, stride, end, width)
     return True
 
 
