@@ -11,7 +11,6 @@ import pytest
 
 from solvers.cuda import device
 from solvers.problem import Unsupported
-from tests.cuda import simulator
 
 
 def _there() -> bool:
@@ -29,4 +28,6 @@ collect_ignore_glob = [] if _there() else ["test_*.py"]
 def fast(monkeypatch: pytest.MonkeyPatch) -> None:
     """The simulator is, where it stands for a device."""
     if device.simulated():
-        simulator.hasten(monkeypatch)
+        from tests.cuda.simulator import hasten  # what it loads takes a second, which others need not wait for
+
+        hasten(monkeypatch)
