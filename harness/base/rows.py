@@ -14,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -73,10 +74,23 @@ def read(
     if len(paths) > _FEW:
         with suppress(union.Unfit):
             return union.table(paths, schema, needed, most=MOST, promote=promote, named=named)
+    return read_each(paths, schema, needed=needed, promote=promote, named=named)
+
+
+def read_each(
+    paths: Sequence[Path],
+    schema: pa.Schema = SCHEMA,
+    *,
+    needed: Sequence[str] = (),
+    promote: union.Promote = "default",
+    named: bool = False,
+) -> pa.Table:
+    """As `read`, by pyarrow, file by file: the reader against which what is written is compared."""
     tables, mistakes = list[pa.Table](), list[Mistake]()
+    packed = _packed(paths)
     for path in paths:
         try:
-            table = _one(path, schema, needed)
+            table = _one(path, schema, needed, packed)
             names = pa.array([path.stem] * len(table) if named else [], pa.string())
             tables.append(table.append_column(shelf.FILE, names) if named else table)
         except InputError as error:
@@ -87,6 +101,32 @@ def read(
         return pa.concat_tables([schema.empty_table(), *tables], promote_options=promote)
     except pa.ArrowException as error:  # two foreign columns of one name
         raise InputError(f"rows do not fit together ({error}); take the foreign files out of the results") from error
+
+
+def _packed(paths: Sequence[Path]) -> dict[Path, pa.Table]:
+    """The rows of those units that are packed, each packed file read once. Raises InputError for a damaged one."""
+    names: dict[Path, list[str]] = {}
+    for path in paths:
+        if not os.path.lexists(path) and path.stem in shelf.packed_units(path.parent):
+            names.setdefault(path.parent, []).append(path.stem)
+    found: dict[Path, pa.Table] = {}
+    for folder, units in names.items():
+        chosen: Any = [(shelf.FILE, "in", units)]
+        file = shelf.packed_file(folder)
+        try:
+            with file.open("rb") as content:
+                table = pq.read_table(content, filters=chosen, partitioning=None)
+        except (pa.ArrowException, OSError) as error:
+            raise InputError(Mistake(f"holds no packed rows ({error}); take it out of the results", file)) from error
+        names_of_rows: Any = table[shelf.FILE].combine_chunks()
+        of_row = names_of_rows.dictionary_encode()
+        order = np.argsort(of_row.indices.to_numpy(), kind="stable")
+        rows = table.drop_columns([shelf.FILE]).take(order)
+        at = 0
+        for name, count in zip(of_row.dictionary.to_pylist(), np.bincount(of_row.indices.to_numpy()), strict=True):
+            found[folder / f"{name}.parquet"] = rows.slice(at, count)
+            at += count
+    return found
 
 
 def heads(
@@ -107,20 +147,28 @@ def heads(
                 bad = {paths[number]: first(paths[number], schema, needed=needed) for number in unfit.damaged}
                 found_of = heads(whole, columns, schema, needed=needed) | bad
                 return {path: found_of[path] for path in paths}
-    return {path: found.get(k) or first(path, schema, needed=needed) for k, path in enumerate(paths)}
+    packed = _packed([path for number, path in enumerate(paths) if number not in found])
+    return {path: found.get(k) or _first(path, schema, needed, packed) for k, path in enumerate(paths)}
 
 
 def first(path: Path, schema: pa.Schema = SCHEMA, *, needed: Sequence[str] = ()) -> dict[str, Any] | str:
     """The first row of a unit, or in words what is wrong with its rows."""
+    return _first(path, schema, needed, _packed([path]))
+
+
+def _first(
+    path: Path, schema: pa.Schema, needed: Sequence[str], packed: Mapping[Path, pa.Table]
+) -> dict[str, Any] | str:
     try:
-        return _one(path, schema, needed).slice(0, 1).to_pylist()[0]
+        return _one(path, schema, needed, packed).slice(0, 1).to_pylist()[0]
     except InputError as error:
         return error.mistakes[0].problem
 
 
-def _one(path: Path, schema: pa.Schema, needed: Sequence[str]) -> pa.Table:
+def _one(path: Path, schema: pa.Schema, needed: Sequence[str], packed: Mapping[Path, pa.Table]) -> pa.Table:
     try:
-        table = pa.concat_tables([schema.empty_table(), _rows(path)], promote_options="default")
+        found = packed.get(path) or _file(path)
+        table = pa.concat_tables([schema.empty_table(), found], promote_options="default")
     except (pa.ArrowException, OSError) as error:
         raise InputError(Mistake(f"holds no rows ({error}); take it out of the results", path)) from error
     lacking = [name for name in needed if name not in table.column_names or table[name].null_count]
@@ -130,24 +178,18 @@ def _one(path: Path, schema: pa.Schema, needed: Sequence[str]) -> pa.Table:
     return table
 
 
-def _rows(unit: Path) -> pa.Table:
-    if os.path.lexists(unit):
-        with suppress(FileNotFoundError):  # it was packed a moment ago
-            return _file(unit)
-    if unit.stem not in shelf.packed_units(unit.parent):
-        raise OSError("it is no plain file")
-    named: Any = [(shelf.FILE, "==", unit.stem)]
-    only = pq.read_table(shelf.packed_file(unit.parent), filters=named)
-    return only.drop_columns([shelf.FILE])
-
-
 def _file(path: Path) -> pa.Table:
     if not path.is_file() and path.exists():  # a pipe would be waited for
         raise OSError("it is no plain file")
-    with pq.ParquetFile(path) as file:
-        if file.metadata.num_rows > MOST:
-            raise OSError(f"it claims {file.metadata.num_rows:,} rows, and at most {MOST:,} are read")
-        return file.read()
+    try:
+        with path.open("rb") as content, pq.ParquetFile(content) as file:
+            if file.metadata.num_rows > MOST:
+                raise OSError(f"it claims {file.metadata.num_rows:,} rows, and at most {MOST:,} are read")
+            return file.read()
+    except FileNotFoundError:  # it was packed a moment ago
+        if found := _packed([path]).get(path):
+            return found
+        raise OSError("it is no plain file") from None
 
 
 def same(one: pa.Table, other: pa.Table) -> bool:

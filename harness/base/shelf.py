@@ -66,7 +66,8 @@ def _packed(path: Path, *state: int) -> frozenset[str]:
     try:
         if not path.is_file():
             raise OSError("it is no plain file")
-        names = pq.read_table(path, columns=[FILE])[FILE]
+        with path.open("rb") as file:  # pyarrow takes some paths for URLs, and none that is no UTF-8
+            names = pq.read_table(file, columns=[FILE], partitioning=None)[FILE]
         if names.null_count:
             raise OSError(f"rows without a {FILE}")
         return frozenset(map(str, names.cast(pa.string()).unique().to_pylist()))
@@ -121,7 +122,8 @@ def schema(part: Part) -> pa.Schema:
     """The schema of a part's rows."""
     import pyarrow.parquet as pq
 
-    found = pq.read_schema(part.files[0])
+    with open(part.files[0], "rb") as file:
+        found = pq.read_schema(file)
     return found if part.packed is None else found.remove(found.get_field_index(FILE))
 
 

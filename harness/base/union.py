@@ -3,11 +3,13 @@
 """The rows of many units at once, by DuckDB on their Parquet files; those of one schema are read together.
 
 `union_by_name` would do as much for files of any schema, and takes 140 kB of memory a file. What does not fit together
-raises `Unfit`: whoever reads then looks unit by unit, and can say which.
+raises `Unfit`: whoever reads then looks unit by unit, and can say which. So does a path that is a pattern to DuckDB.
 """
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -52,6 +54,9 @@ class Union:
     none: str
     """The columns where there are no parts."""
 
+    files: list[str]
+    """The files of all parts, by the paths that DuckDB reads."""
+
     def select(self) -> str:
         """A query for all rows, in the columns of the schema."""
         parts = [f"SELECT {columns} FROM {source}" for columns, source in zip(self.columns, self.sources, strict=True)]
@@ -77,7 +82,8 @@ def union(
 ) -> Union:
     """Units as DuckDB reads them, in variables of these names; the schema's columns come first.
 
-    Raises Unfit, and InputError for a packed file that is damaged.
+    Values come from inside the files alone: a folder called `size=64` sets no column. Raises Unfit, and InputError for
+    a packed file that is damaged.
     """
     found, damaged = parts(asked)
     if damaged:
@@ -87,20 +93,38 @@ def union(
         whole = pa.unify_schemas([schema, *schemas], promote_options=promote).remove_metadata()
     except (pa.ArrowException, OSError) as error:
         raise Unfit(str(error)) from error
+    names = [name.casefold() for name in whole.names]
+    if len({*names, *_RESERVED}) < len(names) + len(_RESERVED):
+        raise Unfit("columns whose names DuckDB cannot tell apart")
     types = _types(connection, whole)
     sources: list[str] = []
     columns: list[str] = []
+    files: list[str] = []
     for number, (part, own) in enumerate(zip(found, schemas, strict=True)):
         variable = f"{name}_{number}"
-        connection.execute(f"SET VARIABLE {variable} = $files", {"files": list(part.files)})
-        source = f"read_parquet(getvariable('{variable}'))"
+        literal = _literal(part.files)
+        files += literal
+        connection.execute(f"SET VARIABLE {variable} = $files", {"files": literal})
+        source = f"read_parquet(getvariable('{variable}'), hive_partitioning = false)"
         if part.packed is not None:
             connection.execute(f"SET VARIABLE {variable}_units = $units", {"units": list(part.packed)})
             source += f" WHERE {FILE} IN (SELECT unnest(getvariable('{variable}_units')))"
         sources.append(source)
         columns.append(", ".join(_column(field, own, types[field.name]) for field in whole))
     none = ", ".join(_column(field, pa.schema([]), types[field.name]) for field in whole)
-    return Union(found, whole, sources, columns, none)
+    return Union(found, whole, sources, columns, none, files)
+
+
+_PATTERN = re.compile(r"[*?\[\\\ud800-\udfff]")
+"""Characters by which DuckDB takes a path for a pattern of several files, and those that UTF-8 does not have."""
+
+
+def _literal(files: Sequence[str]) -> list[str]:
+    """Paths that DuckDB takes as they are: absolute, or `~` and `file:` at the start had a meaning. Raises Unfit."""
+    found = [os.path.abspath(file) for file in files]
+    if bad := next((file for file in found if _PATTERN.search(file)), None):
+        raise Unfit(f"{bad!a} would be read as a pattern")
+    return found
 
 
 def table(
@@ -130,7 +154,7 @@ def table(
                 tables.append(read.drop_columns([_AT]).cast(whole.schema))
                 count += len(read)
                 if not checked and count > most:  # only then can a file claim as many
-                    _check_claims(whole.parts, most)
+                    _check_claims(whole.files, most)
                     checked = True
     number = np.concatenate(numbers)
     found = pa.concat_tables(tables)
@@ -143,10 +167,9 @@ def table(
     return found if np.all(np.diff(number) >= 0) else found.take(np.argsort(number, kind="stable"))
 
 
-def _check_claims(parts: Sequence[Part], most: int) -> None:
-    for part in parts:
-        if part.packed is None and any(pq.read_metadata(file).num_rows > most for file in part.files):
-            raise Unfit("a file has too many rows")
+def _check_claims(files: Sequence[str], most: int) -> None:
+    if any(pq.read_metadata(file).num_rows > most for file in files):
+        raise Unfit("a file has too many rows")
 
 
 def heads(
@@ -171,7 +194,8 @@ def heads(
 
 
 _AT, _ROW = "unit_asked_for", "row_of_the_unit"
-"""Names that no column has."""
+_RESERVED = (_AT, _ROW, "file_index", "file_row_number", "filename")
+"""Names that no column may have: ours, and those by which DuckDB states where a row comes from."""
 
 
 def _numbers(part: Part, at: Any) -> np.ndarray[Any, np.dtype[np.int64]]:

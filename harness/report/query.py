@@ -92,23 +92,20 @@ def answer(sql: str, results: Path, *, most: int = SHOWN, seconds: float = 15.0)
 
 def _answered(sql: str, folders: dict[str, list[Path]], most: int) -> QueryResult:
     units = {table: [unit for folder in folders[table] for unit in shelf.units(folder)] for table in _TABLES}
-    for _ in range(_TRIES - 1):
+    for _ in range(_TRIES):
         with suppress(union.Unfit):  # units were packed since they were looked for
             return _found(sql, units, most)
-    try:
-        return _found(sql, units, most)
-    except union.Unfit as error:  # else units are damaged
-        why = str(error)
-    heads = {unit: rows.first(unit, schema) for table, schema in _TABLES.items() for unit in units[table]}
-    damaged = [Mistake(said, unit) for unit, said in heads.items() if isinstance(said, str)]
-    raise InputError(damaged or f"query: {why[:2000]}")
+    try:  # else units are damaged, or their paths are patterns to DuckDB
+        return _found(sql, units, most, in_memory=True)
+    except union.Unfit as error:
+        raise InputError(f"query: {str(error)[:2000]}") from error
 
 
-def _found(sql: str, units: dict[str, list[Path]], most: int) -> QueryResult:
+def _found(sql: str, units: dict[str, list[Path]], most: int, *, in_memory: bool = False) -> QueryResult:
     with union.connected(MEMORY // 2) as connection:
         try:
-            lazily = all(s.type == duckdb.StatementType.SELECT for s in connection.extract_statements(sql))
-            _offer(connection, units, lazily=lazily)
+            reads = all(s.type == duckdb.StatementType.SELECT for s in connection.extract_statements(sql))
+            _offer(connection, units, lazily=reads and not in_memory)
             found: Any = connection.execute(sql)
             if found is None or found.description is None:
                 raise InputError("query: came without a statement; wanted one, such as SELECT count(*) FROM rows")
@@ -136,7 +133,7 @@ def _offer(connection: duckdb.DuckDBPyConnection, units: dict[str, list[Path]], 
         if lazily:
             whole = union.union(connection, table, units[table], schema, "default")
             connection.execute(f"CREATE VIEW {table} AS {whole.select()}")
-            files += [file for part in whole.parts for file in part.files]
+            files += whole.files
         else:
             connection.register(table, rows.read(units[table], schema))
     connection.execute("SET allowed_paths = $files", {"files": files})

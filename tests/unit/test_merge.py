@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from harness.base import rows, shelf
@@ -67,6 +69,38 @@ def test_positions_that_differ_are_a_conflict_on_one_machine_and_told_between_tw
     unit.unlink()
     found = merge([two / "a", two / "b"], two / "others", lambda line: None)
     assert (found.conflicts, found.others) == ([], ["scene2 10 hybrid: from step 1"])
+
+
+def test_folders_that_look_like_columns_or_patterns_are_merged_as_all_are(two: Path):
+    for name, other in (("a", "size=64"), ("b", "solver=x[1]")):
+        (two / name).rename(two / other)
+    merge([two / "size=64", two / "solver=x[1]"], two / "status=failed", lambda line: None)
+    found = rows.read_each(shelf.units(two / "status=failed" / "sweep" / "rows"))
+    wanted = [row for number in range(5) for row in dummy_rows(number)]
+    for name in ("run_id", "size", "solver", "status"):
+        assert found[name].to_pylist() == [row[name] for row in wanted]
+
+
+def test_rows_that_are_not_written_as_they_were_replace_nothing(two: Path, monkeypatch: pytest.MonkeyPatch):
+    merged(two, "a")
+    before = {path: path.read_bytes() for path in (two / "all").rglob("*.parquet")}
+    (unit,) = (unit for unit in shelf.units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
+    rewritten(unit, started="2027-01-01T00:00:00+00:00")
+    write = pq.write_table
+    monkeypatch.setattr(pq, "write_table", lambda table, file: write(table.slice(1), file))
+    with pytest.raises(InputError, match="differ from those written"):
+        merged(two, "a")
+    assert {path: path.read_bytes() for path in (two / "all").rglob("*.parquet")} == before
+
+
+def test_a_column_of_another_type_is_named_before_anything_is_written(two: Path):
+    unit = shelf.units(two / "a" / "sweep" / "rows")[1]
+    table = pq.read_table(unit)
+    for name, values in (("size", ["large", "small"]), ("digest", [1.5, 2.5])):
+        pq.write_table(table.set_column(table.schema.get_field_index(name), name, pa.array(values)), unit)
+        with pytest.raises(InputError, match=rf"{unit.name}: rows do not fit .*{name}"):
+            merged(two, "b", "a")
+    assert not (two / "all").exists()
 
 
 def test_what_cannot_be_merged_is_the_users_mistake(two: Path):

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from harness.base import rows, shelf
+from harness.base import rows, shelf, union
 from harness.base.errors import InputError
 from harness.experiments.archive import compact as module
 from harness.experiments.archive.compact import compact
@@ -81,6 +81,59 @@ def test_packed_rows_are_the_same_to_all_who_read(sweep: Path):
     assert first["run_id"] == units[2].stem[-12:]
     turned = answer("PIVOT rows ON solver USING count(*) GROUP BY status", sweep.parent)
     assert turned.columns == ["status", "hybrid", "lbfgs", "numba", "sparse", "xpbd"]
+
+
+COLUMN_NAMES = "size=64/solver=a/scene=b/threads=9/machine=c/status=failed/frame=1/file=d"
+PATTERNS = ("a[b]c", "a*c", "a?c", "a[!x]c", "a\\*c", "{a,b}", "~", "file:a", "100%41", "\udcff")
+SHORT = ("run_id", "size", "solver", "scene", "status")
+
+
+@pytest.mark.parametrize(
+    "place", [COLUMN_NAMES, PATTERNS[0], *(pytest.param(name, marks=pytest.mark.long) for name in PATTERNS[1:])]
+)
+def test_no_name_of_a_folder_sets_a_column_or_leads_to_other_files(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    write_dummies(tmp_path / "abc" / "sweep", 1, first=99)  # what patterns match
+    monkeypatch.chdir(tmp_path)
+    results = Path(place)
+    units = write_dummies(results / "sweep", 9, frames=1)
+    short = [tuple(dummy_rows(int(unit.stem[-12:], 16))[0][name] for name in SHORT) for unit in units]
+
+    def check() -> None:
+        assert list(zip(*(rows.read(units)[name].to_pylist() for name in SHORT), strict=True)) == short
+        heads = rows.heads(units, SHORT)
+        assert [tuple(dict(heads[unit])[name] for name in SHORT) for unit in units] == short
+        assert answer(f"SELECT {', '.join(SHORT)} FROM rows ORDER BY ALL", results).values == sorted(short)
+
+    check()
+    assert compact(results, lambda line: None) == len(units)
+    assert list((results / "sweep" / "rows").iterdir()) == []
+    check()
+
+
+def test_nothing_is_removed_where_the_packed_rows_differ_from_the_originals(
+    sweep: Path, monkeypatch: pytest.MonkeyPatch
+):
+    before = {path: path.read_bytes() for path in sweep.rglob("*.parquet")}
+
+    def wrong(*arguments: object, **named: object) -> pa.Table:
+        table = pa.concat_tables([union.table(*arguments, **named)])  # type: ignore[arg-type]
+        return table.set_column(table.schema.get_field_index("size"), "size", pa.array([64] * len(table)))
+
+    monkeypatch.setattr(rows, "read", lambda units, schema, named: wrong(units, schema, most=1000, named=named))
+    with pytest.raises(InputError, match="nothing was removed"):
+        compact(sweep, lambda line: None)
+    assert {path: path.read_bytes() for path in sweep.rglob("*.parquet")} == before
+
+
+def test_columns_that_duckdb_cannot_tell_apart_are_read_by_their_exact_names(tmp_path: Path):
+    units = write_dummies(tmp_path / "sweep", 9, frames=1)
+    for name in ("SIZE", "file_index"):
+        for number, unit in enumerate(units):
+            pq.write_table(pq.read_table(unit).append_column(name, pa.array([number])), unit)
+        read = rows.read(units)
+        assert (read[name].to_pylist(), read["size"].to_pylist()) == (list(range(9)), [8 + k for k in range(9)])
 
 
 def test_a_run_that_is_done_again_takes_the_place_of_its_packed_rows_and_packing_goes_on(sweep: Path):

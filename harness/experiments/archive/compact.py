@@ -2,9 +2,10 @@
 # pyarrow's stubs say little of columns, and of files that Parquet is read from.
 """Packs the rows of many units into one file beside their folder; whoever reads rows sees the same before and after.
 
-The packed file is written anew under a partial name, with what was packed before; it is read back, and takes its place
-by a rename; then the units' own files go. A unit's own file goes before its packed rows (`harness.base.shelf`): so a
-kill leaves, at any moment, all rows where they are seen once, and the next start does the rest.
+The packed file is written anew under a partial name, with what was packed before; it is compared with the originals,
+which another reader reads for that, file by file, and takes its place by a rename; then the units' own files go. A
+unit's own file goes before its packed rows (`harness.base.shelf`): so a kill leaves, at any moment, all rows where they
+are seen once, and the next start does the rest.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from time import time
+from typing import BinaryIO
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -27,6 +29,8 @@ TABLES = ("rows", "accuracy", "ablation")
 _BATCH = 2_000
 """So many units are in memory at once."""
 _DAY = 86_400.0
+_ANY = pa.schema([])
+_NAME = pa.field(shelf.FILE, pa.string())
 _STARTED = pa.schema([columns.SCHEMA.field("started")])
 
 
@@ -61,15 +65,17 @@ def _compact(folder: Path, before: float, say: Callable[[str], None]) -> int:
         return 0
     stays = sorted(shelf.packed_units(folder) - {unit.stem for unit in whole})
     asked = sorted([*whole, *(folder / f"{name}.parquet" for name in stays)])
-    schema = _schema(asked, packed)
+    schema = fitting_schema(asked)
+    if shelf.FILE in schema.names:
+        raise InputError(Mistake(f"rows have a column {shelf.FILE!r} of their own; they cannot be packed", packed))
     with replacing(packed) as partial:
-        with pq.ParquetWriter(partial, schema.append(pa.field(shelf.FILE, pa.string()))) as writer:
+        with partial.open("wb") as into, pq.ParquetWriter(into, schema.append(_NAME)) as writer:
             for batch in _batches(asked):
                 table = rows.read(batch, schema, named=True)
                 writer.write_table(table, row_group_size=len(table))
         with partial.open("rb") as written:
             os.fsync(written.fileno())
-        _verify(partial, asked, schema)
+            _compare(written, asked, schema)
     _sync(packed.parent)
     for unit in whole:
         unit.unlink()
@@ -77,29 +83,30 @@ def _compact(folder: Path, before: float, say: Callable[[str], None]) -> int:
     return len(whole)
 
 
-def _schema(units: Sequence[Path], packed: Path) -> pa.Schema:
-    """The schema of all units. Raises InputError where there is none."""
+def fitting_schema(units: Sequence[Path], schema: pa.Schema = _ANY) -> pa.Schema:
+    """The schema of all units, those columns first that they have to have if at all. Raises InputError that names a
+    file whose columns are of other types."""
     found, _ = shelf.parts(units)
-    try:
-        whole = pa.unify_schemas([shelf.schema(part) for part in found]).remove_metadata()
-    except pa.ArrowException as error:
-        raise InputError(Mistake(f"rows do not fit together ({error}); take the foreign files out", packed)) from error
-    if shelf.FILE in whole.names:
-        raise InputError(Mistake(f"rows have a column {shelf.FILE!r} of their own; they cannot be packed", packed))
-    return whole
+    for part in found:
+        try:
+            schema = pa.unify_schemas([schema, shelf.schema(part)]).remove_metadata()
+        except (pa.ArrowException, OSError) as error:
+            why = f"rows do not fit those of other files ({error}); take it out of the results"
+            raise InputError(Mistake(why, Path(part.files[0]))) from error
+    return schema
 
 
 def _batches(units: Sequence[Path]) -> Iterator[Sequence[Path]]:
     return (units[start : start + _BATCH] for start in range(0, len(units), _BATCH))
 
 
-def _verify(partial: Path, units: Sequence[Path], schema: pa.Schema) -> None:
-    """Hold what was written against what is there: nothing goes before that."""
-    with pq.ParquetFile(partial) as file:
+def _compare(written: BinaryIO, units: Sequence[Path], schema: pa.Schema) -> None:
+    """Compare what was written with the originals. Raises InputError where rows differ: nothing is removed then."""
+    with pq.ParquetFile(written) as file:
         for group, batch in enumerate(_batches(units)):
-            pair = file.read_row_group(group), rows.read(batch, schema, named=True)
-            if not rows.same(*pair):
-                raise InputError(Mistake("was not read back as it was written; nothing was taken away", partial))
+            if not rows.same(file.read_row_group(group), rows.read_each(batch, schema, named=True)):
+                why = f"the packed rows differ from those in the {len(batch)} files from here on; nothing was removed"
+                raise InputError(Mistake(why, batch[0]))
 
 
 def _sync(folder: Path) -> None:

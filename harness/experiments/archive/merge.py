@@ -3,8 +3,9 @@
 """Results of several folders in one: rows are told apart by their content, so that nothing is lost and nothing doubled.
 
 A run on two machines has two ids, so both keep their rows. Where the rows of one unit differ, since it was done twice,
-the newer keep its name and the others are named by their content, `<unit>~<digest>`. Runs that should have ended at
-the same positions and did not are reported.
+the newer keep its name and the others are named by their content, `<unit>~<digest>`. Rows are copied file by file, by
+pyarrow, and what was written is compared with the original before it takes the place of anything. Runs that should
+have ended at the same positions and did not are reported.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from glob import escape
 from pathlib import Path
 
 import pyarrow as pa
@@ -25,7 +27,7 @@ from harness.base.claim import NAME as CLAIM
 from harness.base.claim import claimed
 from harness.base.errors import InputError, Mistake
 from harness.base.files import replacing
-from harness.experiments.archive.compact import TABLES
+from harness.experiments.archive.compact import TABLES, fitting_schema
 from harness.report.machines import KNOWN, foot
 from harness.report.stored import ASKED
 
@@ -60,7 +62,7 @@ def merge(sources: Sequence[Path], into: Path, say: Callable[[str], None]) -> Me
     some already. A merge that was stopped is gone on with by the same command.
 
     Raises InputError where a folder has no rows, where one lies in another, or is of a sweep and another of several,
-    and for damaged rows.
+    and for damaged rows and such that do not fit together.
     """
     for source in sources:
         if into.resolve().is_relative_to(source.resolve()) or source.resolve().is_relative_to(into.resolve()):
@@ -71,6 +73,11 @@ def merge(sources: Sequence[Path], into: Path, say: Callable[[str], None]) -> Me
     if len({place == Path() for _, place in places}) > 1:
         raise InputError("merge: one folder is that of a sweep, another holds several; wanted folders of one kind")
     written = known = 0
+    for place in {place for _, place in places}:  # all that do not fit are refused before anything is written
+        for table in TABLES:
+            folders = [folder / place / table for folder in (into, *sources)]
+            schema = columns.SCHEMA if table == "rows" else _ANY
+            fitting_schema([unit for folder in folders for unit in shelf.units(folder)], schema)
     for place in sorted({place for _, place in places}):
         home = into / place
         home.mkdir(parents=True, exist_ok=True)
@@ -101,7 +108,7 @@ def _table(folders: Sequence[Path], home: Path) -> tuple[int, int]:
         if len(units) == 1:
             continue
         heads = rows.heads(units, ["started"], _STARTED)
-        tables = [(unit, rows.read([unit], _ANY)) for unit in units]
+        tables = [(unit, rows.read_each([unit], _ANY)) for unit in units]
         newest = sorted(tables, key=lambda pair: _started(heads[pair[0]]), reverse=True)  # the first where they tie
         kept = list[pa.Table]()
         named = list[tuple[Path, pa.Table, Path]]()
@@ -112,7 +119,7 @@ def _table(folders: Sequence[Path], home: Path) -> tuple[int, int]:
             named.append((unit, table, home / (f"{name}~{content(table)}.parquet" if kept else f"{name}.parquet")))
             kept.append(table)
         for unit, table, target in reversed(named):  # what gives its name to a newer one is there under another first
-            if not shelf.there(target) or not rows.same(rows.read([target], _ANY), table):
+            if not shelf.there(target) or not rows.same(rows.read_each([target], _ANY), table):
                 _put(table, unit, target)
                 written += 1
     return written, known
@@ -129,15 +136,14 @@ def _tables(units: Sequence[Path], batch: int = 1_000) -> Iterator[tuple[Path, p
     for start in range(0, len(units), batch):
         chosen = units[start : start + batch]
         packed = [unit for unit in chosen if not unit.exists()]
-        yield from ((unit, rows.read([unit], _ANY)) for unit in chosen if unit.exists())
+        yield from ((unit, rows.read_each([unit], _ANY)) for unit in chosen if unit.exists())
         if packed:
-            table = rows.read(packed, _ANY, named=True)
-            ends = table[shelf.FILE].to_pylist()
+            table = rows.read_each(packed, _ANY, named=True)
+            lengths = Counter(table[shelf.FILE].to_pylist())
             at = 0
             for unit in packed:
-                length = ends.count(unit.stem)
-                yield unit, table.slice(at, length).drop_columns([shelf.FILE])
-                at += length
+                yield unit, table.slice(at, lengths[unit.stem]).drop_columns([shelf.FILE])
+                at += lengths[unit.stem]
 
 
 def content(table: pa.Table) -> str:
@@ -150,14 +156,17 @@ def _put(table: pa.Table, unit: Path, target: Path) -> None:
     """Write a unit's rows, after its recordings and its picture: where rows are, all is."""
     source, home = unit.parent.parent, target.parent.parent
     for part in ("recordings", "pictures"):
-        for path in sorted((source / part).glob(f"{unit.stem}[.-]*")):
+        for path in sorted((source / part).glob(f"{escape(unit.stem)}[.-]*")):
             if path.is_file() and path.suffix in (".rrd", ".png"):
                 _copy(path, home / part / (target.stem + path.name[len(unit.stem) :]))
     target.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(target) as partial, partial.open("wb") as file:
-        pq.write_table(table, file)
-        file.flush()
-        os.fsync(file.fileno())
+    with replacing(target) as partial:
+        with partial.open("wb") as file:
+            pq.write_table(table, file)
+            file.flush()
+            os.fsync(file.fileno())
+        if not rows.same(rows.read_each([partial], _ANY), table):
+            raise InputError(Mistake("its rows differ from those written; nothing was replaced", unit))
 
 
 def _copy(path: Path, target: Path) -> None:
@@ -180,10 +189,21 @@ def _conflicts(folders: Sequence[Path]) -> tuple[list[str], list[str], list[str]
     """Runs that were asked the same and ended a step at other positions: of one machine and code, and of several; and
     the machines that there are."""
     units = [unit for folder in folders for unit in shelf.units(folder)]
+    try:
+        return _differing(units)
+    except union.Unfit:  # damaged, or paths that are patterns to DuckDB
+        return _differing(units, rows.read_each(units))
+
+
+def _differing(units: Sequence[Path], read: pa.Table | None = None) -> tuple[list[str], list[str], list[str]]:
+    """See `_conflicts`. read: the rows of the units; else DuckDB reads them. Raises Unfit."""
     asked = ", ".join(f'"{name}"' for name in ASKED)
     with union.connected() as connection:
-        whole = union.union(connection, "files", units, columns.SCHEMA, "default")
-        connection.execute(f"CREATE VIEW rows AS {whole.select()}")
+        if read is None:
+            whole = union.union(connection, "files", units, columns.SCHEMA, "default")
+            connection.execute(f"CREATE VIEW rows AS {whole.select()}")
+        else:
+            connection.register("rows", read)
 
         def differing(key: str) -> list[str]:
             each = f"SELECT {key}, {asked}, frame FROM rows WHERE phase = 'step' AND digest IS NOT NULL GROUP BY ALL"
