@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
 
-from harness.base.errors import SpringbenchError
+from harness.base.errors import InputError, Mistake, SpringbenchError
 
 
 class CannotWrite(SpringbenchError):
@@ -45,6 +46,40 @@ def replacing(path: Path) -> Generator[Path]:
     finally:
         with suppress(OSError):  # a folder that is gone tells its own tale
             partial.unlink(missing_ok=True)
+
+
+def open_lock(path: Path, access: int = os.O_RDWR, *, otherwise: str = "") -> int:
+    """A file to lock, opened, and made where it is missing; access: for reading or writing. No link is followed, and
+    nothing is waited for. Raises InputError that says what is in the way; otherwise: what else to do than remove it.
+    """
+    flags = access | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        try:
+            lock = os.open(path, flags)
+        except FileNotFoundError:
+            with suppress(FileExistsError):  # by another process, a moment ago
+                os.close(os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o644))
+            lock = os.open(path, flags)
+    except OSError as error:
+        if not os.path.lexists(path) or error.errno not in _IN_THE_WAY:
+            raise
+        mode = os.lstat(path).st_mode
+        what = f"cannot be opened ({reason(error)})" if stat.S_ISREG(mode) else f"is {_kind(mode)}"
+        raise InputError(Mistake(f"{what}; wanted a plain file to lock: remove it{otherwise}", path)) from error
+    mode = os.fstat(lock).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(lock)
+        raise InputError(Mistake(f"is {_kind(mode)}; wanted a plain file to lock: remove it{otherwise}", path))
+    return lock
+
+
+_IN_THE_WAY = {errno.EACCES, errno.EPERM, errno.EISDIR, errno.ELOOP, errno.ENXIO, errno.ENODEV, errno.EOPNOTSUPP}
+
+
+def _kind(mode: int) -> str:
+    """What a file is that is no plain one, in words."""
+    kinds = {stat.S_IFIFO: "a pipe", stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFSOCK: "a socket"}
+    return kinds.get(stat.S_IFMT(mode), "a device")
 
 
 def users_cache(name: str) -> Path:

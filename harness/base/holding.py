@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import fcntl
 import os
-import stat
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 from time import monotonic, sleep
 
-from harness.base.errors import InputError, Mistake
+from harness.base.errors import InputError
+from harness.base.files import open_lock
 
 DONE, TAKEN = "was done by another command", "is left to another command"
 
@@ -58,22 +58,13 @@ def together(folder: Path) -> Generator[None]:
 @contextmanager
 def _opened(folder: Path) -> Generator[int]:
     """The file by which a folder is held."""
-    lock = plain_lock(folder / ".lock")
+    lock = open_lock(folder / ".lock")
     _LOCKS.add(lock)
     try:
         yield lock
     finally:
         _LOCKS.discard(lock)
         os.close(lock)
-
-
-def plain_lock(path: Path) -> int:
-    """A file to be locked, opened, made where it is missing. Raises InputError for what is no plain file."""
-    lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
-    if not stat.S_ISREG(os.fstat(lock).st_mode):
-        os.close(lock)
-        raise InputError(Mistake("is no plain file; take it away", path))
-    return lock
 
 
 def _locked(lock: int, how: int) -> bool:
@@ -112,7 +103,7 @@ class Claims:
 
     def __init__(self, folder: Path, units: Sequence[Path]) -> None:
         """units: their files of rows."""
-        self._lock = plain_lock(folder / ".claims")
+        self._lock = open_lock(folder / ".claims")
         self._units = {path: _state(path) for path in units}
 
     def take(self, unit: Path) -> str:

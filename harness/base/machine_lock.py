@@ -21,6 +21,7 @@ from pathlib import Path
 from time import sleep
 
 from harness.base.asides import WAITING, Tick, aside
+from harness.base.files import open_lock
 
 _PAUSE = 0.02
 """Seconds between two looks for a free core."""
@@ -105,7 +106,7 @@ def _free(cores: list[int], most: int) -> dict[int, int]:
     for core in cores:
         if len(found) == most:
             break
-        lock = os.open(_file(f"core-{core}"), os.O_RDONLY | os.O_CLOEXEC)
+        lock = _opened(f"core-{core}")
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             found[core] = lock
@@ -131,7 +132,7 @@ def _held(name: str, how: int, tick: Tick) -> Generator[None]:
 
 
 def _locked(name: str, how: int, tick: Tick) -> int:
-    lock = os.open(_file(name), os.O_RDONLY | os.O_CLOEXEC)
+    lock = _opened(name)
     try:
         try:
             fcntl.flock(lock, how | fcntl.LOCK_NB)
@@ -150,11 +151,8 @@ def _let_go(*locks: int) -> None:
         os.close(lock)
 
 
-def _file(name: str) -> Path:
-    """A lock's file, which all users of the machine may lock."""
+def _opened(name: str) -> int:
+    """A lock's file, which all users of the machine may lock. Raises InputError."""
     path = Path(os.environ.get("SPRINGBENCH_LOCKS") or tempfile.gettempdir()) / f"springbench-{name}.lock"
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with suppress(FileExistsError):
-            os.close(os.open(path, os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o644))
-    return path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return open_lock(path, os.O_RDONLY, otherwise=", or set SPRINGBENCH_LOCKS to a folder of your own")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import socket
 import threading
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from functools import partial
 from pathlib import Path
 from time import monotonic
@@ -14,6 +16,9 @@ import pytest
 
 from harness.base.asides import WAITING, begun, ended
 from harness.base.crew import Task, done_by
+from harness.base.errors import InputError
+from harness.base.files import open_lock
+from harness.base.holding import Claims, together
 from harness.base.machine_lock import Turn, alone, beside, own_cores
 from harness.base.workers import Limits, Tick
 
@@ -103,6 +108,43 @@ def test_who_was_timed_looks_beside_others():
         assert not timed.inside.wait(SOON)
     assert timed.inside.wait(PATIENCE)
     timed.leave.set()
+
+
+IN_THE_WAY: dict[str, Callable[[Path], object]] = {
+    "a pipe": os.mkfifo,
+    "a link": lambda path: path.symlink_to("/dev/null"),
+    "a folder": Path.mkdir,
+    "a socket": lambda path: socket.socket(socket.AF_UNIX).bind(str(path)),
+}
+
+
+@pytest.mark.parametrize("what", IN_THE_WAY)
+def test_what_is_in_the_way_of_a_lock_is_named_at_once(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)  # the name of a socket may not be long
+    monkeypatch.setenv("SPRINGBENCH_LOCKS", "locks")
+    Path("locks").mkdir()
+    places: dict[str, Callable[[], AbstractContextManager[object]]] = {
+        "locks/springbench-wanted.lock": lambda: alone(quiet),
+        "locks/springbench-used.lock": lambda: beside(quiet),
+        f"locks/springbench-core-{min(os.sched_getaffinity(0))}.lock": lambda: own_cores(1, quiet),
+        ".lock": lambda: together(Path()),
+        ".claims": lambda: closing(Claims(Path(), [])),
+    }
+    for name, lock in places.items():
+        IN_THE_WAY[what](Path(name))
+        with pytest.raises(InputError, match=f"{name}: is {what}; wanted a plain file"), lock():
+            pass
+        os.rename(name, "elsewhere" + name.replace("/", "-"))
+
+
+def test_a_lock_that_may_not_be_opened_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refused(path: Path, *flags: int) -> int:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    (tmp_path / "lock").touch()
+    monkeypatch.setattr(os, "open", refused)
+    with pytest.raises(InputError, match=r"cannot be opened \(Permission denied\).*, or do so"):
+        open_lock(tmp_path / "lock", otherwise=", or do so")
 
 
 def at_core(tick: Tick) -> tuple[list[int], set[int], float, float]:

@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -102,8 +103,8 @@ def test_no_name_of_a_folder_sets_a_column_or_leads_to_other_files(
 
     def check() -> None:
         assert list(zip(*(rows.read(units)[name].to_pylist() for name in SHORT), strict=True)) == short
-        heads = rows.heads(units, SHORT)
-        assert [tuple(dict(heads[unit])[name] for name in SHORT) for unit in units] == short
+        heads: Any = rows.heads(units, SHORT)
+        assert [tuple(heads[unit][name] for name in SHORT) for unit in units] == short
         assert answer(f"SELECT {', '.join(SHORT)} FROM rows ORDER BY ALL", results).values == sorted(short)
 
     check()

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.base.errors import InputError
-from harness.base.files import users_cache
+from harness.base.files import open_lock, users_cache
 from harness.experiments.gates.pair import Side
 
 KEPT = 6
@@ -121,6 +121,9 @@ def _last(said: str) -> str:
 def _alone(folder: Path) -> Generator[None]:
     """One process at a time makes worktrees."""
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as lock:
+    lock = open_lock(folder / ".lock")
+    try:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
+    finally:
+        os.close(lock)
