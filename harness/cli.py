@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from harness.base.commands import Again, Changed, Check, Commands, Error, Horizon, InThisProcess, Peers, Results, Rows
-from harness.base.console import aligned, err, narrow, out
+from harness.base.console import err, narrow, out
 from harness.base.console import say as _say
 from harness.base.errors import InputError, Mistake
 from harness.config.command_line import taking
@@ -30,6 +30,7 @@ from harness.experiments.gallery import gallery
 from harness.experiments.gates.command import gate
 from harness.experiments.gates.history_command import history
 from harness.experiments.gates.study_command import study
+from harness.experiments.listing import list_command
 from harness.experiments.repeat import repeat
 from harness.experiments.show import show
 from harness.experiments.speed.command import speed
@@ -41,15 +42,32 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     cls=Commands,
-    help="A laboratory for implicit time stepping of mass-spring systems.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 Config = Annotated[Path, typer.Argument(help="A sweep or a scene (YAML), or an assignment's scene (JSON).")]
-Recordings = Annotated[list[Path], typer.Argument(help="Recordings (.rrd).")]
+Recordings = Annotated[list[Path], typer.Argument(help="Recordings (.rrd), or folders of them.")]
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        print(f"springbench {version('springbench')}")
+        raise typer.Exit
+
+
+@app.callback()
+def main_options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """A laboratory for implicit time stepping of mass-spring systems."""
 
 
 @app.command(cls=taking())
@@ -185,6 +203,7 @@ def report(
 
 
 app.command(cls=taking("frames", "iterations", "tolerance", "rounds"))(ablate)
+app.command("list")(list_command)
 app.command()(speed)
 app.command()(recommend)
 app.command()(repeat)
@@ -199,25 +218,6 @@ app.command()(show)
 app.command()(gate)
 app.command()(history)
 app.add_typer(study, name="gate-study")
-
-
-@app.command("list")
-def list_runs(config: Config, results: Results = Path("results")) -> None:
-    """Check a config, and show what would run and what is there already."""
-    from harness.base.machine import describe
-    from harness.config.load import load_any
-    from harness.experiments.plan import plan
-
-    sweep = load_any(config, opens=False)
-    lines: list[tuple[str, ...]] = [("run", "scene", "size", "solver", "iterations", "frames", "threads", "state")]
-    for p in plan(sweep.runs(), results / sweep.name):
-        r, there = p.run, p.standing
-        state = there.state + (" (by other code)" if there.older else "") + (" (damaged)" if there.damage else "")
-        what = r.scene_name, r.size, r.solver.name, r.iterations, r.frames, r.threads
-        lines.append((p.files.rows.stem[-12:], *map(str, what), state))
-    for line in aligned(lines):
-        print(line)
-    print(f"states are those on this machine, {describe().id:.6}; settings hold on any")
 
 
 @app.command()
@@ -277,14 +277,10 @@ def _check_positions(path: Path | None) -> None:
 
 
 def main() -> None:
-    """The console script."""
+    """Run the command that the arguments name."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for some in every installed package
     # Typer makes a parser of every command that it knows, a tenth of what it takes to list.
     one = copy(app)
     asked = [c for c in app.registered_commands if c.callback and (c.name or c.callback.__name__) in sys.argv[1:2]]
     one.registered_commands = asked or app.registered_commands
-    one()
-
-
-if __name__ == "__main__":
-    main()
+    one(prog_name="springbench")

@@ -80,6 +80,7 @@ class _Child:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, **settings, "PYTHONPATH": os.pathsep.join(paths)},
+            process_group=0,  # a terminal's Ctrl-C is for the parent alone
         )
 
     @classmethod

@@ -88,7 +88,7 @@ def aligned(lines: Sequence[Sequence[str]]) -> Iterator[str]:
     for number, line in enumerate(lines):
         yield "  ".join(map(str.ljust, line, widths)).rstrip()
         if number == 0:
-            yield "  ".join("─" * width for width in widths)
+            yield "  ".join("-" * width for width in widths)
 
 
 def say(line: str) -> None:

@@ -21,6 +21,7 @@ from pickle import UnpicklingError
 from time import monotonic
 from typing import Any
 
+from harness.base import interrupts
 from harness.base.asides import LOOK, WAITING, begun, ended, is_step
 from harness.base.blame import place
 from harness.base.worker import DUMP, Limits, Piece, PieceOutcome, Tick, serve
@@ -63,7 +64,8 @@ class Workers:
         """Start a worker where there is none; it gets ready while this process does something else."""
         if self._worker is None or not self._worker.alive:
             self.end()
-            self._worker = _Worker(self._ready, fork=self._fork)
+            with interrupts.blocked():  # a worker that has started is known to this, and never receives Ctrl-C
+                self._worker = _Worker(self._ready, fork=self._fork)
 
     def do(self, piece: Piece, tick: Tick, limits: Limits, meanwhile: Callable[[], object] = int) -> Any:
         """What the piece returns. meanwhile: done here once the worker has it. Raises the SpringbenchError that the
@@ -85,7 +87,8 @@ class Workers:
         try:
             answer = yield from self._worker.ask(piece, tick, limits)
         except BaseException:  # it was lost, or somebody wants to leave
-            self._worker.kill()
+            if self._worker:
+                self._worker.kill()
             self.end()
             raise
         if not answer.clean:

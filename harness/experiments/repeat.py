@@ -38,8 +38,10 @@ def repeat(
             f"came {point!r}, which {len(found)} points of outside engines end with; `springbench repeat {config}` "
         )
         raise InputError(Mistake(f"{problem}lists them", key="POINT"))
-    if not output.is_dir():
-        raise InputError(Mistake(f"came {output}; wanted a folder that exists", key="--output"))
+    if output.exists() and not output.is_dir():
+        raise InputError(
+            Mistake(f"{output} is a file; expected a folder, which is made if it is missing", key="--output")
+        )
     texts = _written(found[0], engines[found[0]], output)
     print(texts[f"{found[0]}.py"], end="")
     say(f"{', '.join(texts)} and {found[0]}.npz are in {output.resolve()}: run `python {found[0]}.py` there")
@@ -76,6 +78,7 @@ def _written(name: str, spec: WorkSpec, folder: Path) -> dict[str, str]:
     except Unsupported as refused:
         raise RunFailed(str(refused)) from refused
     arrays: dict[str, Any] = {**network.arrays(begun), "end": end}
+    folder.mkdir(parents=True, exist_ok=True)
     np.savez(folder / f"{name}.npz", **arrays)
     for file, text in texts.items():
         (folder / file).write_text(text)

@@ -26,6 +26,8 @@ from harness.record.reader import Summary, open_recording, read_replay, summary
 
 _SURFACE = (".obj", ".ply", ".stl", ".vtk", ".vtp")
 _LINES = (".vtk", ".vtp")
+_MOST = 50
+"""Recordings of a folder that are opened together."""
 _MILLISECONDS = "/milliseconds/"
 
 
@@ -36,6 +38,7 @@ def inspect(paths: list[Path], *, frame: int | None, export: Path | None, csv: P
     suffix; csv: file for the scalars in long form. Raises InputError for files that are no recordings, frames that
     are not there, suffixes that are unknown, and where `export` or `csv` is asked of several recordings.
     """
+    paths = find_recordings(paths)
     if len(paths) != 1 and (export or csv):
         raise InputError(f"--export and --csv take one recording; {len(paths)} came")
     if frame is not None and export is None:
@@ -54,11 +57,31 @@ def inspect(paths: list[Path], *, frame: int | None, export: Path | None, csv: P
         _print_difference(paths, console)
 
 
+def find_recordings(paths: Sequence[Path]) -> list[Path]:
+    """Return the paths, each folder among them replaced by the recordings below it.
+
+    Raises: InputError for a folder without recordings, or with more than a viewer can show.
+    """
+    found: list[Path] = []
+    for path in paths:
+        below = sorted(path.rglob("*.rrd")) if path.is_dir() else [path]
+        if not below:
+            raise InputError(Mistake("this folder has no Rerun recording (.rrd) below it", file=path))
+        if len(below) > _MOST:
+            problem = (
+                f"{len(below):,} recordings are below this folder; at most {_MOST} can be opened, such as {below[0]}"
+            )
+            raise InputError(Mistake(problem, file=path))
+        found += below
+    return found
+
+
 def view(paths: list[Path]) -> None:
     """Open recordings in the Rerun viewer and wait until it is closed.
 
     Raises InputError for files that are no recordings, RunFailed where there is no display or no viewer.
     """
+    paths = find_recordings(paths)
     for path in paths:
         with open_recording(path):
             pass

@@ -39,7 +39,7 @@ from solvers.problem import (
 
 @dataclass(frozen=True)
 class BaraffWitkin:
-    """It does not iterate: its only iterate is the linearised step, whatever the stop rule and the first guess."""
+    """One linearised step of implicit Euler: one iterate, whatever the stop rule and the first guess."""
 
     minimises: ClassVar[bool] = False
     descends: ClassVar[bool] = False

@@ -41,7 +41,7 @@ _MOST = 1e10
 
 @dataclass(frozen=True)
 class SymplecticEuler(Precise):
-    """It does not iterate: its only iterate is the whole step, whatever the stop rule and the first guess. Pins by
+    """Symplectic Euler: one iterate, the whole step, whatever the stop rule and the first guess. Pins by
     penalty are taken to be exact, for their weight would ask for the shortest substeps; pins move evenly, and forces
     stay."""
 

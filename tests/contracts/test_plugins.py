@@ -110,7 +110,7 @@ def configs(folder: Path, names: dict[str, str]) -> Path:
 
 def springbench(folder: Path, *arguments: str, code: int = 0) -> str:
     """What a command says in a process of its own, to which the folder's `installed` are packages."""
-    command = [sys.executable, "-m", "harness.cli", *arguments]
+    command = [sys.executable, "-m", "harness", *arguments]
     path = os.pathsep.join([str(ROOT), str(folder / "installed")])
     told = subprocess.run(command, cwd=folder, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True)
     assert told.returncode == code, told.stdout + told.stderr

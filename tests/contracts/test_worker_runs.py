@@ -123,7 +123,7 @@ def test_no_worker_stays_behind(how: signal.Signals, tmp_path: Path, monkeypatch
     made = own(tmp_path, monkeypatch)
     made.sweep.write_text(LONG)
     process = subprocess.Popen(
-        [sys.executable, "-m", "harness.cli", "run", str(made.sweep), "--results", str(tmp_path / "r")],
+        [sys.executable, "-m", "harness", "run", str(made.sweep), "--results", str(tmp_path / "r")],
         cwd=ROOT,
         stderr=subprocess.DEVNULL,
         # A shell that started these tests in the background has made its children deaf to Ctrl-C.

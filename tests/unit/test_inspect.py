@@ -20,7 +20,7 @@ from harness.record.cells import cell
 from harness.record.compare import Look, side_by_side
 from harness.record.reader import open_recording, read_replay
 from harness.report import inspect as module
-from harness.report.inspect import inspect, view
+from harness.report.inspect import find_recordings, inspect, view
 from harness.scenes.mesh.files import File
 from tests.recordings import info, record
 
@@ -210,3 +210,14 @@ def test_the_viewer_refuses_what_is_no_recording(tmp_path: Path):
     (tmp_path / "a.rrd").write_text("no")
     with pytest.raises(InputError, match="is not a Rerun recording"):
         view([tmp_path / "a.rrd"])
+
+
+def test_a_folder_stands_for_the_recordings_below_it(cloth: Path, chain: Path):
+    assert find_recordings([cloth.parent]) == [chain, cloth]
+    for count, words in ((0, "no Rerun recording"), (60, "60 recordings")):
+        folder = cloth.parent / str(count)
+        folder.mkdir()
+        for number in range(count):
+            (folder / f"{number}.rrd").touch()
+        with pytest.raises(InputError, match=words):
+            find_recordings([folder])

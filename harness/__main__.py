@@ -1,0 +1,47 @@
+"""The console script: prepares the process, then imports and runs the command line."""
+
+from __future__ import annotations
+
+import os
+import sys
+from io import TextIOWrapper
+
+from harness.base import interrupts
+
+
+def main() -> None:
+    """Run the command that the arguments name."""
+    interrupts.install_handler()
+    try:
+        _prepare_environment()
+        from harness.cli import main as run_command
+
+        run_command()
+    except KeyboardInterrupt:
+        interrupts.end_command()
+        interrupts.exit_process()
+    except SystemExit as exit:
+        if exit.code == interrupts.EXIT_CODE:
+            interrupts.exit_process()
+        raise
+    finally:
+        interrupts.ignore()
+
+
+def _prepare_environment() -> None:
+    """Replace settings of the environment that no command can use; exit with code 2 where one has no meaning."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # what a terminal cannot write is written as an escape sequence
+            stream.reconfigure(errors="backslashreplace")
+    os.environ["MPLBACKEND"] = "agg"  # all pictures go to files
+    threads = os.environ.get("NUMBA_NUM_THREADS") or "1"
+    if not threads.isdecimal() or int(threads) < 1:
+        print(
+            f"springbench: the environment's NUMBA_NUM_THREADS is {threads!r}; expected a number from 1",
+            file=sys.stderr,
+        )
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""Ctrl-C: a command ends with one message and exit code 130, from its first import to its last picture.
+
+* While a module is being imported the interrupt is deferred, because extension modules turn a KeyboardInterrupt into an
+  ImportError and print it.
+* Where a callback or a destructor swallows the KeyboardInterrupt, it is raised again.
+* Once the command is ending, further interrupts are ignored.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import signal
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import NoReturn
+
+EXIT_CODE = 130
+"""Of a command that Ctrl-C stopped, as shells have it."""
+
+MESSAGE = "springbench: stopped; what is complete is kept, and the same command goes on from there"
+
+_RETRY = 0.02
+"""Seconds until a deferred interrupt is tried again."""
+_MAX_DEFERRALS = 250
+"""An import that takes longer, 5 s, is interrupted."""
+
+_IMPORTING = ("importlib._bootstrap", "_frozen_importlib")
+
+_deferrals = 0
+
+
+def install_handler() -> None:
+    """Handle Ctrl-C in this process. A shell that starts a command in the background makes it ignore Ctrl-C, which is
+    left so."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
+        sys.unraisablehook = _raise_again
+        if sys.platform != "win32":
+            signal.signal(signal.SIGALRM, _interrupt)
+
+
+def ignore() -> None:
+    """Ignore Ctrl-C from here on."""
+    if signal.getsignal(signal.SIGINT) is _interrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextmanager
+def blocked() -> Generator[None]:
+    """Defer Ctrl-C inside the block; processes that are started there never receive it."""
+    if sys.platform == "win32":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def end_command() -> None:
+    """Say that the command was stopped."""
+    ignore()
+    _kill_workers()
+    print(MESSAGE, file=sys.stderr)
+
+
+def exit_process() -> NoReturn:
+    """Exit as interrupted. The interpreter's own way out ends by a signal where `exec` was interrupted."""
+    atexit._run_exitfuncs()  # pyright: ignore[reportPrivateUsage]
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(EXIT_CODE)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, as soon as no module is being imported."""
+    global _deferrals
+    while frame and sys.platform != "win32" and _deferrals < _MAX_DEFERRALS:
+        if frame.f_globals.get("__name__") in _IMPORTING:
+            _deferrals += 1
+            signal.setitimer(signal.ITIMER_REAL, _RETRY)
+            return
+        frame = frame.f_back
+    _deferrals = 0
+    _kill_workers()
+    raise KeyboardInterrupt
+
+
+def _kill_workers() -> None:
+    """Kill the worker processes, which are not to finish their work first."""
+    if multiprocessing := sys.modules.get("multiprocessing"):
+        for child in multiprocessing.active_children():
+            child.kill()
+
+
+def _raise_again(unraisable: sys.UnraisableHookArgs) -> None:
+    """Interrupt again where a KeyboardInterrupt could not be passed on."""
+    if unraisable.exc_type is KeyboardInterrupt and sys.platform != "win32":
+        signal.setitimer(signal.ITIMER_REAL, _RETRY)
+    else:
+        sys.__unraisablehook__(unraisable)

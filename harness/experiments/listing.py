@@ -1,0 +1,131 @@
+"""`springbench list`: the runs of a config and states, or the names of solvers, integrators, effects and meshes."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from importlib.util import find_spec
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from harness.base.commands import Results
+from harness.base.console import aligned
+
+if TYPE_CHECKING:
+    from harness.config.sweep import RunSpec
+
+_ALWAYS = ("iterations", "frames", "threads")
+"""Options with a column of their own, whether runs differ in them or not."""
+
+
+def list_command(
+    config: Annotated[
+        Path | None,
+        typer.Argument(help="A sweep or a scene (YAML), or an assignment's scene (JSON); all names if left out."),
+    ] = None,
+    results: Results = Path("results"),
+) -> None:
+    """Check a config and show its runs with their states; without a config, list solvers, effects and meshes."""
+    if config is None:
+        _print_names()
+    else:
+        _print_runs(config, results)
+
+
+def _print_runs(config: Path, results: Path) -> None:
+    from harness.base.machine import describe
+    from harness.config.load import load_any
+    from harness.experiments.plan import plan
+
+    sweep = load_any(config, opens=False)
+    planned = plan(sweep.runs(), results / sweep.name)
+    columns = settings([p.run for p in planned])
+    lines: list[tuple[str, ...]] = [("run", "scene", "size", "solver", *columns, "state")]
+    for number, p in enumerate(planned):
+        there = p.standing
+        state = there.state + (" (by other code)" if there.older else "") + (" (damaged)" if there.damage else "")
+        values = (values[number] for values in columns.values())
+        what = p.run.scene_name, str(p.run.size), p.run.solver.name
+        lines.append((p.files.rows.stem[-12:], *what, *values, state))
+    for line in aligned(lines):
+        print(line)
+    print(f"states are those on this machine, {describe().id:.6}; settings hold on any")
+
+
+def settings(runs: Sequence[RunSpec]) -> dict[str, list[str]]:
+    """Return the options and solver parameters that tell runs of one scene, size and solver apart.
+
+    Args:
+        runs: of one sweep.
+
+    Returns: a value for each run by column; empty for a parameter that the run's solver does not have.
+    """
+    from harness.config.options import OPTIONS
+
+    alike: dict[tuple[str, int, str], list[RunSpec]] = {}
+    for run in runs:
+        alike.setdefault((run.scene_name, run.size, run.solver.name), []).append(run)
+
+    def differ(value: Callable[[RunSpec], Any]) -> bool:
+        return any(len({repr(value(run)) for run in group}) > 1 for group in alike.values())
+
+    values: dict[str, Callable[[RunSpec], Any]] = {name: attrgetter(name) for name in OPTIONS}
+    columns = {name: value for name, value in values.items() if name in _ALWAYS or differ(value)}
+    for key in sorted({key for run in runs for key in run.solver.parameters}):
+        parameter = partial(_parameter, key)
+        if differ(parameter):
+            columns[key] = parameter
+    return {
+        name: ["" if (cell := value(run)) is None else str(cell) for run in runs] for name, value in columns.items()
+    }
+
+
+def _parameter(key: str, run: RunSpec) -> Any:
+    return run.solver.parameters.get(key)
+
+
+def _print_names() -> None:
+    from harness.scenes.effects.effect_names import EVERY as EFFECTS
+    from harness.scenes.mesh.mesh_names import EVERY as MESHES
+    from solvers.integrators import EVERY as INTEGRATORS
+    from solvers.registry import EVERY as SOLVERS
+
+    kinds: dict[str, Mapping[str, Any]] = {
+        "solvers": SOLVERS,
+        "integrators": INTEGRATORS,
+        "effects": EFFECTS,
+        "meshes": MESHES,
+    }
+    for heading, table in kinds.items():
+        print(f"\n{heading}, {len(table)}")
+        lines = [(f"  {name}", _summary(target)) for name, target in table.items()]
+        width = max(len(name) for name, _ in lines)
+        for name, summary in lines:
+            print(f"{name:{width}}  {summary}".rstrip())
+    print("\nsolvers/README.md and configs/README.md describe each; `springbench schema` has all parameters")
+
+
+def _summary(target: Any) -> str:
+    """The first sentence on a class, read from its source because importing a solver compiles kernels."""
+    if not isinstance(target, str):
+        from solvers.integrators import OWN
+
+        return "for solvers that integrate a step by themselves" if target is OWN else f"order {target.order}"
+    module, _, name = target.partition(":")
+    spec = find_spec(module)
+    if spec is None or not spec.origin:
+        return ""
+    tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
+    classes = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    said = next((ast.get_docstring(node) or "" for node in classes), "")
+    # A docstring that starts with the parameters leaves it to the module's to say what the class is.
+    return _first_sentence(ast.get_docstring(tree) or "" if said[:1].islower() else said)
+
+
+def _first_sentence(text: str) -> str:
+    return re.split(r"(?<!et al)\.(?=\s|$)|[:;]\s|\s\(", " ".join(text.split()), maxsplit=1)[0]

@@ -1,0 +1,46 @@
+"""`springbench list` tells runs apart, and names what ships; `--version` and `-h`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from typer.testing import CliRunner
+
+from harness.cli import app
+from harness.scenes.effects.effect_names import EFFECTS
+from harness.scenes.mesh.mesh_names import MESHES
+from solvers.integrators import INTEGRATORS
+from solvers.registry import SOLVERS
+
+SWEEP = """
+scenes: [{scene}]
+sizes: [5, 6]
+solvers: [sparse, {{name: lbfgs, pairs: 3}}, {{name: lbfgs, pairs: 5}}]
+options: {{tolerance: [1e-2, 1e-3], frames: 2}}
+"""
+SCENE = Path(__file__).resolve().parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
+
+
+def test_runs_are_listed_with_the_settings_in_which_they_differ(tmp_path: Path):
+    (tmp_path / SCENE.name).write_text(SCENE.read_text())
+    (tmp_path / "sweep.yaml").write_text(SWEEP.format(scene=SCENE.name))
+    listed = CliRunner().invoke(app, ["list", str(tmp_path / "sweep.yaml"), "--results", str(tmp_path)])
+    heading, _, *lines = listed.stdout.splitlines()[:-1]
+    columns = ["run", "scene", "size", "solver", "iterations", "tolerance", "threads", "frames", "pairs", "state"]
+    assert heading.split() == columns
+    without_hash = {line.split(maxsplit=1)[1] for line in lines}
+    assert len(without_hash) == len(lines) == 2 * 3 * 2
+
+
+def test_everything_that_ships_is_listed_with_a_sentence():
+    lines = CliRunner().invoke(app, ["list"]).stdout.splitlines()
+    for table in (SOLVERS, INTEGRATORS, EFFECTS, MESHES):
+        for name in table:
+            (line,) = [line for line in lines if line.startswith(f"  {name} ")]
+            assert line.removeprefix(f"  {name}").strip()
+
+
+def test_the_version_and_short_help():
+    assert CliRunner().invoke(app, ["--version"]).stdout.startswith("springbench 0.")
+    for arguments in (["-h"], ["run", "-h"]):
+        assert "Usage:" in CliRunner().invoke(app, arguments).stdout
