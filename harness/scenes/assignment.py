@@ -24,7 +24,7 @@ from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.cells import network
 from harness.scenes.mesh.obj import read_obj
 from harness.scenes.mesh.scene_json import line_of, read_scene_json
-from harness.scenes.mesh.topology import NO_PAIRS, Indices, Points
+from harness.scenes.mesh.topology import NO_PAIRS, NO_TRIANGLES, Indices, Points, fan
 
 TIME_STEP = 1 / 30
 """dt [s]."""
@@ -60,6 +60,8 @@ def read_assignment(path: Path) -> Assignment:
     if not cells.polygons:
         raise InputError(Mistake("has no faces (f lines), so there are no springs", obj))
     mesh = network(cells, "face_pairs", obj)
+    fans = np.concatenate([NO_TRIANGLES, *map(fan, cells.polygons.values())])  # as the assignment's code cuts faces
+    mesh = replace(mesh, triangles=fans)
     pins = _pins(scene.b, len(mesh.rest), path)
     if scene.m is None:
         mass = voronoi_areas(mesh.rest, mesh.triangles)

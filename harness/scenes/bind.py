@@ -211,7 +211,7 @@ def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
     if spec.mass_per_area is not None:
         if mesh.dimension != 2 or not len(mesh.triangles):
             raise InputError(Mistake("needs a surface, and this mesh is none; give `mass`", key="mass_per_area"))
-        return spec.mass_per_area * by_area(mesh.rest, mesh.triangles)
+        return spec.mass_per_area * (by_area(mesh.rest, mesh.triangles) if mesh.areas is None else mesh.areas)
     if mesh.mass is None:
         raise InputError(Mistake("is missing; this mesh brings no masses, so give the total [kg]", key="mass"))
     return mesh.mass

@@ -24,7 +24,8 @@ class Mesh:
     resolution: the mesh size, mostly vertices along a side; 0 for a mesh from a file;
     parts: named sets of vertices (`corners`, `top`, `left`, ...), each (q,), sorted;
     mass: (n,) [kg] where a file gives absolute masses, else None;
-    attributes: numbers by vertex that a file names, each (n,).
+    attributes: numbers by vertex that a file names, each (n,);
+    areas: (n,) [m^2] at rest by vertex where they are not thirds of its triangles, else None.
     All arrays are read-only.
     """
 
@@ -39,9 +40,10 @@ class Mesh:
     parts: Mapping[str, NDArray[np.int64]] = field(default_factory=dict[str, NDArray[np.int64]])
     mass: NDArray[np.float64] | None = None
     attributes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict[str, NDArray[np.float64]])
+    areas: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
-        arrays = [self.rest, self.springs, self.triangles, self.shares, self.mass]
+        arrays = [self.rest, self.springs, self.triangles, self.shares, self.mass, self.areas]
         for array in [*arrays, *self.families.values(), *self.parts.values(), *self.attributes.values()]:
             if array is not None:
                 array.flags.writeable = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -13,6 +14,13 @@ import numpy as np
 from harness.base.errors import InputError, Mistake
 from harness.scenes.mesh.base import SHEAR, STRETCH, Mesh
 from harness.scenes.mesh.generator import MAX_VERTICES
+from harness.scenes.mesh.polygons import (
+    MAX_CONCAVE_CORNERS,
+    find_covers,
+    repeated_rows,
+    triangulate,
+    vertex_areas,
+)
 from harness.scenes.mesh.topology import (
     NO_PAIRS,
     NO_TRIANGLES,
@@ -24,7 +32,6 @@ from harness.scenes.mesh.topology import (
     by_length,
     by_volume,
     corner_pairs,
-    fan,
     sides,
     signed_volumes,
     unique_pairs,
@@ -37,19 +44,24 @@ MAX_BYTES = 2**30
 MAX_COORDINATE = 1e12
 """No position [m] may be farther out: squares of lengths must stay finite with digits to spare."""
 _MAX_PAIRS = 200_000_000
+_MOST_MISTAKES, _MOST_REPEATS = 20, 5
+_LOG = logging.getLogger("springbench")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """points: (n, 3) [m]; polygons: corners k >= 2 -> (f, k); segments: (s, 2); tetrahedra: (t, 4); groups: the points
-    of what the file names; attributes: numbers by point that it names, each (n,)."""
+    """points: (n, 3) [m]; polygons: corners k >= 2 -> (f, k); places: k -> the line of each, (f,), or its number in the
+    file; counted: which of them; segments: (s, 2); tetrahedra: (t, 4); groups: the points of what the file names;
+    attributes: numbers by point that it names, each (n,)."""
 
     points: Points
     polygons: Mapping[int, Indices] = field(default_factory=dict[int, Indices])
+    places: Mapping[int, Indices] = field(default_factory=dict[int, Indices])
     segments: Indices = field(default_factory=lambda: NO_PAIRS)
     tetrahedra: Indices = field(default_factory=lambda: np.empty((0, 4), np.int64))
     groups: Mapping[str, Indices] = field(default_factory=dict[str, Indices])
     attributes: Mapping[str, Points] = field(default_factory=dict[str, Points])
+    counted: Literal["line", "face"] = "face"
 
     @property
     def lines_only(self) -> bool:
@@ -76,10 +88,12 @@ def network(cells: Cells, rule: SpringRule, path: Path) -> Mesh:
     Where every cell names two vertices, each is a spring (STRETCH), in file order: polygons, then segments.
     Otherwise the springs are unique pairs in lexicographic order: the sides of polygons, the segments and the
     edges of tetrahedra (STRETCH), then with `face_pairs` the other pairs of corners of a face (SHEAR).
-    Triangles: the polygons as fans, or the surface of the tetrahedra, facing outwards. Mass goes by volume
-    where there are tetrahedra, else by area, else by length; a vertex that no such cell uses gets none.
+    Triangles: those of the polygons, or the surface of the tetrahedra, facing outwards. Mass goes by volume
+    where there are tetrahedra, else by area, else by length; a vertex that no such cell uses gets none. A cell that
+    repeats another, or is a part of it, counts once, with a warning.
 
-    Raises InputError where there are no vertices or springs, too many, or nothing that has a size.
+    Raises InputError where there are no vertices or springs, too many, nothing that has a size, and for faces that
+    cross themselves.
     """
     rest, groups = cells.points, list(cells.polygons.values())
     pairs = sum(len(g) * (g.shape[1] if rule == "edges" else g.shape[1] ** 2 // 2) for g in groups)
@@ -103,12 +117,13 @@ def network(cells: Cells, rule: SpringRule, path: Path) -> Mesh:
             springs[SHEAR] = _without(
                 unique_pairs(np.concatenate([NO_PAIRS, *map(corner_pairs, groups)])), springs[STRETCH]
             )
-    triangles = np.concatenate([NO_TRIANGLES, *map(fan, groups)])
+    triangles, areas = _surface_of_faces(cells, path)
     if len(cells.tetrahedra):
-        triangles = _surface(rest, cells.tetrahedra)
-        dimension, weights = 3, by_volume(rest, cells.tetrahedra)
+        tetrahedra = _distinct_tetrahedra(cells.tetrahedra, path)
+        triangles, areas = _surface(rest, tetrahedra), None
+        dimension, weights = 3, by_volume(rest, tetrahedra)
     elif len(triangles):
-        dimension, weights = 2, by_area(rest, triangles)
+        dimension, weights = 2, by_area(rest, triangles) if areas is None else areas
     else:
         dimension, weights = 1, by_length(rest, springs[STRETCH])
     if not weights.any():
@@ -125,7 +140,68 @@ def network(cells: Cells, rule: SpringRule, path: Path) -> Mesh:
         resolution=0,
         parts=box_parts(rest) | dict(cells.groups),
         attributes=cells.attributes,
+        areas=areas,
     )
+
+
+def _surface_of_faces(cells: Cells, path: Path) -> tuple[Indices, Points | None]:
+    """The triangles (f, 3) of the faces, each part of the surface once, and the areas (n,) [m^2] by vertex, None where
+    they are thirds of the triangles."""
+    faces = {k: polygons for k, polygons in cells.polygons.items() if k >= 3}
+    places = {k: cells.places.get(k, np.arange(len(polygons))) for k, polygons in faces.items()}
+    surfaces = {k: triangulate(cells.points, polygons) for k, polygons in faces.items()}
+    crossed = [(int(places[k][i]), k) for k, made in surfaces.items() for i in np.flatnonzero(made.failed).tolist()]
+    if crossed:
+        raise InputError([_crossed_face(cells, path, *one) for one in sorted(crossed)[:_MOST_MISTAKES]])
+    first = {k: repeated_rows(polygons) for k, polygons in faces.items()}
+    new = {k: first[k] == np.arange(len(first[k])) for k in faces}
+    repeats = [
+        (int(places[k][i]), int(places[k][first[k][i]])) for k in faces for i in np.flatnonzero(~new[k]).tolist()
+    ]
+    for cover in find_covers(cells.points, faces, surfaces):
+        larger = places[cover.larger][cover.larger_rows].tolist()
+        fresh = new[cover.corners][cover.rows]
+        mine = places[cover.corners][cover.rows]
+        repeats += [(int(a), int(b)) for a, b in zip(mine[fresh], np.array(larger)[fresh], strict=True)]
+        new[cover.corners][cover.rows] = False
+    if repeats:
+        _warn_of_repeats(cells, path, sorted(repeats))
+    kept = {k: surfaces[k].chosen(new[k]) for k in faces}
+    triangles = np.concatenate([NO_TRIANGLES, *(made.triangles.reshape(-1, 3) for made in kept.values())])
+    if set(faces) <= {3}:
+        return triangles, None
+    areas = [vertex_areas(cells.points, faces[k][new[k]], kept[k]) for k in faces]
+    return triangles, np.sum(areas, axis=0)
+
+
+def _crossed_face(cells: Cells, path: Path, place: int, corners: int) -> Mistake:
+    problem = "the sides of this face cross each other; list its corners in order around it, or split it into triangles"
+    if corners > MAX_CONCAVE_CORNERS:
+        problem = f"this face of {corners:,} corners is not convex; split it ({MAX_CONCAVE_CORNERS:,} corners at most)"
+    if cells.counted == "line":
+        return Mistake(problem, path, place)
+    return Mistake(f"face {place} (counted from 0): {problem}", path)
+
+
+def _warn_of_repeats(cells: Cells, path: Path, repeats: list[tuple[int, int]]) -> None:
+    """Say which faces repeat another; pairs of places, the repetition first."""
+    what = "line" if cells.counted == "line" else "face, counted from 0"
+    listed = ", ".join(f"{place} repeats {other}" for place, other in repeats[:_MOST_REPEATS])
+    more = f", and {len(repeats) - _MOST_REPEATS:,} more" if len(repeats) > _MOST_REPEATS else ""
+    problem = f"{len(repeats):,} faces repeat others, or a part of them; each counts once ({what}: {listed}{more})"
+    _LOG.warning("%s", Mistake(problem, path, repeats[0][0] if cells.counted == "line" else None))
+
+
+def _distinct_tetrahedra(tetrahedra: Indices, path: Path) -> Indices:
+    """Each set of corners once."""
+    new = repeated_rows(tetrahedra) == np.arange(len(tetrahedra))
+    if not new.all():
+        at = int(np.flatnonzero(~new)[0])
+        problem = (
+            f"{int((~new).sum()):,} tetrahedra repeat others; each counts once (the first is {at}, counted from 0)"
+        )
+        _LOG.warning("%s", Mistake(problem, path))
+    return tetrahedra[new]
 
 
 def _edges(tetrahedra: Indices) -> Indices:

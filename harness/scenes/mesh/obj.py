@@ -125,6 +125,8 @@ class _Reader:
             attributes=dict(zip(("red", "green", "blue"), np.array(colours).T.copy(), strict=False)),
             points=np.array(self.points, np.float64),
             polygons={k: np.array(self.polygons[k], np.int64) for k in sorted(self.polygons)},
+            places={k: np.array(lines, np.int64) for k, lines in self.lines.items()},
+            counted="line",
             segments=np.array(self.segments, np.int64) if self.segments else NO_PAIRS,
         )
 

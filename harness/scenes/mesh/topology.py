@@ -122,6 +122,7 @@ def assemble(
     spacing: float | None = None,
     resolution: int = 0,
     parts: Mapping[str, ArrayLike] | None = None,
+    areas: Points | None = None,
     attributes: Mapping[str, Points] | None = None,
 ) -> Mesh:
     """A mesh of springs given by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND.
@@ -145,5 +146,6 @@ def assemble(
         spacing=spacing,
         resolution=resolution,
         parts={name: distinct(np.asarray(part, np.int64), len(rest)) for name, part in (parts or {}).items()},
+        areas=areas,
         attributes=dict(attributes or {}),
     )

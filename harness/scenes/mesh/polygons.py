@@ -1,0 +1,301 @@
+"""Faces of any number of corners: triangles, areas by vertex, and duplicates, whichever corner a face lists first.
+
+Triangles: a convex quadrangle is cut by its shorter diagonal; a convex face of more corners is a fan from its
+lowest-numbered vertex; other faces lose one ear after the other, that with the shortest diagonal first (Meisters 1975,
+"Polygons have ears"). Lengths that differ by less than a millionth count as equal, and the diagonal with the lowest
+numbers is taken. Convex is what is so in the plane across the face's vector area.
+
+Areas: the mean over the fans from all corners, for a convex face. That is half of each diagonal's thirds in a
+quadrangle, which is also what the bilinear map gives, and thirds in a triangle:
+
+    a_i = (t_(i-1) + t_i)/3 + sum(t)/(3 k),     t_i the area of the mean of the k corners, corner i and corner i + 1
+
+Faces that are not convex give each corner a third of its triangles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.scenes.mesh.topology import Indices, Points, by_area
+
+MAX_CONCAVE_CORNERS = 2_000
+"""More corners take too long: each ear is looked for among all of them."""
+_ROUND = 16.0 * float(np.finfo(np.float64).eps)
+"""Of the coordinates times the size of a face: an area below it is round-off."""
+_EQUAL = 1e-6
+"""Squared lengths that differ by less are equal, relatively."""
+_INSIDE = 1e-9
+"""Of a triangle: how far outside of it a point still counts as inside."""
+_AT_ONCE = 1_000_000
+"""Corners that are looked at together."""
+
+
+class Surface(NamedTuple):
+    """Triangles (f, k - 2, 3) of f faces of k corners, in their orientation; convex (f,); failed (f,): faces whose
+    boundary crosses itself, whose triangles mean nothing."""
+
+    triangles: Indices
+    convex: NDArray[np.bool_]
+    failed: NDArray[np.bool_]
+
+    def chosen(self, rows: NDArray[np.bool_]) -> Surface:
+        """The same of some of the faces, rows (f,)."""
+        return Surface(self.triangles[rows], self.convex[rows], self.failed[rows])
+
+
+def triangulate(rest: Points, polygons: Indices) -> Surface:
+    """Cut faces (f, k) of vertices at rest (n, 3) [m] into triangles."""
+    f, k = polygons.shape
+    if k == 3:
+        return Surface(polygons.reshape(f, 1, 3), np.ones(f, np.bool_), np.zeros(f, np.bool_))
+    some = max(1, _AT_ONCE // k)
+    parts = [_triangulate(rest, polygons[i : i + some]) for i in range(0, f, some)]
+    return Surface(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _triangulate(rest: Points, polygons: Indices) -> Surface:
+    f, k = polygons.shape
+    around: Indices = (polygons.argmin(axis=1)[:, None] + np.arange(k, dtype=np.int64)) % k
+    corners = np.take_along_axis(polygons, around, axis=1)
+    flat, slack = _projected(rest, corners)
+    turns = _turn(np.roll(flat, 1, axis=1), flat, np.roll(flat, -1, axis=1))
+    convex = (turns >= -slack[:, None]).all(axis=1) & _winds_once(flat, slack)
+    strict = convex & (turns > slack[:, None]).all(axis=1)
+    triangles, failed = np.empty((f, k - 2, 3), np.int64), np.zeros(f, np.bool_)
+    triangles[strict] = _halves(rest, corners[strict]) if k == 4 else _fans(corners[strict])
+    rows = np.flatnonzero(~strict)
+    if len(rows) and k > MAX_CONCAVE_CORNERS:
+        failed[rows] = True
+    elif len(rows):
+        triangles[rows], failed[rows] = _clip_ears(rest, corners[rows], flat[rows], slack[rows])
+        rows = rows[~convex[rows]]
+        failed[rows] |= _crosses(flat[rows], slack[rows])
+    return Surface(triangles, convex, failed)
+
+
+def _halves(rest: Points, corners: Indices) -> Indices:
+    """The triangles (f, 2, 3) of convex quadrangles (f, 4), the lowest corner first."""
+    one, two = (((rest[corners[:, i + 2]] - rest[corners[:, i]]) ** 2).sum(axis=1) for i in (0, 1))
+    other = one > (1.0 + _EQUAL) * two
+    cuts = np.where(other[:, None], [0, 1, 3, 1, 2, 3], [0, 1, 2, 0, 2, 3])
+    return _lowest_first(np.take_along_axis(corners, cuts, axis=1).reshape(-1, 2, 3))
+
+
+def _fans(corners: Indices) -> Indices:
+    """The triangles (f, k - 2, 3) of faces (f, k) around their first corners."""
+    first = np.repeat(corners[:, :1], corners.shape[1] - 2, axis=1)
+    return np.stack([first, corners[:, 1:-1], corners[:, 2:]], axis=2)
+
+
+def _lowest_first(triangles: Indices) -> Indices:
+    """The same triangles (..., 3), each from its lowest corner on."""
+    lowest = triangles.argmin(axis=-1)[..., None]
+    return np.take_along_axis(triangles, (lowest + np.arange(3)) % 3, axis=-1)
+
+
+def vertex_areas(rest: Points, polygons: Indices, surface: Surface) -> Points:
+    """The area (n,) [m^2] of faces (f, k) by vertex."""
+    if polygons.shape[1] == 3:
+        return by_area(rest, polygons)
+    faces = polygons[surface.convex]
+    areas = by_area(rest, surface.triangles[~surface.convex].reshape(-1, 3))
+    p = rest[faces]
+    p = p - p[:, :1]
+    p = p - p.mean(axis=1, keepdims=True)
+    t = np.linalg.norm(np.cross(p, np.roll(p, -1, axis=1)), axis=2) / 2
+    shares = (t + np.roll(t, 1, axis=1)) / 3 + t.sum(axis=1, keepdims=True) / (3 * faces.shape[1])
+    return areas + np.bincount(faces.ravel(), shares.ravel(), minlength=len(rest))
+
+
+def repeated_rows(cells: Indices) -> Indices:
+    """For each cell (f, k) the first one with the same vertices in any order, (f,): itself if it is new."""
+    rows = np.sort(cells, axis=1)
+    order = np.lexsort(rows.T[::-1]) if len(rows) > 1 else np.arange(len(rows))  # stable: the first one leads
+    new = np.ones(len(rows), np.bool_)
+    new[1:] = (rows[order][1:] != rows[order][:-1]).any(axis=1)
+    first = np.empty(len(rows), np.int64)
+    first[order] = order[np.flatnonzero(new)][np.cumsum(new) - 1]
+    return first
+
+
+class Cover(NamedTuple):
+    """Faces of `corners` corners, their rows (c,), that faces of `larger` corners, their rows (c,), cover."""
+
+    corners: int
+    rows: Indices
+    larger: int
+    larger_rows: Indices
+
+
+def find_covers(rest: Points, polygons: Mapping[int, Indices], surfaces: Mapping[int, Surface]) -> list[Cover]:
+    """Find faces that are a part of a larger one: all their corners are its corners, and they lie inside it."""
+    sizes = [k for k in sorted(polygons) if k >= 3 and len(polygons[k])]
+    if len(sizes) < 2:
+        return []
+    from scipy.sparse import csr_array  # for those who mix faces
+
+    def incidence(faces: Indices) -> csr_array:
+        ends = np.arange(len(faces) + 1) * faces.shape[1]
+        return csr_array((np.ones(faces.size, np.int32), faces.ravel(), ends), shape=(len(faces), len(rest)))
+
+    found: list[Cover] = []
+    for small, large in combinations(sizes, 2):
+        common = (incidence(polygons[small]) @ incidence(polygons[large]).T).tocoo()
+        shared = common.data == small
+        part, whole = (np.asarray(x[shared], np.int64) for x in common.coords)
+        inside = _contains(rest, surfaces[large].triangles[whole], surfaces[small].triangles[part])
+        rows, first = np.unique(part[inside], return_index=True)
+        if len(rows):
+            found.append(Cover(small, rows, large, whole[inside][first]))
+    return found
+
+
+def _contains(rest: Points, large: Indices, small: Indices) -> NDArray[np.bool_]:
+    """Whether the middles of the triangles small (c, s, 3) all lie in triangles of large (c, l, 3), seen along the
+    normal of these."""
+    a, b, c = (rest[large[..., i]] for i in range(3))
+    normal = np.cross(b - a, c - a).sum(axis=1)
+    middle = rest[small].mean(axis=2)[:, :, None]
+    margin = -_INSIDE * (normal**2).sum(axis=1)[:, None, None]
+    inside = np.ones((len(large), small.shape[1], large.shape[1]), np.bool_)
+    for p, q in ((a, b), (b, c), (c, a)):
+        turn = np.cross((q - p)[:, None], middle - p[:, None])
+        inside &= np.einsum("csli,ci->csl", turn, normal) >= margin
+    return inside.any(axis=2).all(axis=1)
+
+
+def _projected(rest: Points, corners: Indices) -> tuple[Points, Points]:
+    """Corners (f, k) in the plane across each face's vector area, (f, k, 2) [m]; twice the area (f,) that is none."""
+    p = rest[corners]
+    farthest = np.abs(p).max(axis=(1, 2))
+    p = p - p[:, :1]
+    size = np.linalg.norm(np.ptp(p, axis=1), axis=1)
+    normal = np.cross(p, np.roll(p, -1, axis=1)).sum(axis=1)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    slack = _ROUND * farthest * size
+    # Lobes may cancel: then the plane of the largest corner shows how the face crosses itself.
+    sides = np.roll(p, -1, axis=1) - p
+    turns = np.cross(np.roll(sides, 1, axis=1), sides)
+    largest = turns[np.arange(len(p)), np.linalg.norm(turns, axis=2).argmax(axis=1)]
+    normal = np.where(length > slack[:, None], normal, largest)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.divide(normal, length, out=np.tile([0.0, 0.0, 1.0], (len(p), 1)), where=length > 0.0)
+    axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    u = np.cross(axis, normal)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(normal, u)
+    flat = np.stack([np.einsum("fkx,fx->fk", p, u), np.einsum("fkx,fx->fk", p, v)], axis=2)
+    return flat, slack
+
+
+def _turn(a: Points, b: Points, c: Points) -> Points:
+    """Twice the signed areas of triangles in the plane, (..., 2) each."""
+    one, two = b - a, c - b
+    return one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0]
+
+
+def _winds_once(flat: Points, slack: Points) -> NDArray[np.bool_]:
+    """Whether closed paths (f, k, 2) that only turn left go around once: a pentagram goes around twice."""
+    if flat.shape[1] == 4:
+        return np.ones(len(flat), np.bool_)
+    sides = np.roll(flat, -1, axis=1) - flat
+    angle = np.arctan2(sides[..., 1], sides[..., 0])
+    turned = np.mod(np.roll(angle, -1, axis=1) - angle + np.pi, 2 * np.pi) - np.pi
+    return np.abs(turned.sum(axis=1)) < 3 * np.pi
+
+
+def _crosses(flat: Points, slack: Points) -> NDArray[np.bool_]:
+    """Whether two sides of a closed path (f, k, 2) cross each other; those that only touch do not."""
+    k = flat.shape[1]
+    a, b, found = flat, np.roll(flat, -1, axis=1), np.zeros(len(flat), np.bool_)
+    for shift in range(2, k // 2 + 1):
+        c, d = np.roll(a, -shift, axis=1), np.roll(b, -shift, axis=1)
+        sides = [_turn(a, b, c), _turn(a, b, d), _turn(c, d, a), _turn(c, d, b)]
+        apart = np.min(np.abs(sides), axis=0) > slack[:, None]
+        found |= (apart & (sides[0] * sides[1] < 0.0) & (sides[2] * sides[3] < 0.0)).any(axis=1)
+    return found
+
+
+def _clip_ears(rest: Points, corners: Indices, flat: Points, slack: Points) -> tuple[Indices, NDArray[np.bool_]]:
+    """The triangles (f, k - 2, 3) of faces (f, k), and which faces (f,) have no ear left though corners are left."""
+    f, k = corners.shape
+    triangles, failed = np.zeros((f, k - 2, 3), np.int64), np.zeros(f, np.bool_)
+    around: Indices = np.arange(k, dtype=np.int64)
+    before: Indices = np.tile(np.roll(around, 1), (f, 1))
+    after: Indices = np.tile(np.roll(around, -1), (f, 1))
+    there, rejected = np.ones((f, k), np.bool_), np.zeros((f, k), np.bool_)
+    clipped, since = np.zeros(f, np.int64), np.zeros(f, np.int64)  # since: ears clipped since rejections were cleared
+    every: Indices = np.arange(f, dtype=np.int64)
+    turn = _turn(np.take_along_axis(flat, before[..., None], 1), flat, np.take_along_axis(flat, after[..., None], 1))
+    squared = _diagonals(rest, corners, before, after)
+    while len(every):
+        r: Indices = every
+        left = there[r] & ~rejected[r]
+        ears = left & (turn[r] > slack[r, None])
+        lost: NDArray[np.bool_] = np.logical_not(ears.any(axis=1))
+        again = lost & (since[r] > 0) & rejected[r].any(axis=1)
+        rejected[r[again]] = False
+        since[r[again]] = 0
+        empty = left & (np.abs(turn[r]) <= slack[r, None])  # corners without area go where there is no ear
+        ears = np.where((lost & ~again)[:, None], empty, ears)
+        failed[r[lost & ~again & ~ears.any(axis=1)]] = True
+        some = np.flatnonzero(ears.any(axis=1))
+        r, ears, forced = r[some], ears[some], lost[some]
+        tip = _first_of_shortest(ears, squared[r], corners[r], before[r], after[r])
+        a, c = before[r, tip], after[r, tip]
+        blocked = ~forced & _blocked(flat[r], there[r], a, tip, c, slack[r])
+        rejected[r[blocked], tip[blocked]] = True
+        r, a, tip, c = r[~blocked], a[~blocked], tip[~blocked], c[~blocked]
+        triangles[r, clipped[r]] = np.stack([corners[r, a], corners[r, tip], corners[r, c]], axis=1)
+        there[r, tip] = False
+        after[r, a], before[r, c] = c, a
+        for end in (a, c):
+            b, d = before[r, end], after[r, end]
+            turn[r, end] = _turn(flat[r, b], flat[r, end], flat[r, d])
+            squared[r, end] = ((rest[corners[r, d]] - rest[corners[r, b]]) ** 2).sum(axis=1)
+            rejected[r, end] = False
+        clipped[r] += 1
+        since[r] += 1
+        every = every[~failed[every] & (clipped[every] < k - 3)]
+    last = np.argsort(~there, axis=1, kind="stable")[:, :3]
+    triangles[:, -1] = np.take_along_axis(corners, last, axis=1)
+    return _lowest_first(triangles), failed
+
+
+def _diagonals(rest: Points, corners: Indices, before: Indices, after: Indices) -> Points:
+    """The squared length (f, k) [m^2] of what each corner's neighbours are apart."""
+    one, two = (rest[np.take_along_axis(corners, index, axis=1)] for index in (before, after))
+    return ((two - one) ** 2).sum(axis=2)
+
+
+def _first_of_shortest(
+    ears: NDArray[np.bool_], squared: Points, corners: Indices, before: Indices, after: Indices
+) -> Indices:
+    """Of the ears (f, k) that with the shortest diagonal; of equal ones the lowest numbers, (f,)."""
+    shortest = np.where(ears, squared, np.inf)
+    tied = ears & (shortest <= (1.0 + _EQUAL) * shortest.min(axis=1, keepdims=True))
+    one, two = (np.take_along_axis(corners, index, axis=1) for index in (before, after))
+    most = np.iinfo(np.int64).max
+    for key in (np.minimum(one, two), np.maximum(one, two), corners):
+        key = np.where(tied, key, most)
+        tied &= key == key.min(axis=1, keepdims=True)
+    return tied.argmax(axis=1)
+
+
+def _blocked(
+    flat: Points, there: NDArray[np.bool_], a: Indices, b: Indices, c: Indices, slack: Points
+) -> NDArray[np.bool_]:
+    """Whether another corner lies in the triangle of the corners a, b, c (f,), or on its sides; not at its corners."""
+    rows = np.arange(len(flat))
+    p, q, s = (flat[rows, x][:, None] for x in (a, b, c))
+    margin = -slack[:, None]
+    inside = (_turn(p, q, flat) >= margin) & (_turn(q, s, flat) >= margin) & (_turn(s, p, flat) >= margin)
+    for corner in (p, q, s):
+        inside &= ((flat - corner) ** 2).sum(axis=2) > slack[:, None]
+    return (inside & there).any(axis=1)
