@@ -14,7 +14,9 @@ from socket import create_connection
 from typing import Any
 from urllib.parse import urlsplit
 
+from dask import config
 from distributed import LocalCluster
+from distributed.security import Security
 from ruamel.yaml import YAML
 
 from harness.base.errors import InputError, Mistake
@@ -31,13 +33,25 @@ SILENCE = logging.CRITICAL
 
 @contextmanager
 def scheduler(on: str) -> Generator[Any]:
-    """An address as it stands, or the cluster that is started for as long. Raises InputError."""
+    """An address as it stands, or the cluster that is started for as long. Raises InputError.
+
+    A cluster on this machine takes TLS connections alone, by a certificate that its processes hold in memory: whoever
+    connects to a scheduler has it run any code, and all users of the machine reach the loopback. Its HTTP servers ask
+    for no certificate, and serve no pages.
+    """
     kind, _, many = on.partition(":")
     if kind == "local":
         if not many.isdecimal() or not 1 <= int(many) <= 1024:
             raise InputError(Mistake(f"came {on}; wanted local:N with a number of workers", key="--on"))
+        try:
+            secure = Security.temporary()
+        except ImportError:
+            raise InputError(Mistake("needs cryptography: pip install 'springbench[cluster]'", key="--on")) from None
         quiet: Any = {"dashboard_address": None, "silence_logs": SILENCE}
-        with LocalCluster(n_workers=int(many), threads_per_worker=1, **quiet) as found:
+        with (
+            config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}),
+            LocalCluster(n_workers=int(many), threads_per_worker=1, security=secure, **quiet) as found,
+        ):
             yield found
     elif on.endswith((".yaml", ".yml")):
         with _batch(Path(on)) as found:

@@ -5,17 +5,22 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
+import ssl
 import threading
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pyarrow as pa
 import pytest
 from distributed import Client, LocalCluster
+from distributed.security import Security
 
 from harness.base.machine import node
 from harness.config.load import load_any
 from harness.experiments.ability import NAMES as MACHINE
+from harness.experiments.scheduler import scheduler
 from harness.experiments.sweep import run_sweep
 from tests.displays import Quiet
 from tests.own_solvers import SCENE, SOURCE, own
@@ -40,6 +45,45 @@ def test_runs_are_done_by_workers_and_a_crash_is_a_row(tmp_path: Path, monkeypat
     assert "ended its process with exit code 3" in first["mine"]["reason"]
     assert {row["node"] for row in first.values()} == {node()}
     assert not [*(tmp_path / "r").rglob("*partial*")]
+
+
+def refused(place: tuple[str, int], security: Security | None) -> bool:
+    """Whether a server talks neither Dask's protocol, with this certificate if any, nor HTTP, but of pages it lacks."""
+    bare = ssl.create_default_context()
+    bare.check_hostname, bare.verify_mode = False, ssl.CERT_NONE
+    context = security.get_connection_args("client")["ssl_context"] if security else bare
+    with socket.create_connection(place, timeout=10.0) as connection:
+        try:
+            with context.wrap_socket(connection, server_hostname="dask-internal") as talk:
+                talk.sendall(b"\0" * 64)
+                return not talk.recv(1)
+        except OSError:
+            pass
+    with socket.create_connection(place, timeout=10.0) as connection:
+        connection.sendall(b"GET /health HTTP/1.0\r\n\r\n")
+        try:
+            return connection.recv(64).startswith((b"HTTP/1.1 404", b"HTTP/1.0 404")) or not connection.recv(1)
+        except OSError:
+            return True
+
+
+def test_nobody_without_the_certificate_reaches_a_cluster_of_this_machine():
+    with scheduler("local:1") as found, Client(found, timeout=60.0) as client:
+        assert client.submit(os.getpid).result() != os.getpid()
+        me = psutil.Process()
+        there = [c for process in (me, *me.children(recursive=True)) for c in process.net_connections()]
+        places = {(c.laddr.ip, c.laddr.port) for c in there if c.status == "LISTEN"}
+        assert {place for place, _ in places} == {"127.0.0.1"}
+        assert int(found.scheduler_address.rpartition(":")[2]) in {port for _, port in places}
+        another = Security.temporary()
+        assert all(refused(place, security) for place in places for security in (None, another))
+        mine = found.security.get_connection_args("client")["ssl_context"]
+        address = found.scheduler_address.rpartition(":")[2]
+        with (
+            socket.create_connection(("127.0.0.1", int(address))) as connection,
+            mine.wrap_socket(connection, server_hostname="dask-internal") as talk,
+        ):
+            assert talk.recv(1), "with the certificate the scheduler answers"
 
 
 RUNS, FRAMES, ROUNDS, SLEEP = 12, 2, 2, 0.02
