@@ -3,7 +3,7 @@
 A benchmark that was measured against a yardstick stores `extra_info["ratio"]` (median, low, high): it is slower
 where the new interval lies wholly above the old one, by more than a margin. Of others the minima are compared, with a
 wide margin, and a difference between two machines is a remark only. A benchmark that vanished counts as a
-regression: deleting a gate must not open it.
+regression: deleting a gate must not open it. Of files without a common benchmark nothing can be told.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from rich.table import Table
 
 from harness.base.console import narrow
 from harness.base.errors import InputError, Mistake
+from harness.report.stored import CANNOT_TELL
 
 RATIO_MARGIN = 0.10
 """Beyond both intervals: those of two runs of the same code lay up to 4 % apart on a loaded machine."""
@@ -102,11 +103,15 @@ class Stored(BaseModel):
 
 
 def compare(base: Path, new: Path, console: Console) -> int:
-    """Print a table of what changed from `base` to `new`; 1 if anything became slower or vanished, else 0.
+    """Print a table of what changed from `base` to `new`; 1 if anything became slower or vanished, CANNOT_TELL if they
+    have no benchmark in common, else 0.
 
     Raises InputError for a file that pytest-benchmark did not store.
     """
     old, now = read_stored(base), read_stored(new)
+    if not old.by_name.keys() & now.by_name.keys():
+        console.print(f"cannot tell: {base} and {new} have no benchmark in common", markup=False)
+        return CANNOT_TELL
     same = old.machine == now.machine
     table = Table("benchmark", "old", "new", "change", "verdict", box=SIMPLE_HEAD)
     verdicts: list[str] = []

@@ -29,6 +29,10 @@ from harness.base import rows, shelf, statistics
 from harness.base.console import narrow
 from harness.base.errors import InputError, Mistake
 
+CANNOT_TELL = 3
+"""The exit code of a gate where valid results have nothing that can be compared: 2 would blame one of the files, and
+neither 0 nor 1 would be true."""
+
 MARGIN = 0.10
 """Beyond the interval: minima of two runs of the same code lie up to 4 % apart on an idle machine, more on others."""
 
@@ -67,12 +71,16 @@ class StoredRun:
 
 
 def compare(old: Path, new: Path, console: Console, yardstick: str | None = None) -> int:
-    """Print what changed from `old` to `new`; 1 if anything became slower or fails now, else 0.
+    """Print what changed from `old` to `new`; 1 if anything became slower or fails now, CANNOT_TELL with the reasons
+    if nothing can be compared, else 0.
 
-    yardstick: the name of a solver; times are then its multiples, which compare between machines too.
-    Raises InputError where nothing can be compared, with the reasons.
+    yardstick: the name of a solver; times are then its multiples, which compare between machines too. Raises InputError
+    for what holds no results, or those of no such solver.
     """
     was, now = read(old), read(new)
+    for path, runs in ((old, was), (new, now)):
+        if yardstick is not None and all(run.row["solver"] != yardstick for run in runs.values()):
+            raise InputError(Mistake(f"{yardstick} was not run in {path}; wanted a solver of both", key="--yardstick"))
     table = Table(
         "run", "old", "new", "change", "verdict", "iterations", "residual", "error", "last positions", box=SIMPLE_HEAD
     )
@@ -96,7 +104,8 @@ def compare(old: Path, new: Path, console: Console, yardstick: str | None = None
         table.add_row(escape(before.name), *figures, verdict, *_beside(before, after))
     if not compared:
         said = "; ".join(dict.fromkeys(refused.values())) or "they have no run in common"
-        raise InputError(f"{old} and {new} cannot be compared: {said}")
+        console.print(f"cannot tell: {old} and {new} cannot be compared: {said}", markup=False)
+        return CANNOT_TELL
     console.print(narrow(table))
     for name, reason in refused.items():
         console.print(f"not compared: {name}: {reason}", markup=False)

@@ -121,6 +121,12 @@ def test_a_foreign_file_is_the_users_mistake(content: str | None, told: str, tmp
         assert "wanted a file that pytest-benchmark stored" in message
 
 
+def test_files_without_a_common_benchmark_tell_nothing(tmp_path: Path):
+    code, text = judged(stored(tmp_path / "a.json", benchmark("a")), stored(tmp_path / "b.json", benchmark("b")))
+    assert code == 3
+    assert "no benchmark in common" in text
+
+
 @pytest.mark.parametrize(("new", "code"), [(1.0, 0), (1.5, 1), (None, 2)])
 def test_the_command_line_answers_with_the_exit_code(new: float | None, code: int, tmp_path: Path):
     base = stored(tmp_path / "base.json", benchmark(ratio=ratio(1.0)))

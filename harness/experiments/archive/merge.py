@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 
 from harness.base import columns, holding, rows, shelf, union
 from harness.base.claim import NAME as CLAIM
-from harness.base.claim import claimed
+from harness.base.claim import claimed, config_of
 from harness.base.errors import InputError, Mistake
 from harness.base.files import replacing
 from harness.experiments.archive.compact import TABLES, fitting_schema
@@ -179,9 +179,8 @@ def _copy(path: Path, target: Path) -> None:
 
 def _claim(source: Path, home: Path) -> None:
     """The merged folder belongs to the config of its sources, where that is still there."""
-    note = source / CLAIM
-    config = source / note.read_text(errors="replace").strip() if note.is_file() else None
-    if config and config.is_file() and not (home / CLAIM).exists():
+    config = config_of(source)
+    if config and not (home / CLAIM).exists():
         claimed(home, config)
 
 

@@ -5,8 +5,10 @@
     environment/           the machine, and the installed packages as `pip install -r` takes them
     CITATION.cff, ro-crate-metadata.json, SHA256SUMS
 
-It unpacks to a folder of results: `springbench list`, `query` and `gate` work on it as on any other. The metadata are
-those of RO-Crate 1.1 (https://w3id.org/ro/crate/1.1), the checksums are for `sha256sum -c`.
+Only files that lie in the folder of results, or in a config's folder, go in: all others to which a link or a config
+leads are refused by name. The archive unpacks to a folder of results: `springbench list`, `query` and `gate` work on it
+as on any other. The metadata are those of RO-Crate 1.1 (https://w3id.org/ro/crate/1.1), the checksums are for
+`sha256sum -c`.
 """
 
 from __future__ import annotations
@@ -15,8 +17,10 @@ import hashlib
 import json
 import mimetypes
 import os
+import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import distributions, version
@@ -25,9 +29,12 @@ from typing import Any
 
 from harness.base import machine, rows, shelf
 from harness.base.claim import NAME as CLAIM
+from harness.base.claim import config_of
 from harness.base.document import is_list
 from harness.base.errors import InputError, Mistake
 from harness.base.files import replacing
+from harness.base.model import Model
+from harness.base.yaml import read_yaml
 from harness.config.load import load_any
 from harness.experiments.archive.merge import sweeps
 from harness.scenes.mesh.scene_json import read_scene_json
@@ -37,6 +44,8 @@ SUMS, CRATE, CITATION = "SHA256SUMS", "ro-crate-metadata.json", "CITATION.cff"
 _PACKAGE = Path(__file__).resolve().parents[2]
 _KINDS = {".parquet": "application/vnd.apache.parquet", ".rrd": "application/octet-stream", ".yaml": "application/yaml"}
 _BUFFER = 2**20
+_ODD = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
+"""Characters that neither archives nor checksums hold in the names of files."""
 
 Content = Path | bytes
 
@@ -44,22 +53,36 @@ Content = Path | bytes
 def publish(results: Path, archive: Path, say: Callable[[str], None], *, license: str = "") -> int:
     """Write an archive (.zip) of a folder of results, or of one sweep's; how many files it holds.
 
-    license: what others may do with it, a name or a URL. Damaged rows are refused. Raises InputError, CannotWrite.
+    license: what others may do with it, a name or a URL. Damaged rows are refused, and files outside of the folders.
+    Raises InputError, CannotWrite.
     """
-    if archive.suffix.lower() != ".zip":
-        raise InputError(Mistake("wanted a name that ends in .zip", archive, key="--output"))
+    if archive.suffix.lower() != ".zip" or archive.is_dir():
+        raise InputError(Mistake("wanted the name of a file that ends in .zip", archive, key="--output"))
+    if not archive.parent.is_dir():
+        raise InputError(Mistake(f"there is no folder {archive.parent}; make it first", archive, key="--output"))
     content: dict[str, Content] = {}
+    refused: list[Mistake] = []
     for folder in sweeps(results):
         name = "/".join(folder.relative_to(results).parts) or folder.resolve().name
-        rows.read(shelf.units(folder / "rows"))  # names what is damaged
-        content |= {f"results/{name}/{file.relative_to(folder).as_posix()}": file for file in _shown(folder)}
-        if config := config_of(folder):
-            root, files = _needed(config)
-            content |= {f"configs/{name}/{file.relative_to(root).as_posix()}": file for file in files}
-            way = os.path.relpath(f"configs/{name}/{config.relative_to(root).as_posix()}", f"results/{name}")
+        files = [file for file in _shown(folder) if file.resolve() != archive.resolve()]
+        refused += [Mistake(why, file) for file in files if (why := _unfit(file, results))]
+        content |= {f"results/{name}/{file.relative_to(folder).as_posix()}": file for file in files}
+        config = config_of(folder)
+        if config and _is_config(config):
+            files = _needed(config)
+            refused += [Mistake(why, file) for file in files if (why := _unfit(file, config.parent))]
+            content |= {f"configs/{name}/{os.path.relpath(file, config.parent)}": file for file in files}
+            way = os.path.relpath(f"configs/{name}/{config.name}", f"results/{name}")
             content[f"results/{name}/{CLAIM}"] = f"{way}\n".encode()
         else:
-            say(f"{folder}: its config is not there any more, so nobody can do its runs again")
+            gone = f"what it names as its config, {config}, is none" if config else "its config is not there any more"
+            say(f"{folder}: {gone}, so nobody can do its runs again")
+    odd = "its name is no UTF-8, or breaks a line; rename it"
+    refused += [Mistake(odd, Path(name)) for name in content if _ODD.search(name)]
+    if refused:
+        raise InputError(refused)
+    for folder in sweeps(results):
+        rows.read(shelf.units(folder / "rows"))  # names what is damaged
     content |= {"environment/machine.json": _environment(), "environment/requirements.txt": _requirements()}
     if citation := next((p for p in (_PACKAGE.parent / CITATION, _PACKAGE / CITATION) if p.is_file()), None):
         content[CITATION] = citation
@@ -73,38 +96,53 @@ def _shown(folder: Path) -> Iterator[Path]:
     for path in sorted(folder.rglob("*")):
         place = path.relative_to(folder)
         hidden = any(part.startswith(".") for part in place.parts)
-        if path.is_file() and not path.is_symlink() and not hidden and place.parts[0] != "build":
+        if (path.is_file() or path.is_symlink()) and not hidden and place.parts[0] != "build":
             yield path
 
 
-def config_of(folder: Path) -> Path | None:
-    """The config whose results a folder holds, if it is there."""
-    note = folder / CLAIM
-    said = note.read_text(errors="replace").strip() if note.is_file() else ""
-    config = folder / said
-    return config.resolve() if said and "\0" not in said and config.is_file() else None
+def _unfit(path: Path, folder: Path) -> str:
+    """Why a file is not published, empty where it is: it has to lie in a folder, all links resolved."""
+    place = path.resolve()
+    if not place.is_relative_to(folder.resolve()):
+        leads = f"leads to {place}, which lies" if path.is_symlink() else "lies"
+        return f"{leads} outside of {folder}; put what is to be published into that folder"
+    return "" if place.is_file() else "is a link to what is no file; remove it"
 
 
-def _needed(config: Path) -> tuple[Path, list[Path]]:
-    """A config and the files that it names, and the folder that all lie in. None of its code is run."""
+def _is_config(path: Path) -> bool:
+    """Whether a file is a config of any kind: results from elsewhere may name any file as theirs."""
+    if path.suffix.lower() == ".json":
+        with suppress(InputError):
+            return bool(read_scene_json(path))
+    with suppress(InputError):
+        return path.suffix.lower() in (".yaml", ".yml") and bool(_KEYS & set(read_yaml(path).data))
+    return False
+
+
+_KEYS = {"scenes", "mesh", "curves", "work", "goals"}
+"""Of each kind of config, a key that it has to have."""
+
+
+def _needed(config: Path) -> list[Path]:
+    """A config and the files that it names. None of its code is run."""
     files = {config}
-    try:
+    with suppress(InputError):  # a config of another kind, or one that was changed; it goes along all the same
         sweep = load_any(config, opens=False)
-    except InputError:  # a config of another kind, or one that was changed; what it is goes along all the same
-        return config.parent, [config]
-    plugins = found(sweep.reports)
-    for run in sweep.runs():
-        scene = run.scene
-        files.add(scene.path)
-        for part in (scene.mesh, *scene.effects):
-            files |= {value for value in vars(part).values() if isinstance(value, Path)}
-        for _, given in scene.own.values():  # names of files come with their digests there
-            files |= {scene.path.parent / value[0] for value in given.values() if _is_file(value, scene.path.parent)}
-        plugins += run.own()
-    files |= {Path(plugin.source) for plugin in plugins if _is_beside(plugin)}
-    files |= {path.parent / read_scene_json(path).obj for path in files if path.suffix.lower() == ".json"}
-    there = sorted({Path(os.path.abspath(path)) for path in files})
-    return Path(os.path.commonpath([path.parent for path in there])), there
+        plugins = found(sweep.reports)
+        for run in sweep.runs():
+            scene = run.scene
+            files.add(scene.path)
+            if scene.path.suffix.lower() == ".json":
+                files.add(scene.path.parent / read_scene_json(scene.path).obj)
+            for part in (scene.mesh, *scene.effects):
+                if isinstance(part, Model):  # what is somebody's own is not opened
+                    files |= {value for value in vars(part).values() if isinstance(value, Path)}
+            for _, given in scene.own.values():  # names of files come with their digests there
+                there = scene.path.parent
+                files |= {there / value[0] for value in given.values() if _is_file(value, there)}
+            plugins += run.own()
+        files |= {Path(plugin.source) for plugin in plugins if _is_beside(plugin)}
+    return sorted({Path(os.path.abspath(path)) for path in files})
 
 
 def _is_file(value: Any, folder: Path) -> bool:
@@ -131,7 +169,9 @@ def _write(path: Path, content: Mapping[str, Content], title: str, license: str)
 
         def put(name: str, data: Content) -> None:
             digest, size = hashlib.sha256(), 0
-            with packed.open(zipfile.ZipInfo.from_file(data, name) if isinstance(data, Path) else name, "w") as into:
+            of_file = isinstance(data, Path)
+            info = zipfile.ZipInfo.from_file(data, name, strict_timestamps=False) if of_file else name
+            with packed.open(info, "w") as into:
                 for chunk in _chunks(data):
                     digest.update(chunk)
                     into.write(chunk)

@@ -25,13 +25,14 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from harness.base import machine, rows, shelf, statistics
+from harness.base.claim import config_of
 from harness.base.errors import InputError, Mistake
 from harness.base.progress import Display
 from harness.config.load import load_any
 from harness.config.options import AUTO
 from harness.config.sweep import RunSpec
 from harness.experiments.archive.merge import sweeps
-from harness.experiments.archive.publish import SUMS, config_of
+from harness.experiments.archive.publish import SUMS
 from harness.experiments.core import do_all
 from harness.experiments.plan import Files
 from harness.experiments.run_unit import RunUnit
