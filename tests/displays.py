@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from harness.base.progress import Effort
+
 
 class Quiet:
     """A display that shows nothing, and is stopped after some units, those that find steps apart."""
@@ -10,9 +14,9 @@ class Quiet:
         self.finished_units, self._stop_after, self._counts = 0, stop_after, True
         self.titles: list[str] = []
 
-    def begin(self, runs: int, work: float, at_once: int = 1) -> None: ...
+    def begin(self, efforts: Sequence[Effort], at_once: int = 1) -> None: ...
 
-    def run(self, title: str, ticks: int, work: float) -> Quiet:
+    def run(self, title: str, ticks: int, effort: Effort) -> Quiet:
         self.titles.append(title)
         self._counts = not title.endswith("steps to freeze")
         return self
@@ -24,7 +28,7 @@ class Quiet:
         if self.finished_units == self._stop_after:
             raise KeyboardInterrupt
 
-    def elsewhere(self, title: str, work: float, outcome: str) -> None:
+    def elsewhere(self, title: str, effort: Effort, outcome: str) -> None:
         self.titles.append(f"{title} {outcome}")
 
     def end(self) -> None: ...

@@ -5,10 +5,12 @@ Nothing here runs beside the measurements: bars are redrawn between steps, while
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from statistics import median
 from time import monotonic
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
@@ -22,7 +24,24 @@ _SILENT = 10.0
 """Seconds after which a line is printed, though nothing has ended."""
 
 _KNOWN = 0.2
-"""The share of the work from which on the time left is told: it is then four times what is known, at most."""
+"""The share of runs or of their work from which on the time left is stated; half where no run of a kind has ended."""
+
+_OWN_PACE = 0.05
+"""The share of a run from which on its own pace tells when it ends."""
+
+
+class Effort(NamedTuple):
+    """What a run takes, before it is known in seconds.
+
+    kind: runs of one kind, such as those by one solver, take time in proportion to their amount, in any measure.
+    """
+
+    kind: str = ""
+    amount: float = 1.0
+
+
+ANY_EFFORT = Effort()
+"""Of runs of which nothing is known."""
 
 
 class Remarks:
@@ -51,17 +70,17 @@ class Run(Protocol):
 
 
 class Display(Protocol):
-    """Is told what happens in a sweep. `work` is any measure of effort, the same for all runs of a sweep."""
+    """Is told what happens in a sweep."""
 
-    def begin(self, runs: int, work: float, at_once: int = 1) -> None:
-        """The sweep begins: so many runs are to be done, so many at once, with so much work in all."""
+    def begin(self, efforts: Sequence[Effort], at_once: int = 1) -> None:
+        """The sweep begins: these runs are to be done, so many of them at once."""
         ...
 
-    def run(self, title: str, ticks: int, work: float) -> Run:
+    def run(self, title: str, ticks: int, effort: Effort) -> Run:
         """A run begins: it will take so many ticks."""
         ...
 
-    def elsewhere(self, title: str, work: float, outcome: str) -> None:
+    def elsewhere(self, title: str, effort: Effort, outcome: str) -> None:
         """A run that is none of this command's any more, and why in words."""
         ...
 
@@ -75,38 +94,63 @@ def display(console: Console) -> Display:
     return Bars(console) if console.is_terminal else Lines(console)
 
 
-@dataclass
 class Pace:
-    """How long work takes, by the runs that have ended.
+    """How long the runs take that have not ended, by those that have.
 
-    seconds = b work,   b = sum of seconds x work / sum of work^2,
+    seconds = a + b amount,   a = least seconds of a run,   b = (seconds - a) / amount of the kind's latest run,
 
-    so that the larger runs count, of whose time less goes into what comes with any run. Compiling and waiting are no
-    work: their seconds are left out. Runs that go on at once are as many as their seconds are more than those by the
-    wall.
+    where a is what comes with any run. A kind of which no run has ended has the median b of the others. Compiling and
+    waiting are left out of the seconds. Where several runs go on at once, the sum is divided by how many did so far.
     """
 
-    work: float
-    at_once: int = 1
-    done: float = 0.0
-    _began: float = field(default_factory=lambda: monotonic())
-    _seconds: float = 0.0
-    _products: float = 0.0
-    _squares: float = 0.0
+    def __init__(self, efforts: Sequence[Effort] = (), at_once: int = 1) -> None:
+        self._left: dict[str, list[float]] = {}
+        for effort in efforts:
+            self._left.setdefault(effort.kind, []).append(effort.amount)
+        self._runs, self.amount, self._at_once = len(efforts), sum(effort.amount for effort in efforts), at_once
+        self._ended = 0
+        self.done = 0.0
+        self._began, self._seconds, self._least = monotonic(), 0.0, math.inf
+        self._latest: dict[str, tuple[float, float]] = {}
 
-    def ended(self, work: float, seconds: float) -> None:
-        """A run has ended, after so many seconds of its own."""
-        self.done += work
-        self._seconds += seconds
-        self._products += seconds * work
-        self._squares += work**2
+    def leave_out(self, effort: Effort) -> None:
+        """Leave out a run that is done elsewhere."""
+        self._left[effort.kind].remove(effort.amount)
+        self._runs, self.amount = self._runs - 1, self.amount - effort.amount
 
-    def left(self, going: float = 0.0) -> float | None:
-        """Seconds until all is done; None while that is not known. going: work that is done of runs that go on."""
-        if not self._squares or self.done < _KNOWN * self.work:
+    def add_ended(self, effort: Effort, seconds: float) -> None:
+        """Take note of a run that has ended, and of the seconds that it took itself."""
+        if effort.amount in self._left.get(effort.kind, ()):
+            self._left[effort.kind].remove(effort.amount)
+        self._ended, self.done = self._ended + 1, self.done + effort.amount
+        self._seconds, self._least = self._seconds + seconds, min(self._least, seconds)
+        self._latest[effort.kind] = effort.amount, seconds
+
+    def left(self, going: Sequence[_Running] = ()) -> float | None:
+        """Estimate the seconds until all runs have ended.
+
+        Args:
+            going: runs that have begun; from a twentieth of its steps on, a run's own pace counts.
+
+        Returns: None while too few runs have ended for an estimate.
+        """
+        known = max(self._ended / max(1, self._runs), self.done / (self.amount or 1.0))
+        kinds = {kind for kind, amounts in self._left.items() if amounts}
+        if not self._latest or known < (_KNOWN if kinds <= set(self._latest) else 0.5):
             return None
-        at_once = min(self.at_once, max(1.0, self._seconds / max(1e-9, monotonic() - self._began)))
-        return max(0.0, self.work - self.done - going) * self._products / self._squares / at_once
+        rates = {kind: (seconds - self._least) / (amount or 1.0) for kind, (amount, seconds) in self._latest.items()}
+        usual = median(rates.values())
+
+        def estimate(effort: Effort) -> float:
+            return self._least + effort.amount * rates.get(effort.kind, usual)
+
+        seconds = sum(estimate(Effort(kind, amount)) for kind, amounts in self._left.items() for amount in amounts)
+        for run in going:
+            whole = estimate(run.effort)
+            left = run.seconds * (1.0 - run.done) / run.done if run.done > _OWN_PACE else whole * (1.0 - run.done)
+            seconds += left - whole
+        at_once = min(self._at_once, max(1.0, self._seconds / max(1e-9, monotonic() - self._began)))
+        return max(0.0, seconds) / at_once
 
 
 @dataclass
@@ -115,7 +159,7 @@ class _Running:
 
     title: str
     ticks: int
-    work: float
+    effort: Effort
     pace: Pace
     changed: Callable[[_Running], None]
     ended: Callable[[_Running, str], None]
@@ -130,6 +174,12 @@ class _Running:
     def done(self) -> float:
         """The share of its steps that is done."""
         return min(1.0, self.steps / max(1, self.ticks))
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since it began, without those that it compiled or waited."""
+        aside = monotonic() - self._since if self.aside else 0.0
+        return monotonic() - self.began - self._beside - aside
 
     @property
     def doing(self) -> str:
@@ -148,7 +198,7 @@ class _Running:
 
     def finished(self, outcome: str) -> None:
         """See Run."""
-        self.pace.ended(self.work, monotonic() - self.began - self._beside)
+        self.pace.add_ended(self.effort, self.seconds)
         self.ended(self, outcome)
 
 
@@ -178,19 +228,19 @@ class Bars:
             console=console,
             auto_refresh=False,
         )
-        self._drawn, self._pace, self._tasks = 0.0, Pace(0.0), dict[int, TaskID]()
+        self._drawn, self._pace, self._tasks = 0.0, Pace(), dict[int, TaskID]()
         self._going: list[_Running] = []
         self._sweep = self._bars.add_task("", phase="")
 
-    def begin(self, runs: int, work: float, at_once: int = 1) -> None:
+    def begin(self, efforts: Sequence[Effort], at_once: int = 1) -> None:
         """See Display."""
-        self._pace = Pace(work, at_once)
+        self._pace = Pace(efforts, at_once)
         self._bars.start()
-        self._bars.update(self._sweep, description="sweep", total=work, phase=f"{runs} runs")
+        self._bars.update(self._sweep, description="sweep", total=self._pace.amount, phase=f"{len(efforts)} runs")
 
-    def run(self, title: str, ticks: int, work: float) -> Run:
+    def run(self, title: str, ticks: int, effort: Effort) -> Run:
         """See Display."""
-        running = _Running(title, ticks, work, self._pace, self._changed, self._ended)
+        running = _Running(title, ticks, effort, self._pace, self._changed, self._ended)
         self._tasks[id(running)] = self._bars.add_task(title, total=ticks, phase="prepare")
         self._going.append(running)
         self._bars.refresh()
@@ -203,9 +253,8 @@ class Bars:
             self._show()
 
     def _show(self) -> None:
-        going = sum(run.done * run.work for run in self._going)
-        told = left_in_words(self._pace.left(going))
-        self._bars.update(self._sweep, completed=self._pace.done + going, phase=told)
+        completed = self._pace.done + sum(run.effort.amount * run.done for run in self._going)
+        self._bars.update(self._sweep, completed=completed, phase=left_in_words(self._pace.left(self._going)))
         self._bars.refresh()
         self._drawn = monotonic()
 
@@ -215,10 +264,10 @@ class Bars:
         self._bars.console.print(f"{run.title}: {outcome}", highlight=False)
         self._show()
 
-    def elsewhere(self, title: str, work: float, outcome: str) -> None:
+    def elsewhere(self, title: str, effort: Effort, outcome: str) -> None:
         """See Display."""
-        self._pace.work -= work
-        self._bars.update(self._sweep, total=self._pace.work)
+        self._pace.leave_out(effort)
+        self._bars.update(self._sweep, total=self._pace.amount)
         self._bars.console.print(f"{title}: {outcome}", highlight=False)
         self._show()
 
@@ -232,17 +281,17 @@ class Lines:
     no other for a while."""
 
     def __init__(self, console: Console) -> None:
-        self._console, self._pace, self._printed = console, Pace(0.0), monotonic()
+        self._console, self._pace, self._printed = console, Pace(), monotonic()
         self._going: list[_Running] = []
         self._runs = self._number = 0
 
-    def begin(self, runs: int, work: float, at_once: int = 1) -> None:
+    def begin(self, efforts: Sequence[Effort], at_once: int = 1) -> None:
         """See Display."""
-        self._runs, self._number, self._pace, self._printed = runs, 0, Pace(work, at_once), monotonic()
+        self._runs, self._number, self._pace, self._printed = len(efforts), 0, Pace(efforts, at_once), monotonic()
 
-    def run(self, title: str, ticks: int, work: float) -> Run:
+    def run(self, title: str, ticks: int, effort: Effort) -> Run:
         """See Display."""
-        running = _Running(title, ticks, work, self._pace, self._changed, self._ended)
+        running = _Running(title, ticks, effort, self._pace, self._changed, self._ended)
         self._going.append(running)
         return running
 
@@ -255,14 +304,14 @@ class Lines:
         self._number += 1
         self._print(f"{run.title}: {outcome}")
 
-    def elsewhere(self, title: str, work: float, outcome: str) -> None:
+    def elsewhere(self, title: str, effort: Effort, outcome: str) -> None:
         """See Display."""
-        self._pace.work -= work
+        self._pace.leave_out(effort)
         self._number += 1
         self._print(f"{title}: {outcome}")
 
     def _print(self, told: str) -> None:
-        left = left_in_words(self._pace.left(sum(run.done * run.work for run in self._going)))
+        left = left_in_words(self._pace.left(self._going))
         rest = f"; {left}" if left and self._number < self._runs else ""
         line = f"[{self._number}/{self._runs}] {told}{rest}"
         self._console.print(line, highlight=False, soft_wrap=True, markup=False)

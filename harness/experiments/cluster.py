@@ -33,7 +33,7 @@ from distributed.utils import silence_logging_cmgr
 from harness.base import machine
 from harness.base.errors import InputError, Mistake, RunFailed
 from harness.base.files import CannotWrite, replacing
-from harness.base.progress import Display
+from harness.base.progress import Display, Effort
 from harness.base.workers import Lost, Workers
 from harness.config.sweep import RunSpec
 from harness.experiments.core import TABLES, ready, watched
@@ -180,8 +180,10 @@ def do_on(
     threads, asked = dict[str, int](), 0.0
     going: dict[Future, tuple[int, RunUnit]] = {}
     fixed = folder.resolve(), f"rows/{token.name}", machine.code_hash(), [dict(table) for table in TABLES]
-    display.begin(len(units), 0.0)
-    looks = display.run(f"{len(units)} runs on {client.scheduler.address if client.scheduler else 'a cluster'}", 1, 0.0)
+    display.begin([unit.effort for unit in units])
+    looks = display.run(
+        f"{len(units)} runs on {client.scheduler.address if client.scheduler else 'a cluster'}", 1, Effort(amount=0.0)
+    )
     try:
         token.touch()
         while left or going:
@@ -191,7 +193,7 @@ def do_on(
             while left and len(going) < _AHEAD * max(1, sum(workers.values())):
                 number, unit = left.pop()
                 if why := another(unit):
-                    display.elsewhere(unit.title, unit.work, why)
+                    display.elsewhere(unit.title, unit.effort, why)
                     continue
                 key = f"springbench-{unit.run.title.replace(' ', '-')}-{uuid4().hex}"
                 only = list(workers) if excluded and workers else None
@@ -241,7 +243,7 @@ def _ended(
     """Keep what a task left; whether its run is to be done again. answer: if known already; last: no more."""
     if task.status in ("cancelled", "lost"):
         raise RunFailed(_GONE)
-    run = display.run(unit.title, 1, 0.0)
+    run = display.run(unit.title, 1, unit.effort)
     try:
         done: Done = answer or task.result()
     except KilledWorker as error:

@@ -18,7 +18,7 @@ from harness.base.asides import compiling_told
 from harness.base.crew import Task, done_by
 from harness.base.holding import TAKEN, Claims
 from harness.base.machine_lock import alone
-from harness.base.progress import Display, Remarks, Run
+from harness.base.progress import Display, Effort, Remarks, Run
 from harness.base.workers import Limits, Lost, Tick
 from harness.scenes.effects.effect_names import EFFECTS
 from harness.scenes.mesh.mesh_names import MESHES
@@ -44,8 +44,8 @@ class Unit(Protocol):
         ...
 
     @property
-    def work(self) -> float:
-        """Its effort, by a measure that is the same for all of an experiment."""
+    def effort(self) -> Effort:
+        """What it takes, for the time left."""
         ...
 
     @property
@@ -127,15 +127,15 @@ def do_all(
     another: see `do_together`. Nothing else of ours is done on the machine while a unit is timed. Raises InputError,
     CannotWrite.
     """
-    display.begin(len(todo), sum(unit.work for unit in todo), at_once)
+    display.begin([unit.effort for unit in todo], at_once)
     runs: dict[int, Run] = {}
 
     def start(number: int) -> Task | None:
         unit = todo[number]
         if why := another(unit):
-            display.elsewhere(unit.title, unit.work, why)
+            display.elsewhere(unit.title, unit.effort, why)
             return None
-        run = runs[number] = display.run(unit.title, unit.ticks, unit.work)
+        run = runs[number] = display.run(unit.title, unit.ticks, unit.effort)
         return Task(partial(watched, unit), run.tick, unit.limits)
 
     try:

@@ -10,6 +10,7 @@ from typing import Any
 
 from harness.base import rows
 from harness.base.files import half_written
+from harness.base.progress import Effort
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts
@@ -43,9 +44,9 @@ class RunUnit:
         return self.run.frames * self.run.passes
 
     @property
-    def work(self) -> float:
-        """A rough measure of the run's effort, for the time left."""
-        return (self.run.size or 32) ** 2 * self.ticks * self.run.iterations
+    def effort(self) -> Effort:
+        """See Unit."""
+        return Effort(self.run.solver.name, (self.run.size or 32) ** 2 * self.ticks * self.run.iterations)
 
     @property
     def limits(self) -> Limits:

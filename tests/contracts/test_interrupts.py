@@ -101,7 +101,8 @@ def test_a_terminal_that_writes_ascii_alone_gets_escape_sequences(arguments: lis
     rows.write(tmp_path / "sweep" / "rows" / "a.parquet", [{"sweep": "sweep", "seconds": 0.5}])
     process = start(
         *("query", "SELECT 'fl\u00e4che' AS name", "--results", str(tmp_path), *arguments),
-        **{"PYTHONIOENCODING": "ascii", "MPLBACKEND": "none such"},
+        PYTHONIOENCODING="ascii",
+        MPLBACKEND="none such",
     )
     output, errors = process.communicate(timeout=60.0)
     assert process.returncode == 0, errors

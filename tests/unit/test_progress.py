@@ -10,7 +10,7 @@ from rich.console import Console
 
 from harness.base import progress
 from harness.base.asides import COMPILING, LOOK, aside
-from harness.base.progress import Bars, Display, Lines
+from harness.base.progress import Bars, Display, Effort, Lines, Pace
 
 
 @pytest.fixture
@@ -29,29 +29,51 @@ def told(kind: Callable[[Console], Display], does: Callable[[Display], None]) ->
     return out.getvalue()
 
 
+SWEEP = [Effort("fast", 10.0), Effort("slow", 10.0), Effort("fast", 40.0), Effort("slow", 40.0), Effort("fast", 100.0)]
+
+
 @pytest.mark.parametrize("kind", [Lines, Bars])
-def test_the_time_left_follows_from_the_work_of_runs_that_have_ended(kind: Callable[..., Display], clock: list[float]):
+def test_the_time_left_follows_from_the_latest_run_of_each_kind(kind: Callable[..., Display], clock: list[float]):
     def does(display: Display) -> None:
-        display.begin(4, 100.0)
-        for work, seconds in ((10.0, 5.0), (40.0, 20.0)):  # 0.5 s for each of the work
-            run = display.run("one", 10, work)
+        display.begin(SWEEP)
+        for effort, seconds in zip(SWEEP, (3.0, 5.0, 9.0, 35.0), strict=False):
+            run = display.run("one", 10, effort)
             with aside(run.tick, COMPILING):
-                clock[0] += 300.0
+                clock[0] += 3000.0  # is no work
             clock[0] += seconds
             run.finished("ok")
 
     lines = told(kind, does)
-    assert lines.count("left") >= 1
-    assert "about 25 s left" in lines
-    assert "3" not in "".join(part.split("s left")[0][-5:] for part in lines.split("about ")[1:])  # nothing of 300 s
-    first = lines.split("one: ok")[1]
-    assert kind is Bars or "left" not in first  # a tenth of the work tells nothing yet
+    # 3 s come with any run. After the second one: fast 0 s and slow 0.2 s for each of the amount, so 3, 3 + 8 and 3 s.
+    # After the third one: fast 6 s for 40, so 3 + 8 s and 3 + 15 s. After the fourth one 3 + 15 s.
+    for seconds in (17, 29, 18):
+        assert f"about {seconds} s left" in lines
+
+
+def test_a_run_that_is_done_elsewhere_is_left_out(clock: list[float]):
+    pace = Pace(SWEEP)
+    pace.leave_out(SWEEP[-1])
+    pace.add_ended(SWEEP[0], 3.0)
+    pace.add_ended(SWEEP[1], 3.0)
+    assert pace.left() == 2 * 3.0
+
+
+def test_a_run_that_goes_on_tells_its_own_pace(clock: list[float]):
+    def does(display: Display) -> None:
+        display.begin([Effort(), Effort()])
+        display.run("one", 10, Effort()).finished("ok")
+        run = display.run("two", 10, Effort())
+        for _ in range(4):
+            clock[0] += 12.0
+            run.tick("timed pass")
+
+    assert "40 %; about 72 s left" in told(Lines, does)
 
 
 def test_a_line_comes_though_no_run_ends(clock: list[float]):
     def does(display: Display) -> None:
-        display.begin(1, 10.0)
-        run = display.run("one", 10, 10.0)
+        display.begin([Effort()])
+        run = display.run("one", 10, Effort())
         run.tick("timed pass")
         for _ in range(35):
             clock[0] += 1.0
@@ -63,8 +85,8 @@ def test_a_line_comes_though_no_run_ends(clock: list[float]):
 
 def test_what_is_compiled_is_told_while_it_is(clock: list[float]):
     def does(display: Display) -> None:
-        display.begin(1, 10.0)
-        run = display.run("one", 10, 10.0)
+        display.begin([Effort()])
+        run = display.run("one", 10, Effort())
         with aside(run.tick, COMPILING):
             clock[0] += 11.0
             run.tick(LOOK)

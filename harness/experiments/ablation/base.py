@@ -9,6 +9,7 @@ from typing import Any
 
 from harness.base import machine, rows
 from harness.base.errors import InputError
+from harness.base.progress import ANY_EFFORT, Effort
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.ablation.ablation_rows import SCHEMA
@@ -36,9 +37,9 @@ class OfEffects(ABC):
         return standings({self.path: lambda row: True}, (), SCHEMA)[self.path]
 
     @property
-    def work(self) -> float:
+    def effort(self) -> Effort:
         """See Unit."""
-        return 1.0
+        return ANY_EFFORT
 
     @property
     def limits(self) -> Limits:

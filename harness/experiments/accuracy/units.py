@@ -14,6 +14,7 @@ from typing import Any
 
 from harness.base import machine, rows
 from harness.base.errors import InputError
+from harness.base.progress import ANY_EFFORT, Effort
 from harness.base.stated import stated
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.accuracy import Case, CurveSpec, WorkSpec, moment_name
@@ -65,7 +66,7 @@ class StepsUnit:
 
     specs: tuple[CurveSpec, ...]
     home: Home
-    work: float = 1.0
+    effort: Effort = ANY_EFFORT
 
     @property
     def title(self) -> str:
@@ -128,7 +129,7 @@ class CurveUnit:
     spec: CurveSpec
     home: Home
     step: Mapping[str, Any]
-    work: float = 1.0
+    effort: Effort = ANY_EFFORT
 
     @property
     def title(self) -> str:
@@ -179,7 +180,7 @@ class WorkUnit:
 
     spec: WorkSpec
     home: Home
-    work: float = 1.0
+    effort: Effort = ANY_EFFORT
 
     @property
     def title(self) -> str:

@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from harness.base import holding, machine, rows
 from harness.base.columns import SCHEMA
-from harness.base.progress import Display
+from harness.base.progress import Display, Effort
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.load import Sweep
 from harness.config.sweep import RunSpec, SolverSpec
@@ -72,9 +72,9 @@ class Comparison:
         return PREPARES + max(run.rounds for run in self.members)
 
     @property
-    def work(self) -> float:
+    def effort(self) -> Effort:
         """See Unit: by vertices."""
-        return float(self.members[0].size or 32) ** 2
+        return Effort(amount=float(self.members[0].size or 32) ** 2)
 
     @property
     def limits(self) -> Limits:
