@@ -183,7 +183,8 @@ def _frame(table: Any) -> Any:
 
 
 def open_recording(path: str | Path) -> Replay:
-    """What a recording shows: times (k,) [s], positions (k, n, 3) [m], springs, strain, scalars. Raises InputError."""
+    """What a recording shows: times (k,) [s], positions (k, n, 3) [m] relative to `origin`
+    (3,), springs, scalars; `absolute_positions(k)` adds the origin, in double precision. Raises InputError."""
     from harness.record.reader import read_replay
 
     return read_replay(Path(path))

@@ -43,6 +43,7 @@ def _tile(path: Path) -> Any:
     from harness.base import machine
     from harness.config.load import load_any
     from harness.record.base import Replay
+    from harness.record.local_origin import local_origin, store_relative
     from harness.record.obstacles import declared, listed
     from harness.record.shading import STRAIN_RANGE
     from harness.report.contact_sheet import Tile
@@ -60,12 +61,13 @@ def _tile(path: Path) -> Any:
         settings = Settings(StopRule(200, float(_TOLERANCE)), run.first_guess, run.frames, 1)
         for step in steps(scene, prepare(scene, solver), settings):
             p = step.positions
+    origin = local_origin(scene.mesh.rest)
     replay = Replay(
         title=run.scene_name,
         run_id="",
         frames=np.array([run.frames]),
         times=np.array([scene.time(run.frames)]),
-        positions=p[None].astype(np.float32),
+        positions=store_relative(p, origin)[None],
         triangles=scene.mesh.triangles,
         springs=scene.springs.edges,
         rest_lengths=scene.springs.rest_length,
@@ -77,6 +79,7 @@ def _tile(path: Path) -> Any:
             "cpu": machine.describe().cpu,
             "commit": machine.commit(),
         },
+        origin=origin,
     )
     kinds = dict.fromkeys(effect.kind for effect in run.scene.effects)
     camera = run.scene.camera

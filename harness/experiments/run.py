@@ -31,7 +31,7 @@ from harness.record.base import Frame, RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
 from harness.record.shading import strain_range
-from harness.record.verify import require_last
+from harness.record.verify import FrameSamples, require_frames
 from harness.reference.grade import Graded
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
@@ -138,8 +138,9 @@ def _to_error(
             recorder.close({})
         finally:
             recorder.abandon()
-        ends = run.frames, found.scene.time(run.frames), seen[-1]
-        last = {"recorded": require_last(files.recording, recorder.info, *ends)}
+        chosen = sorted(FrameSamples(run.frames).frames)
+        due = {k: found.scene.time(k) for k in chosen}
+        last = {"recorded": require_frames(files.recording, recorder.info, due, {k: seen[k] for k in chosen})}
     return [how | row | (last if row["frame"] == run.frames else {}) for row in told]
 
 
@@ -165,6 +166,7 @@ def _second_pass(
 ) -> dict[int, dict[str, Any]]:
     """Simulate again with everything that is looked at: energies, convergence, recording, positions."""
     stored = np.empty((run.frames, len(scene.mesh.rest), 3)) if positions else None
+    samples = FrameSamples(run.frames)
     with ExitStack() as cleanup:
         recorder = None
         if run.record:
@@ -183,6 +185,7 @@ def _second_pass(
             if run.convergence_frames is None
             else run.convergence_frames,
             stored=stored,
+            sample=samples.add if recorder else None,
             judge=_judge(run, scene),
             tick=lambda: tick("second pass"),
             clock=measured.clock,
@@ -191,8 +194,9 @@ def _second_pass(
             raise RunFailed("the recorded pass ended at other positions than the timed pass")
         if recorder and measured.final is not None:
             recorder.close(times.milliseconds(measured, run.frames))
-            ends = run.frames, scene.time(run.frames), measured.final
-            found[run.frames]["recorded"] = require_last(files.recording, recorder.info, *ends)
+            due = {frame: scene.time(frame) for frame in samples.frames}
+            motion = samples.positions | {run.frames: measured.final}
+            found[run.frames]["recorded"] = require_frames(files.recording, recorder.info, due, motion)
     if positions and stored is not None:
         save_positions(positions, stored)
     return {frame: graded.found.get(frame, {}) | columns for frame, columns in found.items()}

@@ -28,6 +28,7 @@ def show(
     from harness.base import machine
     from harness.config.load import load_any
     from harness.record.base import Replay
+    from harness.record.local_origin import local_origin, store_relative
     from harness.record.obstacles import declared, listed
     from harness.record.shading import STRAIN_RANGE
     from harness.report.shown import Choice, draw_scene
@@ -48,12 +49,13 @@ def show(
         say(f"{one.name}: {len(one.vertices)} vertices ({one.how}): {some}")
     for kind, words in notes:
         say(f"{kind}: {words}")
+    origin = local_origin(mesh.rest)
     replay = Replay(
         title=f"{run.scene_name}, size {run.size}" if run.size else run.scene_name,
         run_id="",
         frames=np.zeros(1, np.int64),
         times=np.zeros(1),
-        positions=start(made).now.positions[None].astype(np.float32),
+        positions=store_relative(start(made).now.positions, origin)[None],
         triangles=mesh.triangles,
         springs=made.springs.edges,
         rest_lengths=made.springs.rest_length,
@@ -65,6 +67,7 @@ def show(
             "cpu": machine.describe().cpu,
             "commit": machine.commit(),
         },
+        origin=origin,
     )
     facts = [
         f"{len(mesh.rest):,} vertices, {len(mesh.triangles):,} triangles, {len(made.springs.edges):,} springs",

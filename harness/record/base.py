@@ -89,9 +89,9 @@ class Recorder(Protocol):
 class Replay:
     """A recording read back: what pictures are drawn from.
 
-    frames: indices (k,); times (k,) [s]; positions (k, n, 3) float32 [m]; triangles (f, 3);
+    frames: indices (k,); times (k,) [s]; positions (k, n, 3) float32 [m], relative to `origin`; triangles (f, 3);
     springs (m, 2); rest_lengths (m,) [m]; pinned (q,); strain_range; scalars: entity name -> (frames, values);
-    properties and title as recorded.
+    properties and title as recorded; origin (3,) [m], zero unless the mesh is far from zero.
     """
 
     title: str
@@ -106,3 +106,8 @@ class Replay:
     strain_range: float
     scalars: Mapping[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
     properties: Mapping[str, str | int | float | bool]
+    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+    def absolute_positions(self, frame: int) -> Positions:
+        """Return the positions (n, 3) [m] of a recorded frame, counted from 0, with the origin added."""
+        return self.positions[frame] + self.origin

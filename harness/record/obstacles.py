@@ -39,10 +39,10 @@ def declared(obstacles: Sequence[AnySurface]) -> dict[str, str]:
 
 
 class Obstacles:
-    """Obstacles beside a mesh at rest (n, 3) [m], in an open recording."""
+    """Obstacles beside a mesh at rest (n, 3) [m], in an open recording whose positions are relative to an origin."""
 
-    def __init__(self, stream: rr.RecordingStream, obstacles: Sequence[AnySurface], rest: Array) -> None:
-        self._stream = stream
+    def __init__(self, stream: rr.RecordingStream, obstacles: Sequence[AnySurface], rest: Array, origin: Array) -> None:
+        self._stream, self._origin = stream, origin
         self._moving: list[tuple[str, KeyedMotion]] = []
         self._deforming: list[tuple[str, Solid]] = []
         for k, one in enumerate(obstacles):
@@ -50,25 +50,27 @@ class Obstacles:
             if one.kind == "mesh" and one.frames:
                 self._deforming.append((entity, one))
                 continue
-            stream.log(entity, _SHAPES[one.kind](one, rest), static=True)
+            stream.log(entity, _SHAPES[one.kind](one, rest, origin), static=True)
             if one.motion:
                 self._moving.append((entity, one.motion))
 
     def at(self, time: float) -> None:
         """Record where those that move are at a time [s], on the timelines as they are set."""
         for entity, motion in self._moving:
-            origin, *ends = motion.moved(np.concatenate([np.zeros((1, 3)), np.eye(3)]), time)
-            self._stream.log(entity, rr.Transform3D(translation=origin, mat3x3=(np.array(ends) - origin).T))
+            base, *ends = motion.moved(self._origin + np.concatenate([np.zeros((1, 3)), np.eye(3)]), time)
+            moved = rr.Transform3D(translation=base - self._origin, mat3x3=(np.array(ends) - base).T)
+            self._stream.log(entity, moved)
         for entity, one in self._deforming:
             points, triangles = one.shape()
-            self._stream.log(entity, _faces(one.placed(points, time), triangles))
+            self._stream.log(entity, _faces(one.placed(points, time) - self._origin, triangles))
 
 
-def _sphere(one: Sphere, rest: Array) -> rr.Ellipsoids3D:
-    return rr.Ellipsoids3D(centers=[one.center], radii=[one.radius], colors=[_COLOUR], fill_mode="solid")
+def _sphere(one: Sphere, rest: Array, origin: Array) -> rr.Ellipsoids3D:
+    center = np.array(one.center) - origin
+    return rr.Ellipsoids3D(centers=[center], radii=[one.radius], colors=[_COLOUR], fill_mode="solid")
 
 
-def _capsule(one: Capsule, rest: Array) -> rr.Capsules3D:
+def _capsule(one: Capsule, rest: Array, origin: Array) -> rr.Capsules3D:
     """Rerun's go along z from the origin; this one is turned there by the half way between z and its own direction."""
     first, last = np.array(one.ends)
     length = float(np.linalg.norm(last - first))
@@ -77,34 +79,35 @@ def _capsule(one: Capsule, rest: Array) -> rr.Capsules3D:
     return rr.Capsules3D(
         lengths=[length],
         radii=[one.radius],
-        translations=[first],
+        translations=[first - origin],
         rotation_axis_angles=[rr.RotationAxisAngle(axis=axis, angle=rr.Angle(deg=180.0))],
         colors=[_COLOUR],
         fill_mode="solid",
     )
 
 
-def _box(one: Box, rest: Array) -> rr.Boxes3D:
+def _box(one: Box, rest: Array, origin: Array) -> rr.Boxes3D:
     sizes = np.subtract(one.high, one.low)
-    return rr.Boxes3D(mins=[one.low], sizes=[sizes], colors=[_COLOUR], fill_mode="solid")
+    return rr.Boxes3D(mins=[np.array(one.low) - origin], sizes=[sizes], colors=[_COLOUR], fill_mode="solid")
 
 
-def _plane(one: Plane, rest: Array) -> rr.Mesh3D:
+def _plane(one: Plane, rest: Array, origin: Array) -> rr.Mesh3D:
     """Two triangles about the foot of the mesh's middle."""
-    origin, x, normal, z = one.model_copy(update={"motion": None}).obstacle().frame(0.0)
+    foot, x, normal, z = one.model_copy(update={"motion": None}).obstacle().frame(0.0)
     middle = rest.mean(axis=0)
-    height = float((middle - origin) @ normal)
+    height = float((middle - foot) @ normal)
     half = _AROUND * (float(np.linalg.norm(np.ptp(rest, axis=0))) + abs(height))
-    corners = middle - height * normal + half * np.array([-x - z, z - x, x + z, x - z])
+    corners = middle - origin - height * normal + half * np.array([-x - z, z - x, x + z, x - z])
     faces = [[0, 1, 2], [0, 2, 3]]
     return rr.Mesh3D(
         vertex_positions=corners, triangle_indices=faces, vertex_normals=[normal] * 4, vertex_colors=[_COLOUR] * 4
     )
 
 
-def _mesh(one: Solid, rest: Array) -> rr.Mesh3D:
+def _mesh(one: Solid, rest: Array, origin: Array) -> rr.Mesh3D:
     """Every triangle with points of its own: edges stay sharp."""
-    return _faces(*one.shape())
+    points, triangles = one.shape()
+    return _faces(points - origin, triangles)
 
 
 def _faces(points: Array, triangles: NDArray[np.int64]) -> rr.Mesh3D:
@@ -119,7 +122,7 @@ def _faces(points: Array, triangles: NDArray[np.int64]) -> rr.Mesh3D:
     )
 
 
-_SHAPES: dict[str, Callable[[Any, Array], rr.AsComponents]] = {
+_SHAPES: dict[str, Callable[[Any, Array, Array], rr.AsComponents]] = {
     "sphere": _sphere,
     "capsule": _capsule,
     "box": _box,

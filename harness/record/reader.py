@@ -27,6 +27,7 @@ from harness.base.errors import InputError, Mistake
 from harness.record import cells
 from harness.record.base import LAYOUT, Replay
 from harness.record.cells import cell
+from harness.record.local_origin import read_origin
 from harness.record.sound import require_sound, trust, whole_messages
 
 _MAGIC = b"RRF2"
@@ -113,6 +114,7 @@ def read_replay(path: Path, frames: Collection[int] | None = None) -> Replay:
             strain_range=float(springs["strain_range"][0]),
             scalars=_by_frame(_scalars(source)),
             properties=facts,
+            origin=read_origin(facts),
         )
 
 
@@ -209,7 +211,7 @@ def network(source: Source) -> dict[str, NDArray[Any]]:
 def positions(
     source: Source, wanted: Collection[int] | None = None
 ) -> Iterator[tuple[int, float, NDArray[np.float32]]]:
-    """Frame, time [s] and positions (n, 3) of the wanted frames, as they come in the file."""
+    """Frame, time [s] and positions (n, 3), relative to the origin, of the wanted frames, as they come in the file."""
     for chunk in source.chunks(content="/scene/mesh", components=_POSITIONS):
         batch = chunk.to_record_batch()
         (name,) = set(_POSITIONS) & set(batch.schema.names)

@@ -6,6 +6,8 @@ Topology is written once, positions every FLUSH frames in one piece, scalars in 
 of its own, so a killed run leaves all but the last few frames. The file has a partial name until it is complete and its
 end has been found.
 
+Positions are stored relative to an origin (`harness.record.local_origin`).
+
 Entities: `/scene/mesh` (positions, exact to float32), `/scene/pins`, `/scene/springs`, `/scene/obstacles/*`;
 `/scene/forces/*`, arrows that are hidden at first; `/scene/scale`, of strain; `/energy/*`, `/residual`, `/iterations`,
 `/strain/largest`, `/milliseconds/*` by `frame` and `time`, `/energy_change/*` as a share of its largest;
@@ -31,6 +33,7 @@ from harness.record import blueprint, curves
 from harness.record.arrows import Arrows
 from harness.record.base import LAYOUT, Frame, RecordingInfo
 from harness.record.camera import Extent
+from harness.record.local_origin import local_origin, origin_property, store_relative
 from harness.record.obstacles import Obstacles, declared
 from harness.record.partial import PartialFile
 from harness.record.shading import PIN_COLOUR, Shading, widest
@@ -56,7 +59,8 @@ class RerunRecorder:
     def __init__(self, path: Path, info: RecordingInfo) -> None:
         self._info = info
         self._shading = Shading(info)
-        self._box = Extent(info.mesh.rest)
+        self._origin = local_origin(info.mesh.rest)
+        self._box = Extent(info.mesh.rest - self._origin)
         self._scalars: dict[str, list[tuple[int, float]]] = {}
         self._styled: dict[str, list[str]] = {}
         self._frames = 0
@@ -78,11 +82,10 @@ class RerunRecorder:
 
     def frame(self, frame: Frame) -> None:
         """Record one frame; its arrays are only read."""
-        with np.errstate(over="ignore"):
-            p = frame.positions.astype(np.float32)
+        p = store_relative(frame.positions, self._origin)
         if not self._frames:
             self._begin()
-            self._box = Extent(self._info.mesh.rest, first=p)
+            self._box = Extent(self._info.mesh.rest - self._origin, first=p)
         strain, of_vertex = self._shading.strains(frame.positions)
         self._stream.set_time("frame", sequence=frame.index)
         self._stream.set_time("time", duration=frame.time)
@@ -142,12 +145,13 @@ class RerunRecorder:
 
     def _begin(self) -> None:
         self._log_once()
-        self._obstacles = Obstacles(self._stream, self._info.obstacles, self._info.mesh.rest)
+        self._obstacles = Obstacles(self._stream, self._info.obstacles, self._info.mesh.rest, self._origin)
         self._arrows = Arrows(self._stream, self._info.mesh.size)
 
     def _log_once(self) -> None:
         info, mesh = self._info, self._info.mesh
-        facts: dict[str, Any] = {k: [v] for k, v in {**info.properties, **declared(info.obstacles)}.items()}
+        stated = {**info.properties, **declared(info.obstacles), **origin_property(self._origin)}
+        facts: dict[str, Any] = {k: [v] for k, v in stated.items()}
         self._stream.send_property("run", rr.AnyValues(**facts))
         network: dict[str, Any] = {
             "layout": LAYOUT,
@@ -207,8 +211,8 @@ class RerunRecorder:
         self._stream.log("/scene/scale/numbers", numbers, static=True)
 
     def _send_convergence(self) -> None:
-        frames = sorted(self._curves)
-        if not frames:
+        frames = sorted(frame for frame, (residuals, _) in self._curves.items() if len(residuals))
+        if not frames:  # no frame needed an iteration
             return
         longest = max(len(self._curves[frame][0]) for frame in frames)
         table = np.full((2, longest, len(frames)), np.nan)
@@ -225,7 +229,8 @@ class RerunRecorder:
             index = rr.TimeColumn("iteration", sequence=range(1, longest + 1))
             self._stream.send_columns(f"/convergence/{name}", [index], columns)
         residuals = {name: table[0, :, k].tolist() for k, name in enumerate(names)}
-        above = {name: (table[1, :, k] - np.nanmin(table[1, :, k])).tolist() for k, name in enumerate(names)}
+        lowest = np.nanmin(table[1], axis=0, initial=np.inf)  # infinite where no objective is known
+        above = {name: (table[1, :, k] - lowest[k]).tolist() for k, name in enumerate(names)}
         curves.draw(self._stream, "/curves/residual", residuals, colours)
         curves.draw(self._stream, "/curves/objective", above, colours)
 

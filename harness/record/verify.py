@@ -1,12 +1,17 @@
-"""A recording read back from its file, before its run counts as done: its last frame is the motion's end.
+"""A recording read back from its file, before its run counts as done: its last frame and a few random ones.
 
-Colours are made once more, plainly, from the positions that the run ended at, so that neither another frame's positions
+Positions are the run's, rounded to single precision relative to the recording's origin. What that rounds is bounded by
+the mesh's size, wherever the mesh is: an origin that does not resolve the mesh is an error.
+
+Colours are made once more, plainly, from the positions of the run, so that neither another frame's positions
 nor another frame's colours pass. They may be one level of the scale off, for the rounding of a strain between two.
 """
 
 from __future__ import annotations
 
 import hashlib
+import random
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,58 +21,104 @@ from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
 from harness.record.base import RecordingInfo
-from harness.record.reader import cell, open_recording
+from harness.record.local_origin import CELLS, read_origin, store_relative
+from harness.record.reader import cell, open_recording, properties
 from harness.record.shading import LEVELS, palette
 from solvers.problem import Positions
 
 ROUNDING = 1e-9
 """Strains that differ by less, one of them stretched and one compressed, may be taken in either order."""
 
+SAMPLES = 8
+"""Frames before the last that are read back: a recording wrong in half of its frames passes once in 256 runs."""
+
+_UNIT = 2.0**-24
+"""Round-off of single precision, relative."""
+
 _PARTS = (("Mesh3D:vertex_positions", "Mesh3D:vertex_colors"), ("Points3D:positions", "Points3D:colors"))
 
 
-def require_last(path: Path, info: RecordingInfo, frame: int, time: float, p: Positions) -> str:
+class FrameSamples:
+    """Copies of the positions of some random frames of a run, and of its last one."""
+
+    def __init__(self, last: int) -> None:
+        before = range(1, last)
+        self.frames = {*random.sample(before, min(SAMPLES, len(before))), last}
+        self.positions: dict[int, Positions] = {}
+
+    def add(self, frame: int, p: Positions) -> None:
+        """Copy the positions (n, 3) [m] after a step, if its frame is one of those."""
+        if frame in self.frames:
+            self.positions[frame] = p.copy()
+
+
+def require_frames(path: Path, info: RecordingInfo, times: Mapping[int, float], run: Mapping[int, Positions]) -> str:
     """The SHA-256 of the positions in the recording's last frame, as its file has them (float32 bytes).
 
-    Raises RunFailed unless that frame has this number, time [s], these positions (n, 3) [m], rounded to float32, and
-    their colours; InputError where the file cannot be read.
+    times, run: time [s] and positions (n, 3) [m] of some frames of the run, the last of them the run's last.
+    Raises RunFailed unless the recording ends with that frame and has all of these frames with their times, positions
+    and colours; InputError where the file cannot be read.
     """
-    last = _last(path)
-    if last.frame != frame or not abs(last.time - time) <= 1e-6 * max(1.0, abs(time)):  # the file counts nanoseconds
-        came = f"frame {last.frame} at {last.time:g} s" if last.frame >= 0 else "no frame"
-        raise RunFailed(f"{path.name}: the recording ends with {came}, the run with frame {frame} at {time:g} s")
-    with np.errstate(over="ignore"):
-        expected = p.astype(np.float32)
-    if last.positions.tobytes() != expected.tobytes():
-        raise RunFailed(f"{path.name}: frame {frame} was recorded with other positions than the run ended at")
-    if not _are_of(last.colours, info, p):
-        raise RunFailed(f"{path.name}: frame {frame} was recorded with other colours than its strains have")
-    return hashlib.sha256(last.positions.tobytes()).hexdigest()
+    last = max(run)
+    origin, end, found = _read(path, run)
+    if end != last or last not in found:
+        came = f"frame {end}" if end >= 0 else "no frame"
+        raise RunFailed(f"{path.name}: the recording ends with {came}, the run with frame {last}")
+    for frame, p in run.items():
+        if frame not in found:
+            raise RunFailed(f"{path.name}: frame {frame} was not recorded")
+        recorded, time = found[frame], times[frame]
+        if not abs(recorded.time - time) <= 1e-6 * max(1.0, abs(time)):  # the file counts nanoseconds
+            raise RunFailed(f"{path.name}: frame {frame} was recorded at {recorded.time:g} s, it is at {time:g} s")
+        if recorded.positions.tobytes() != store_relative(p, origin).tobytes():
+            raise RunFailed(f"{path.name}: frame {frame} was recorded with other positions than the run had")
+        coarse = _beyond_rounding(recorded.positions, origin, info, p)
+        if coarse:
+            raise RunFailed(f"{path.name}: frame {frame} was recorded with positions rounded by {coarse:.2g} m")
+        if not _are_of(recorded.colours, info, p):
+            raise RunFailed(f"{path.name}: frame {frame} was recorded with other colours than its strains have")
+    return hashlib.sha256(found[last].positions.tobytes()).hexdigest()
 
 
-class _Last(NamedTuple):
-    """Number (-1 for none), time [s], positions (n, 3) [m] and colours (n,), as 0xRRGGBBAA, of the last frame."""
+class _Recorded(NamedTuple):
+    """Time [s], positions (n, 3) [m] relative to the origin, and colours (n,), as 0xRRGGBBAA, of a frame."""
 
-    frame: int
     time: float
     positions: NDArray[np.float32]
     colours: NDArray[np.uint32]
 
 
-def _last(path: Path) -> _Last:
-    found = _Last(-1, np.nan, np.empty((0, 3), np.float32), np.empty(0, np.uint32))
+def _read(path: Path, wanted: Collection[int]) -> tuple[NDArray[np.float64], int, dict[int, _Recorded]]:
+    """The origin, the number of the last frame (-1 for none), and those of the wanted frames that are recorded."""
+    end, found = -1, dict[int, _Recorded]()
     with open_recording(path) as source:
+        origin = read_origin(properties(source)[1])
         for positions, colours in _PARTS:
             for chunk in source.chunks(content="/scene/mesh", components=[positions, colours]):
                 batch = chunk.to_record_batch()
                 if not {positions, colours} <= set(batch.schema.names):
                     continue
                 numbers, times = (batch[name].cast(pa.int64()).to_numpy() for name in ("frame", "time"))
-                k = int(np.argmax(numbers))
-                if numbers[k] > found.frame:
-                    at, of = cell(batch, positions, k).reshape(-1, 3), cell(batch, colours, k)
-                    found = _Last(int(numbers[k]), times[k] / 1e9, at, of)
-    return found
+                end = max(end, int(numbers.max()))
+                for k in np.flatnonzero(np.isin(numbers, [*wanted])).tolist():
+                    p, of = cell(batch, positions, k).reshape(-1, 3), cell(batch, colours, k)
+                    found[int(numbers[k])] = _Recorded(times[k] / 1e9, p.copy(), of.copy())
+    return origin, end, found
+
+
+def _beyond_rounding(
+    recorded: NDArray[np.float32], origin: NDArray[np.float64], info: RecordingInfo, p: Positions
+) -> float:
+    """The largest error [m] of what was recorded, if single precision relative to the mesh allows less; else 0.
+
+    Allowed is the round-off of the distance from the middle of the mesh at rest, and of the largest cell of an origin.
+    """
+    rest = info.mesh.rest
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(recorded + origin - p)
+        reach = np.abs(p - (rest.min(axis=0) / 2 + rest.max(axis=0) / 2)) + 2 * CELLS * (info.mesh.size or 1.0)
+        beyond = error > _UNIT * reach + np.spacing(np.abs(p))  # the origin is added in double precision
+    return float(error[beyond].max(initial=0.0))
 
 
 def _are_of(colours: NDArray[np.uint32], info: RecordingInfo, p: Positions) -> bool:

@@ -202,7 +202,7 @@ def _distance(replay: Replay, reference: Replay) -> float:
     )
     if not comparable:
         return np.nan
-    away = replay.positions[-1].astype(np.float64) - reference.positions[-1]
+    away = replay.absolute_positions(-1) - reference.absolute_positions(-1)
     return float(np.linalg.norm(away, axis=1).max(initial=0.0) / spacing(replay))
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from harness.record.base import Replay
 from harness.record.shading import scale_end
-from harness.report.render import spring_strain, vertex_strain
+from harness.report.render import spacing, spring_strain, vertex_strain
 
 _BLOWN_UP = 1e4  # coordinates this many times larger than the start's are drawn as if not finite
 
@@ -17,7 +17,7 @@ _BLOWN_UP = 1e4  # coordinates this many times larger than the start's are drawn
 def drawable_frames(replay: Replay) -> NDArray[np.int64]:
     """The recorded frames before the first that is not finite (or has blown up beyond drawing)."""
     start = replay.positions[0]
-    limit = _BLOWN_UP * max(float(np.abs(start).max(initial=0.0)), 1.0)
+    limit = _BLOWN_UP * (max(float(np.abs(start).max(initial=0.0)), spacing(replay)) or 1.0)
     with np.errstate(invalid="ignore"):
         good = np.abs(replay.positions).max(axis=(1, 2), initial=0.0) <= limit  # not so for a NaN
     return np.arange(len(good) if good.all() else int(np.argmin(good)))

@@ -135,7 +135,7 @@ def _print_difference(paths: list[Path], console: Console) -> None:
     if a.positions.shape != b.positions.shape:
         came = f"{a.positions.shape[1]} and {b.positions.shape[1]}"
         raise InputError(f"{paths[0]} and {paths[1]} have {came} vertices: their positions cannot be compared")
-    apart = np.linalg.norm(a.positions[0].astype(np.float64) - b.positions[0], axis=1)
+    apart = np.linalg.norm(a.absolute_positions(0) - b.absolute_positions(0), axis=1)
     spacing = float(a.rest_lengths.mean()) if len(a.rest_lengths) else np.nan
     figures = {"max": apart.max(), "rms": math.sqrt((apart**2).mean())}
     rows = [(name, f"{value:.6g}", f"{value / spacing:.6g}") for name, value in figures.items()]
@@ -177,7 +177,7 @@ def _export(replay: Replay, recording: Path, export: Path) -> None:
 
     from harness.report.render import spring_strain, vertex_strain
 
-    points = replay.positions[0]
+    points = replay.absolute_positions(0)
     if len(replay.triangles):
         mesh = pv.PolyData.from_regular_faces(points, replay.triangles)
     else:

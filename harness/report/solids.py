@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # a recording without obstacles imports none of them
     from harness.scenes.obstacles import Box, Capsule, Plane, Sphere
     from harness.scenes.shapes import AnySurface, Solid
 
+_ZERO = np.zeros(3)
 _LEVEL = 0.999
 """Planes whose normal is as upright as this are the ground, which pictures show by the shadow on it."""
 
@@ -29,7 +30,7 @@ def solids(replay: Replay, frame: int) -> list[pv.PolyData]:
     from harness.scenes.shapes import from_json
 
     time, seen = float(replay.times[frame]), replay.positions[frame]
-    made = (solid(one, time, seen) for one in from_json(str(replay.properties[KEY])))
+    made = (solid(one, time, seen, replay.origin) for one in from_json(str(replay.properties[KEY])))
     return [one for one in made if one is not None]
 
 
@@ -38,30 +39,46 @@ def seen(replay: Replay, frames: Iterable[int]) -> NDArray[np.float32]:
     return np.concatenate([p for k in frames for p in (replay.positions[k], *(s.points for s in solids(replay, k)))])
 
 
-def solid(obstacle: AnySurface, time: float, seen: NDArray[np.floating]) -> pv.PolyData | None:
-    """The obstacle at a time [s]; of a plane the part below the points `seen` (q, 3) [m]; None for the level ground."""
-    made = _MADE[obstacle.kind](obstacle, seen)
-    if obstacle.kind == "mesh" and made is not None:
-        made.points = obstacle.placed(np.asarray(made.points, np.float64), time)
-    elif made is not None and obstacle.motion is not None:
-        made.points = obstacle.motion.moved(np.asarray(made.points, np.float64), time)
+def solid(
+    obstacle: AnySurface, time: float, seen: NDArray[np.floating], origin: NDArray[np.float64] = _ZERO
+) -> pv.PolyData | None:
+    """The obstacle at a time [s]; of a plane the part below the points `seen` (q, 3) [m]; None for the level ground.
+
+    origin: what all points, those seen and those returned, are relative to.
+    """
+    made = _MADE[obstacle.kind](obstacle, seen + origin)
+    if made is None:
+        return None
+    points = np.asarray(made.points, np.float64)
+    if obstacle.kind == "mesh":
+        points = obstacle.placed(points, time)
+    elif obstacle.motion is not None:
+        points = obstacle.motion.moved(points, time)
+    made.points = points - origin
     return made
 
 
+def _shifted(shape: pv.PolyData, by: Sequence[float] | NDArray[np.float64]) -> pv.PolyData:
+    """The shape, moved in double precision: VTK's sources make points in single precision."""
+    shape.points = np.asarray(shape.points, np.float64) + by
+    return shape
+
+
 def _sphere(one: Sphere, seen: NDArray[np.floating]) -> pv.PolyData:
-    return pv.Sphere(radius=one.radius, center=one.center, theta_resolution=48, phi_resolution=32)
+    return _shifted(pv.Sphere(radius=one.radius, theta_resolution=48, phi_resolution=32), one.center)
 
 
 def _capsule(one: Capsule, seen: NDArray[np.floating]) -> pv.PolyData:
-    a, b = (np.array(end) for end in one.ends)
+    first, last = (np.array(end) for end in one.ends)
+    a, b = np.zeros(3), last - first
     bar = pv.Line(a, b).tube(radius=one.radius, n_sides=32, capping=False)
-    balls = [pv.Sphere(radius=one.radius, center=end, theta_resolution=32, phi_resolution=24) for end in one.ends]
-    return cast(pv.PolyData, bar.merge(balls).extract_surface(algorithm=None))
+    balls = [pv.Sphere(radius=one.radius, center=end, theta_resolution=32, phi_resolution=24) for end in (a, b)]
+    return _shifted(cast(pv.PolyData, bar.merge(balls).extract_surface(algorithm=None)), first)
 
 
 def _box(one: Box, seen: NDArray[np.floating]) -> pv.PolyData:
-    (a, b, c), (d, e, f) = one.low, one.high
-    return pv.Box(bounds=(a, d, b, e, c, f))
+    x, y, z = np.subtract(one.high, one.low)
+    return _shifted(pv.Box(bounds=(0, x, 0, y, 0, z)), one.low)
 
 
 def _plane(one: Plane, seen: NDArray[np.floating]) -> pv.PolyData | None:
@@ -72,7 +89,7 @@ def _plane(one: Plane, seen: NDArray[np.floating]) -> pv.PolyData | None:
     foot = seen - (away @ normal)[:, None] * normal
     side = 1.3 * float(np.linalg.norm(np.ptp(foot, axis=0)))
     middle = (foot.min(axis=0) + foot.max(axis=0)) / 2.0
-    return pv.Plane(center=middle, direction=normal, i_size=side, j_size=side)
+    return _shifted(pv.Plane(center=(0, 0, 0), direction=normal, i_size=side, j_size=side), middle)
 
 
 def _mesh(one: Solid, seen: NDArray[np.floating]) -> pv.PolyData:

@@ -39,6 +39,7 @@ def observe(
     recorder: Recorder | None,
     convergence: Collection[int],
     stored: NDArray[np.float64] | None,
+    sample: Callable[[int, Positions], None] | None = None,
     judge: Callable[[Step], dict[str, Any]] | None,
     tick: Callable[[], None],
     clock: AbstractContextManager[None] = NO_CLOCK,
@@ -46,8 +47,8 @@ def observe(
     """Simulate a run's frames and return, by frame, the columns of its rows that tell of the solution.
 
     recorder: takes every frame, and how the solve converged in the frames `convergence`; stored: where to put the
-    positions after each step, (frames, n, 3) [m]; judge: adds what an oracle says of each step; tick: called after
-    each step; clock: within which each is done.
+    positions after each step, (frames, n, 3) [m]; sample: called with each frame and its positions (n, 3) [m]; judge:
+    adds what an oracle says of each step; tick: called after each step; clock: within which each is done.
     """
     found: dict[int, dict[str, Any]] = {}
 
@@ -56,6 +57,8 @@ def observe(
         found[step.index] = told = columns(scene, step, terms, residual) | (judge(step) if judge else {})
         if stored is not None:
             stored[step.index - 1] = step.positions
+        if sample:
+            sample(step.index, step.positions)
         if recorder:
             drawn = terms, residual, step.iterations, acting(step), told["intersections"]
             recorder.frame(Frame(step.index, scene.time(step.index), step.positions, *drawn))

@@ -160,10 +160,13 @@ def test_convergence_is_one_entity_by_iteration_with_a_value_for_each_frame(tmp_
         recorder.frame(frame)
     recorder.convergence(3, [1.0, 0.1, 0.0], [5.0, 4.0, 4.0])
     recorder.convergence(7, [2.0, 0.2], [3.0, 2.0])
+    recorder.convergence(4, [], [])  # at rest
+    recorder.convergence(5, [3.0], [np.nan])  # a method without an objective
     found = summary(recorder.close({}))
     rows = [row for row in found.scalars.to_pylist() if row["entity"] == "/convergence/residual"]
     told = {(row["frame"], row["iteration"], row["time"]): row["value"] for row in rows}
     expected = {(3, 1, 0.03): 1.0, (3, 2, 0.03): 0.1, (3, 3, 0.03): 0.0, (7, 1, 0.07): 2.0, (7, 2, 0.07): 0.2}
+    expected |= {(5, 1, 0.05): 3.0}
     assert {key: value for key, value in told.items() if not np.isnan(value)} == expected
     entities = [entity for entity in found.entities if "convergence" in entity]
     assert entities == [
@@ -171,7 +174,7 @@ def test_convergence_is_one_entity_by_iteration_with_a_value_for_each_frame(tmp_
         *(f"/convergence/{name}" for name in ("objective", "residual")),
     ]
     with open_recording(tmp_path / "a.rrd") as source:
-        assert residuals(source) == {3: [1.0, 0.1, 0.0], 7: [2.0, 0.2]}
+        assert residuals(source) == {3: [1.0, 0.1, 0.0], 5: [3.0], 7: [2.0, 0.2]}
         curves = list(source.chunks(content="/curves/residual/lines"))
     assert [chunk.is_static for chunk in curves] == [True], "it is drawn on every timeline"
 

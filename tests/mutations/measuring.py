@@ -134,7 +134,7 @@ MEASURING = (
     Mutation(
         "recording-not-compared",
         "harness/record/verify.py",
-        "if last.positions.tobytes() != expected.tobytes():",
+        "if recorded.positions.tobytes() != store_relative(p, origin).tobytes():",
         "if False:",
         ("tests/unit/test_record_verify.py",),
     ),

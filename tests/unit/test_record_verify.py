@@ -1,8 +1,9 @@
-"""What a recording ends with is read back from its file and compared with where the run ended."""
+"""Frames of a recording are read back from its file and compared with the run: the last one and some random ones."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +11,12 @@ import numpy as np
 import pytest
 
 from harness.base.errors import InputError, RunFailed
+from harness.record import rerun
+from harness.record.base import Frame, RecordingInfo
+from harness.record.local_origin import local_origin
+from harness.record.reader import read_replay
 from harness.record.rerun import RerunRecorder
-from harness.record.verify import require_last
+from harness.record.verify import FrameSamples, require_frames
 from tests.recordings import MESHES, info, record, waving
 
 COUNT = 12
@@ -21,6 +26,10 @@ TIME = 0.01 * (COUNT - 1)
 def ends(mesh: str = "cloth") -> np.ndarray:
     """The positions in the last frame."""
     return [*waving(info(mesh), COUNT)][-1].positions
+
+
+def require_last(path: Path, of: RecordingInfo, frame: int, time: float, p: np.ndarray) -> str:
+    return require_frames(path, of, {frame: time}, {frame: p})
 
 
 @pytest.mark.parametrize("mesh", MESHES)
@@ -42,8 +51,8 @@ def moved(p: np.ndarray) -> np.ndarray:
 
 
 ENDS = {
-    "another frame": (COUNT, TIME, lambda p: p, "ends with frame 11 at 0.11 s"),
-    "another time": (COUNT - 1, TIME + 0.01, lambda p: p, "the run with frame 11 at 0.12 s"),
+    "another frame": (COUNT, TIME, lambda p: p, "ends with frame 11, the run with frame 12"),
+    "another time": (COUNT - 1, TIME + 0.01, lambda p: p, "frame 11 was recorded at 0.11 s, it is at 0.12 s"),
     "another last bit": (COUNT - 1, TIME, moved, "other positions"),
 }
 
@@ -71,3 +80,82 @@ def test_a_recording_without_frames_and_a_file_that_is_none_are_refused(tmp_path
     (tmp_path / "b.rrd").write_bytes(b"")
     with pytest.raises(InputError, match="not a Rerun recording"):
         require_last(tmp_path / "b.rrd", replace(info()), 1, 0.01, ends())
+
+
+def whole(of: RecordingInfo) -> dict[int, np.ndarray]:
+    return {frame.index: frame.positions for frame in waving(of, COUNT)}
+
+
+TIMES = {k: 0.01 * k for k in range(COUNT)}
+LIES = {
+    "one step late in odd frames": lambda f, before: replace(f, positions=(before if f.index % 2 else f).positions),
+    "late in one frame": lambda f, before: replace(f, positions=before.positions if f.index == 4 else f.positions),
+    "its time late": lambda f, before: replace(f, time=before.time if f.index == 4 else f.time),
+}
+
+
+@pytest.mark.parametrize("lie", LIES.values(), ids=LIES)
+def test_a_recording_that_is_wrong_before_its_end_is_refused(lie: Callable[[Frame, Frame], Frame], tmp_path: Path):
+    of, before = info(), next(waving(info(), 1))
+    recorder = RerunRecorder(tmp_path / "a.rrd", of)
+    for frame in waving(of, COUNT):
+        recorder.frame(lie(frame, before) if frame.index < COUNT - 1 else frame)
+        before = frame
+    path = recorder.close({})
+    require_last(path, of, COUNT - 1, TIME, ends())
+    with pytest.raises(RunFailed, match=r"frame \d+ was recorded (with other positions|at)"):
+        require_frames(path, of, TIMES, whole(of))
+
+
+def test_a_few_random_frames_and_the_last_are_sampled():
+    drawn = [FrameSamples(100).frames for _ in range(20)]
+    assert all(len(frames) == 9 and max(frames) == 100 and min(frames) >= 1 for frames in drawn)
+    assert len(set[int]().union(*drawn)) > 30, "other frames each time"
+    assert (FrameSamples(1).frames, FrameSamples(3).frames) == ({1}, {1, 2, 3})
+    samples, p = FrameSamples(2), np.zeros((1, 3))
+    for frame in (1, 2):
+        p[:] = frame  # solvers may reuse an array
+        samples.add(frame, p)
+    assert [float(samples.positions[frame][0, 0]) for frame in (1, 2)] == [1.0, 2.0]
+
+
+FAR = np.array([32_000_000.0, -5e6, 1e6])
+
+
+def far_info() -> RecordingInfo:
+    mesh = replace(MESHES["cloth"], rest=MESHES["cloth"].rest + FAR)
+    return replace(info(), mesh=mesh)
+
+
+def test_positions_far_from_zero_are_stored_relative_to_an_origin(tmp_path: Path):
+    of = far_info()
+    path = record(tmp_path / "a.rrd", of, COUNT)
+    require_frames(path, of, TIMES, whole(of))
+    replay = read_replay(path)
+    assert np.abs(replay.positions).max() < 10 * of.mesh.size
+    np.testing.assert_array_equal(replay.origin, local_origin(of.mesh.rest))
+    for k, p in whole(of).items():
+        assert np.abs(replay.absolute_positions(k) - p).max() < 1e-6 * of.mesh.size, "not the metre of single precision"
+
+
+def test_positions_rounded_far_from_zero_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Single precision resolves 2 m at 32,000 km; an origin of zero is consistent with that, and no excuse for it."""
+    of = far_info()
+    monkeypatch.setattr(rerun, "local_origin", lambda rest: np.zeros(3))
+    with pytest.raises(RunFailed, match=r"positions rounded by 1\.\d* m|positions rounded by 0\.\d+ m"):
+        require_last(record(tmp_path / "a.rrd", of, COUNT), of, COUNT - 1, TIME, whole(of)[COUNT - 1])
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-9, 1.0, 1e9, 1e300])
+@pytest.mark.parametrize("distance", [0.0, 3.0, 1e3, 1e7])
+def test_an_origin_is_near_its_mesh_and_keeps_what_is_relative_to_it(size: float, distance: float):
+    rest = size * (np.array([[0.0, 0, 0], [0.3, 0.9, 0], [0, 0, 0.1]]) + np.array([distance, -distance, 0]))
+    origin, diagonal = local_origin(rest), float(np.linalg.norm(np.ptp(rest / size, axis=0))) * size
+    assert np.abs(rest - origin).max() <= 10 * diagonal, "a cell is less than 16 diagonals"
+    np.testing.assert_allclose((rest - origin) + origin, rest, rtol=3e-16, atol=0)  # a unit in the last place
+    assert distance > 4 or not origin.any(), "near zero positions stay as they are"
+
+
+def test_an_origin_of_what_has_no_extent_or_no_end_is_finite():
+    np.testing.assert_array_equal(local_origin(np.array([[0.2, 1e7 + 0.3, 0]])), [0, 1e7, 0])
+    np.testing.assert_array_equal(local_origin(np.array([[1e308, 0, 0], [-1e308, 0, 0]])), np.zeros(3))

@@ -10,6 +10,7 @@ from harness.config.load import load_any
 from harness.experiments import run
 from harness.experiments.plan import Files
 from harness.experiments.run import execute
+from harness.record.reader import summary
 from harness.simulation.measure import StepFailed
 from harness.simulation.observe import require_numbers
 
@@ -84,3 +85,17 @@ def test_a_method_that_minimises_nothing_may_be_asked_for_a_tolerance(tmp_path: 
     found = execute(spec, files, lambda phase: None)
     assert {row["status"] for row in found} == {"ok"}, found[0]["reason"]
     assert all(row["residual"] is row["yardstick"] is None for row in found if row["phase"] == "step")
+
+
+@pytest.mark.parametrize("solver", ["newton", "newton-cg", "pncg", "jgs2"])
+def test_a_scene_at_rest_is_recorded_with_no_iterations(tmp_path: Path, solver: str):
+    (tmp_path / "scene.yaml").write_text(
+        "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 3\ndefault_size: 3\neffects: [{kind: springs, stretch: 10}]\n"
+    )
+    (spec,) = load_any(tmp_path / "scene.yaml", solvers=[solver], tolerance=1e-6).runs()
+    files = Files.of(spec, tmp_path)
+    files.rows.parent.mkdir()
+    found = execute(spec, files, lambda phase: None)
+    assert {row["status"] for row in found} == {"ok"}, found[0]["reason"]
+    assert [row["iterations"] for row in found if row["phase"] == "step" and row["round"] == 0] == [0, 0, 0]
+    assert summary(files.recording).complete

@@ -113,7 +113,7 @@ def _made(of: tuple[str, ...], name: tuple[str, ...], path: Path, label: str, lo
     title = [label, size, f"at {clock(replay, frame)}{lost}"]
     limit = shown_limit([replay], [frame])
     return Picture(
-        *(of, name, _subject(replay), ", ".join(title), replay.positions[frame].astype(float), replay.springs),
+        *(of, name, _subject(replay), ", ".join(title), replay.absolute_positions(frame), replay.springs),
         *(replay.triangles, vertex_strain(replay, frame), limit, aspect),
         render=_Render(replace(replay, strain_range=limit), frame, frame_all(points, aspect=aspect, angles=angles)),
         facts=(f"largest strain {100 * np.abs(spring_strain(replay, frame)).max(initial=0.0):.3g} %",),

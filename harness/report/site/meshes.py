@@ -1,6 +1,6 @@
 """Meshes for the page, from recordings: the last frame of each run, and each solve's iterates beside its reference.
 
-Positions are single precision, as recordings have them: differences below 1e-7 of a scene's size are none.
+Positions are single precision, relative to the recording's origin: differences below 1e-7 of a scene's size are none.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from harness.base.errors import SpringbenchError
 from harness.record.base import Replay
+from harness.record.local_origin import store_relative
 from harness.report.accuracy.measured import Curve, Measurements
 from harness.report.site import script
 from harness.report.site.folders import Folder
@@ -74,8 +75,9 @@ def _solves(folder: Folder, home: Path, curves: Sequence[Curve], best: Curve, sa
         if replay is None or last is None or not len(replay.frames):
             continue
         distance = script.number(float(best.largest[-1] * best.problem.mean_rest_length))
-        told = {"of": best.label, "distance": distance, "positions": _packed(last.positions[-1], np.float32)}
-        value = _iterates(replay, last.positions[-1]) | {"reference": told}
+        reference = store_relative(last.absolute_positions(-1), replay.origin)
+        told = {"of": best.label, "distance": distance, "positions": _packed(reference, np.float32)}
+        value = _iterates(replay, reference) | {"reference": told}
         script.write(targets[name], f"{folder.slug}/solves/{targets[name].stem}", value)
     return {name: f"solves/{target.stem}" for name, target in targets.items() if target.exists()}
 
