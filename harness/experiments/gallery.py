@@ -49,14 +49,14 @@ def _tile(path: Path) -> Any:
     from harness.report.contact_sheet import Tile
     from harness.scenes.bind import build
     from harness.simulation.measure import Settings, steps
-    from harness.simulation.step import prepare
+    from harness.simulation.step import prepare, start
     from solvers.problem import StopRule
     from solvers.registry import SOLVERS, load
 
     run = load_any(path, solvers=[_SOLVER]).runs()[0]
     scene = build(run.scene, run.size)
     solver = load(SOLVERS[_SOLVER])()
-    p = scene.mesh.rest
+    first = p = start(scene).now.positions
     with machine.pinned_threads(1):
         settings = Settings(StopRule(200, float(_TOLERANCE)), run.first_guess, run.frames, 1)
         for step in steps(scene, prepare(scene, solver), settings):
@@ -65,9 +65,9 @@ def _tile(path: Path) -> Any:
     replay = Replay(
         title=run.scene_name,
         run_id="",
-        frames=np.array([run.frames]),
-        times=np.array([scene.time(run.frames)]),
-        positions=store_relative(p, origin)[None],
+        frames=np.array([0, run.frames]),
+        times=np.array([0.0, scene.time(run.frames)]),
+        positions=np.stack([store_relative(at, origin) for at in (first, p)]),
         triangles=scene.mesh.triangles,
         springs=scene.springs.edges,
         rest_lengths=scene.springs.rest_length,

@@ -45,7 +45,7 @@ def scene_view(root: str, name: str, box: Extent, *, springs_visible: bool) -> r
     shown[f"{root}/scene/forces"] = rrb.EntityBehavior(visible=False)
     return rrb.Spatial3DView(
         origin=f"{root}/scene",
-        name=name,
+        name=", ".join([name, *box.outside()]),
         background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=box.eye(),

@@ -20,6 +20,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from harness.record.framing import framed_vertices, outside_words
 from harness.record.shading import LEVELS, palette, percent
 
 _AROUND, _UP = 38.5, 20.8
@@ -57,7 +58,7 @@ _LEAST = 1e-3
 
 
 class Extent:
-    """The box that the positions stay in, and what of them a camera must see.
+    """The positions of some frames, and what of them a camera must see: see `harness.record.framing`.
 
     aspect: of the view, its width over its height; first: what is seen first, the positions at rest if left out
     or not finite.
@@ -66,24 +67,42 @@ class Extent:
     def __init__(
         self, rest: NDArray[np.floating], aspect: float = 1.0, *, first: NDArray[np.floating] | None = None
     ) -> None:
-        self._low, self._high, self._aspect = rest.min(axis=0), rest.max(axis=0), aspect
+        start = rest if first is None or not np.isfinite(first).all() else first
+        self._aspect, self._start = aspect, start.astype(np.float64)
+        self._rest = rest.astype(np.float64)
+        self._low, self._high = self._rest.min(axis=0), self._rest.max(axis=0)
         self._limit = 10 * np.linalg.norm(self._high - self._low)
-        self._seen = [_outermost(rest if first is None or not np.isfinite(first).all() else first)]
+        self._moved = np.zeros(len(start))
+        self._seen = [_outermost(self._start, np.arange(len(start)))]
         self._sight: _Sight | None = None
 
     def add(self, p: NDArray[np.floating]) -> None:
-        """Widen the box to positions (n, 3) [m], unless they have blown up beyond showing."""
-        low, high = np.minimum(self._low, p.min(axis=0)), np.maximum(self._high, p.max(axis=0))
+        """See positions (n, 3) [m] too, unless they have blown up beyond showing."""
+        p = p.astype(np.float64)
+        if not np.isfinite(p).all():
+            return
+        moved = np.maximum(self._moved, np.linalg.norm(p - self._start, axis=1))
+        near = np.flatnonzero(framed_vertices(self._start, moved))
+        low, high = np.minimum(self._low, p[near].min(axis=0)), np.maximum(self._high, p[near].max(axis=0))
         if np.linalg.norm(high - low) <= self._limit:
-            self._low, self._high = low, high
-            self._seen.append(_outermost(p))
+            self._low, self._high, self._moved = low, high, moved
+            self._seen.append(_outermost(p, near))
             self._sight = None
+
+    def outside(self) -> list[str]:
+        """How many vertices the camera leaves out, in words; nothing where it frames all."""
+        return outside_words(framed_vertices(self._start, self._moved))
 
     def _best(self) -> _Sight:
         """Of the sights that fill the view well, over all frames."""
         if self._sight is None:
-            least = _NEAREST * float(np.linalg.norm(self._high - self._low)) or 1.0  # of a single point
-            first, *others = (_Sight(angles, self._aspect, self._seen, least) for angles in ((_AROUND, _UP), *_OTHERS))
+            near = framed_vertices(self._start, self._moved)
+            seen = [p[near[which]] for which, p in self._seen if near[which].any()]
+            if not near.all() and len(np.unique(np.concatenate(seen), axis=0)) == 1:  # of a point nothing has a size
+                seen.append(self._start)
+            around = np.ptp(np.concatenate([self._rest[near], *seen]), axis=0)
+            least = _NEAREST * float(np.linalg.norm(around)) or 1.0  # of a single point
+            first, *others = (_Sight(angles, self._aspect, seen, least) for angles in ((_AROUND, _UP), *_OTHERS))
             best = max(sight.filled for sight in others)
             better = next(sight for sight in others if sight.filled >= _AS_GOOD * best)
             self._sight = better if best > _BETTER * first.filled else first
@@ -177,15 +196,16 @@ class _Sight:
         return float(across * upright) / 4
 
 
-def _outermost(p: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The points that are the last along some axis, spread evenly over all directions."""
-    if len(p) <= 2 * _SUPPORTS:
-        return p.copy()
+def _outermost(p: NDArray[np.float64], of: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Of these vertices those that are the last along some axis, spread over all directions; and where they are."""
+    if len(of) <= 2 * _SUPPORTS:
+        return of, p[of]
     turn = np.arange(_SUPPORTS)
     up = (turn + 0.5) / _SUPPORTS  # of half a ball, in a spiral by the golden angle
     out, around = np.sqrt(1 - up**2), turn * np.pi * (3 - np.sqrt(5))
-    along = p @ np.stack([out * np.cos(around), up, out * np.sin(around)]).astype(p.dtype)
-    return p[np.unique([along.argmax(axis=0), along.argmin(axis=0)])]
+    along = p[of] @ np.stack([out * np.cos(around), up, out * np.sin(around)])
+    which = of[np.unique([along.argmax(axis=0), along.argmin(axis=0)])]
+    return which, p[which]
 
 
 def _middle(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:

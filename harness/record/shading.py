@@ -108,9 +108,9 @@ class Shading:
 
     def normals(self, p: NDArray[np.float32]) -> NDArray[np.float32]:
         """The unit normal of each vertex, rounded to 1/32, shape (n, 3); zero where there is none."""
-        normals = np.zeros_like(p)
-        _normals(p, self._triangles, normals)
-        return normals
+        normals = np.zeros(p.shape)  # areas of tiny or huge triangles leave the range of single precision
+        _normals(p.astype(np.float64), self._triangles, normals)
+        return normals.astype(np.float32)
 
 
 def strains(
@@ -144,7 +144,7 @@ def _strains(
 
 
 @kept(error_model="numpy", nogil=True)
-def _normals(p: NDArray[np.float32], triangles: NDArray[np.int64], out: NDArray[np.float32]) -> None:
+def _normals(p: Reals, triangles: NDArray[np.int64], out: Reals) -> None:
     for t in range(len(triangles)):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]

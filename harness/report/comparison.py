@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from harness.record.base import Replay
+from harness.record.framing import outside_words
 from harness.report.frames import drawable_frames, shown_ends, shown_limit
 from harness.report.origin import made_by
 from harness.report.page import (
@@ -32,7 +33,7 @@ from harness.report.page import (
     text,
 )
 from harness.report.render import Studio, area_vectors, frame_all, natural_angles, shape, spacing, spring_strain
-from harness.report.solids import seen
+from harness.report.solids import framed, seen
 from harness.report.style import HEIGHT, MUTED, RC, RULE, WIDTH, Mark, marks
 
 _LEFT, _TOP, _RIGHT, _BOTTOM = 40, 118, WIDTH - 40, HEIGHT - 28
@@ -135,11 +136,11 @@ def _panel(
 ) -> None:
     """The tiles of one scene and size, row by row; all with one camera."""
     finite = [replay for _, replay in panel if _ends_finite(replay)]
-    points = np.concatenate([r.positions[-1] for r in finite] or [np.zeros((1, 3))])
+    points = np.concatenate([r.positions[-1][framed(r, [-1])] for r in finite] or [np.zeros((1, 3))])
     areas = np.concatenate([area_vectors(r, -1) for r in finite] or [np.zeros((0, 3))])
     angles = natural_angles(points, areas)
-    framed = np.concatenate([seen(r, [-1]) for r in finite] or [points])
-    view = frame_all(framed, aspect=grid.width / grid.height, angles=angles)
+    points = np.concatenate([seen(r, [-1]) for r in finite] or [points])
+    view = frame_all(points, aspect=grid.width / grid.height, angles=angles)
     solvers = [_solver(*entry) for entry in panel]
     best = panel[reference([replay for _, replay in panel])][1]
     for k, (label, replay) in enumerate(panel):
@@ -149,6 +150,8 @@ def _panel(
         x, y = left + column * (grid.width + _GAP), top + row * (grid.height + _CAPTION)
         if _ends_finite(replay):
             paste(page, studio.draw(replay, len(replay.frames) - 1, view), x, y)
+            for words in outside_words(framed(replay, [-1])):
+                text(page, x + 3, y + grid.height - 4, words, size=9, color=MUTED)
         else:
             first = replay.frames[len(drawable_frames(replay))]
             words = f"not finite\nfrom frame {first} on"

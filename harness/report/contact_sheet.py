@@ -17,10 +17,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from harness.record.base import Replay
+from harness.record.framing import outside_words
 from harness.report.origin import machine_and_commit
 from harness.report.page import save
 from harness.report.render import Studio, area_vectors, frame_all, natural_angles
-from harness.report.solids import seen
+from harness.report.solids import framed, seen
 from harness.report.style import DPI, INK, MUTED, PAGE, RC, WIDTH
 
 _MOST, _FEWEST = 5, 3
@@ -37,9 +38,9 @@ _MARGIN, _GAP, _TILE, _CAPTION, _FOOT = 28, 20, 290, 78, 24
 class Tile:
     """A scene at one moment.
 
-    replay: of the frame to be drawn alone, its properties with the processor (`cpu`) and the `commit`; mass: of its
-    vertices (n,) [kg]; name and effects: in words; angles: azimuth and elevation [degrees], chosen by the mesh's shape
-    where None.
+    replay: of the start and the frame to be drawn, its properties with the processor (`cpu`) and the `commit`; mass: of
+    its vertices (n,) [kg]; name and effects: in words; angles: azimuth and elevation [degrees], chosen by the mesh's
+    shape where None.
     """
 
     replay: Replay
@@ -65,7 +66,7 @@ def draw_sheet(tiles: Sequence[Tile], path: Path, facts: Sequence[str] = ()) -> 
             row, column = divmod(k, columns)
             left, top = _MARGIN + column * (width + _GAP), _MARGIN + row * step
             page.figimage(_drawn(studio, tile, width / _TILE), xo=left, yo=height - top - _TILE, origin="upper")
-            for words, below, size, color in ((tile.name, 20, 15.0, INK), *_lines(tile.effects, width)):
+            for words, below, size, color in ((tile.name, 20, 15.0, INK), *_lines(_words(tile), width)):
                 page.text(left / WIDTH, 1 - (top + _TILE + below) / height, words, size=size, color=color)
         said = "   ·   ".join((*facts, *machine_and_commit([tile.replay.properties for tile in tiles])))
         page.text(_MARGIN / WIDTH, _MARGIN / height, said, size=10.0, color=MUTED)
@@ -79,6 +80,10 @@ def abreast(count: int) -> int:
     return min(range(_FEWEST, _MOST + 1), key=lambda columns: (-count % columns, abs(columns - 4)))
 
 
+def _words(tile: Tile) -> str:
+    return ", ".join([tile.effects, *outside_words(framed(tile.replay, [-1]))])
+
+
 def _lines(effects: str, width: int) -> list[tuple[str, int, float, str]]:
     """The effects in two lines at most, with their places."""
     lines = wrap(effects, int(width / 7.2), max_lines=2, placeholder=" …")
@@ -86,8 +91,8 @@ def _lines(effects: str, width: int) -> list[tuple[str, int, float, str]]:
 
 
 def _drawn(studio: Studio, tile: Tile, aspect: float) -> np.ndarray:
-    replay, points = tile.replay, tile.replay.positions[-1]
+    replay, points = tile.replay, tile.replay.positions[-1][framed(tile.replay, [-1])]
     radius = _BOB * float(np.linalg.norm(np.ptp(points, axis=0)))
-    bobs = [pv.Sphere(radius=radius, center=p) for p in points[tile.mass > _HEAVY * np.median(tile.mass)]]
+    bobs = [pv.Sphere(radius=radius, center=p) for p in replay.positions[-1][tile.mass > _HEAVY * np.median(tile.mass)]]
     angles = tile.angles or natural_angles(points, area_vectors(replay, -1))
     return studio.draw(replay, -1, frame_all(seen(replay, [-1]), aspect=aspect, angles=angles), bobs)

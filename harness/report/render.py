@@ -7,10 +7,11 @@ All frames of a run share one camera, so that what moves in the pictures is the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import pyvista as pv
@@ -65,11 +66,24 @@ def spacing(replay: Replay) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A camera: `position` and `target` (3,) [m], y up, and the height `ground` [m] that the shadow falls on."""
+    """A camera: `position` and `target` (3,) [m], y up, and the height `ground` [m] that the shadow falls on; what it
+    frames lies within the box from `low` to `high` (3,) [m]."""
 
     position: Points
     target: Points
     ground: float
+    low: Points
+    high: Points
+
+    def scaled(self, by: float) -> View:
+        """The view of a scene whose coordinates are multiplied."""
+        return View(by * self.position, by * self.target, by * self.ground, by * self.low, by * self.high)
+
+    def near(self, p: Points) -> Points:
+        """Those of the points (n, 3) that are in the box or within its diagonal of it; all where none is."""
+        around = _extent(np.stack([self.low, self.high]))
+        inside = ((p >= self.low - around) & (p <= self.high + around)).all(axis=1)
+        return p[inside] if inside.any() else p
 
 
 def natural_angles(points: Points, areas: Points) -> tuple[float, float]:
@@ -90,7 +104,8 @@ def natural_angles(points: Points, areas: Points) -> tuple[float, float]:
 
 def area_vectors(replay: Replay, frame: int) -> Points:
     """Half the cross product of two sides of each triangle [m^2], shape (f, 3)."""
-    a, b, c = (replay.positions[frame][corner] for corner in replay.triangles.T)
+    p = replay.positions[frame].astype(np.float64)
+    a, b, c = (p[corner] for corner in replay.triangles.T)
     return np.cross(b - a, c - a) / 2.0
 
 
@@ -119,8 +134,9 @@ def frame_all(points: Points, *, aspect: float, angles: tuple[float, float]) -> 
         eye[k] = (above - below) / 2.0
         distance = max(distance, (above + below) / (2.0 * slope))
     middle = (c.min() + c.max()) / 2.0
-    eye[2] = max(distance, middle + 1e-3)
-    return View(eye @ axes, np.array([eye[0], eye[1], middle]) @ axes, ground)
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    eye[2] = max(distance, middle + 1e-3 * (float(np.linalg.norm(high - low)) or 1.0))
+    return View(eye @ axes, np.array([eye[0], eye[1], middle]) @ axes, ground, low, high)
 
 
 def _camera_axes(angles: tuple[float, float]) -> Points:
@@ -145,7 +161,7 @@ def shape(points: Points, angles: tuple[float, float]) -> float:
 
 def _extent(p: Points) -> float:
     """The diagonal of the points' bounding box [m], never zero."""
-    return max(float(np.linalg.norm(np.ptp(p, axis=0))), 1e-30)
+    return max(float(np.linalg.norm(np.ptp(p, axis=0).astype(np.float64))), 1e-30)
 
 
 def _cast(p: Points, ground: float) -> Points:
@@ -164,6 +180,13 @@ def _balls(at: Points, radius: float) -> pv.PolyData:
     """A sphere at each point (q, 3)."""
     ball = pv.Sphere(radius=radius, theta_resolution=16, phi_resolution=12)
     return cast(pv.PolyData, pv.PolyData(at).glyph(geom=ball, orient=False, scale=False))
+
+
+class _Sizes(NamedTuple):
+    """The diagonal of what is framed, and the mean rest length, in the units of a picture."""
+
+    extent: float
+    spacing: float
 
 
 class Studio:
@@ -203,21 +226,28 @@ class Studio:
         obstacles, and with dots at points (q, 3) in a colour; it must be finite."""
         plotter = self._plotter
         plotter.clear_actors()
+        # A power of two: pictures of what is large or small are drawn as others are, and others are the same.
+        unit = 2.0 ** -round(math.log2(float(np.linalg.norm(view.position - view.target))))
+        view = view.scaled(unit)
         plotter.camera.position = tuple(view.position)
         plotter.camera.focal_point = tuple(view.target)
         plotter.camera.up = (0.0, 1.0, 0.0)
         plotter.camera.view_angle = 2.0 * np.degrees(_HALF_ANGLE)
-        p = np.ascontiguousarray(replay.positions[frame], np.float32)
+        p = np.ascontiguousarray(unit * replay.positions[frame].astype(np.float64), np.float32)
+        sizes = _Sizes(_extent(view.near(p)), unit * spacing(replay))
         if self._page is not None:
-            self._shadow(replay, p, view.ground, self._page)
+            self._shadow(replay, p, view, sizes, self._page)
         if len(replay.triangles):
             self._surface(replay, frame, p)
         else:
-            self._springs(replay, frame, p)
-        for at, colour in ((p[replay.pinned], PIN_COLOUR), *dots):
-            self._dots(replay, p, at, colour)
+            self._springs(replay, frame, p, sizes)
+        self._dots(replay, sizes, p[replay.pinned], PIN_COLOUR)
+        for at, colour in dots:
+            self._dots(replay, sizes, unit * at, colour)
         for solid in (*solids(replay, frame), *more):
-            plotter.add_mesh(solid, color=_SOLID, smooth_shading=solid.n_cells > 6, **_MATERIAL)
+            shape = solid.copy()
+            shape.points = unit * np.asarray(solid.points, np.float64)
+            plotter.add_mesh(shape, color=_SOLID, smooth_shading=solid.n_cells > 6, **_MATERIAL)
         plotter.reset_camera_clipping_range()
         plotter.render()
         clear = self._page is None
@@ -244,8 +274,11 @@ class Studio:
             show_scalar_bar=False,
         )
 
-    def _springs(self, replay: Replay, frame: int, p: NDArray[np.float32]) -> None:
-        m = len(replay.springs)
+    def _springs(self, replay: Replay, frame: int, p: NDArray[np.float32], sizes: _Sizes) -> None:
+        m, radius = len(replay.springs), self._tube(sizes)
+        if not m:
+            self._plotter.add_mesh(_balls(p, 1.5 * radius), color=_JOINT, smooth_shading=True, **_MATERIAL)
+            return
         lines = pv.PolyData(p, lines=np.c_[np.full(m, 2), replay.springs].ravel())
         lines.cell_data["strain"] = spring_strain(replay, frame)
         look: dict[str, Any] = {
@@ -258,27 +291,27 @@ class Studio:
         if m > _TUBES:
             self._plotter.add_mesh(lines, line_width=1.5, **look)
             return
-        radius = self._tube(replay, p)
         tubes = cast(pv.PolyData, lines.tube(radius=radius, n_sides=12))
         self._plotter.add_mesh(tubes, smooth_shading=True, **look)
         self._plotter.add_mesh(_balls(p, 1.5 * radius), color=_JOINT, smooth_shading=True, **_MATERIAL)
 
-    def _tube(self, replay: Replay, p: NDArray[np.float32]) -> float:
-        """The radius of a spring [m]: thin against its length and the scene, but no less than about a pixel."""
-        thin = min(0.07 * spacing(replay), 0.007 * _extent(p))
-        return max(thin, 1.1 * _extent(p) / self._height)
+    def _tube(self, sizes: _Sizes) -> float:
+        """The radius of a spring: thin against its length and the scene, but no less than about a pixel."""
+        thin = min(0.07 * sizes.spacing, 0.007 * sizes.extent)
+        return max(thin, 1.1 * sizes.extent / self._height)
 
-    def _dots(self, replay: Replay, p: NDArray[np.float32], at: Points, colour: str) -> None:
+    def _dots(self, replay: Replay, sizes: _Sizes, at: Points, colour: str) -> None:
         if len(at):
-            spaced = min(0.3 * spacing(replay), 0.009 * _extent(p))
-            radius = max(spaced, 0.004 * _extent(p), 0.0 if len(replay.triangles) else 2.2 * self._tube(replay, p))
+            spaced = min(0.3 * sizes.spacing, 0.009 * sizes.extent)
+            radius = max(spaced, 0.004 * sizes.extent, 0.0 if len(replay.triangles) else 2.2 * self._tube(sizes))
             self._plotter.add_mesh(_balls(at, radius), color=colour, smooth_shading=True, **_MATERIAL)
 
-    def _shadow(self, replay: Replay, p: NDArray[np.float32], ground: float, behind: str) -> None:
+    def _shadow(self, replay: Replay, p: NDArray[np.float32], view: View, sizes: _Sizes, behind: str) -> None:
         """A soft shadow on the ground: the scene seen from the light, as a blurred picture on an unlit plane."""
-        flat = _cast(p, ground)[:, [0, 2]]
-        centre = (flat.min(axis=0) + flat.max(axis=0)) / 2
-        side = 1.5 * float(np.ptp(flat, axis=0).max()) + 0.2 * _extent(p)
+        ground = view.ground
+        flat, near = (_cast(points, ground)[:, [0, 2]] for points in (p, view.near(p)))
+        centre = (near.min(axis=0) + near.max(axis=0)) / 2
+        side = 1.5 * float(np.ptp(near, axis=0).max()) + 0.2 * sizes.extent
         pixels = 384
         at = ((flat - centre) / side + 0.5) * pixels
         stencil = Image.new("L", (pixels, pixels), 0)

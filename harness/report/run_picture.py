@@ -20,6 +20,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from harness.record.base import Replay
+from harness.record.framing import outside_words
 from harness.report.frames import drawable_frames, shown_ends, shown_limit
 from harness.report.origin import made_by
 from harness.report.page import (
@@ -36,7 +37,7 @@ from harness.report.page import (
     text,
 )
 from harness.report.render import Studio, area_vectors, frame_all, natural_angles, shape
-from harness.report.solids import seen
+from harness.report.solids import framed, seen
 from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, RULE, WIDTH
 
 _LEFT, _TOP, _RIGHT, _HEIGHT = 36, 114, WIDTH - 36, 750
@@ -93,7 +94,7 @@ def draw_run(replay: Replay, path: Path, *, camera: tuple[float, float] | None =
         replay = replace(replay, strain_range=shown_limit([replay] * len(shown), shown.tolist()))
     with matplotlib.rc_context(RC):
         page = new_page()
-        header(page, headline(replay), _facts(replay))
+        header(page, headline(replay), [*_facts(replay), *(outside_words(framed(replay, shown)) if len(shown) else [])])
         strain_scale(
             page, replay.strain_range, shown_ends([replay] * len(shown), shown.tolist()), pins=len(replay.pinned) > 0
         )
@@ -117,7 +118,7 @@ def _facts(replay: Replay) -> list[str]:
 
 def _frames(page: Figure, replay: Replay, shown: NDArray[np.int64], camera: tuple[float, float] | None) -> None:
     *earlier, final = (int(k) for k in shown)
-    points = replay.positions[shown].reshape(-1, 3)
+    points = replay.positions[shown][:, framed(replay, shown)].reshape(-1, 3)
     angles = natural_angles(points, area_vectors(replay, final)) if camera is None else camera
     last, every = seen(replay, [final]), seen(replay, (*earlier, final))
     main, tiles = layout(shape(last, angles), shape(every, angles), len(earlier))

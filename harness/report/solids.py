@@ -12,6 +12,7 @@ import pyvista as pv
 from numpy.typing import NDArray
 
 from harness.record.base import Replay
+from harness.record.framing import framed_vertices
 from harness.record.obstacles import KEY
 
 if TYPE_CHECKING:  # a recording without obstacles imports none of them
@@ -34,9 +35,23 @@ def solids(replay: Replay, frame: int) -> list[pv.PolyData]:
     return [one for one in made if one is not None]
 
 
-def seen(replay: Replay, frames: Iterable[int]) -> NDArray[np.float32]:
-    """All points (q, 3) [m] of the mesh and of the obstacles in recorded frames: what a camera should see."""
-    return np.concatenate([p for k in frames for p in (replay.positions[k], *(s.points for s in solids(replay, k)))])
+def framed(replay: Replay, frames: Iterable[int]) -> NDArray[np.bool_]:
+    """The vertices (n,) that a camera frames in recorded frames."""
+    start = replay.positions[0].astype(np.float64)
+    moved = [np.linalg.norm(replay.positions[k] - start, axis=1) for k in frames]
+    return framed_vertices(start, np.max(moved, axis=0))
+
+
+def seen(replay: Replay, frames: Sequence[int]) -> NDArray[np.float32]:
+    """All points (q, 3) [m] of the mesh and of the obstacles in recorded frames: what a camera should see.
+
+    Vertices far from all others are left out; where the others are one point, all of the mesh at its start is seen.
+    """
+    near = framed(replay, frames)
+    points = np.concatenate(
+        [p for k in frames for p in (replay.positions[k][near], *(s.points for s in solids(replay, k)))]
+    )
+    return points if near.all() or np.ptp(points, axis=0).any() else np.concatenate([points, replay.positions[0]])
 
 
 def solid(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.record.blueprint import run_document, scale_name, spring_cadence
+from harness.record.blueprint import run_document, scale_name, scene_view, spring_cadence
 from harness.record.camera import Extent
 from harness.record.shading import LEVELS
 from harness.scenes.mesh.grid import Grid
@@ -54,7 +54,8 @@ def height(box: Extent, points: np.ndarray) -> np.ndarray:
 def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: float):
     points = np.vstack([CORNER, CORNER + np.array([0.0, fall, 0.0])])
     box = Extent(CORNER, aspect)
-    box.add(points)
+    box.add(CORNER)
+    box.add(CORNER + np.array([0.0, fall, 0.0]))
     places = seen(box, points, aspect)
     assert places.max() <= 1.0
     if fall:  # else the nearest camera is nearer than any that has room around it
@@ -86,8 +87,21 @@ def test_what_is_wide_and_low_stands_in_the_middle_of_the_room_above_the_scale()
 @pytest.mark.parametrize("bad", [1e6, np.nan, np.inf])
 def test_the_camera_ignores_positions_that_have_blown_up(bad: float):
     box, same = Extent(CORNER), Extent(CORNER)
-    box.add(np.array([[bad, 0.0, 0.0]]))
+    box.add(CORNER + np.array([[bad, 0.0, 0.0]]))
     assert numbers(box.eye().position) == pytest.approx(numbers(same.eye().position))
+
+
+def test_the_camera_leaves_out_what_falls_away_and_says_so():
+    net = np.array([[x, y, 0.0] for x in (0.0, 0.5, 1.0) for y in (0.0, -0.5)])
+    start = np.vstack([net, [[2.0, 0.0, 0.0]]])
+    box, without = Extent(start), Extent(net)
+    for fallen in (0.1, 3.0, 15.0, 44.0):
+        box.add(np.vstack([net, [[2.0, -fallen, 0.0]]]))
+        without.add(net)
+    assert numbers(box.eye().position) == pytest.approx(numbers(without.eye().position), rel=0.02)
+    assert box.outside() == ["1 of 7 vertices is outside"]
+    assert scene_view("", "net", box, springs_visible=True).name == "net, 1 of 7 vertices is outside"
+    assert scene_view("", "net", without, springs_visible=True).name == "net"
 
 
 def test_a_single_point_can_be_looked_at():

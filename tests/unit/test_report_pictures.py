@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,12 +16,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from harness.record.base import Replay
+from harness.record.framing import outside_words
 from harness.record.shading import STRAIN_COLOURS
 from harness.report import comparison, opengl, page, run_picture
 from harness.report.comparison import draw_comparison
 from harness.report.frames import drawable_frames
 from harness.report.render import Studio, area_vectors, frame_all, natural_angles, spring_strain, vertex_strain
 from harness.report.run_picture import PixelBox, draw_run, layout
+from harness.report.solids import framed, seen
 from harness.report.style import HEIGHT, PAGE, WIDTH
 
 needs_opengl = pytest.mark.skipif(opengl.problem() is not None, reason=opengl.problem() or "")
@@ -137,9 +140,9 @@ def test_a_uniform_strain_has_the_documented_colour(strain: float, colour: str) 
     view = frame_all(replay.positions[0], aspect=1.0, angles=(0.0, 0.0))
     with Studio(160, 160) as studio:
         image = studio.draw(replay, 0, view)
-    seen = seen_colour(image)
+    found = seen_colour(image)
     # Light and mesh lines change a facing surface's brightness by up to a tenth; the colours differ by more.
-    assert np.abs(seen - to_rgb(colour)).max() < 0.1
+    assert np.abs(found - to_rgb(colour)).max() < 0.1
 
 
 def seen_colour(image: NDArray[np.float64] | NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -229,6 +232,110 @@ def test_the_view_is_from_the_side_where_most_surface_shows() -> None:
         assert shown[azimuth] >= max(shown.values()) / 1.05
         chosen.append(abs(azimuth) < 90)
     assert sorted(chosen) == [False, True], "mirrored scenes are seen from opposite sides"
+
+
+@needs_opengl
+@pytest.mark.parametrize("make", [cloth, chain], ids=["cloth", "chain"])
+@pytest.mark.parametrize("scale", [2.0**-30, 2.0**40], ids=["nanometres", "terametres"])
+def test_a_picture_does_not_depend_on_the_unit_of_length(make: Callable[[], Replay], scale: float) -> None:
+    plain = make()
+    scaled = replace(plain, positions=np.float32(scale) * plain.positions, rest_lengths=scale * plain.rest_lengths)
+    images = []
+    with Studio(80, 80) as studio:
+        for replay in (plain, scaled):
+            assert len(drawable_frames(replay)) == len(replay.frames)
+            images.append(studio.draw(replay, 7, frame_all(seen(replay, [7]), aspect=1.0, angles=(20.0, 10.0))))
+    np.testing.assert_array_equal(*images)
+    assert drawn(images[0].astype(float), 0, 0, 80, 80) > 0.01
+
+
+@needs_opengl
+def test_obstacles_far_from_zero_are_drawn_as_near_it() -> None:
+    """Of the same numbers: an origin that is a multiple of a power of two moves nothing by less than that."""
+    far = np.array([2.0**25, -(2.0**25), 2.0**24])
+    turns = {"keys": [{"time": 0}, {"time": 1, "offset": [0, 0.25, 0], "turn": 90}], "axis": [0, 1, 0]}
+
+    def obstacles(o: NDArray[np.float64]) -> str:
+        def at(*p: float) -> list[float]:
+            return (o + p).tolist()
+
+        sphere = {"kind": "sphere", "center": at(0.5, -1.0, 0), "radius": 0.25}
+        capsule = {"kind": "capsule", "ends": [at(0, -1.5, 0), at(1, -1.5, 0)], "radius": 0.1}
+        box = {"kind": "box", "low": at(0, -2, 0), "high": at(0.5, -1.75, 0.25)}
+        plane = {"kind": "plane", "point": at(0, 0, -1), "normal": [0, 0, 1]}
+        return json.dumps([sphere, capsule, box | {"motion": turns | {"about": at(0, 0, 0)}}, plane])
+
+    images = []
+    with Studio(80, 80) as studio:
+        for o in (np.zeros(3), far):
+            plain = cloth()
+            replay = replace(plain, origin=o, properties={**plain.properties, "obstacles": obstacles(o)})
+            images.append(studio.draw(replay, 7, frame_all(seen(replay, [7]), aspect=1.0, angles=(20.0, 10.0))))
+    changed = (np.abs(images[0].astype(int) - images[1]).max(axis=2) > 8).mean()
+    assert changed < 0.005, "of the pixels; turned corners are rounded at 33,000 km"
+
+
+@needs_opengl
+def test_a_mesh_without_springs_is_drawn_by_its_vertices(tmp_path: Path) -> None:
+    plain = chain()
+    draw_run(replace(plain, springs=plain.springs[:0], rest_lengths=plain.rest_lengths[:0]), tmp_path / "run.png")
+    assert drawn(pixels(tmp_path / "run.png"), 0, 114, WIDTH, 750) > 0.0001
+
+
+def falling(replay: Replay, vertices: slice, metres: float) -> Replay:
+    """Some vertices fall by so much until the last frame."""
+    positions = replay.positions.copy()
+    positions[:, vertices, 1] -= metres * np.linspace(0, 1, len(positions))[:, None].astype(np.float32) ** 2
+    return replace(replay, positions=positions)
+
+
+LEFT_OUT = {
+    "nobody falls": (slice(0, 0), 0.0, 0),
+    "one vertex": (slice(3, 4), 44.0, 1),
+    "half of the mesh": (slice(18, 36), 44.0, 18),
+    "two thirds of it": (slice(12, 36), 44.0, 24),
+    "all but one vertex": (slice(1, 36), 44.0, 0),
+    "all of it": (slice(0, 36), 44.0, 0),
+    "not far": (slice(3, 4), 1.5, 0),
+}
+
+
+@pytest.mark.parametrize(("vertices", "metres", "count"), LEFT_OUT.values(), ids=LEFT_OUT)
+def test_what_leaves_the_others_far_behind_is_not_framed(vertices: slice, metres: float, count: int) -> None:
+    replay = falling(cloth(), vertices, metres)
+    found = framed(replay, range(8))
+    assert np.flatnonzero(~found).tolist() == list(range(36))[vertices][:count]
+    points = seen(replay, range(8))
+    assert (np.ptp(points, axis=0).max() < 3.0) == (count > 0 or metres < 2.0)
+    wanted = {0: [], 1: ["1 of 36 vertices is outside"]}.get(count, [f"{count} of 36 vertices are outside"])
+    assert outside_words(found) == wanted
+
+
+def test_what_is_stretched_evenly_is_framed_whole() -> None:
+    replay = chain()
+    pulled = replay.positions * np.linspace(1, 100, 8, dtype=np.float32)[:, None, None]
+    assert framed(replace(replay, positions=pulled), range(8)).all()
+
+
+def test_where_one_point_is_framed_the_start_gives_the_size() -> None:
+    replay = chain(2)
+    replay = falling(
+        replace(replay, springs=replay.springs[:0], rest_lengths=replay.rest_lengths[:0]), slice(1, 2), 490.0
+    )
+    replay.positions[:, 0] = replay.positions[0, 0]
+    assert framed(replay, [7]).tolist() == [True, False]
+    assert np.ptp(seen(replay, [7]), axis=0).max() == pytest.approx(1.05)
+
+
+@needs_opengl
+def test_a_picture_says_how_many_vertices_are_outside(words: list[str], tmp_path: Path) -> None:
+    replay = falling(cloth(), slice(3, 4), 44.0)
+    draw_run(replay, tmp_path / "run.png")
+    assert sum("1 of 36 vertices is outside" in word for word in words) == 1, words
+    assert drawn(pixels(tmp_path / "run.png"), 36, 114, 700, 750) > 0.05, "the cloth is no dot"
+    words.clear()
+    draw_comparison({"a": replay, "b": cloth()}, tmp_path / "both.png")
+    assert words.count("1 of 36 vertices is outside") == 1
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])

@@ -90,7 +90,8 @@ def test_a_method_that_minimises_nothing_may_be_asked_for_a_tolerance(tmp_path: 
 @pytest.mark.parametrize("solver", ["newton", "newton-cg", "pncg", "jgs2"])
 def test_a_scene_at_rest_is_recorded_with_no_iterations(tmp_path: Path, solver: str):
     (tmp_path / "scene.yaml").write_text(
-        "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 3\ndefault_size: 3\neffects: [{kind: springs, stretch: 10}]\n"
+        "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 3\ndefault_size: 3\n"
+        "effects: [{kind: springs, stretch: 10}]\n"
     )
     (spec,) = load_any(tmp_path / "scene.yaml", solvers=[solver], tolerance=1e-6).runs()
     files = Files.of(spec, tmp_path)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from harness.base.errors import InputError, Mistake
 from harness.record.base import Replay
+from harness.record.framing import outside_words
 from harness.report.comparison import distance_words, reference
 from harness.report.figures.entry import Entry
 from harness.report.figures.of_runs import sweep_rows
@@ -30,7 +31,7 @@ from harness.report.render import (
     spring_strain,
     vertex_strain,
 )
-from harness.report.solids import seen
+from harness.report.solids import framed, seen
 from harness.report.style import Mark, marks
 from harness.report.timing_table import RunTimes, labels, runs
 
@@ -116,7 +117,10 @@ def _made(of: tuple[str, ...], name: tuple[str, ...], path: Path, label: str, lo
         *(of, name, _subject(replay), ", ".join(title), replay.absolute_positions(frame), replay.springs),
         *(replay.triangles, vertex_strain(replay, frame), limit, aspect),
         render=_Render(replace(replay, strain_range=limit), frame, frame_all(points, aspect=aspect, angles=angles)),
-        facts=(f"largest strain {100 * np.abs(spring_strain(replay, frame)).max(initial=0.0):.3g} %",),
+        facts=(
+            f"largest strain {100 * np.abs(spring_strain(replay, frame)).max(initial=0.0):.3g} %",
+            *outside_words(framed(replay, [frame])),
+        ),
         look=look,
         machine=told,
         mesh=str(path),
