@@ -27,11 +27,11 @@ from harness.experiments.code import TO_ERROR, code, parts, solver_class
 from harness.experiments.failure import failure
 from harness.experiments.plan import Files
 from harness.experiments.provenance import asked, common, tolerance
-from harness.record.base import Frame, RecordingInfo
+from harness.record.base import Frame, FrameSamples, RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
 from harness.record.shading import strain_range
-from harness.record.verify import FrameSamples, require_frames
+from harness.record.verify import require_frames
 from harness.reference.grade import Graded
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,10 @@ if TYPE_CHECKING:
 
 LAYOUT = 2
 """Of entities and columns: recordings of another one are not read."""
+
+
+SAMPLES = 8
+"""Frames before the last that are read back: a recording wrong in half of its frames passes once in 256 runs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +88,20 @@ class Recorder(Protocol):
     def abandon(self) -> None:
         """Stop without leaving a file under the final name."""
         ...
+
+
+class FrameSamples:
+    """Copies of the positions of some random frames of a run, and of its last one."""
+
+    def __init__(self, last: int) -> None:
+        before = range(1, last)
+        self.frames = {*random.sample(before, min(SAMPLES, len(before))), last}
+        self.positions: dict[int, Positions] = {}
+
+    def add(self, frame: int, p: Positions) -> None:
+        """Copy the positions (n, 3) [m] after a step, if its frame is one of those."""
+        if frame in self.frames:
+            self.positions[frame] = p.copy()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,6 @@ nor another frame's colours pass. They may be one level of the scale off, for th
 from __future__ import annotations
 
 import hashlib
-import random
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -29,27 +28,10 @@ from solvers.problem import Positions
 ROUNDING = 1e-9
 """Strains that differ by less, one of them stretched and one compressed, may be taken in either order."""
 
-SAMPLES = 8
-"""Frames before the last that are read back: a recording wrong in half of its frames passes once in 256 runs."""
-
 _UNIT = 2.0**-24
 """Round-off of single precision, relative."""
 
 _PARTS = (("Mesh3D:vertex_positions", "Mesh3D:vertex_colors"), ("Points3D:positions", "Points3D:colors"))
-
-
-class FrameSamples:
-    """Copies of the positions of some random frames of a run, and of its last one."""
-
-    def __init__(self, last: int) -> None:
-        before = range(1, last)
-        self.frames = {*random.sample(before, min(SAMPLES, len(before))), last}
-        self.positions: dict[int, Positions] = {}
-
-    def add(self, frame: int, p: Positions) -> None:
-        """Copy the positions (n, 3) [m] after a step, if its frame is one of those."""
-        if frame in self.frames:
-            self.positions[frame] = p.copy()
 
 
 def require_frames(path: Path, info: RecordingInfo, times: Mapping[int, float], run: Mapping[int, Positions]) -> str:

@@ -162,8 +162,8 @@ MEASURING = (
     Mutation(
         "picture-of-other-frame",
         _RENDER,
-        "np.ascontiguousarray(replay.positions[frame], np.float32)",
-        "np.ascontiguousarray(replay.positions[0], np.float32)",
+        "np.ascontiguousarray(unit * replay.positions[frame].astype(np.float64), np.float32)",
+        "np.ascontiguousarray(unit * replay.positions[0].astype(np.float64), np.float32)",
         (_PICTURES,),
     ),
 )

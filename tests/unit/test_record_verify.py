@@ -12,11 +12,11 @@ import pytest
 
 from harness.base.errors import InputError, RunFailed
 from harness.record import rerun
-from harness.record.base import Frame, RecordingInfo
+from harness.record.base import Frame, FrameSamples, RecordingInfo
 from harness.record.local_origin import local_origin
 from harness.record.reader import read_replay
 from harness.record.rerun import RerunRecorder
-from harness.record.verify import FrameSamples, require_frames
+from harness.record.verify import require_frames
 from tests.recordings import MESHES, info, record, waving
 
 COUNT = 12
