@@ -16,7 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.base.errors import RunFailed
+from harness.reference.frozen import bind
 from harness.scenes.bind import Scene
+from harness.scenes.spec import SceneSpec
 from harness.simulation.step import start
 from solvers.compiling import kernel
 from solvers.contact.touching import without_contact
@@ -96,6 +98,19 @@ class Field:
         """F at a state that stretches and moves everything: it stands for the equations of motion."""
         y = self.start
         return self(0.5, y + 0.01 * (self._scene.mesh.size or 1.0) * np.random.default_rng(1).normal(size=y.shape))
+
+
+def moving(spec: SceneSpec, size: int) -> Scene:
+    """A scene with equations of motion; what is a filter without one is taken as a force. Raises Unintegrable."""
+    scene = bind(spec, size)
+    try:
+        Field(scene)
+    except Unintegrable:
+        if not scene.filters:
+            raise
+        scene = bind(spec, size, "own")
+        Field(scene)
+    return scene
 
 
 @kernel

@@ -4,6 +4,7 @@
     problem-SCENE-SIZE-INTEGRATOR-FRAME.npz   a frozen problem
     minima-PROBLEM.npz                        the minima known of it
     trajectory-SCENE-SIZE-TIMES.npz           positions and velocities at some times; SCENE without its time step
+    growth-SCENE-SIZE-HORIZON.npz             how a perturbation of the start grows up to a horizon
     converged-SCENE-SIZE-TIMES.npz            the same of a scene with contact, as far as it converged
 
 Files have a partial name until they are complete, and hold arrays only.
@@ -12,17 +13,17 @@ Files have a partial name until they are complete, and hold arrays only.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from harness.base.files import replacing
 from harness.reference.frozen import Arrays, Frozen, agree, bind, freeze, moment_frames, reference_run, thaw
+from harness.reference.growth import Growth, growth
 from harness.reference.minimiser import MINIMUM, KnownMinima, Minimum, find_minima, polish
-from harness.reference.motion import Field, Unintegrable
+from harness.reference.motion import Field, moving
 from harness.reference.self_converged import SelfConverged, converge, touches
 from harness.reference.trajectory import Told, Trajectory, integrate
 from harness.scenes.bind import Scene
@@ -33,6 +34,8 @@ from solvers.problem import Positions, Solver
 
 _CERTIFICATE = ("positions", "g", "error", "smallest_eigenvalue", "doubt", "near")
 """What is kept of a minimum: all of the point that is stored."""
+_INTEGRATED = tuple(f.name for f in fields(Trajectory) if f.name != "growth")
+"""What is stored of a trajectory; the growth of perturbations has a file of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,19 +103,32 @@ class Store:
         It is the same for every time step of the scene; with contact it is self-converged, from steps of about the
         scene's own. Raises InputError, Unintegrable, Unpredictable.
         """
-        name = f"{spec.stepped(1.0).digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
+        name = _named(spec, size, times)
         if touches(bind(spec, size).system):
             return self._converged(self.folder / f"converged-{name}.npz", spec, size, times, error)
-        scene, witness = _moving(spec, size)
-        path = self.folder / f"trajectory-{name}.npz"
+        seen = self.growth(spec, size, times[-1])
+        seen.require(error, times)
+        scene = moving(spec, size)
+        witness, path = Field(scene).witness(), self.folder / f"trajectory-{name}.npz"
         stored: dict[str, Any] = dict(_read(path)) if path.exists() else {}
         if stored and agree(stored.pop("witness"), witness):
-            found = Trajectory(**stored)
+            found = Trajectory(**{key: stored[key] for key in _INTEGRATED}, growth=seen.at(times))
         else:
-            found = integrate(scene, times, told)
-            arrays = {f.name: getattr(found, f.name) for f in fields(Trajectory)}
-            _write(path, arrays | {"witness": witness})
+            found = replace(integrate(scene, times, told), growth=seen.at(times))
+            _write(path, {key: getattr(found, key) for key in _INTEGRATED} | {"witness": witness})
         found.require(error)
+        return found
+
+    def growth(self, spec: SceneSpec, size: int, horizon: float) -> Growth:
+        """How a perturbation of the start grows up to a horizon [s]. Raises what `harness.reference.growth` raises."""
+        witness = Field(moving(spec, size)).witness()
+        path = self.folder / f"growth-{_named(spec, size, [horizon])}.npz"
+        stored: dict[str, Any] = dict(_read(path)) if path.exists() else {}
+        if stored and agree(stored.pop("witness"), witness):
+            return Growth(scale=float(stored.pop("scale")), **stored)
+        found = growth(spec, size, horizon)
+        arrays = {f.name: np.asarray(getattr(found, f.name)) for f in fields(Growth)}
+        _write(path, arrays | {"witness": witness})
         return found
 
     def _converged(self, path: Path, spec: SceneSpec, size: int, times: Sequence[float], error: float) -> SelfConverged:
@@ -159,16 +175,9 @@ class _Asked:
         self.name = f"{spec.digest[:12]}-{size}-{integrator}"
 
 
-def _moving(spec: SceneSpec, size: int) -> tuple[Scene, NDArray[np.float64]]:
-    """A scene with equations of motion, and their witness; what is a filter without one is taken as a force."""
-    scene = bind(spec, size)
-    try:
-        return scene, Field(scene).witness()
-    except Unintegrable:
-        if not scene.filters:
-            raise
-    scene = bind(spec, size, "own")
-    return scene, Field(scene).witness()
+def _named(spec: SceneSpec, size: int, times: Sequence[float]) -> str:
+    """What is asked of a motion, in a file's name: the scene without its time step."""
+    return f"{spec.stepped(1.0).digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
 
 
 def _minima(arrays: Arrays) -> KnownMinima:

@@ -2,7 +2,8 @@
 
 Dormand and Prince's method of order 8 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section
 II.10) at rtol 1e-12, checked by Adams methods of orders up to 12 (VODE; ibid., section III.1). A motion in which what
-is 1e-12 at the start grows past the error that is to be measured has no trajectory to grade against: it is refused.
+is 1e-12 at the start grows past the error that is to be measured (`harness.reference.growth`) has no trajectory to
+grade against: it is refused.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Trajectory:
     """times (k,) [s]; free: the vertices that are not pinned; positions (k, n, 3) [m] and velocities (k, n, 3) [m/s].
 
     moved (k,) [m]: the displacement from the start, Frobenius norm over the free vertices. In the same norm, relative
-    to it: disagreement (k,) of the two methods; growth (k,) of the perturbation.
+    to it: disagreement (k,) of the two methods; growth (k,) of a perturbation of the start, 0 where none was estimated.
     """
 
     times: NDArray[np.float64]
@@ -67,7 +68,7 @@ class Trajectory:
 
 
 Told = Callable[[int, float], None]
-"""Is told, with each evaluation of the forces, which of the motions is followed, from 1 to 3, and up to when [s]."""
+"""Is told, with each evaluation of the forces, which of the motions is followed, from 1 to 2, and up to when [s]."""
 
 
 class _Telling:
@@ -89,14 +90,9 @@ def integrate(scene: Scene, times: Sequence[float], told: Told | None = None) ->
 
     Raises Unintegrable."""
     alone = Field(scene)
-    start, size = alone.start, scene.mesh.size or 1.0
+    start, atol = alone.start, RTOL * (scene.mesh.size or 1.0)
     field = _Telling(alone, told) if told else alone
-    nudge = np.zeros_like(start)
-    half = len(start) // 2
-    nudge[:half] = PERTURBATION * size * np.random.default_rng(0).choice([-1.0, 1.0], half)
-    atol = RTOL * size
-    path, perturbed = (_dop853(field, y, times, atol) for y in (start, start + nudge))
-    other = _adams(field, start, times, atol)
+    path, other = _dop853(field, start, times, atol), _adams(field, start, times, atol)
     moved, unknown = _apart(path, start), np.full(len(path), np.inf)
     motions = [tuple(part.copy() for part in alone.motion(t, y)) for t, y in zip(times, path, strict=True)]
     return Trajectory(
@@ -105,7 +101,8 @@ def integrate(scene: Scene, times: Sequence[float], told: Told | None = None) ->
         np.array([p for p, _ in motions]),
         np.array([v for _, v in motions]),
         moved,
-        *(np.divide(_apart(path, q), moved, out=unknown.copy(), where=moved > 0.0) for q in (other, perturbed)),
+        np.divide(_apart(path, other), moved, out=unknown, where=moved > 0.0),
+        growth=np.zeros(len(path)),
     )
 
 

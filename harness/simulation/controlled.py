@@ -87,12 +87,14 @@ class Follower(Protocol):
         """The setting to begin with, where steps may err by a tolerance [m]."""
         return 1.0 if self.even else tolerance
 
-    def changed(self, setting: float, ratio: float) -> float:
+    def changed(self, setting: float, ratio: float, order: float | None = None) -> float:
         """The setting at which the error of the end is about so many times as large: that of a step of h is of order
-        h^(order + 1). There are no longer even steps than the longest."""
+        h^(order + 1); order: as it was measured, its own if left out. There are no longer even steps than the
+        longest."""
+        order = order or self.order
         if self.even:
-            return max(1.0, setting * ratio ** (-1.0 / self.order))
-        return setting * ratio ** ((self.order + 1.0) / self.order)
+            return max(1.0, setting * ratio ** (-1.0 / order))
+        return setting * ratio ** ((order + 1.0) / order)
 
     def follow(self, setting: float, *, limit: float = inf) -> Path:
         """The motion up to the horizon; limit: processor seconds.

@@ -17,9 +17,9 @@ from harness.experiments.asked.libraries import pattern
 from harness.experiments.asked.search import foresee, search
 from harness.experiments.asked.ways import Asked, tried, ways
 from harness.reference.growth import growth
-from harness.reference.motion import Field
+from harness.reference.motion import Field, moving
 from harness.reference.store import Store
-from harness.reference.trajectory import integrate
+from harness.reference.trajectory import PERTURBATION, RTOL, Unpredictable, _dop853, integrate
 from harness.scenes.bind import Scene, build
 from harness.scenes.effects.air_drag import AirDrag
 from harness.scenes.effects.contact import Contact
@@ -28,6 +28,7 @@ from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.chain import Chain
+from harness.scenes.mesh.grid import Grid
 from harness.scenes.spec import SceneSpec
 from harness.simulation.controlled import Implicit, Stuck, hermite
 from harness.simulation.own_steps import Own, OwnEven
@@ -137,21 +138,80 @@ def test_the_error_is_never_above_the_one_that_was_asked_for_whichever_way_wins(
     assert any("an error of" in line for line in told)
 
 
-def test_growth_tells_a_motion_that_can_be_known_from_one_that_cannot():
-    pendulum = Asked.of(load_scene(SCENES / "single-spring.yaml"), 2, 1.0)
-    cloth = Asked.of(load_scene(SCENES / "hanging-cloth.yaml"), 9, 2.0)
-    calm, wild = (growth(one.bound, one.horizon, one.frames) for one in (pendulum, cloth))
-    assert calm.least < 1e-9  # 1e-12 of the size grows with the time, and no faster
-    assert wild.least > 1e3 * calm.least
-    assert wild.known(wild.least / 10) < 2.0 <= wild.known(1.01 * wild.least)
-    with pytest.raises(RunFailed, match=r"nobody can know the motion to .* it can be known to .* up to"):
-        foresee(cloth, wild.least / 10, lambda line: None)
+def steps_of(spec: SceneSpec, size: int) -> list[Any]:
+    scene = build(spec, size, "own")
+    return [*simulate(scene, prepare(scene, VelocityVerlet()), StopRule(1), first_guess="current", frames=10)]
+
+
+def perturbed(spec: SceneSpec, size: int, times: list[float]) -> np.ndarray:
+    """What 1e-12 of the size at the start becomes, relative to the displacement, by the reference's own method."""
+    field = Field(moving(spec, size))
+    begun, half, length = field.start, len(field.start) // 2, build(spec, size).mesh.size or 1.0
+    nudge = np.zeros_like(begun)
+    nudge[:half] = PERTURBATION * length * np.random.default_rng(0).choice([-1.0, 1.0], half)
+    one, two = (_dop853(field, y, times, RTOL * length) for y in (begun, begun + nudge))
+    return np.linalg.norm((two - one)[:, :half], axis=1) / np.linalg.norm((one - begun)[:, :half], axis=1)
+
+
+CRUMPLING = SceneSpec(
+    mesh=Grid(),
+    effects=(Springs(stretch=300.0, shear=60.0), Gravity(), Pins(at=("top_corners",), weight="exact")),
+    mass=0.3, time_step=1 / 30, frames=60, path=Path("cloth.yaml"), default_size=9,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("spec", "size", "end"),
+    [
+        (CRUMPLING, 7, 1.0),
+        (chain(Springs(stretch=40.0), Gravity(), AirDrag(law="quadratic", coefficient=0.5), HELD), 5, 0.5),
+        (chain(Springs(stretch=40.0), Gravity(), MOVED), 5, 0.3),
+    ],
+    ids=["crumpling", "drag", "moving pin"],
+)
+def test_the_estimated_growth_is_that_of_perturbed_integrations(spec, size, end):
+    found = growth(spec, size, end)
+    times = [float(t) for t in found.times[5::10]]
+    np.testing.assert_allclose(found.at(times), perturbed(spec, size, times), rtol=0.5)  # over some orders of magnitude
+
+
+def test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_known():
+    one, other = (growth(CRUMPLING.stepped(h), 9, 3.0) for h in (1 / 30, 1 / 240))
+    np.testing.assert_array_equal(one.grown, other.grown)
+    assert one.grown[-1] == 1.0
+    assert (np.diff(one.grown >= 1.0) >= 0).all()
+
+
+def test_a_refusal_names_the_longest_horizon_that_works(tmp_path):
+    asked, error = Asked.of(CRUMPLING, 7, 1.6), 1e-7
+    with pytest.raises(Unpredictable, match=r"after 1.6 s .* a --horizon of [\d.]+ s or less") as refused:
+        foresee(asked, error, lambda line: None)
+    horizon = float(str(refused.value).rpartition("--horizon of ")[2].split()[0])
+    assert 0.3 < horizon < 1.6
+    foresee(Asked.of(CRUMPLING, 7, horizon), error, lambda line: None)
+    kept = Store(tmp_path)
+    assert kept.trajectory(CRUMPLING, 7, [horizon], error=error).growth[0] <= 0.1 * error
+    with pytest.raises(Unpredictable, match=f"a --horizon of {horizon:g} s or less"):
+        kept.trajectory(CRUMPLING, 7, [1.6], error=error)
 
 
 def test_an_error_below_round_off_is_refused_with_the_one_that_can_be_had():
     pendulum = Asked.of(load_scene(SCENES / "single-spring.yaml"), 2, 1.0)
-    with pytest.raises(RunFailed, match=r"nobody can know the motion to 1e-14 there; it can be known to \de-1[0-2],"):
+    assert growth(pendulum.scene, 2, 1.0).least < 1e-9  # 1e-12 of the size grows with the time, and no faster
+    with pytest.raises(Unpredictable, match=r"error of 1e-14 cannot .*; ask for an --error of \de-1[0-2] or more"):
         foresee(pendulum, 1e-14, lambda line: None)
+
+
+def test_what_only_round_off_moves_is_at_rest(tmp_path):
+    """A flat cloth without a load, pinned at its corners."""
+    spec = CRUMPLING.model_copy(update={"effects": (Springs(stretch=10.0), Pins(at=("corners",), weight="exact"))})
+    assert len({step.positions.tobytes() for step in steps_of(spec, 5)}) > 1, "round-off does move it"
+    for ask in (
+        lambda: foresee(Asked.of(spec, 5, 1.0), 1e-3, lambda line: None),
+        lambda: Store(tmp_path).trajectory(spec, 5, [1.0], error=1e-3),
+    ):
+        with pytest.raises(Unpredictable, match="nothing moves up to the horizon"):
+            ask()
 
 
 def test_the_pattern_of_the_jacobian_holds_all_that_differs_from_zero():

@@ -176,7 +176,7 @@ def _referenced(
     def told(motion: int, time: float) -> None:
         if monotonic() - last[0] > _SAID:
             last[0] = monotonic()
-            say(f"  motion {motion} of 3, at {time:.3g} of {horizon:g} s")
+            say(f"  motion {motion} of 2, at {time:.3g} of {horizon:g} s")
 
     store.trajectory(scene, size, [horizon], error=error, told=told)
 

@@ -61,8 +61,7 @@ def run_to_error(
         before = known(folder / "accuracy", asked)
         answer = _searched(asked, error, seen, [] if again else before, say)
     path, best = answer.best.path, answer.best
-    each = path.seconds / asked.horizon
-    say(f"asked {error:g}, estimated {best.estimated:.1g}, {1e3 * each:.3g} ms a simulated second")
+    say(f"asked {error:g}, estimated {best.estimated:.1g}, {path.processor:.3g} s of processor time")
     factors = f", {path.factorisations} factorisations" if path.factorisations else ""
     say(
         f"by {best.way}: {path.accepted} steps, {path.rejected} rejected{factors}"
@@ -146,6 +145,7 @@ def _row(name: str, asked: Asked, error: float, answer: Answer) -> dict[str, Any
         **best.columns,
         "iterations_done": path.iterations,
         "seconds": [path.seconds],
+        "cpu_seconds": path.processor,
         "seconds_per_simulated": path.seconds / asked.horizon,
         "estimate_seconds": answer.seconds,
         **provenance(),

@@ -3,14 +3,15 @@
     estimate = |p(T) - q(T)| / |q(T) - p(0)|,    q the same motion to a much smaller error
 
 in Frobenius norms over the vertices that are not pinned, as errors are told everywhere. How the cost of a way grows
-with its error is known from its order: a step is in proportion to error^(1/order).
+with its error is known from its order: a step is in proportion to error^(1/order). The order is measured where two
+settings were tried, for a scene may lower it. Ways are compared by processor seconds, preparing included.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from math import inf, sqrt
+from dataclasses import dataclass, replace
+from math import inf, log, sqrt
 from time import perf_counter
 from typing import Any
 
@@ -38,21 +39,27 @@ DOUBT = 1.25
 the steps and its own are hardly shorter."""
 _FINER = 10.0
 """Times as exact, by the order and the number of steps, at which a motion counts as closer."""
-_MOVES, _CLOSINGS = 6, 3
+_MOVES, _STALLS, _CLOSINGS = 6, 2, 3
 _SHORT = 0.05
 """Processor seconds below which a way is run twice, and the lesser time counts."""
 _AT_FIRST, _PATIENCE = 1.0, 4.0
 """Processor seconds that a way may take, so many times as many if none ends within them, or as the cheapest takes."""
+_DEAR = 2.0
+"""Times what the next way promises, what one may take before that one is tried instead."""
+_LEAST_ORDER = 0.5
+"""No order is measured below it: a way whose error falls more slowly is given up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """A way, its setting (`Follower`), the path that it gave, and its estimated relative error."""
+    """A way, its setting (`Follower`), the path that it gave, its estimated relative error, and the order by which the
+    error falls with the step: the way's own, or less where two settings showed it."""
 
     way: Way
     setting: float
     path: Path
     estimated: float
+    order: float
 
     @property
     def tolerance(self) -> float | None:
@@ -97,21 +104,14 @@ class Answer:
 
 
 def foresee(asked: Asked, error: float, say: Callable[[str], None]) -> Growth:
-    """How far ahead the motion can be known, told before anything else. Raises RunFailed where the error cannot be had
-    at the horizon, with the one that can."""
-    seen = growth(asked.bound, asked.horizon, asked.frames)
-    if not seen.scale > 0.0:
-        raise RunFailed("nothing moves up to the horizon, and errors are relative to what does")
-    worst = float(seen.grown[-1])
-    told = (
-        f"what differs by 1e-12 of the size at the start differs by {worst:.1g} of the motion after {asked.horizon:g} s"
+    """How far ahead the motion can be known, told before anything else. Raises Unpredictable where the error cannot be
+    had at the horizon, with the one that can, and where nothing moves."""
+    seen = growth(asked.scene, asked.size, asked.horizon)
+    seen.require(error)
+    say(
+        f"a perturbation of 1e-12 of the size grows to {seen.grown[-1]:.1e} of the displacement after "
+        f"{asked.horizon:g} s: an error of {error:g} can be reached there, of {seen.least:.0e} at the least"
     )
-    if not seen.known(error) >= asked.horizon * (1.0 - 1e-9):
-        raise RunFailed(
-            f"{told}: nobody can know the motion to {error:g} there; it can be known to {seen.least:.1g}, and to "
-            f"{error:g} up to {seen.known(error):.3g} s: ask for a larger --error or a shorter --horizon"
-        )
-    say(f"{told}: an error of {error:g} can be known there, and of {seen.least:.0e} at the least")
     return seen
 
 
@@ -139,17 +139,24 @@ class _Search:
         began = perf_counter()
         raced = self._race(known, tolerance)
         closer = self._closer(raced)
-        graded = sorted((self._graded(one, closer) for one in raced), key=self._promise)
+        graded = sorted((self._measured(one, closer) for one in raced), key=self._promise)
         for one in graded:
-            self._say(f"  {one.way}: {one.path.seconds:.3g} s, an error of {one.estimated:.1e}")
-        best, note = self._moved(graded[0], closer)
+            self._say(
+                f"  {one.way}: {self._promise(one):.3g} s predicted; {one.path.processor:.3g} s for an error of "
+                f"{one.estimated:.1e}, of order {one.order:.2g}"
+            )
+        best, note = self._reached(graded, closer)
         besides = perf_counter() - began - best.path.seconds
         promised = tuple((one, self._promise(one)) for one in graded)
         return Answer(best, promised, tolerance, closer, besides, note)
 
     @staticmethod
     def _run(way: Way, setting: float, limit: float = inf) -> Found:
-        return Found(way, setting, way.follower.follow(setting, limit=limit), inf)
+        """With a second run where the first is too short to be timed."""
+        paths = [way.follower.follow(setting, limit=limit)]
+        if paths[0].processor < _SHORT:
+            paths.append(way.follower.follow(setting, limit=limit))
+        return Found(way, setting, min(paths, key=lambda path: path.processor), inf, way.follower.order)
 
     def _race(self, ways: list[Way], tolerance: float) -> list[Found]:
         """Those that end, none of which takes much longer than the fastest."""
@@ -158,10 +165,7 @@ class _Search:
             late = list[tuple[Way, float]]()
             for way in ways:
                 try:
-                    one = self._run(way, way.follower.first(tolerance), limit)
-                    if one.path.processor < _SHORT:
-                        one = min(one, self._run(way, one.setting), key=lambda run: run.path.processor)
-                    found.append(one)
+                    found.append(self._run(way, way.follower.first(tolerance), limit))
                     limit = max(_AT_FIRST, _PATIENCE * min(one.path.processor for one in found))
                 except Stuck as error:
                     stuck.append(error)
@@ -179,28 +183,48 @@ class _Search:
         by so much smaller a one that it can tell the error asked."""
         best = min(raced, key=lambda one: (one.way.follower.even, self._cost(one, CLOSER)))
         follower, found = best.way.follower, best
-        part = CLOSER ** (follower.order / (follower.order + 1.0))
+        order = self._order(best) if follower.even else float(follower.order)
+        part = CLOSER ** (order / (order + 1.0))
         for _ in range(_CLOSINGS):  # where frames or stability rule the steps, a closer tolerance may change nothing
-            found = self._run(best.way, follower.changed(found.setting, part))
-            if (found.path.accepted / best.path.accepted) ** follower.order >= _FINER:
+            found = self._run(best.way, follower.changed(found.setting, part, order))
+            if (found.path.accepted / best.path.accepted) ** order >= _FINER:
                 break
         begun = self._graded(best, found)
         if AIM * self._error < begun.estimated < inf:
-            found = self._run(best.way, follower.changed(found.setting, AIM * self._error / begun.estimated))
+            found = self._run(best.way, follower.changed(found.setting, AIM * self._error / begun.estimated, order))
         return found
+
+    def _order(self, one: Found) -> float:
+        """Of steps of one length, by what halving them twice changes (Richardson)."""
+        two, four = (self._run(one.way, parts * one.setting).path.positions[-1] for parts in (2.0, 4.0))
+        first, second = self._apart(one.path.positions[-1], two), self._apart(two, four)
+        fell = log(first / second, 2.0) if 0.0 < first < inf and 0.0 < second < inf else inf
+        return min(float(one.way.follower.order), max(_LEAST_ORDER, fell))
 
     @staticmethod
     def _cost(one: Found, part: float) -> float:
         """Processor seconds with a part of the error of a step: it prepares once."""
         stepping = min(one.path.seconds, one.path.processor)
-        return one.path.processor - stepping + stepping * part ** (-1.0 / one.way.follower.order)
+        return one.path.processor - stepping + stepping * part ** (-1.0 / one.order)
 
     def _graded(self, one: Found, closer: Found) -> Found:
         p, q = one.path.positions, closer.path.positions
         moved = self._apart(q[-1], q[0])
         least = (closer.tolerance or 0.0) / self._seen.scale
         estimated = max(DOUBT * self._apart(p[-1], q[-1]) / moved, least) if moved else inf
-        return Found(one.way, one.setting, one.path, estimated if estimated < inf else inf)
+        return replace(one, estimated=estimated if estimated < inf else inf)
+
+    def _measured(self, one: Found, closer: Found) -> Found:
+        """One with its estimated error; of steps of one length, with its order by half of them, and where it errs too
+        much, those."""
+        one = self._graded(one, closer)
+        if not one.way.follower.even:
+            return one
+        try:
+            half = _of_order(one, self._graded(self._run(one.way, 2.0 * one.setting), closer))
+        except Stuck:
+            return one
+        return half if one.estimated > self._error else replace(one, order=half.order)
 
     def _apart(self, p: Positions, q: Positions) -> float:
         return float(np.linalg.norm((p - q)[self._free]))
@@ -214,26 +238,57 @@ class _Search:
         """The error that a setting is chosen for."""
         return (_AIM_EVEN if one.way.follower.even else AIM) * self._error
 
-    def _moved(self, one: Found, closer: Found) -> tuple[Found, str]:
-        """The way at the setting that gives the error asked, and why it is far more exact, if it is."""
+    def _reached(self, graded: list[Found], closer: Found) -> tuple[Found, str]:
+        """The first way that gives the error asked, at its setting for that, and why it is far more exact, if it is.
+
+        A way that takes much longer than the next one promises is tried again after all others."""
+        nearest, times = list[Found](), _DEAR
+        while graded:
+            late = list[Found]()
+            for one, after in zip(graded, [*graded[1:], graded[-1]], strict=True):
+                limit = times * max(_SHORT, self._promise(one), self._promise(after))
+                try:
+                    found, note = self._moved(one, closer, limit)
+                except TooSlow:
+                    self._say(f"  {one.way}: takes more than {limit:.3g} s")
+                    late.append(one)
+                    continue
+                if found.estimated <= self._error:
+                    return found, note
+                nearest.append(found)
+                self._say(f"  {one.way}: reaches {found.estimated:.1e}, and shorter steps come no nearer")
+            graded, times = late, _PATIENCE * times
+        raise self._nothing(min(nearest, key=lambda one: one.estimated))
+
+    def _moved(self, one: Found, closer: Found, limit: float) -> tuple[Found, str]:
+        """The way at the setting that gives the error asked, or the nearest to it, and why it is far more exact, if it
+        is. Raises TooSlow beyond a limit of processor seconds."""
         best, above = None if one.estimated > self._error else one, None
+        nearest, stalled = one, 0
         for _ in range(_MOVES):
             if best and best.estimated >= DOUBT * WIDE * self._error:
                 return best, ""
             setting = self._next(one, best, above)
             if setting == one.setting:
                 return one, _STABLE
-            before, one = one, self._graded(self._run(one.way, setting), closer)
+            before = one
+            try:
+                one = _of_order(before, self._graded(self._run(one.way, setting, limit), closer))
+            except Stuck:
+                break
+            nearest = min(nearest, one, key=lambda found: found.estimated)
             if one.estimated > self._error:
-                if best is None and one.estimated > 0.5 * before.estimated and setting < 0.1 * before.setting:
-                    raise self._nothing(min(one, before, key=lambda x: x.estimated))
+                shorter = setting < 0.1 * before.setting or one.path.accepted > 4 * before.path.accepted
+                stalled = stalled + 1 if best is None and one.estimated > 0.5 * before.estimated and shorter else 0
+                if stalled == _STALLS:
+                    break
                 above = one
             elif best and one.path.processor > 0.9 * best.path.processor:
                 return best, _STABLE
             else:
                 best = one
         if best is None:
-            raise self._nothing(one)
+            return nearest, ""
         return best, _STABLE if best.estimated < DOUBT * WIDE * self._error else ""
 
     def _next(self, one: Found, best: Found | None, above: Found | None) -> float:
@@ -242,14 +297,24 @@ class _Search:
             return sqrt(best.setting * above.setting)
         aim = self._aim(one)
         ratio = aim / max(one.estimated, 1e-3 * aim)
-        return one.way.follower.changed(one.setting, min(30.0, max(1e-3, ratio)))
+        return one.way.follower.changed(one.setting, min(30.0, max(1e-3, ratio)), one.order)
 
     def _nothing(self, nearest: Found) -> RunFailed:
         at = f" at {nearest.tolerance:.1e} m a step" if nearest.tolerance else f" with {nearest.path.accepted} steps"
         return RunFailed(
-            f"no steps keep to an error of {self._error:g}: {nearest.way} reached {nearest.estimated:.1g}{at}, and "
-            "shorter ones do not come nearer; ask for a larger --error or a shorter --horizon"
+            f"no steps keep to an error of {self._error:g}: {nearest.way} came nearest and reached "
+            f"{nearest.estimated:.1g}{at}, and shorter ones come no nearer; ask for a larger --error or a shorter "
+            "--horizon"
         )
+
+
+def _of_order(before: Found, after: Found) -> Found:
+    """After, with the order by which errors fell from one to the other, at most that of the way."""
+    shorter = log(after.path.accepted / before.path.accepted)
+    if not (0.0 < before.estimated < inf and 0.0 < after.estimated < inf and abs(shorter) > 0.1):
+        return after
+    fell = log(before.estimated / after.estimated) / shorter
+    return replace(after, order=min(float(after.way.follower.order), max(_LEAST_ORDER, fell)))
 
 
 _STABLE = "longer steps are unstable, or cost as much"

@@ -1,0 +1,121 @@
+"""The search for the cheapest way to an error, on ways whose errors and costs are formulas of the number of steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil, inf
+from pathlib import Path as File
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from harness.base.errors import RunFailed
+from harness.config.load import load_scene
+from harness.experiments.asked.search import Answer, Found, search
+from harness.experiments.asked.ways import Asked, Way
+from harness.reference.growth import growth
+from harness.simulation.controlled import Follower, Path, TooSlow
+
+SPRING = load_scene(File(__file__).parents[2] / "configs" / "scenes" / "single-spring.yaml")
+STEPS = 10
+"""The fewest."""
+
+
+@dataclass(frozen=True)
+class Formula(Follower):
+    """Its free vertex ends at (1 + error(steps), 0, 0); seconds: of processor time a step; wall time is twice that."""
+
+    error: Callable[[int], float]
+    seconds: float
+    stated: int = 2
+    even: ClassVar[bool] = True
+
+    @property
+    def order(self) -> int:
+        return self.stated
+
+    def follow(self, setting: float, *, limit: float = inf) -> Path:
+        steps = ceil(STEPS * setting)
+        if (took := steps * self.seconds) > limit:
+            raise TooSlow
+        positions = np.zeros((2, 2, 3))
+        positions[1, :, 0] = 1.0 + self.error(steps)
+        return Path(positions, steps, 0, 0, steps, (1.0, 1.0), 2.0 * took, (2.0 * took,), took)
+
+
+class Tolerant(Formula):
+    """Its setting is a tolerance, from which the steps follow; it is never too slow."""
+
+    even: ClassVar[bool] = False
+
+    def follow(self, setting: float, *, limit: float = inf) -> Path:
+        return super().follow(max(1.0, setting ** (-1.0 / (self.order + 1.0))))
+
+
+def found(monkeypatch: pytest.MonkeyPatch, error: float, told: list[str], **followers: Follower) -> Answer:
+    """The answer among ways of these names, the last of which tells the errors of all."""
+    exact = Tolerant(lambda steps: 5.0 * steps**-4.0, 0.5, 4)
+    named = [Way("own", name, one) for name, one in {**followers, "exact": exact}.items()]
+    monkeypatch.setattr("harness.experiments.asked.search.ways", lambda *_: named)
+    asked = Asked.of(SPRING, 2, 0.2)
+    return search(asked, error, growth(SPRING, 2, 0.2), told.append)
+
+
+def test_the_order_is_measured_and_the_cost_predicted_by_it(monkeypatch):
+    """Of order 1 though it states 2, a way costs the ratio of the errors, and not its square root."""
+    first = Formula(lambda steps: 2.0 / steps, 1e-3)
+    second = Formula(lambda steps: 20.0 / steps**2, 1e-2)
+    answer = found(monkeypatch, 1e-3, [], first=first, second=second)
+    by_name = {one.way.solver: (one, promise) for one, promise in answer.tried}
+    assert by_name["first"][0].order == pytest.approx(1.0, abs=0.05)
+    assert by_name["second"][0].order == pytest.approx(2.0, abs=0.05)
+    # DOUBT times the error, at AIM for steps of one length: 2.5/N = 0.85e-3 and 25/N^2 = 0.85e-3.
+    assert by_name["first"][1] == pytest.approx(2941 * 1e-3, rel=0.1)
+    assert by_name["second"][1] == pytest.approx(171 * 1e-2, rel=0.1)
+
+
+def test_ways_are_sorted_chosen_and_printed_by_one_statistic(monkeypatch):
+    told = list[str]()
+    ways = {f"w{k}": Formula(lambda steps: 1.0 / steps**2, 1e-3 * cost) for k, cost in enumerate((3.0, 1.0, 2.0))}
+    answer = found(monkeypatch, 1e-2, told, **ways)
+    promises = [promise for _, promise in answer.tried]
+    assert promises == sorted(promises)
+    assert answer.best.way is answer.tried[0][0].way
+    assert answer.best.way.solver == "w1"
+    printed = [line.split(": ")[1].split(" s ")[0] for line in told if " predicted; " in line]
+    assert printed == [f"{promise:.3g}" for promise in promises]
+
+
+def test_a_way_that_comes_no_nearer_is_followed_by_the_next(monkeypatch):
+    told = list[str]()
+    stuck = Formula(lambda steps: 0.03 + 1.0 / steps**2, 1e-4)
+    answer = found(monkeypatch, 1e-2, told, stuck=stuck, slower=Formula(lambda steps: 1.0 / steps, 1e-2))
+    assert answer.best.way.solver != "stuck"
+    assert answer.best.estimated <= 1e-2
+    assert any(line.startswith("  stuck: reaches 3.") and "come no nearer" in line for line in told)
+
+
+def test_a_way_that_takes_longer_than_the_next_promises_is_tried_after_it(monkeypatch):
+    """Its error falls as promised at first, and then by order a half alone."""
+    told = list[str]()
+    late = Formula(lambda steps: 20.0 / steps**2 if steps < 40 else 0.0125 * (40 / steps) ** 0.5, 1e-4)
+    answer = found(monkeypatch, 1e-3, told, late=late, steady=Formula(lambda steps: 1.0 / steps, 3e-4))
+    assert answer.tried[0][0].way.solver == "late"
+    assert answer.best.way.solver == "steady"
+    assert any(line.startswith("  late: takes more than") for line in told)
+
+
+def test_an_error_that_no_way_comes_near_is_refused_with_the_nearest(monkeypatch):
+    lows = {"a": 0.3, "b": 0.2}
+    named = [Way("own", k, Formula(lambda steps, low=low: low + 1.0 / steps**2, 1e-3)) for k, low in lows.items()]
+    monkeypatch.setattr("harness.experiments.asked.search.ways", lambda *_: named)
+    monkeypatch.setattr("harness.experiments.asked.search._Search._closer", lambda *_: _truth())
+    with pytest.raises(RunFailed, match=r"no steps keep to an error of 0.01: b came nearest and reached 0\.3"):
+        search(Asked.of(SPRING, 2, 0.2), 1e-2, growth(SPRING, 2, 0.2), lambda line: None)
+
+
+def _truth() -> Found:
+    follower = Formula(lambda steps: 0.0, 1e-3)
+    return Found(Way("own", "truth", follower), 1.0, follower.follow(1.0), 0.0, 2)
