@@ -10,7 +10,7 @@ import pytest
 
 from harness.base.errors import RunFailed
 from harness.config.load import load_scene
-from harness.reference import store
+from harness.reference import motion, store
 from harness.reference.frozen import bind
 from harness.reference.motion import Field, Unintegrable
 from harness.reference.store import Store
@@ -216,7 +216,7 @@ def test_a_trajectory_of_equations_that_have_changed_is_integrated_anew(tmp_path
     kept, asked = Store(tmp_path), spec(Chain(), *SWING)
     before = kept.trajectory(asked, 3, TIMES, error=1e-3)
     stiffer = bind(spec(Chain(), Springs(rule="fixed", stretch=K + 1.0), *SWING[1:]), 3)
-    monkeypatch.setattr(store, "bind", lambda *question: stiffer)
+    monkeypatch.setattr(motion, "bind", lambda *question: stiffer)
     after = kept.trajectory(asked, 3, TIMES, error=1e-3)
     assert np.abs(after.positions - before.positions).max() > 1e-4
     np.testing.assert_array_equal(after.positions, integrate(stiffer, TIMES).positions)
