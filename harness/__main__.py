@@ -17,11 +17,10 @@ def main() -> None:
         from harness.cli import main as run_command
 
         run_command()
-    except KeyboardInterrupt:
-        interrupts.end_command()
-        interrupts.exit_process()
-    except SystemExit as exit:
-        if exit.code == interrupts.EXIT_CODE:
+    except (
+        BaseException
+    ) as end:  # cleaning up may raise anything after Ctrl-C, and Typer answers that with an exit code
+        if interrupts.is_interrupted() or isinstance(end, KeyboardInterrupt):
             interrupts.exit_process()
         raise
     finally:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from harness.base import interrupts, places
+from harness.base import places
 from harness.base.console import say, show_log
 from harness.base.errors import SpringbenchError
 from harness.base.files import MISTAKES, told
@@ -37,14 +37,7 @@ Peers = Annotated[bool, typer.Option("--peers", help="With --error: time other l
 
 
 class Commands(TyperGroup):
-    """Answers our own errors, those of the system and Ctrl-C."""
-
-    def make_context(self, *args: Any, **extra: Any) -> Any:
-        try:
-            return super().make_context(*args, **extra)
-        except KeyboardInterrupt:
-            interrupts.end_command()
-            raise typer.Exit(interrupts.EXIT_CODE) from None
+    """Answers our own errors and those of the system."""
 
     def invoke(self, ctx: Any) -> Any:
         show_log()
@@ -63,6 +56,3 @@ class Commands(TyperGroup):
         except MemoryError as error:
             say("springbench: there is not enough memory for this; take a smaller mesh")
             raise typer.Exit(1) from error
-        except KeyboardInterrupt:
-            interrupts.end_command()
-            raise typer.Exit(interrupts.EXIT_CODE) from None

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import atexit
+import logging
 import os
 import signal
 import sys
@@ -30,6 +31,7 @@ _MAX_DEFERRALS = 250
 _IMPORTING = ("importlib._bootstrap", "_frozen_importlib")
 
 _deferrals = 0
+_interrupted = False
 
 
 def install_handler() -> None:
@@ -50,7 +52,10 @@ def ignore() -> None:
 
 @contextmanager
 def blocked() -> Generator[None]:
-    """Defer Ctrl-C inside the block; processes that are started there never receive it."""
+    """Defer Ctrl-C inside the block; processes that are started there never receive it.
+
+    A process that multiprocessing spawns needs its resource tracker, whose start unblocks Ctrl-C: start that before.
+    """
     if sys.platform == "win32":
         yield
         return
@@ -61,15 +66,19 @@ def blocked() -> Generator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def end_command() -> None:
-    """Say that the command was stopped."""
-    ignore()
-    _kill_workers()
-    print(MESSAGE, file=sys.stderr)
+def is_interrupted() -> bool:
+    """Whether Ctrl-C has come."""
+    return _interrupted
 
 
 def exit_process() -> NoReturn:
-    """Exit as interrupted. The interpreter's own way out ends by a signal where `exec` was interrupted."""
+    """Say that the command was stopped, and exit. The interpreter's own way out ends by a signal where Ctrl-C came during
+    `exec`."""
+    ignore()
+    _kill_workers()
+    with suppress(OSError, ValueError):
+        print(MESSAGE, file=sys.stderr, flush=True)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what fails from here on was interrupted
     atexit._run_exitfuncs()  # pyright: ignore[reportPrivateUsage]
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
@@ -79,14 +88,15 @@ def exit_process() -> NoReturn:
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """Raise KeyboardInterrupt, as soon as no module is being imported."""
-    global _deferrals
+    global _deferrals, _interrupted
     while frame and sys.platform != "win32" and _deferrals < _MAX_DEFERRALS:
         if frame.f_globals.get("__name__") in _IMPORTING:
             _deferrals += 1
             signal.setitimer(signal.ITIMER_REAL, _RETRY)
             return
         frame = frame.f_back
-    _deferrals = 0
+    _deferrals, _interrupted = 0, True
+    logging.disable()  # what threads of libraries log of the workers that they lose
     _kill_workers()
     raise KeyboardInterrupt
 

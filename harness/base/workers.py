@@ -15,7 +15,7 @@ import signal
 import sys
 from collections.abc import Callable, Generator
 from contextlib import suppress
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from pickle import UnpicklingError
 from time import monotonic
@@ -116,7 +116,10 @@ class _Worker:
         (self._ticks, ticks), (self._said, said), (self._dump, dump) = (context.Pipe(duplex=False) for _ in range(3))
         theirs = calls, ticks, said, dump
         self._process = context.Process(target=serve, args=(*theirs, ready, os.getpid()))
-        self._process.start()
+        if not fork:
+            resource_tracker.ensure_running()  # which unblocks Ctrl-C
+        with interrupts.blocked():
+            self._process.start()
         for end in theirs:
             end.close()
 

@@ -8,6 +8,7 @@ import logging
 from collections.abc import Generator
 from contextlib import contextmanager
 from importlib import import_module
+from multiprocessing import resource_tracker
 from pathlib import Path
 from shutil import which
 from socket import create_connection
@@ -20,6 +21,7 @@ from distributed.security import Security
 from ruamel.yaml import YAML
 
 from harness.base.errors import InputError, Mistake
+from harness.base.interrupts import blocked
 
 PATIENCE = 10.0
 """Seconds in which a scheduler has to answer, and to have a worker."""
@@ -48,11 +50,12 @@ def scheduler(on: str) -> Generator[Any]:
         except ImportError:
             raise InputError(Mistake("needs cryptography: pip install 'springbench[cluster]'", key="--on")) from None
         quiet: Any = {"dashboard_address": None, "silence_logs": SILENCE}
-        with (
-            config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}),
-            LocalCluster(n_workers=int(many), threads_per_worker=1, security=secure, **quiet) as found,
-        ):
-            yield found
+        with config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}):
+            resource_tracker.ensure_running()
+            with blocked():  # Ctrl-C is for this process, which ends the workers
+                cluster = LocalCluster(n_workers=int(many), threads_per_worker=1, security=secure, **quiet)
+            with cluster as found:
+                yield found
     elif on.endswith((".yaml", ".yml")):
         with _batch(Path(on)) as found:
             yield found

@@ -53,14 +53,16 @@ def test_ctrl_c_while_modules_are_imported(seconds: float):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("where", [(), ("--on", "local:2")], ids=["here", "dask"])
 @pytest.mark.parametrize("seed", range(20))
-def test_ctrl_c_at_a_random_moment(seed: int, tmp_path: Path):
+def test_ctrl_c_at_a_random_moment(seed: int, where: tuple[str, ...], tmp_path: Path):
     sweep = tmp_path / "sweep.yaml"
     sweep.write_text(
         f"scenes: [{SCENE.name}]\nsizes: [8, 12]\nsolvers: [sparse, numba, hybrid]\noptions: {{frames: 10}}\n"
     )
     (tmp_path / SCENE.name).write_text(SCENE.read_text())
-    interrupt(start("run", str(sweep), "--results", str(tmp_path / "results")), random.Random(seed).uniform(0.3, 15.0))
+    process = start("run", str(sweep), "--results", str(tmp_path / "results"), *where)
+    interrupt(process, random.Random(seed).uniform(0.3, 15.0))
 
 
 def test_an_interrupt_that_a_destructor_swallows_is_raised_again():
