@@ -72,8 +72,10 @@ def is_interrupted() -> bool:
 
 
 def exit_process() -> NoReturn:
-    """Say that the command was stopped, and exit. The interpreter's own way out ends by a signal where Ctrl-C came during
-    `exec`."""
+    """Say that the command was stopped, and exit.
+
+    The interpreter's own way out ends by a signal where Ctrl-C came during `exec`.
+    """
     ignore()
     _kill_workers()
     with suppress(OSError, ValueError):
