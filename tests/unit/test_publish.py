@@ -1,12 +1,14 @@
 """Publishing results and verifying them: what was changed is found, and what is in an archive comes out again."""
 
 import json
+import re
 import subprocess
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -17,7 +19,7 @@ from harness.base.console import err
 from harness.base.progress import Lines
 from harness.cli import app
 from harness.experiments.archive import verify
-from harness.experiments.archive.verify import Claim, Holds, Published
+from harness.experiments.archive.verify import Claim, Holds, Published, Row
 from tests.contracts.hostile import scene
 from tests.dummies import dummy_rows
 
@@ -69,15 +71,19 @@ def test_what_was_published_comes_out_again(home: Path, name: str, tmp_path: Pat
     with verify.unpacked(home / name) as folder:
         subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=folder, check=True)
         assert verify.checksums(folder) == []
-        runs = verify.published(folder, print, own_code=False)
+        runs, wrong = verify.published(folder, print, own_code=False)
         assert [one.title for one in runs] == ["cloth 4 dense", "cloth 4 sparse"]
-        claims = verify.again(verify.chosen(runs, seed=1), tmp_path, Lines(err()))
+        assert wrong == []
+        taken = verify.chosen(runs, seed=1)
+        claims = verify.compare(taken, verify.again(taken, tmp_path, Lines(err())))
         listed = command("list", folder / "configs" / "sweep" / "sweep.yaml", "--results", folder / "results")
         assert listed.output.count("done") == 2
-    assert sorted(map(str, claims[:2])) == [
-        f"cloth 4 {solver}, positions: holds (2 steps, to the bit)" for solver in ("dense", "sparse")
-    ]
-    assert "times as long as" in claims[2].what
+    told = [*map(str, claims)]
+    for solver in ("dense", "sparse"):
+        assert f"cloth 4 {solver}, positions: holds (2 steps, to the bit)" in told
+        assert any(line.startswith(f"cloth 4 {solver}, other columns: holds (") for line in told), told
+        assert any(line.startswith(f"cloth 4 {solver}, time of a step: ") for line in told)
+    assert "times as long as" in claims[-1].what
 
 
 def test_the_metadata_name_each_file_with_its_sum_and_what_may_be_done_with_it(home: Path):
@@ -101,6 +107,114 @@ def test_an_archive_that_was_changed_is_named_and_none_of_it_is_run(home: Path, 
     for line in ("sweep.yaml: does not hold (was changed)", "mine.py: does not hold (was not", "(missing)"):
         assert line in told.output
     assert "done again" not in told.output
+
+
+@pytest.fixture(scope="module")
+def repeated(home: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Published], list[list[Row]]]:
+    """The published runs, dense and sparse, and what they leave when they are done again."""
+    with verify.unpacked(home / "x.zip") as folder:
+        runs, _ = verify.published(folder, print, own_code=False)
+        return runs, verify.again(runs, tmp_path_factory.mktemp("again"), Lines(err()))
+
+
+def scaled(name: str, factor: float) -> Callable[[Row], Row]:
+    return lambda row: row if row[name] is None else row | {name: row[name] * factor}
+
+
+def only(change: Callable[[Row], Row], **at: Any) -> Callable[[Row], Row]:
+    return lambda row: change(row) if all(row[name] == value for name, value in at.items()) else row
+
+
+FORGED: dict[str, tuple[Callable[[Row], Row], str]] = {
+    "solvers exchanged": (
+        lambda row: row | {"solver": "sparse" if row["solver"] == "dense" else "dense"},
+        "names and options",
+    ),
+    "another scene": (lambda row: row | {"scene": "silk"}, "names and options"),
+    "another size": (lambda row: row | {"size": 64}, "names and options"),
+    "other parameters": (lambda row: row | {"parameters": '{"a": 1}'}, "names and options"),
+    "another time step": (scaled("time_step", 0.5), "names and options"),
+    "more iterations allowed": (scaled("max_iterations", 10), "names and options"),
+    "an integrator": (lambda row: row | {"integrator": "bdf2"}, "names and options"),
+    "one row of another solver": (only(lambda row: row | {"solver": "fast"}, phase="step", frame=2), "names and"),
+    "small residuals": (scaled("residual", 1e-6), "columns: .*residual"),
+    "small last residuals": (scaled("last_residual", 1e-6), "columns: .*last_residual"),
+    "halved energies": (scaled("energy_springs", 0.5), "columns: .*energy_springs"),
+    "an objective": (only(scaled("objective", 0.999), frame=2), "columns: .*objective"),
+    "fewer iterations": (only(scaled("iterations", 2), phase="step"), "columns: .*iterations"),
+    "another end of iterations": (lambda row: row | {"stopped": row["stopped"] and "tolerance"}, "columns: .*stopped"),
+    "more vertices": (scaled("vertices", 100), "columns: .*vertices"),
+    "a smaller strain": (scaled("largest_strain", 0.9), "columns: .*largest_strain"),
+    "fewer numbers in the factor": (scaled("nnz_system", 2), "columns: .*nnz_system"),
+    "a family": (lambda row: row | {"family": "mine"}, "columns: .*family"),
+    "positions of one step": (only(lambda row: row | {"digest": "0" * 64}, frame=2), "positions: .*step 2 of 2"),
+    "a failed rival": (
+        lambda row: row | ({"status": "diverged", "reason": "it is bad"} if row["solver"] == "dense" else {}),
+        "end: does not hold",
+    ),
+    "all 1,000 times as fast": (scaled("seconds", 1e-3), "time of a step: does not hold"),
+    "all 1,000 times as slow": (scaled("seconds", 1e3), "time of a step: does not hold"),
+    "no time": (lambda row: row | {"seconds": None}, "time of a step: does not hold"),
+    "no time at all": (scaled("seconds", 0.0), "time of a step: does not hold"),
+    "one 2.5 times as fast": (only(scaled("seconds", 0.4), solver="dense"), "takes .*does not hold"),
+    "another frame": (only(lambda row: row | {"frame": 7}, frame=2), "positions: .*does not hold|positions: does"),
+    "another phase": (only(lambda row: row | {"phase": "magic"}, phase="prepare"), "a repeat has no magic"),
+    "a phase that is null": (only(lambda row: row | {"phase": None}, phase="prepare"), "a repeat has no None"),
+    "a frame that is null": (only(lambda row: row | {"frame": None}, phase="step"), "positions: does not hold"),
+    "a round that is null": (lambda row: row | {"round": None}, "a repeat has no"),
+}
+
+
+def claims_of(runs: list[Published], new: list[list[Row]]) -> list[str]:
+    """All claims that do not hold, where nothing here was interrupted."""
+    undisturbed = [[row | {"interrupted": False} for row in found] for found in new]
+    named = [claim for one in runs if (claim := verify._names(one))]
+    return [str(claim) for claim in (*named, *verify.compare(runs, undisturbed)) if claim.holds is Holds.NO]
+
+
+@pytest.mark.parametrize("kind", FORGED)
+def test_a_forged_column_does_not_hold(kind: str, repeated: tuple[list[Published], list[list[Row]]]):
+    runs, new = repeated
+    seconds = [
+        [row | {"interrupted": False} for row in found] for found in new
+    ]  # of this very repeat: not of its noise
+    honest = [replace(one, rows=found) for one, found in zip(runs, seconds, strict=True)]
+    assert claims_of(honest, new) == []
+    change, said = FORGED[kind]
+    forged = [replace(one, rows=[change(row) for row in one.rows]) for one in honest]
+    told = claims_of(forged, new)
+    assert any(re.search(said, line) for line in told), told
+
+
+def test_rows_that_are_missing_or_doubled_do_not_hold(repeated: tuple[list[Published], list[list[Row]]]):
+    runs, new = repeated
+    for one, here in zip(runs, new, strict=True):
+        fewer = replace(one, rows=[row for row in here if row["phase"] != "step" or row["frame"] == 1])
+        assert any("positions" in line for line in claims_of([fewer], [here]))
+        better = [row | {"residual": 1e-12} for row in here if row["phase"] == "step"]
+        doubled = replace(one, rows=[*better, *here])
+        assert any("residual" in line for line in claims_of([doubled], [here]))
+
+
+def test_elsewhere_what_differs_refutes_nothing_and_confirms_nothing(
+    repeated: tuple[list[Published], list[list[Row]]],
+):
+    runs, new = repeated
+    for change in (scaled("residual", 0.5), scaled("seconds", 1e-3), lambda row: row | {"digest": "0"}):
+        there = [replace(one, rows=[change(row) | {"machine": "another"} for row in one.rows]) for one in runs]
+        assert claims_of(there, new) == []
+        assert Holds.UNKNOWN in {claim.holds for claim in verify.compare(there, new)}
+
+
+def test_runs_that_no_config_asks_for_cannot_be_told(home: Path, tmp_path: Path):
+    def change(content: dict[str, bytes]) -> None:
+        made_up = [row | {"run_id": "f" * 12, "solver": "magic"} for row in dummy_rows(1)]
+        content["results/sweep/rows/cloth-4-magic.parquet"] = rows.encoded(made_up)
+
+    told = command("verify", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True), "--seed", "1")
+    assert "1 of 3 runs of sweep: cannot tell (the config asks for none such)" in told.output
+    assert told.exit_code == (1 if "does not hold" in told.output else 3), told.output
+    assert "no repeat confirms these columns: " in told.output
 
 
 def test_rows_that_lie_under_true_checksums_do_not_hold(home: Path, tmp_path: Path):
@@ -150,7 +264,7 @@ def test_damaged_rows_are_not_published(home: Path, tmp_path: Path):
 def claim(home: Path, factor: float, *, interrupted: bool = False, machine: str = "00000000") -> Claim:
     """What is said of a ratio that was 1 and is `factor`."""
     with verify.unpacked(home / "x.zip") as folder:
-        run = verify.published(folder, print, own_code=False)[0].run
+        run = verify.published(folder, print, own_code=False)[0][0].run
     old = [row | {"interrupted": False} for row in dummy_rows(1)]
     there = (Published(old, run), Published(old, run.but(size=5)))
     slower = [row | {"seconds": row["seconds"] * factor, "interrupted": interrupted} for row in old]
@@ -168,7 +282,7 @@ def test_a_ratio_holds_or_not_or_cannot_be_told(home: Path):
 
 def test_a_tenth_is_chosen_and_each_has_another_solver_beside_it(home: Path):
     with verify.unpacked(home / "x.zip") as folder:
-        (a, b) = verify.published(folder, print, own_code=False)
+        (a, b), _ = verify.published(folder, print, own_code=False)
     runs = [replace(one, run=one.run.but(size=size)) for size in range(10) for one in (a, b)]
     for seed in range(20):
         taken = verify.chosen(runs, seed)

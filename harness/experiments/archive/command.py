@@ -80,13 +80,15 @@ def verify(
             say(f"{archive} is not what was published; nothing of it was run")
             raise typer.Exit(1)
         say("all checksums hold")
-        runs = checks.possible(checks.published(folder, say, own_code=own_code))
+        found, claims = checks.published(folder, say, own_code=own_code)
+        runs = checks.possible(found, say)
         chance = randbelow(10**6) if seed is None else seed
         taken = checks.chosen(runs, chance)
         say(f"{len(taken)} of {len(runs)} runs are done again (--seed {chance})")
-        claims = checks.again(taken, Path(scratch), display(err()))
+        claims += checks.compare(taken, checks.again(taken, Path(scratch), display(err())))
     for claim in claims:
         say(str(claim))
+    say(f"no repeat confirms these columns: {', '.join(sorted(checks.UNREPEATED))}")
     states = {claim.holds for claim in claims}
     bad, unknown = checks.Holds.NO in states, checks.Holds.UNKNOWN in states or not claims
     say(

@@ -1,10 +1,11 @@
 """Whether an archive is what was published, and whether its numbers come out again.
 
-All checksums are compared. Then a random tenth of its runs is done here, each beside another solver's run on the same
-scene and size: positions must be equal to the bit after every step, and the ratio of the two solvers' times, step by
-step (`harness.base.statistics.changed`), that which was published: within RATIO on the machine type that it was
-published from, within ELSEWHERE on others. Where another machine, other libraries or other code ran, positions that
-differ, and ratios that do not hold, refute nothing: it cannot be told.
+All checksums are compared, and the names and options of all runs with those of their configs. Then a random tenth of
+the runs is done here, each beside another solver's run on the same scene and size. Positions after every step, and all
+columns but UNREPEATED, must be equal to the bit; a step's time must be that which was published within SECONDS, and the
+ratio of the two solvers' times, step by step (`harness.base.statistics.changed`), within RATIO on the machine type that
+it was published from, within ELSEWHERE on others. Where another machine, other libraries or other code ran, what
+differs refutes nothing: it cannot be told. Nor can it of a run for which no config asks.
 """
 
 from __future__ import annotations
@@ -12,11 +13,14 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import random
 import shutil
+import struct
 import zipfile
+import zlib
 from collections import defaultdict
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
@@ -24,10 +28,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from harness.base import machine, rows, shelf, statistics
+from harness.base import child, columns, machine, rows, shelf, statistics
 from harness.base.claim import config_of
 from harness.base.errors import InputError, Mistake
 from harness.base.progress import Display
+from harness.base.stated import stated
 from harness.config.load import load_any
 from harness.config.options import AUTO
 from harness.config.sweep import RunSpec
@@ -35,12 +40,32 @@ from harness.experiments.archive.merge import sweeps
 from harness.experiments.archive.publish import SUMS
 from harness.experiments.core import do_all
 from harness.experiments.plan import Files
+from harness.experiments.provenance import asked
 from harness.experiments.run_unit import RunUnit
 
-RATIO, ELSEWHERE = 1.25, 2.0
+RATIO, ELSEWHERE, SECONDS = 1.25, 2.0, 3.0
 """Minima of two runs of the same code lie up to 4 % apart on an idle machine, ratios far more on busy ones; another
-processor has other vectors and caches."""
-_BUFFER = 2**20
+processor has other vectors and caches. Times themselves change with all else that the machine does."""
+
+UNREPEATED = frozenset(
+    (
+        *("seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted", "adds_up", "estimate_seconds"),
+        *("kernel_seconds", "transfer_seconds", "load", "started", "machine", "node", "cpu", "cores", "memory_gib"),
+        *("machine_bandwidth", "machine_flops", "machine_step", "system", "versions", "commit", "code", "device"),
+        *("device_memory_gib", "device_driver", "device_versions", "device_bandwidth", "sm_clock_mhz"),
+        *("memory_clock_mhz", "power_w", "power_limit_w", "performance_state", "temperature_c", "sweep", "recorded"),
+        *("time_limit", "memory_limit", "timing", "at_once", "pinned"),
+    )
+)
+"""Columns that no repeat confirms: times, the state and the kind of the machine, the sweep's name, the recording, which
+is not made again, and how the run was limited and timed."""
+
+_MOST_FILES, _MOST_SUMS, _MOST_TIMES = 200_000, 2**26, 200
+"""Files of an archive, bytes of its checksums, and how many times as large as itself it may unpack to."""
+_READING = child.Allowance(600.0, 2**31)
+"""What reading an archive's rows may take."""
+_MOST_LOADED = 200
+"""Configs are read with at most so many different options."""
 
 Row = dict[str, Any]
 
@@ -82,28 +107,53 @@ class Published:
         """The runs whose times are compared: of one sweep, scene and size."""
         return self.run.sweep, self.run.scene_name, self.run.size
 
+    @property
+    def steps(self) -> list[Row]:
+        """The rows of its steps."""
+        return [row for row in self.rows if row["phase"] == "step"]
+
 
 @contextmanager
 def unpacked(archive: Path) -> Generator[Path]:
     """A folder with what an archive holds, for a while. Raises InputError for what is none, or is too large."""
+    wanted = "wanted an archive that `springbench publish` wrote (.zip)"
+    if not archive.is_file():  # a device or a pipe would be read for ever
+        raise InputError(Mistake(f"is {'no plain file' if archive.exists() else 'not there'}; {wanted}", archive))
     with TemporaryDirectory() as scratch:
         try:
             with zipfile.ZipFile(archive) as packed:
-                size, free = sum(info.file_size for info in packed.infolist()), shutil.disk_usage(scratch).free
-                if size > free:
-                    raise InputError(Mistake(f"takes {size:,} bytes unpacked; there are {free:,}", archive))
+                if why := _excess(packed.infolist(), archive.stat().st_size, shutil.disk_usage(scratch).free):
+                    raise InputError(Mistake(f"{why}; {wanted}", archive))
                 packed.extractall(scratch)  # names that lead out of the folder are made to stay in it
-        except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError) as error:
-            raise InputError(Mistake(f"is no archive that `springbench publish` wrote: {error}", archive)) from error
+        except (*_DAMAGE, OSError) as error:
+            raise InputError(Mistake(f"cannot be unpacked ({error}); {wanted}", archive)) from error
         yield Path(scratch)
+
+
+_DAMAGE = (zipfile.BadZipFile, RuntimeError, NotImplementedError, ValueError, EOFError, zlib.error, struct.error)
+"""What zipfile raises on archives that are damaged or made up."""
+
+
+def _excess(files: Sequence[zipfile.ZipInfo], size: int, free: int) -> str:
+    """Why files of an archive of this size are not unpacked, empty where they are."""
+    unpacked = sum(info.file_size for info in files)
+    if len(files) > _MOST_FILES:
+        return f"holds {len(files):,} files, and at most {_MOST_FILES:,} are unpacked"
+    if unpacked > free:
+        return f"takes {unpacked:,} bytes unpacked; there are {free:,}"
+    if unpacked > _MOST_TIMES * size or sum(info.compress_size for info in files) > size:
+        return f"takes {unpacked:,} bytes unpacked of {size:,}, which no results do"
+    if any(info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for info in files):
+        return "is compressed by another method"
+    return ""
 
 
 def checksums(folder: Path) -> list[Claim]:
     """What is not as it was published; empty where all is. Raises InputError where there are no checksums."""
     sums = folder / SUMS
-    if not sums.is_file():
+    if not sums.is_file() or sums.stat().st_size > _MOST_SUMS:
         raise InputError(Mistake(f"holds no {SUMS}; wanted an archive that `springbench publish` wrote", folder))
-    lines = [line.partition("  ") for line in sums.read_text().splitlines()]
+    lines = [line.partition("  ") for line in os.fsdecode(sums.read_bytes()).splitlines()]
     stated = {name: digest for digest, _, name in lines if name}
     there = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
     del there[SUMS]
@@ -118,60 +168,102 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def published(folder: Path, say: Callable[[str], None], *, own_code: bool) -> list[Published]:
-    """The runs in a folder of results that ended well and can be done again, by the configs beside them.
+def published(folder: Path, say: Callable[[str], None], *, own_code: bool) -> tuple[list[Published], list[Claim]]:
+    """The runs in a folder of results that can be done again, by the configs beside them; and what does not hold, or
+    cannot be told, of the names of runs.
 
     own_code: whether those that need code from the archive are among them.
     """
-    found: list[Published] = []
+    runs: list[Published] = []
+    claims: list[Claim] = []
+    _LOADED.clear()
     for sweep in sweeps(folder / "results"):
-        units = shelf.units(sweep / "rows")
         config = config_of(sweep)
         if config and not config.is_relative_to(folder.resolve()):
             raise InputError(Mistake("leads out of the archive; nothing of it was run", sweep / ".config"))
         by_run: dict[str, list[Row]] = defaultdict(list)
-        for row in rows.read(units).to_pylist():
+        for row in _rows(sweep):
             by_run[row["run_id"]].append(row)
-        whole = [of_run for of_run in by_run.values() if all(row["status"] == "ok" for row in of_run)]
-        whole = [of_run for of_run in whole if any(row["digest"] for row in of_run)]
-        specs = [_spec(config, of_run, own_code) if config else None for of_run in whole]
-        found += [Published(of_run, spec) for of_run, spec in zip(whole, specs, strict=True) if spec]
-        if left := sum(spec is None for spec in specs):
-            why = "their code is in the archive: read it, then give --own-code" if config and not own_code else ""
-            say(f"{sweep.name}: {left} of {len(specs)} runs cannot be done again{f'; {why}' if why else ''}")
-    return found
+        specs = {name: _spec(config, of_run, own_code=own_code) if config else None for name, of_run in by_run.items()}
+        found = [Published(by_run[name], spec) for name, spec in specs.items() if spec]
+        claims += [claim for one in found if (claim := _names(one))]
+        if unknown := len(specs) - len(found):
+            why = "the config asks for none such" if config else "there is no config"
+            claims.append(Claim(f"{unknown} of {len(specs)} runs of {sweep.name}", Holds.UNKNOWN, why))
+        repeated = [one for one in found if all(row["status"] in _REPEATED for row in one.rows)]
+        if left := len(found) - len(repeated):
+            say(f"{sweep.name}: {left} runs failed, which depends on more than their config: they are not done again")
+        safe = [one for one in repeated if own_code or not one.run.own()]
+        if left := len(repeated) - len(safe):
+            say(f"{sweep.name}: {left} runs need code from the archive: read it, then give --own-code")
+        runs += safe
+    return runs, claims
 
 
-def _spec(config: Path, of_run: Sequence[Row], own_code: bool) -> RunSpec | None:
+_REPEATED = ("ok", "unsupported", "diverged", "disputed")
+"""How a run ends by what its config says alone."""
+
+
+def _rows(sweep: Path) -> list[Row]:
+    """The rows of a sweep. Raises InputError for what takes too much."""
+    try:
+        found = child.call(rows.read, shelf.units(sweep / "rows"), limits=_READING)
+    except child.NoAnswer as error:
+        raise InputError(Mistake(str(error), sweep / "rows")) from error
+    if found["run_id"].null_count:
+        raise InputError(Mistake("holds rows without a run_id", sweep / "rows"))
+    return found.to_pylist()
+
+
+def _spec(config: Path, of_run: Sequence[Row], *, own_code: bool) -> RunSpec | None:
     """The run that left these rows, by its id, which tells its content; None where the config asks for none such."""
     steps = [row for row in of_run if row["phase"] == "step"]
-    first = steps[0]
+    first = (steps or of_run)[0]
     names = {"iterations": "max_iterations"} | {n: n for n in ("tolerance", "integrator", "time_step", "first_guess")}
     options = {name: first[column] for name, column in names.items()}
-    options |= {"frames": max(row["frame"] for row in steps), "rounds": 1 + max(row["round"] for row in steps)}
+    options |= {"frames": _largest(steps, "frame"), "rounds": 1 + _largest(steps, "round")}
     options["tolerance"] = AUTO if options["tolerance"] == 0.0 else options["tolerance"]
     if first["asked"] is not None:
         options = {name: options[name] for name in ("time_step", "frames", "rounds")} | {"accuracy": first["asked"]}
     sizes = [first["size"]] if first["size"] else []
     scene = {"solvers": [first["solver"]], "sizes": sizes, **options}
-    for asked in ({}, scene | {"threads": "auto"}, scene | {"threads": first["threads"]}):
-        try:
-            runs = _runs(config, json.dumps(asked, sort_keys=True), own_code)
-        except InputError:
-            continue
-        for run in runs:
-            if run.run_id(first["machine"]) == first["run_id"]:
-                return run if own_code or not run.own() else None
+    for given in ({}, scene | {"threads": "auto"}, scene | {"threads": first["threads"]}):
+        for opens in (False, True) if own_code else (False,):
+            for run in _runs(config, json.dumps(given, sort_keys=True), opens):
+                if run.run_id(str(first["machine"])) == first["run_id"] and (opens or not own_code or not run.own()):
+                    return run
     return None
 
 
-def _runs(config: Path, asked: str, own_code: bool) -> list[RunSpec]:
-    if (config, asked, own_code) not in _LOADED:
-        _LOADED[config, asked, own_code] = load_any(config, opens=own_code, **json.loads(asked)).runs()
-    return _LOADED[config, asked, own_code]
+def _largest(steps: Sequence[Row], name: str) -> int:
+    return max((row[name] for row in steps if row[name] is not None), default=0)
+
+
+def _runs(config: Path, given: str, opens: bool) -> list[RunSpec]:
+    """The runs of a config with options, as JSON; none where it refuses them. opens: whether code that it names is
+    run."""
+    key = config, given, opens
+    if key not in _LOADED:
+        if len(_LOADED) >= _MOST_LOADED:
+            return []
+        try:
+            _LOADED[key] = load_any(config, opens=opens, **json.loads(given)).runs()
+        except InputError:
+            _LOADED[key] = []
+    return _LOADED[key]
 
 
 _LOADED: dict[tuple[Path, str, bool], list[RunSpec]] = {}
+
+
+def _names(one: Published) -> Claim | None:
+    """What of the names and options in a run's rows is not what its config says."""
+    left_out = {"threads", *stated(one.run.solver.name)}  # of the machine, and of the code
+    if one.run.accuracy is not None:
+        left_out |= {"integrator", "time_step", "tolerance", "max_iterations", "first_guess"}  # are chosen
+    asked_for = {name: value for name, value in asked(one.run).items() if name not in left_out}
+    wrong = _differing([(row, asked_for) for row in one.rows], asked_for)
+    return Claim(f"{one.title}, names and options", Holds.NO, _listed(wrong)) if wrong else None
 
 
 def chosen(runs: Sequence[Published], seed: int, part: float = 0.1) -> list[Published]:
@@ -185,35 +277,125 @@ def chosen(runs: Sequence[Published], seed: int, part: float = 0.1) -> list[Publ
     return taken
 
 
-def again(runs: Sequence[Published], folder: Path, display: Display) -> list[Claim]:
-    """Do runs again, in this folder, and say what holds. Raises InputError."""
+def again(runs: Sequence[Published], folder: Path, display: Display) -> list[list[Row]]:
+    """Do runs again, in this folder: the rows of each. Raises InputError."""
     for part in ("rows", "recordings", "pictures"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     bare = [one.run.but(record=False, pictures=False) for one in runs]
     units = [RunUnit(run, Files.of(run, folder)) for run in bare]
     do_all(units, display)
-    new = [rows.read([unit.files.rows]).to_pylist() for unit in units]
-    claims = [_positions(one, rows_of) for one, rows_of in zip(runs, new, strict=True)]
+    return [rows.read([unit.files.rows]).to_pylist() for unit in units]
+
+
+def compare(runs: Sequence[Published], new: Sequence[list[Row]]) -> list[Claim]:
+    """What holds of runs that were done again. new: the rows that each left here."""
+    claims: list[Claim] = []
+    for one, here in zip(runs, new, strict=True):
+        claims += _repeated(one, here)
     for k, one in enumerate(runs):
         for j in range(k):
-            if runs[j].group == one.group and all(row["status"] == "ok" for row in (*new[j], *new[k])):
+            ended = (runs[j].rows, one.rows, new[j], new[k])
+            if runs[j].group == one.group and all(row["status"] == "ok" for found in ended for row in found):
                 claims.append(_ratio((runs[j], one), (new[j], new[k])))
                 break
     return claims
 
 
+def _repeated(old: Published, new: list[Row]) -> list[Claim]:
+    """What holds of a run that was done again: its end, its positions, its other columns and its times."""
+    ended, here = ({(row["status"], row["reason"]) for row in found} for found in (old.rows, new))
+    if {status for status, _ in here} != {status for status, _ in ended}:
+        status, reason = next(iter(here - ended), next(iter(here)))
+        return [Claim(f"{old.title}, end", Holds.NO, f"here it ended as {status}: {reason}")]
+    if {status for status, _ in here} != {"ok"}:
+        return [Claim(f"{old.title}, end", Holds.YES, f"here it ended as {next(iter(here))[0]}, too")]
+    return [_positions(old, new), _columns(old, new), *_seconds_hold(old, new)]
+
+
 def _positions(old: Published, new: list[Row]) -> Claim:
     what = f"{old.title}, positions"
-    if failed := next((row for row in new if row["status"] != "ok"), None):
-        return Claim(what, Holds.NO, f"here it ended as {failed['status']}: {failed['reason']}")
-    was, now = ({row["frame"]: row["digest"] for row in found if row["phase"] == "step"} for found in (old.rows, new))
-    others = sorted(frame for frame in was if now.get(frame) != was[frame])
+    now = {row["frame"]: row["digest"] for row in new if row["phase"] == "step"}
+    others = {row["frame"] for row in old.steps if row["digest"] != now.get(row["frame"])}
+    others |= now.keys() - {row["frame"] for row in old.steps}
     if not others:
-        return Claim(what, Holds.YES, f"{len(was)} steps, to the bit")
-    why = f"they differ from step {others[0]} of {len(was)} on"
+        return Claim(what, Holds.YES, f"{len(now)} steps, to the bit")
+    first = min(others, key=lambda frame: -1 if frame is None else frame)
+    return _refuted(what, f"they differ from step {first} of {len(now)} on", old, new)
+
+
+def _columns(old: Published, new: list[Row]) -> Claim:
+    """Whether all columns that a repeat determines have the published values; an empty one claims nothing."""
+    what = f"{old.title}, other columns"
+    of_place = {_place(row): row for row in new}
+    if lost := [_place(row) for row in old.rows if _place(row) not in of_place]:
+        phase, frame, round = lost[0]
+        return _refuted(what, f"a repeat has no {phase} of step {frame} in round {round}", old, new)
+    if fewer := {place for place in of_place if place[0] == "step"} - {_place(row) for row in old.steps}:
+        return _refuted(what, f"{len(fewer)} steps are missing", old, new)
+    names = [name for name in columns.SCHEMA.names if name not in UNREPEATED | {"digest"}]
+    wrong = _differing([(row, of_place[_place(row)]) for row in old.rows], names)
+    filled = [name for name in names if any(row[name] is not None for row in old.rows)]
+    return (
+        _refuted(what, _listed(wrong), old, new)
+        if wrong
+        else Claim(what, Holds.YES, f"{len(filled)} in {len(old.rows)} rows, to the bit")
+    )
+
+
+def _place(row: Row) -> tuple[Any, ...]:
+    return row["phase"], row["frame"], row["round"]
+
+
+def _differing(pairs: Sequence[tuple[Row, Row]], names: Iterable[str]) -> dict[str, tuple[Row, Any, Any]]:
+    """Columns of published rows that state another value than rows here: the first such row, and both values."""
+    wrong: dict[str, tuple[Row, Any, Any]] = {}
+    for row, here in pairs:
+        for name in names:
+            was, now = row[name], here[name]
+            if was is not None and was != now and not (was != was and now != now):  # what is no number equals itself
+                wrong.setdefault(name, (row, was, now))
+    return wrong
+
+
+def _listed(wrong: Mapping[str, tuple[Row, Any, Any]]) -> str:
+    told = [f"{name} is {was!r:.60}, here {now!r:.60}" for name, (_, was, now) in list(wrong.items())[:5]]
+    more = f", and {len(wrong) - len(told)} more columns" if len(wrong) > len(told) else ""
+    return "; ".join(told) + more
+
+
+def _refuted(what: str, why: str, old: Published, new: list[Row]) -> Claim:
+    """That something differs, which refutes it only where the same code ran on such a machine."""
     if elsewhere := _elsewhere(old.rows[0], new[0]):
         return Claim(what, Holds.UNKNOWN, f"{why}; {elsewhere}")
     return Claim(what, Holds.NO, why)
+
+
+def _seconds_hold(old: Published, new: list[Row]) -> list[Claim]:
+    """Whether a step takes as long as was published; nothing where it was on another machine, and may be."""
+    what = f"{old.title}, time of a step"
+    was, now = _seconds(old.rows), _seconds(new)
+    if was.keys() != now.keys():
+        return [_refuted(what, "a step has no time", old, new)]
+    times = statistics.changed(now, was).middle
+    why = f"here {times:.3g} times as long"
+    elsewhere = _elsewhere(old.rows[0], new[0])
+    if 1 / SECONDS <= times <= SECONDS:
+        return [Claim(what, Holds.YES, why)]
+    if elsewhere and 1 / _OTHER_MACHINE <= times <= _OTHER_MACHINE:
+        return []
+    if not elsewhere and (share := _interrupted([*old.rows, *new])) > 0.1:
+        return [Claim(what, Holds.UNKNOWN, f"{why}; {100 * share:.0f} % of the steps were interrupted")]
+    return [_refuted(what, why, old, new)]
+
+
+_OTHER_MACHINE = 20.0
+"""So many times as fast as this machine another one may be without a question."""
+
+
+def _interrupted(found: Sequence[Row]) -> float:
+    """The share of steps that were interrupted."""
+    steps = [row for row in found if row["phase"] == "step"]
+    return sum(bool(row["interrupted"]) for row in steps) / len(steps)
 
 
 def _elsewhere(old: Row, new: Row) -> str:
@@ -226,7 +408,10 @@ _WHERE = {"machine": "machine", "versions": "libraries", "code": "code", "thread
 
 
 def _ratio(old: tuple[Published, Published], new: tuple[list[Row], list[Row]]) -> Claim:
-    was, now = (_seconds(pair) for pair in ((old[0].rows, old[1].rows), new))
+    was, now = ([_seconds(run) for run in pair] for pair in ((old[0].rows, old[1].rows), new))
+    what = f"{old[0].title} beside {old[1].run.solver.name}, ratio of times"
+    if not was[0].keys() & was[1].keys() & now[0].keys() & now[1].keys():
+        return Claim(what, Holds.UNKNOWN, "they have no step in common that has a time")
     published, here = (statistics.changed(*pair).middle for pair in (was, now))
     apart = statistics.changed(*(_ratios(*pair) for pair in (now, was))).middle
     what = f"{old[0].title} takes {published:.3g} times as long as {old[1].run.solver.name}"
@@ -235,16 +420,16 @@ def _ratio(old: tuple[Published, Published], new: tuple[list[Row], list[Row]]) -
     limit = ELSEWHERE if elsewhere else RATIO
     if 1 / limit <= apart <= limit:
         return Claim(what, Holds.YES, why)
-    disturbed = [row for found in (old[0].rows, old[1].rows, *new) for row in found if row["phase"] == "step"]
-    share = sum(bool(row["interrupted"]) for row in disturbed) / len(disturbed)
+    share = _interrupted([row for found in (old[0].rows, old[1].rows, *new) for row in found])
     if elsewhere or share > 0.1:
         return Claim(what, Holds.UNKNOWN, f"{why}; {elsewhere or f'{100 * share:.0f} % of the steps were interrupted'}")
     return Claim(what, Holds.NO, why)
 
 
-def _seconds(pair: tuple[Sequence[Row], Sequence[Row]]) -> list[dict[int, float]]:
-    """Of the steps of two runs, by frame."""
-    return [statistics.least((r["frame"], r["seconds"]) for r in run if r["phase"] == "step") for run in pair]
+def _seconds(run: Sequence[Row]) -> dict[int, float]:
+    """Of the steps of a run, by frame, those that have a time."""
+    timed = [row for row in run if row["phase"] == "step" and row["frame"] is not None and row["seconds"] is not None]
+    return statistics.least((row["frame"], row["seconds"]) for row in timed if 0.0 < row["seconds"] < math.inf)
 
 
 def _ratios(ours: Mapping[int, float], theirs: Mapping[int, float]) -> dict[int, float]:
@@ -252,7 +437,10 @@ def _ratios(ours: Mapping[int, float], theirs: Mapping[int, float]) -> dict[int,
     return {frame: taken / theirs[frame] for frame, taken in ours.items() if frame in theirs}
 
 
-def possible(runs: Sequence[Published]) -> list[Published]:
+def possible(runs: Sequence[Published], say: Callable[[str], None]) -> list[Published]:
     """Those that this machine has cores for."""
     usable = machine.describe().cores
-    return [one for one in runs if machine.threads(one.run.threads).number <= usable]
+    found = [one for one in runs if machine.threads(one.run.threads).number <= usable]
+    if left := len(runs) - len(found):
+        say(f"{left} of {len(runs)} runs need more cores than this machine has: they are not done again")
+    return found
