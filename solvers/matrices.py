@@ -126,10 +126,12 @@ def require_determined(system: System, Q: scipy.sparse.csr_array) -> None:
     anchor[system.pins.vertices] = 1.0
     loose = np.flatnonzero(np.bincount(component, anchor)[component] <= 0.0)
     if len(loose):
-        named = ", ".join(map(str, loose[:5])) + (", ..." if len(loose) > 5 else "")
+        first = loose[:5].tolist()
+        named = ", ".join(map(str, first)) + (", ..." if len(loose) > 5 else "")
         raise NotPositiveDefinite(
             f"nothing determines the positions of some vertices, {len(loose)} in all ({named}): they have no mass, and "
-            "no spring leads from them to a mass or a pin; give them mass, pin them, or take them out of the mesh"
+            "no spring leads from them to a mass or a pin; give them mass, pin them, or take them out of the mesh",
+            first,
         )
 
 

@@ -10,7 +10,7 @@ others (see `solvers.integrators`). `StepProblem` states g in plain NumPy: every
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, Literal, Protocol, TypeGuard, runtime_checkable
@@ -32,7 +32,14 @@ class Unsupported(Exception):
 
 
 class NotPositiveDefinite(Exception):
-    """The system matrix has no Cholesky factor: some vertex is loose, or round-off or the input spoils it."""
+    """The system matrix has no Cholesky factor: some vertex is loose, or round-off or the input spoils it.
+
+    vertices: those that the message names.
+    """
+
+    def __init__(self, message: str = "", vertices: Sequence[int] = ()) -> None:
+        super().__init__(message)
+        self.vertices = tuple(vertices)
 
 
 class Energy(Protocol):

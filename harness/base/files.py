@@ -109,3 +109,20 @@ def reason(error: Exception) -> str:
     """What the system says of an error, else what the error does: `No space left on device`."""
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else " ".join(str(error).split()) or type(error).__name__
+
+
+HEAD = 1024
+"""Bytes by which `misnamed` tells what a file is."""
+
+
+def misnamed(head: bytes, size: int) -> str:
+    """Say what a file is that has the name of a data file and holds none, by its first HEAD bytes and its size; "" for
+    any other file."""
+    start = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    if not start and size <= len(head):
+        return "is empty"
+    if start.startswith(b"version https://git-lfs.github.com/spec/"):
+        return "is a Git LFS pointer; run `git lfs pull` to get the file itself"
+    if start.startswith((b"<!doctype html", b"<html")):
+        return "is a web page; download the file itself"
+    return ""

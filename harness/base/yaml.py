@@ -19,6 +19,7 @@ from ruamel.yaml.reader import ReaderError
 
 from harness.base.document import Document, Key, key_text, quote
 from harness.base.errors import InputError, Mistake
+from harness.base.files import HEAD, misnamed
 
 MAX_BYTES, MAX_NODES, MAX_DEPTH = 2**18, 100_000, 32
 
@@ -35,6 +36,8 @@ def read_bytes(path: Path) -> bytes:
         raise InputError(Mistake(f"cannot be read: {reason}", path)) from error
     if len(raw) > MAX_BYTES:
         raise InputError(Mistake(f"is larger than {MAX_BYTES} bytes; a config is small", path))
+    if problem := misnamed(raw[:HEAD], len(raw)):
+        raise InputError(Mistake(problem, path))
     return raw
 
 
@@ -57,10 +60,12 @@ def read_yaml(path: Path) -> Document:
         problem = f"holds the character {chr(error.character)!r}, which is not allowed"
         raise InputError(Mistake(problem, path, text.count("\n", 0, at) + 1)) from error
     except (YAMLError, ValueError) as error:
-        line = error.problem_mark.line + 1 if isinstance(error, MarkedYAMLError) and error.problem_mark else None
+        mark = error.problem_mark if isinstance(error, MarkedYAMLError) else None
         parts = [getattr(error, name, None) for name in ("context", "problem")]
         problem = ", ".join(filter(None, parts)) or "cannot be parsed"
-        raise InputError(Mistake(f"is not YAML: {problem}", path, line)) from error
+        if mark:
+            problem = _in_plain_words(problem, text.splitlines()[mark.line : mark.line + 1], mark.column)
+        raise InputError(Mistake(f"is not YAML: {problem}", path, mark.line + 1 if mark else None)) from error
     document = Document(path, {})
     if not isinstance(node, MappingNode):
         document.lines = {(): node.start_mark.line + 1} if node else {}
@@ -70,6 +75,26 @@ def read_yaml(path: Path) -> Document:
     if document.mistakes:
         raise document.error()
     return document
+
+
+def _in_plain_words(problem: str, lines: list[str], column: int) -> str:
+    """What is wrong and how to mend it, of what a parser says about a column of a line; else its own words."""
+    line = lines[0] if lines else ""
+    if "cannot start any token" in problem and line[column:]:
+        return f"a value cannot begin with {line[column]!r}; put the value in quotes"
+    if "undefined alias" in problem:
+        return f"{problem}; put the value in quotes if the * belongs to it"
+    flow = "got ':'" in problem
+    if not flow and "mapping values are not allowed" not in problem:
+        return problem
+    begin = 1 + max(line.rfind(mark, 0, column) for mark in ",{[") if flow else 0
+    end = min((at for mark in ",}]" if (at := line.find(mark, column)) >= 0), default=len(line)) if flow else len(line)
+    key, colon, value = line[begin:end].partition(":")
+    key, value = key.strip().lstrip("- "), value.partition(" #")[0].strip()
+    if begin + len(line[begin:end].partition(":")[0]) >= column or not colon:
+        return "a key stands where the line above has not ended; give both the same indent, and each key a colon"
+    mark = "'" if set(value) & set('"\\') else '"'
+    return f"the value of `{key[:40]}` holds a colon; put it in quotes, {key[:40]}: {mark}{value[:80]}{mark}"
 
 
 _SCALARS: dict[str, Callable[[str], Any]] = {

@@ -113,7 +113,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
     parts = [_bound(spec, i, mesh, mass).by(method) for i in range(len(spec.effects))]
     _single(spec, parts)
     _ends(parts, method, integrator)
-    pins, targets, moving = _pins(parts)
+    pins, targets, moving = _pins(parts, mesh)
     energies = tuple(energy for part in parts for energy in part.energies)
     energies += tuple(energy for part in parts for derive in part.derived for energy in derive(energies))
     forces = [force for part in parts for force in part.forces]
@@ -124,7 +124,7 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
             load += force.force
     load.flags.writeable = False
     system = System(mass, spec.time_step, energies, pins, method.factor, method.speed, lengths)
-    _require_determined(system)
+    _require_determined(system, mesh)
     start = spec.start or AT_REST
     _check(parts, start.positions(mesh.rest))
     _doubt(spec)
@@ -217,17 +217,20 @@ def _mass(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
     return mesh.mass
 
 
-def _require_determined(system: System) -> None:
+def _require_determined(system: System, mesh: Mesh) -> None:
     """Raise InputError where nothing determines the position of a vertex without mass."""
     if system.mass.all():
         return
     try:
         assemble(system, [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)])
     except NotPositiveDefinite as error:
-        raise InputError(Mistake(str(error), key="mesh")) from error
+        numbers = mesh.in_file(*error.vertices) if error.vertices else ""
+        raise InputError(Mistake(f"{error}{numbers}", key="mesh")) from error
 
 
-def _pins(parts: list[Contribution]) -> tuple[Pins, Positions, tuple[tuple[NDArray[np.int64], KeyedMotion], ...]]:
+def _pins(
+    parts: list[Contribution], mesh: Mesh
+) -> tuple[Pins, Positions, tuple[tuple[NDArray[np.int64], KeyedMotion], ...]]:
     """All pins by vertex, their targets, and which move; a vertex may be named twice if both times mean the same."""
     pins: list[Pin] = [pin for part in parts for pin in part.pins]
     if not pins:
@@ -245,9 +248,10 @@ def _pins(parts: list[Contribution]) -> tuple[Pins, Positions, tuple[tuple[NDArr
     clash |= motion != motion[first][back]
     if clash.any():
         one, two = owner[first][back][clash][0], owner[clash][0]
+        vertex = int(vertices[clash][0])
         raise InputError(
-            f"pins: vertex {vertices[clash][0]} is pinned twice, by effects[{one}] and effects[{two}], to different "
-            "places, with different weights or with different motions"
+            f"pins: vertex {vertex} is pinned twice, by effects[{one}] and effects[{two}], to different "
+            f"places, with different weights or with different motions{mesh.in_file(vertex)}"
         )
     moving = ((np.flatnonzero(motion[first] == k), path) for k, path in enumerate(motions) if path is not None)
     return Pins(unique, weight[first]), targets[first], tuple(moving)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -89,30 +88,30 @@ def require_still(who: str, start: Positions, pins: Sequence[PinLike]) -> None:
             )
 
 
-def require_open(who: str, energy: PairContact, start: Positions, thickness: float) -> None:
+def require_open(who: str, energy: PairContact, start: Positions, thickness: float, mesh: Mesh) -> None:
     """Raise InputError for a start (n, 3) [m] where pairs are nearer than the thickness [m]."""
     if closed := energy.closed(start):
-        n = len(start)
-        near = "; ".join(f"{_pair(x.tolist(), two, n)} {apart:.3g} m apart" for x, two, apart in closed[:_NAMED])
+        near = "; ".join(f"{_pair(x.tolist(), two, mesh)} {apart:.3g} m apart" for x, two, apart in closed[:_NAMED])
         raise InputError(
             f"{who}: {len(closed)} pairs start nearer than the thickness of {thickness:g} m: {near}; move them apart, "
             "or take a smaller thickness"
         )
 
 
-def _pair(x: list[int], edges: bool, n: int) -> str:
+def _pair(x: list[int], edges: bool, mesh: Mesh) -> str:
     one, two = (x[:2], x[2:]) if edges else (x[:1], x[1:])
-    return f"{_part(one, n)} and {_part(two, n)}"
+    return f"{_part(one, mesh)} and {_part(two, mesh)}"
 
 
-def _part(x: Sequence[int], n: int) -> str:
-    """A vertex, an edge or a triangle by its vertices; n: of the mesh, those of obstacles follow."""
+def _part(x: Sequence[int], mesh: Mesh) -> str:
+    """A vertex, an edge or a triangle by its vertices; those beyond the mesh's are those of obstacles."""
+    n = len(mesh.rest)
     own = all(i < n for i in x)
     kind = ("vertex", "edge", "triangle")[len(x) - 1]
-    return f"{kind} {'-'.join(str(i if own else i - n) for i in x)}{'' if own else ' of the obstacles'}"
+    return f"{kind} {'-'.join(str(i if own else i - n) for i in x)}{mesh.in_file(*x) if own else ' of the obstacles'}"
 
 
-def told(crossed: list[Crossing], n: int = sys.maxsize) -> str:
-    """The first ones in words; n: vertices of the mesh, those of obstacles follow."""
-    words = "; ".join(f"{_part(e, n)} through {_part(t, n)}" for e, t in crossed[:_NAMED])
+def told(crossed: list[Crossing], mesh: Mesh) -> str:
+    """The first ones in words; vertices beyond those of the mesh are those of obstacles."""
+    words = "; ".join(f"{_part(e, mesh)} through {_part(t, mesh)}" for e, t in crossed[:_NAMED])
     return f"{len(crossed)} times: {words}"

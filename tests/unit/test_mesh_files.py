@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from harness.base.errors import InputError
+from harness.scenes.effects.gas import Gas
 from harness.scenes.mesh import cells as cells_module
 from harness.scenes.mesh.base import SHEAR, STRETCH
 from harness.scenes.mesh.files import File
@@ -75,6 +77,36 @@ def test_comments_colours_groups_windows_line_ends_and_a_byte_order_mark_are_pas
     assert len(File(path=path).build(0).springs) == 3
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "v 0 0 0\nv 1 0 0\nv 1 1 \\\n0\nv 0 1 0\nf 1 2 3 \\\n 4\n",
+        "v 0 0 0\r\nv 1 \\\r\n0 0\r\nv 1 1 0\r\nv 0 1 0\r\nvt 0 \\\r\n1\r\nf 1 2 \\  \r\n 3 4\r\n",
+        "v 0 0\\\n0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf\\\n1 2\\\n\\\n3 4\\",
+        "# ends in \\\nv 0 0 0 # here too \\\nv 1 0 0\nv 1 1 0\nv 0 1 0\nl 1 2 \\\n3 4 1\nf 1 2 3 4\n",
+    ],
+    ids=["v and f", "windows and blanks", "glued and last", "comments"],
+)
+def test_a_backslash_continues_a_line_and_a_comment_ends_with_it(tmp_path, text):
+    mesh = obj(tmp_path, text).build(0)
+    assert mesh.rest.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    assert mesh.springs.tolist() == SIDES
+
+
+def test_a_mistake_in_a_continued_line_has_the_line_in_which_it_begins(tmp_path):
+    with pytest.raises(InputError, match="vertex 9 does not exist") as caught:
+        obj(tmp_path, SQUARE + "f 1 2 \\\n3 \\\n9\nl 1 2\n").build(0)
+    assert caught.value.mistakes[0].line == 5
+
+
+def test_messages_name_vertices_by_the_numbers_of_an_obj_too(tmp_path):
+    mesh = obj(tmp_path, SQUARE + "f 1 2 3 4\n").build(0)
+    assert mesh.in_file(0, 3) == " (1, 4 in the file)"
+    with pytest.raises(InputError, match=r"from vertex 0 to 1 \(1, 2 in the file\)"):
+        Gas(pressure=1.0).bind(mesh, np.ones(4), 0.1)
+    assert replace(mesh, first_vertex=0).in_file(0, 3) == ""
+
+
 def test_parts_are_the_sides_of_the_bounding_box(tmp_path):
     parts = obj(tmp_path, f"{SQUARE}f 1 2 3 4\n").build(0).parts
     assert {name: parts[name].tolist() for name in ("left", "right", "bottom", "top")} == {
@@ -125,7 +157,7 @@ def test_all_mistakes_of_an_obj_come_at_once(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no vertices"),
+        ("", "is empty"),
         ("# nothing\n", "no vertices"),
         (SQUARE, "no cells"),
         ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "without any size"),

@@ -150,20 +150,20 @@ REPEATS = {
 }
 
 
-@pytest.mark.parametrize("suffix", [".obj"])
+@pytest.mark.parametrize("suffix", [".obj", ".ply"])
 @pytest.mark.parametrize("case", REPEATS)
 def test_a_repeated_face_counts_once_with_a_warning(tmp_path, caplog, case, suffix):
     faces, repeats = REPEATS[case]
     path, shift = obj(tmp_path, SQUARE, *faces), 0
     if suffix == ".ply":
-        path, shift = tmp_path / "mesh.ply", 5  # its first face stands in line 10
+        path = tmp_path / "mesh.ply"
         lines = [f"{len(corners)} " + " ".join(str(int(c) - 1) for c in corners) for corners in map(str.split, faces)]
         head = "property float x\nproperty float y\nproperty float z\n"
         path.write_text(
             f"ply\nformat ascii 1.0\nelement vertex 4\n{head}element face {len(faces)}\n"
             "property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n" + "\n".join(lines)
         )
-        shift = 14 - 5
+        shift = 14 - 5  # its first face stands in line 14
     with caplog.at_level(logging.WARNING, "springbench"):
         made = scene(tmp_path, path, "{kind: springs, stretch: 1}", "mass_per_area: 0.5")
     assert made.system.mass.sum() == pytest.approx(0.5, rel=ROUND_OFF)

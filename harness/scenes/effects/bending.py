@@ -37,12 +37,14 @@ class Bending(Model):
         sides = np.linalg.norm([b - a, c - b, a - c], axis=2).max(axis=0)
         flat = np.flatnonzero(np.linalg.norm(np.cross(b - a, c - a), axis=1) <= 1e-9 * sides**2)
         if len(flat):
-            raise InputError(f"bending: the triangle {triangles[flat[0]].tolist()} has no area; repair the mesh")
+            corners = triangles[flat[0]].tolist()
+            raise InputError(f"bending: the triangle {corners} has no area{mesh.in_file(*corners)}; repair the mesh")
         edges = np.sort(np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
         shared, count = np.unique(edges, axis=0, return_counts=True)
         if (count > 2).any():
+            ends = shared[count > 2][0].tolist()
             raise InputError(
-                f"bending: more than two triangles meet at the edge {shared[count > 2][0].tolist()}; repair the mesh"
+                f"bending: more than two triangles meet at the edge {ends}{mesh.in_file(*ends)}; repair the mesh"
             )
         return Contribution(energies=(bending.Bending.of(mesh.rest, triangles, self.stiffness),))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -81,9 +82,9 @@ class Contact(Model):
             slip, margin = self.creep * mesh.spacing, _MARGIN * mesh.size
             return (Energy(obstacles, self.thickness, self.friction, stiffness, slip, margin, time_step),)
 
-        return Contribution(derived=(derived,), checks=(self._check,))
+        return Contribution(derived=(derived,), checks=(partial(self._check, mesh),))
 
-    def _check(self, start: Positions, pins: Sequence[Pin]) -> None:
+    def _check(self, mesh: Mesh, start: Positions, pins: Sequence[Pin]) -> None:
         """Raise InputError for pins or a start (n, 3) [m] inside an obstacle, and for planes without room between."""
         limit = self.thickness - self.depth
         for k, given in enumerate(self.obstacles):
@@ -91,8 +92,8 @@ class Contact(Model):
             for pin in pins:
                 if met := nearest(obstacle, given.motion, pin.targets, pin.motion, limit):
                     time, distance = met
-                    self._refuse(f"pins hold vertex {{}} at {time:g} s", k, distance, pin.vertices)
-            self._refuse("vertex {} starts", k, obstacle.distance(start, 0.0), np.arange(len(start)))
+                    self._refuse(mesh, f"pins hold vertex {{}} at {time:g} s", k, distance, pin.vertices)
+            self._refuse(mesh, "vertex {} starts", k, obstacle.distance(start, 0.0), np.arange(len(start)))
         planes = [one for one in self.obstacles if one.kind == "plane"]
         if len(planes) > 1 and any(one.motion for one in planes):  # others leave the room that the start is in
             solid = [one.obstacle() for one in planes]
@@ -103,12 +104,13 @@ class Contact(Model):
                         f"between them, and vertices stay {self.thickness:g} m away from each; move them less"
                     )
 
-    def _refuse(self, who: str, k: int, distance: NDArray[np.float64], vertices: NDArray[np.int64]) -> None:
+    def _refuse(self, mesh: Mesh, who: str, k: int, distance: NDArray[np.float64], vertices: NDArray[np.int64]) -> None:
         near = np.flatnonzero(distance < self.thickness - self.depth)
         if len(near):
             worst = near[distance[near].argmin()]
+            vertex = f"{vertices[worst]}{mesh.in_file(int(vertices[worst]))}"
             raise InputError(
-                f"contact: {who.format(vertices[worst])} {distance[worst]:.3g} m from the surface of obstacles[{k}] "
+                f"contact: {who.format(vertex)} {distance[worst]:.3g} m from the surface of obstacles[{k}] "
                 f"({self.obstacles[k].kind}), which is nearer than the thickness of {self.thickness:g} m; move one of "
                 "them" + (" (negative distances are inside)" if distance[worst] < 0.0 else "")
             )

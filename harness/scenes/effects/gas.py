@@ -31,7 +31,7 @@ class Gas(Model):
         if not len(triangles):
             raise InputError("gas: needs a closed surface of triangles, and this mesh has no triangles")
         sides = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
-        _check_closed(sides, len(mesh.rest))
+        _check_closed(sides, mesh)
         volume = gas.Gas(triangles, self.pressure, 1.0).volume_at(mesh.rest)
         if not abs(volume) > 1e-9 * mesh.size**3:
             raise InputError(f"gas: the mesh encloses no volume (came {volume:.3g} m^3)")
@@ -39,19 +39,21 @@ class Gas(Model):
         return Contribution(energies=(gas.Gas(outwards, self.pressure, abs(volume)),))
 
 
-def _check_closed(sides: NDArray[np.int64], n: int) -> None:
+def _check_closed(sides: NDArray[np.int64], mesh: Mesh) -> None:
     """Raise InputError unless each side (3 f, 2) of a triangle is that of one other, which goes along it backwards."""
+    n = len(mesh.rest)
     forth, back = sides[:, 0] * n + sides[:, 1], sides[:, 1] * n + sides[:, 0]
     code, count = np.unique(forth, return_counts=True)
     if (count > 1).any():
         i, j = divmod(int(code[count > 1][0]), n)
         raise InputError(
-            f"gas: two triangles go the same way along the edge from vertex {i} to {j}; let all triangles face outwards"
+            f"gas: two triangles go the same way along the edge from vertex {i} to {j}"
+            f"{mesh.in_file(i, j)}; let all triangles face outwards"
         )
     alone = ~np.isin(forth, back)
     if alone.any():
         i, j = sides[alone][0].tolist()
         raise InputError(
             f"gas: needs a closed mesh; {alone.sum()} edges belong to one triangle only, the first from vertex {i} to "
-            f"{j}; close the holes, join vertices that lie in one place"
+            f"{j}{mesh.in_file(i, j)}; close the holes, join vertices that lie in one place"
         )

@@ -58,7 +58,7 @@ class SelfContact(Model):
             return Contribution()
         reach = self.thickness if self.range is None else self.range
         if crossed := crossings(rest, edges, mesh.triangles):
-            raise InputError(f"self-contact: the mesh passes through itself at rest, {told(crossed)}; repair it")
+            raise InputError(f"self-contact: the mesh passes through itself at rest, {told(crossed, mesh)}; repair it")
 
         def energy(stiffness: NDArray[np.float64]) -> Energy:
             surface = Surface.of(rest, edges, faces, stiffness, self.thickness, reach)
@@ -73,8 +73,10 @@ class SelfContact(Model):
             """Raise InputError for exact pins that move, and for a start (n, 3) [m] that is not free."""
             require_still("self-contact", start, pins)
             if crossed := crossings(start, edges, mesh.triangles):
-                raise InputError(f"self-contact: the start passes through itself, {told(crossed)}; move them apart")
-            require_open("self-contact", energy(np.ones(len(mass))), start, self.thickness)
+                raise InputError(
+                    f"self-contact: the start passes through itself, {told(crossed, mesh)}; move them apart"
+                )
+            require_open("self-contact", energy(np.ones(len(mass))), start, self.thickness, mesh)
 
         apart = (Apart(((edges, mesh.triangles),)),)
         return Contribution(derived=(derived,), checks=(check,), once=("self-contact",), ends=ENDS, apart=apart)

@@ -47,7 +47,9 @@ class Sewing(Model):
         """The threads as one energy, none for a stiffness of zero; raises InputError for rows that share a vertex."""
         rows = self.first.chosen(mesh, f"{self.kind}: first"), self.second.chosen(mesh, f"{self.kind}: second")
         if len(both := np.intersect1d(*rows)):
-            raise InputError(f"{self.kind}: vertex {both[0]} is in both rows; each should be in one of them")
+            raise InputError(
+                f"{self.kind}: vertex {both[0]}{mesh.in_file(both[0])} is in both rows; each should be in one of them"
+            )
         if not self.stiffness:
             return Contribution()
         pairs = _matched(mesh, *rows)

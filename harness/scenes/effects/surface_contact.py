@@ -102,8 +102,8 @@ class SurfaceContact(Model):
             require_still(self.kind, start, pins)
             if crossed := apart.crossings(start, 0.0):
                 raise InputError(
-                    f"{self.kind}: the start passes through obstacles, {told(crossed, n)}; move them apart"
+                    f"{self.kind}: the start passes through obstacles, {told(crossed, mesh)}; move them apart"
                 )
-            require_open(self.kind, energy(np.ones(n)), start, self.thickness)
+            require_open(self.kind, energy(np.ones(n)), start, self.thickness, mesh)
 
         return Contribution(derived=(derived,), checks=(check,), ends=ENDS, apart=(apart,))

@@ -25,7 +25,8 @@ class Mesh:
     parts: named sets of vertices (`corners`, `top`, `left`, ...), each (q,), sorted;
     mass: (n,) [kg] where a file gives absolute masses, else None;
     attributes: numbers by vertex that a file names, each (n,);
-    areas: (n,) [m^2] at rest by vertex where they are not thirds of its triangles, else None.
+    areas: (n,) [m^2] at rest by vertex where they are not thirds of its triangles, else None;
+    first_vertex: the number of the first vertex in the mesh's file.
     All arrays are read-only.
     """
 
@@ -41,6 +42,7 @@ class Mesh:
     mass: NDArray[np.float64] | None = None
     attributes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict[str, NDArray[np.float64]])
     areas: NDArray[np.float64] | None = None
+    first_vertex: int = 0
 
     def __post_init__(self) -> None:
         arrays = [self.rest, self.springs, self.triangles, self.shares, self.mass, self.areas]
@@ -52,6 +54,11 @@ class Mesh:
     def size(self) -> float:
         """The diagonal of the rest shape's bounding box [m]."""
         return float(np.linalg.norm(np.ptp(self.rest, axis=0))) if len(self.rest) else 0.0
+
+    def in_file(self, *vertices: int) -> str:
+        """What a message adds behind vertices counted from 0: their numbers in the file, where they are others."""
+        numbers = ", ".join(str(vertex + self.first_vertex) for vertex in vertices)
+        return f" ({numbers} in the file)" if self.first_vertex else ""
 
     @property
     def rest_lengths(self) -> NDArray[np.float64]:

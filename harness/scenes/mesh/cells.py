@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from harness.base.errors import InputError, Mistake
+from harness.base.files import HEAD, misnamed
 from harness.scenes.mesh.base import SHEAR, STRETCH, Mesh
 from harness.scenes.mesh.generator import MAX_VERTICES
 from harness.scenes.mesh.polygons import (
@@ -52,7 +53,7 @@ _LOG = logging.getLogger("springbench")
 class Cells:
     """points: (n, 3) [m]; polygons: corners k >= 2 -> (f, k); places: k -> the line of each, (f,), or its number in the
     file; counted: which of them; segments: (s, 2); tetrahedra: (t, 4); groups: the points of what the file names;
-    attributes: numbers by point that it names, each (n,)."""
+    attributes: numbers by point that it names, each (n,); first_vertex: the number of the first point in the file."""
 
     points: Points
     polygons: Mapping[int, Indices] = field(default_factory=dict[int, Indices])
@@ -62,6 +63,7 @@ class Cells:
     groups: Mapping[str, Indices] = field(default_factory=dict[str, Indices])
     attributes: Mapping[str, Points] = field(default_factory=dict[str, Points])
     counted: Literal["line", "face"] = "face"
+    first_vertex: int = 0
 
     @property
     def lines_only(self) -> bool:
@@ -70,7 +72,7 @@ class Cells:
 
 
 def check_file(path: Path, *, most: int = MAX_BYTES) -> None:
-    """Raise InputError unless `path` is a file of so many bytes at most."""
+    """Raise InputError unless `path` is a file of so many bytes at most, and neither empty nor a stand-in for one."""
     try:
         size = path.stat().st_size
     except (OSError, ValueError) as error:
@@ -80,6 +82,13 @@ def check_file(path: Path, *, most: int = MAX_BYTES) -> None:
         raise InputError(Mistake("is no file; give the path of a mesh file", path))
     if size > most:
         raise InputError(Mistake(f"has {size:,} bytes; at most {most:,} are read", path))
+    try:
+        with path.open("rb") as file:
+            problem = misnamed(file.read(HEAD), size)
+    except OSError as error:
+        raise InputError(Mistake(f"cannot be read ({error.strerror})", path)) from None
+    if problem:
+        raise InputError(Mistake(problem, path))
 
 
 def network(cells: Cells, rule: SpringRule, path: Path) -> Mesh:
@@ -141,6 +150,7 @@ def network(cells: Cells, rule: SpringRule, path: Path) -> Mesh:
         parts=box_parts(rest) | dict(cells.groups),
         attributes=cells.attributes,
         areas=areas,
+        first_vertex=cells.first_vertex,
     )
 
 

@@ -1,7 +1,8 @@
-"""Meshes from files: OBJ, the assignment's JSON scenes, VTP, and every format that meshio reads."""
+"""Meshes from files: OBJ, the assignment's JSON scenes, PLY, VTP, and every format that meshio reads."""
 
 from __future__ import annotations
 
+import logging
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
@@ -13,13 +14,16 @@ from harness.base.errors import InputError, Mistake
 from harness.base.model import Model
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.cells import MAX_COORDINATE, Cells, SpringRule, check_file, network
-from harness.scenes.mesh.foreign import Found, read
+from harness.scenes.mesh.foreign import FACES, Found, read
 from harness.scenes.mesh.obj import read_obj
 from harness.scenes.mesh.scene_json import read_scene_json
 from harness.scenes.mesh.topology import NO_PAIRS, Indices
 
-_KINDS = ("line", "triangle", "quad", "polygon", "tetra")
+_KINDS = ("line", *FACES, "tetra")
 """The kinds of cells that springs are made of; the kind `vertex` is passed over."""
+
+_MOST_NAMED = 3
+_LOG = logging.getLogger("springbench")
 
 SECONDS, BYTES_PER_SECOND = 5.0, 1e6
 """What a file may take to read: meshio takes text at 1 MB/s at least, and reads some broken files for ever."""
@@ -33,7 +37,7 @@ class File(Model):
 
     kind: Literal["file"] = "file"
     path: Path
-    """An OBJ, a JSON scene of the assignment (its OBJ is read), a VTP, or a file that meshio reads (PLY, VTK, ...)."""
+    """An OBJ, a JSON scene of the assignment (its OBJ is read), a PLY, a VTP, or what meshio reads (VTK, STL, ...)."""
     springs: SpringRule | None = None
     """Springs along `edges` of faces alone, or between all `face_pairs`; by default as JSON scenes want it
     (face_pairs), and edges for all other files."""
@@ -60,13 +64,22 @@ def _read_meshio(path: Path) -> Cells:
     problem = _problem(points, blocks) or _problem_of_groups(found)
     if problem:
         raise InputError(Mistake(problem, path))
-    groups: dict[int, list[Indices]] = {}
-    for kind, data in blocks:
-        if kind in ("triangle", "quad", "polygon"):
-            groups.setdefault(data.shape[1], []).append(data)
+    if len(found.left_out):
+        where = ", ".join(f"({x:g}, {y:g}, {z:g})" for x, y, z in found.left_out[:_MOST_NAMED].tolist())
+        more = ", ..." if len(found.left_out) > _MOST_NAMED else ""
+        problem = f"{len(found.left_out):,} points belong to no cell and are left out: at {where}{more} m"
+        _LOG.warning("%s", Mistake(problem, path))
+    polygons: dict[int, list[Indices]] = {}
+    places: dict[int, list[Indices]] = {}
+    for (kind, data), numbers in zip(blocks, found.places, strict=True):
+        if kind in FACES:
+            polygons.setdefault(data.shape[1], []).append(data)
+            places.setdefault(data.shape[1], []).append(numbers)
     return Cells(
         points=np.pad(points, ((0, 0), (0, 3 - points.shape[1]))),
-        polygons={corners: np.concatenate(groups[corners]) for corners in sorted(groups)},
+        polygons={corners: np.concatenate(polygons[corners]) for corners in sorted(polygons)},
+        places={corners: np.concatenate(places[corners]) for corners in sorted(places)},
+        counted=found.counted,
         segments=np.concatenate([NO_PAIRS, *(data for kind, data in blocks if kind == "line")]),
         tetrahedra=np.concatenate([np.empty((0, 4), np.int64), *(data for kind, data in blocks if kind == "tetra")]),
         groups=found.groups,

@@ -1,40 +1,50 @@
 # pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
 # meshio has no types.
-"""Mesh files of other programs, as meshio reads them, and .vtp, which it does not: what runs in the child that
-`harness.base.child` keeps.
+"""Mesh files of other programs, as meshio reads them, and PLY and .vtp, by readers of our own: what runs in the child
+that `harness.base.child` keeps.
 
-meshio takes some files for whole that were cut before their end. So the sections of a .msh must be closed, a PLY must
-hold what its head promises, and an STL in text must be ended.
+meshio takes some files for whole that were cut before their end. So the sections of a .msh must be closed, and an STL
+in text must be ended.
 """
 
 from __future__ import annotations
 
+import io
 import re
 import warnings
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, Literal, NamedTuple, Protocol, cast
 
 import meshio
 import numpy as np
+from meshio.gmsh import _gmsh40, _gmsh41
 from numpy.typing import NDArray
 
-from harness.scenes.mesh import vtp
+from harness.scenes.mesh import ply, vtp
 
 Block = tuple[str, NDArray[np.int64]]
 """Cells of one kind: its name in meshio, and the points of each."""
 
+FACES = ("triangle", "quad", "polygon")
+_KINDS = {2: "line", 3: "triangle", 4: "quad"}
+"""By the number of corners; others are a polygon."""
 _PHYSICAL = "gmsh:physical"
 
 
 class Found(NamedTuple):
     """What a file holds. points (n, 3); groups: points by the name of a group; attributes: numbers by point (n,), those
-    of vectors by their name and a number, `normal.0`."""
+    of vectors by their name and a number, `normal.0`; places: the line of each cell of a block, or its number;
+    left_out: points that no cell uses, of a format that has them besides the mesh, (k, 3)."""
 
     points: NDArray[np.float64]
     blocks: list[Block]
     groups: dict[str, NDArray[np.int64]]
     attributes: dict[str, NDArray[np.float64]]
+    places: list[NDArray[np.int64]]
+    counted: Literal["line", "face"] = "face"
+    left_out: NDArray[np.float64] = np.empty((0, 3))
 
 
 class _Cells(Protocol):
@@ -56,35 +66,106 @@ class _Raw(Protocol):
 
 def read(path: Path) -> Found:
     """What a mesh file holds; raises anything on a broken file, ValueError on one that was cut."""
-    if path.suffix.lower() == ".vtp":
+    suffix = path.suffix.lower()
+    if suffix == ".vtp":
         return _of_vtp(vtp.read(path.read_bytes()))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        raw = cast(_Raw, meshio.read(path))
-    missing = _MISSING.get(path.suffix.lower())
-    if missing and (what := missing(path.read_bytes(), raw)):
+    if suffix == ".ply":
+        return _of_ply(ply.read(path.read_bytes()))
+    content = path.read_bytes() if suffix in (".msh", ".stl") else b""
+    if suffix == ".msh" and _PARAMETRIC.search(content):
+        raise ValueError("it has parametric nodes; save it without them (Mesh.SaveParametric = 0 in Gmsh)")
+    raw = _by_meshio(path)
+    missing = _MISSING.get(suffix)
+    if missing and (what := missing(content, raw)):
         raise ValueError(f"{what}; the file was cut before its end, so write it once more")
     blocks = [(block.type, np.array(block.data, np.int64)) for block in raw.cells if len(block.data)]
     kept = [(kind, data) for kind, data in blocks if kind != "vertex"]
-    return Found(np.array(raw.points, np.float64), kept, _groups(raw), _columns(raw.point_data, len(raw.points)))
+    points = np.array(raw.points, np.float64)
+    found = Found(points, kept, _groups(raw), _columns(raw.point_data, len(points)), _numbered(kept))
+    return _without_stray(found) if suffix == ".msh" else found
+
+
+def _by_meshio(path: Path) -> _Raw:
+    """What meshio makes of a file. Raises ValueError with the reason where it prints that and exits."""
+    said = io.StringIO()
+    try:
+        with warnings.catch_warnings(), redirect_stdout(said):
+            warnings.simplefilter("ignore")
+            return cast(_Raw, meshio.read(path))
+    except SystemExit:
+        reason = "; ".join(filter(None, map(str.strip, said.getvalue().splitlines())))
+        raise ValueError(reason or f"it does not hold what a {path.suffix} file begins with") from None
+
+
+def _tagged(read_entities: Callable[..., Any]) -> Callable[..., Any]:
+    """A reader of entities that gives those without a physical group the tag 0, which means none: meshio counts blocks
+    of cells wrongly where some entities have none at all."""
+
+    def read(*arguments: Any) -> Any:
+        found = read_entities(*arguments)
+        for of_dimension in found[0] if isinstance(found[0], tuple) else found:
+            for entity, tags in of_dimension.items():
+                of_dimension[entity] = tags or [0]
+        return found
+
+    return read
+
+
+for _module in (_gmsh40, _gmsh41):
+    setattr(_module, "_read_entities", _tagged(_module._read_entities))  # noqa: B010
+
+
+def _numbered(blocks: list[Block]) -> list[NDArray[np.int64]]:
+    """The number of each face among all faces, from 0; of other cells nothing that is used."""
+    faces = [0, *np.cumsum([len(data) if kind in FACES else 0 for kind, data in blocks]).tolist()]
+    return [first + np.arange(len(data)) for first, (_, data) in zip(faces, blocks, strict=False)]
+
+
+def _without_stray(found: Found) -> Found:
+    """Without the points that no cell uses: Gmsh saves the points of a geometry, such as the centres of circles."""
+    used = np.zeros(len(found.points), np.bool_)
+    for _, data in found.blocks:
+        if len(data) and (data.min() < 0 or data.max() >= len(used)):
+            return found  # the caller names the cell
+        used[data.ravel()] = True
+    if used.all():
+        return found
+    number = np.cumsum(used) - 1
+    groups = {name: number[group[used[group]]] for name, group in found.groups.items()}
+    return found._replace(
+        points=found.points[used],
+        blocks=[(kind, number[data]) for kind, data in found.blocks],
+        groups={name: group for name, group in groups.items() if len(group)},
+        attributes={name: column[used] for name, column in found.attributes.items()},
+        left_out=found.points[~used],
+    )
+
+
+def _of_ply(read: ply.Ply) -> Found:
+    blocks = [(_KINDS.get(k, "polygon"), rows) for k, (rows, _) in read.faces.items()]
+    places = [read.first_line + which for _, which in read.faces.values()]
+    counted: Literal["line", "face"] = "line" if read.first_line else "face"
+    return Found(read.points, blocks, {}, read.numbers, places, counted)
 
 
 def _of_vtp(read: vtp.Surface) -> Found:
     """By the number of their corners."""
-    names, groups = {3: "triangle", 4: "quad"}, dict[int, list[NDArray[np.int64]]]()
+    groups = dict[int, list[NDArray[np.int64]]]()
     for polygon in read.polygons:
         groups.setdefault(len(polygon), []).append(polygon)
-    blocks = [(names.get(k, "polygon"), np.array(group)) for k, group in sorted(groups.items())]
+    blocks = [(_KINDS.get(k, "polygon"), np.array(group)) for k, group in sorted(groups.items())]
     pairs = [np.column_stack([line[:-1], line[1:]]) for line in read.lines]
     if pairs:
         blocks.append(("line", np.concatenate(pairs)))
-    return Found(read.points, blocks, {}, _columns(read.numbers, len(read.points)))
+    return Found(read.points, blocks, {}, _columns(read.numbers, len(read.points)), _numbered(blocks))
 
 
 def _groups(raw: _Raw) -> dict[str, NDArray[np.int64]]:
     """The points of named sets of points and of cells, and of Gmsh's physical groups."""
     found: dict[str, list[NDArray[Any]]] = {name: [np.asarray(some)] for name, some in raw.point_sets.items()}
     for name, sets in raw.cell_sets.items():
+        if name.startswith("gmsh:"):  # numbers of bounding entities, of no cells
+            continue
         for block, some in zip(raw.cells, sets, strict=True):
             if some is not None:
                 found.setdefault(name, []).append(np.asarray(block.data)[np.asarray(some, np.int64)])
@@ -107,7 +188,7 @@ def _columns(numbers: dict[str, NDArray[Any]], n: int) -> dict[str, NDArray[np.f
 
 
 _SECTION = re.compile(rb"^\$(End)?((?:MeshFormat|PhysicalNames|Entities|Nodes|Elements|Periodic)\b|\w+Data\b)", re.M)
-_PROMISE = re.compile(rb"^element (vertex|face) (\d+)", re.M)
+_PARAMETRIC = re.compile(rb"^\$ParametricNodes\b", re.M)
 
 
 def _open_sections(content: bytes, raw: _Raw) -> str:
@@ -119,15 +200,6 @@ def _open_sections(content: bytes, raw: _Raw) -> str:
     return f"the section ${left} has no $End{left}" if left else ""
 
 
-def _broken_promise(content: bytes, raw: _Raw) -> str:
-    """Of a PLY."""
-    found = {b"vertex": len(raw.points), b"face": sum(len(block.data) for block in raw.cells)}
-    for what, count in _PROMISE.findall(content.partition(b"end_header")[0]):
-        if found[what] < int(count):
-            return f"its head promises {what.decode()} {count.decode()[:20]}, and {found[what]} are there"
-    return ""
-
-
 def _not_ended(content: bytes, raw: _Raw) -> str:
     """Of an STL; a binary one holds its count."""
     text = content.lstrip().startswith(b"solid") and b"facet" in content
@@ -136,6 +208,5 @@ def _not_ended(content: bytes, raw: _Raw) -> str:
 
 _MISSING: dict[str, Callable[[bytes, _Raw], str]] = {
     ".msh": _open_sections,
-    ".ply": _broken_promise,
     ".stl": _not_ended,
 }

@@ -1,14 +1,16 @@
 """A strict reader of Wavefront OBJ: vertices, polygons of any number of corners, lines.
 
-Vertex tokens are `v`, `v/vt`, `v//vn` or `v/vt/vn`, counted from 1, or from -1 backwards from the last
-vertex read so far. An `f` line of two vertices is a spring (scenes of the Toronto assignment use it so), an
-`l` line is a polyline. Texture, normals, groups and materials are passed over; anything else is a mistake.
+A `\\` at the end of a line continues it on the next one. Vertex tokens are `v`, `v/vt`, `v//vn` or
+`v/vt/vn`, counted from 1, or from -1 backwards from the last vertex read so far. An `f` line of two
+vertices is a spring (scenes of the Toronto assignment use it so), an `l` line is a polyline. Texture,
+normals, groups and materials are passed over; anything else is a mistake.
 """
 
 from __future__ import annotations
 
 import re
 from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -35,7 +37,7 @@ def read_obj(path: Path) -> Cells:
     reader = _Reader(path)
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
-            for number, text in enumerate(file, 1):
+            for number, text in _statements(file):
                 reader.read(number, text)
                 if len(reader.mistakes) >= _MOST_MISTAKES:
                     break
@@ -44,6 +46,21 @@ def read_obj(path: Path) -> Cells:
     except OSError as error:
         raise InputError(Mistake(f"cannot be read ({error.strerror})", path)) from None
     return reader.cells()
+
+
+def _statements(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
+    """Statements without comments, and the number of the line in which each begins."""
+    begun, parts = 0, list[str]()
+    for number, line in enumerate(lines, 1):
+        text, comment, _ = line.partition("#")
+        continued = not comment and (text := text.rstrip()).endswith("\\")
+        begun = begun or number
+        parts.append(text[:-1] if continued else text)
+        if not continued:
+            yield begun, " ".join(parts)
+            begun, parts = 0, []
+    if parts:
+        yield begun, " ".join(parts)
 
 
 class _Reader:
@@ -62,8 +79,8 @@ class _Reader:
         self.mistakes: list[Mistake] = []
 
     def read(self, number: int, text: str) -> None:
-        """Take in one line."""
-        keyword, *words = text.split("#", 1)[0].split() or [""]
+        """Take in one statement that begins in line `number`."""
+        keyword, *words = text.split() or [""]
         try:
             if keyword == "v":
                 self.points.append(_point(words))
@@ -127,6 +144,7 @@ class _Reader:
             polygons={k: np.array(self.polygons[k], np.int64) for k in sorted(self.polygons)},
             places={k: np.array(lines, np.int64) for k, lines in self.lines.items()},
             counted="line",
+            first_vertex=1,
             segments=np.array(self.segments, np.int64) if self.segments else NO_PAIRS,
         )
 

@@ -123,6 +123,7 @@ def assemble(
     resolution: int = 0,
     parts: Mapping[str, ArrayLike] | None = None,
     areas: Points | None = None,
+    first_vertex: int = 0,
     attributes: Mapping[str, Points] | None = None,
 ) -> Mesh:
     """A mesh of springs given by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND.
@@ -147,5 +148,6 @@ def assemble(
         resolution=resolution,
         parts={name: distinct(np.asarray(part, np.int64), len(rest)) for name, part in (parts or {}).items()},
         areas=areas,
+        first_vertex=first_vertex,
         attributes=dict(attributes or {}),
     )

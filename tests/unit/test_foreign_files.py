@@ -1,0 +1,250 @@
+"""Mesh files as other programs write them: PLY of any properties, Gmsh without groups, and what only has their name."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.base.errors import InputError
+from harness.base.yaml import read_yaml
+from harness.scenes.mesh import ply
+from harness.scenes.mesh.files import File
+
+XYZ = "property float x\nproperty float y\nproperty float z\n"
+CORNERS = "property list uchar int vertex_indices\n"
+SQUARE = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n"
+POINTS = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+
+TEXTS = {
+    "a number behind the corners": (CORNERS + "property uchar red\n", "", "4 0 1 2 3 255\n", ""),
+    "a number before them": ("property uchar flags\n" + CORNERS, "", "1 4 0 1 2 3\n", ""),
+    "another list before them": (f"property list uchar float texcoord\n{CORNERS}", "", "2 .5 .5 4 0 1 2 3\n", ""),
+    "a list and numbers behind": (
+        CORNERS + "property list uchar float texcoord\nproperty int a\nproperty double b\n",
+        "",
+        "4 0 1 2 3 2 .5 .5 7 8e-3\n",
+        "",
+    ),
+    "edges behind": (CORNERS, "element edge 1\nproperty int vertex1\nproperty int vertex2\n", "4 0 1 2 3\n", "0 2\n"),
+    "lists of no length": (CORNERS + "property list uchar int none\n", "", "4 0 1 2 3 0\n", ""),
+    "the other name of the corners": (CORNERS.replace("indices", "index"), "", "4 0 1 2 3\n", ""),
+}
+
+
+def text(face: str, other: str, rows: str, others: str) -> bytes:
+    """A PLY of a square in text."""
+    head = f"ply\nformat ascii 1.0\ncomment by hand\nelement vertex 4\n{XYZ}element face 1\n{face}{other}end_header\n"
+    return (head + SQUARE + rows + others).encode()
+
+
+@pytest.mark.parametrize("case", TEXTS)
+def test_other_properties_and_elements_of_a_ply_are_skipped(case):
+    found = ply.read(text(*TEXTS[case]))
+    assert found.points.tolist() == [list(point) for point in POINTS]
+    assert {k: rows.tolist() for k, (rows, _) in found.faces.items()} == {4: [[0, 1, 2, 3]]}
+    assert not found.numbers
+
+
+@pytest.mark.parametrize("order", ["<", ">"], ids=["little", "big"])
+@pytest.mark.parametrize("mixed", [False, True])
+def test_a_binary_ply_of_any_properties_is_read(order, mixed):
+    name = {"<": "little", ">": "big"}[order]
+    head = (
+        f"ply\r\nformat binary_{name}_endian 1.0\r\nelement camera 1\r\nproperty list uint8 short view\r\n"
+        "element vertex 4\r\nproperty double x\r\nproperty uchar red\r\nproperty double y\r\nproperty double z\r\n"
+        "element face 2\r\nproperty char flag\r\nproperty list ushort uint vertex_index\r\n"
+        "property list uchar double texcoord\r\nelement edge 1\r\nproperty int a\r\nproperty int b\r\nend_header\r\n"
+    )
+    body = struct.pack(order + "B2h", 2, -5, 5)
+    body += b"".join(struct.pack(order + "dBdd", x, 200 + i, y, z) for i, (x, y, z) in enumerate(POINTS))
+    faces = [(0, 1, 2), (0, 2, 3)] if not mixed else [(0, 1, 2, 3), (1, 2, 3)]
+    for i, face in enumerate(faces):
+        coordinates = (0.5,) * (2 * i if mixed else 2)
+        body += struct.pack(f"{order}bH{len(face)}I", -1, len(face), *face)
+        body += struct.pack(f"{order}B{len(coordinates)}d", len(coordinates), *coordinates)
+    found = ply.read(head.encode() + body + struct.pack(order + "2i", 0, 2))
+    assert found.points.tolist() == [list(point) for point in POINTS]
+    assert found.numbers["red"].tolist() == [200, 201, 202, 203]
+    rows = {k: (rows.tolist(), which.tolist()) for k, (rows, which) in found.faces.items()}
+    wanted = {3: ([[1, 2, 3]], [1]), 4: ([[0, 1, 2, 3]], [0])}
+    assert rows == (wanted if mixed else {3: ([[0, 1, 2], [0, 2, 3]], [0, 1])})
+
+
+def test_a_ply_gives_a_mesh_with_its_numbers_in_double_precision(tmp_path):
+    path = tmp_path / "mesh.ply"
+    content = text(*TEXTS["a number behind the corners"]).replace(b"float z\n", b"float z\nproperty float heat\n")
+    for i, (x, y, z) in enumerate(POINTS):
+        content = content.replace(f"\n{x} {y} {z}\n".encode(), f"\n{x} {y} {z} {i}.1\n".encode())
+    path.write_bytes(content)
+    mesh = File(path=path).build()
+    assert mesh.springs.tolist() == [[0, 1], [0, 3], [1, 2], [2, 3]]
+    assert mesh.attributes["heat"].tolist() == [0.1, 1.1, 2.1, 3.1]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        (b"uchar int vertex_indices", b"uchar int corners", "no list vertex_indices or vertex_index"),
+        (b"property float y", b"property float u", "have no y"),
+        (b"property float x", b"property half x", "the line 'property half x'"),
+        (b"format ascii 1.0\n", b"", "names no format"),
+        (b"element face 1", b"element face 2", "promises 2 rows of face"),
+        (b"4 0 1 2 3", b"4 0 1 2.5 3", "the vertex 2.5; wanted a whole number"),
+        (b"4 0 1 2 3", b"-4 0 1 2 3", "the length -4"),
+        (b"4 0 1 2 3", b"4 0 1 two 3", "is no number"),
+        (b"4 0 1 2 3", b"9 0 1 2 3", "fewer follow"),
+        (b"end_header", b"the_end", "no head from `ply` to `end_header`"),
+    ],
+)
+def test_a_broken_ply_is_refused_with_the_reason(before, after, words):
+    content = text(CORNERS, "", "4 0 1 2 3\n", "")
+    with pytest.raises(ValueError, match=words.replace(".", r"\.")):
+        ply.read(content.replace(before, after))
+
+
+MSH = """$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$PhysicalNames
+2
+1 1 "rim"
+2 2 "sheet"
+$EndPhysicalNames
+$Entities
+1 1 2 0
+7 9 9 9 0
+1 0 0 0 0 1 0 1 1 0
+1 0 0 0 1 1 0 {sheet} 4 1 2 3 4
+2 0 0 0 1 1 0 0 0
+$EndEntities
+$Nodes
+2 5 1 5
+0 7 0 1
+5
+9 9 9
+2 1 {parametric} 4
+1
+2
+3
+4
+0 0 0
+1 0 0
+1 1 0
+0 1 0
+$EndNodes
+$Elements
+4 4 1 4
+0 7 15 1
+1 5
+1 1 1 1
+2 1 2
+2 1 2 1
+3 1 2 3
+2 2 2 1
+4 1 3 4
+$EndElements
+"""
+
+
+def gmsh(folder: Path, **changes: str) -> Path:
+    """Two triangles, each on a surface of its own, a line, and the point of a geometry."""
+    path = folder / "mesh.msh"
+    path.write_text(MSH.format(**{"sheet": "1 2", "parametric": "0"} | changes))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("sheet", "groups"),
+    [
+        ("1 2", {"rim": [0, 1], "sheet": [0, 1, 2]}),
+        ("0", {"rim": [0, 1]}),
+        ("2 2 1", {"rim": [0, 1], "sheet": [0, 1, 2]}),
+    ],
+    ids=["some", "one", "two of one surface"],
+)
+def test_gmshs_entities_without_a_group_are_read_and_stray_points_left_out(tmp_path, caplog, sheet, groups):
+    mesh = File(path=gmsh(tmp_path, sheet=sheet)).build()
+    assert (len(mesh.rest), len(mesh.springs), len(mesh.triangles)) == (4, 5, 2)
+    sides = ("left", "right", "bottom", "top", "back", "front")
+    assert {name: part.tolist() for name, part in mesh.parts.items() if name not in sides} == groups
+    assert "1 points belong to no cell and are left out: at (9, 9, 9) m" in caplog.messages[0]
+
+
+def test_gmshs_parametric_nodes_are_refused_by_name(tmp_path):
+    path = gmsh(tmp_path, parametric="1")
+    with pytest.raises(InputError, match="parametric nodes"):
+        File(path=path).build()
+    nodes = "$ParametricNodes\n3\n1 0 0 0 0 1\n2 1 0 0 0 2\n3 1 1 0 0 3\n$EndParametricNodes\n"
+    path.write_text(f"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n{nodes}$Elements\n1\n1 2 2 1 1 1 2 3\n$EndElements\n")
+    with pytest.raises(InputError, match="parametric nodes; save it without them"):
+        File(path=path).build()
+
+
+STAND_INS = {
+    "a pointer": (
+        b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n",
+        "Git LFS pointer.*git lfs pull",
+    ),
+    "a page": (b"\n<!DOCTYPE HTML>\n<html><body>404</body></html>\n", "is a web page"),
+    "a page without a type": (b"\xef\xbb\xbf<HTML lang=en>", "is a web page"),
+    "nothing": (b"", "is empty"),
+    "blanks": (b" \r\n\t\n", "is empty"),
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["mesh.obj", "mesh.ply", "mesh.stl", "mesh.vtk", "mesh.vtp", "mesh.msh", "mesh.json", "x.yaml"]
+)
+@pytest.mark.parametrize("case", STAND_INS)
+def test_what_stands_in_place_of_a_file_is_named(tmp_path, name, case):
+    content, words = STAND_INS[case]
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        read_yaml(path) if name == "x.yaml" else File(path=path).build()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("mesh.vtk", b"# vtk DataFile Version 1.0\n", "VTK data type"),
+        ("mesh.off", b"COFF\n3 1 0\n", "OFF"),
+        ("mesh.msh", b"$MeshFormat\n2.2 7 8\n", "msh"),
+    ],
+)
+def test_the_reason_that_a_reader_prints_is_in_the_message(tmp_path, name, content, words):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=f"cannot be read as a mesh: .*({words})"):
+        File(path=path).build()
+
+
+@pytest.mark.parametrize(
+    ("config", "line", "words"),
+    [
+        (
+            "mass: 1\ndescription: Net: 10 x 10\n",
+            2,
+            'value of `description` holds.*description: "Net: 10 x 10"',
+        ),
+        ("mesh: {kind: file, path: a: b.obj}\n", 1, 'value of `path` holds a colon.*path: "a: b.obj"'),
+        ("effects:\n  - kind: pins: all\n", 2, 'value of `kind` holds a colon.*kind: "pins: all"'),
+        ('description: say "x": y\n', 1, "'say \"x\": y'"),
+        ("mass: 1\n  frames: 2\n", 2, "same indent"),
+        ("description: @me\n", 1, "cannot begin with '@'; put the value in quotes"),
+    ],
+)
+def test_a_colon_without_quotes_is_named_with_what_to_quote(tmp_path, config, line, words):
+    path = tmp_path / "scene.yaml"
+    path.write_text(config)
+    with pytest.raises(InputError, match=words) as caught:
+        read_yaml(path)
+    assert caught.value.mistakes[0].line == line
+
+
+def test_text_is_read_as_float64_and_not_as_the_declared_type():
+    found = ply.read(text(CORNERS, "", "4 0 1 2 3\n", "").replace(b"1 1 0\n", b"1 0.1 0\n"))
+    assert np.array_equal(found.points[2], [1, 0.1, 0])
