@@ -16,11 +16,14 @@ from pydantic import (
     ValidationInfo,
     field_validator,
     model_serializer,
+    model_validator,
 )
 
 from harness.base.errors import InputError, Mistake
 from harness.base.model import Model, Vector
+from harness.base.npz import read_numbers
 from harness.scenes.mesh.body import Body
+from harness.scenes.mesh.cells import MAX_COORDINATE
 from harness.scenes.mesh.files import File
 from harness.scenes.mesh.generator import Metres
 from harness.scenes.mesh.grid import Grid
@@ -72,17 +75,12 @@ class Frames(Model):
     @cached_property
     def stored(self) -> Array:
         """(frames, points, 3) [m]; raises InputError."""
-        if not isinstance(self.positions, Path):
-            found = np.array(self.positions)
-        else:
-            try:
-                with np.load(self.positions, allow_pickle=False) as file:
-                    found = np.asarray(file["positions"], np.float64)
-            except (OSError, ValueError, KeyError, EOFError) as error:
-                wanted = "wanted an .npz with `positions` (frames, points, 3)"
-                raise InputError(Mistake(f"cannot be read ({error}); {wanted}", self.positions)) from None
-        if found.ndim != 3 or found.shape[2] != 3 or not len(found) or not np.isfinite(found).all():
-            raise InputError(f"frames: came positions {found.shape}; wanted finite ones of shape (frames, points, 3)")
+        path = self.positions if isinstance(self.positions, Path) else None
+        found = read_numbers(path, "positions") if path else np.array(self.positions)
+        if found.ndim != 3 or found.shape[2] != 3 or not found.size or not (np.abs(found) <= MAX_COORDINATE).all():
+            wanted = f"wanted numbers up to {MAX_COORDINATE:g} m of shape (frames, points, 3)"
+            problem = f"came positions {found.shape}; {wanted}"
+            raise InputError(Mistake(problem, path) if path else f"frames: {problem}")
         return found
 
     def at(self, time: float) -> Array:
@@ -128,6 +126,16 @@ class Solid(Model):
         if frames is None or not isinstance(frames.positions, Path):
             return frames
         return frames.model_copy(update={"positions": _beside(frames.positions, info)})
+
+    @model_validator(mode="after")
+    def _readable(self) -> Solid:
+        """Files are read here already: a mistake that is found while a model is written out has no place."""
+        if isinstance(self.mesh, File) or self.frames:
+            try:
+                self.shape()
+            except InputError as error:
+                raise ValueError("; ".join(map(str, error.mistakes))) from None
+        return self
 
     @model_serializer(mode="wrap")
     def _written_out(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:

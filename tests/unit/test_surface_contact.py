@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from harness.base.errors import InputError
 from harness.record.obstacles import declared
@@ -171,7 +172,7 @@ def test_frames_of_another_mesh_are_refused(tmp_path):
     np.savez(tmp_path / "ball.npz", positions=np.zeros((2, 5, 3)))
     frames = {"positions": str(tmp_path / "ball.npz")}
     for given, words in ((frames, "came 5 points for a mesh of"), ({"positions": [[[0, 0, 0]]]}, "came 1 points")):
-        with pytest.raises(InputError, match=words):
+        with pytest.raises(ValidationError, match=words):
             draped(BALL.model_dump() | {"mesh": {"kind": "balloon"}, "frames": given})
 
 

@@ -1,0 +1,94 @@
+"""Arrays of numbers in .npz files that anybody may have written: read in a child process, within limits.
+
+The whole array is read, so that its check sum is compared; pickles, other types, NaN and infinities are refused.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from math import prod
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.base import child
+from harness.base.errors import InputError, Mistake
+from harness.base.files import HEAD, misnamed, reason
+
+MAX_BYTES = 100_000_000
+"""Of an array in float64, and of a file: a scene writes such numbers out as text, which takes 17 times as much."""
+_SECONDS, _BYTES_PER_SECOND = 5.0, 2e7
+_MEMORY = 2**28 + 3 * MAX_BYTES
+
+
+def read_numbers(path: Path, name: str) -> NDArray[np.float64]:
+    """The array of a name in an .npz file. Raises InputError with the file."""
+    try:
+        if not path.is_file():
+            raise InputError(Mistake("is no file; give the path of an .npz file", path))
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            problem = misnamed(file.read(HEAD), size)
+    except (OSError, ValueError) as error:
+        raise InputError(Mistake(f"cannot be read: {reason(error)}", path)) from None
+    if size > MAX_BYTES:
+        problem = f"has {size:,} bytes; at most {MAX_BYTES:,} are read"
+    if problem:
+        raise InputError(Mistake(problem, path))
+    limits = child.Allowance(_SECONDS + MAX_BYTES / _BYTES_PER_SECOND, _MEMORY)
+    try:
+        return child.call(_extracted, path, name, limits=limits)
+    except child.NoAnswer as error:
+        raise InputError(Mistake(f"cannot be read as an .npz file with an array `{name}`: {error}", path)) from None
+
+
+def _extracted(path: Path, name: str) -> NDArray[np.float64]:
+    """What the child does. Raises InputError, and what the standard library raises for a broken file."""
+    try:
+        with zipfile.ZipFile(path) as packed:
+            names = [info.filename.removesuffix(".npy") for info in packed.infolist()]
+            found = [info for info in packed.infolist() if info.filename == f"{name}.npy"]
+            if len(found) != 1:
+                there = f"; it holds {', '.join(x[:40] for x in names[:5])}" if names else ""
+                raise InputError(Mistake(f"holds {len(found)} arrays `{name}`, wanted one{there}", path))
+            if found[0].flag_bits & 1:
+                raise InputError(Mistake("is encrypted; store it without a password", path))
+            if found[0].file_size > MAX_BYTES:
+                problem = f"its array `{name}` takes {found[0].file_size:,} bytes; at most {MAX_BYTES:,} are read"
+                raise InputError(Mistake(problem, path))
+            content = packed.read(found[0])  # to its end, where the check sum is compared
+    except zipfile.BadZipFile as error:
+        raise InputError(Mistake(f"is no whole .npz file ({error}); write it once more", path)) from None
+    return _array(content, Mistake(f"its array `{name}`", path))
+
+
+def _array(content: bytes, what: Mistake) -> NDArray[np.float64]:
+    """The numbers of a .npy file. Raises InputError."""
+
+    def refuse(problem: str) -> InputError:
+        return InputError(Mistake(f"{what.problem} {problem}", what.file))
+
+    file = io.BytesIO(content)
+    try:
+        version = np.lib.format.read_magic(file)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, is_fortran, dtype = read_header(file)
+    except ValueError as error:
+        raise refuse(f"has no head of an array ({error})") from None
+    if dtype.kind not in "fiu":
+        raise refuse(f"holds values of type {dtype}; wanted real numbers")
+    if any(not isinstance(n, int) or n < 0 for n in shape):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise refuse(f"has the shape {shape}; wanted whole numbers")
+    count, begun = prod(shape), file.tell()
+    if count * dtype.itemsize != len(content) - begun:
+        raise refuse(f"promises {count * dtype.itemsize:,} bytes, and {len(content) - begun:,} are there")
+    if 8 * count > MAX_BYTES:
+        raise refuse(f"has {count:,} numbers; at most {MAX_BYTES // 8:,} are read")
+    with np.errstate(over="ignore"):
+        numbers = np.frombuffer(content, dtype, count, begun).astype(np.float64)
+    if not np.isfinite(numbers).all():
+        at = int(np.flatnonzero(~np.isfinite(numbers))[0])
+        raise refuse(f"holds {numbers[at]} (number {at:,} from 0); wanted finite numbers")
+    return np.ascontiguousarray(numbers.reshape(shape, order="F" if is_fortran else "C"))
