@@ -21,6 +21,7 @@ from pathlib import Path
 from time import sleep
 
 from harness.base.asides import WAITING, Tick, aside
+from harness.base.errors import InputError, Mistake
 from harness.base.files import open_lock
 
 _PAUSE = 0.02
@@ -154,5 +155,9 @@ def _let_go(*locks: int) -> None:
 def _opened(name: str) -> int:
     """A lock's file, which all users of the machine may lock. Raises InputError."""
     path = Path(os.environ.get("SPRINGBENCH_LOCKS") or tempfile.gettempdir()) / f"springbench-{name}.lock"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return open_lock(path, os.O_RDONLY, otherwise=", or set SPRINGBENCH_LOCKS to a folder of your own")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return open_lock(path, os.O_RDONLY, otherwise=", or set SPRINGBENCH_LOCKS to a folder of your own")
+    except OSError as error:
+        problem = f"{path.parent}: expected a folder in which files can be made ({error.strerror})"
+        raise InputError(Mistake(problem, key="SPRINGBENCH_LOCKS")) from error

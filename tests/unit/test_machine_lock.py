@@ -164,3 +164,10 @@ def test_each_has_cores_of_its_own():
         assert len(kept_to) == 1
         meanwhile = [other for other, _, a, b in found if a < end and b > began]
         assert meanwhile.count(cores) == 1
+
+
+@pytest.mark.parametrize("value", ["/proc", "/dev/null"])
+def test_a_folder_for_locks_in_which_no_file_can_be_made_is_refused(value: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("SPRINGBENCH_LOCKS", value)
+    with pytest.raises(InputError, match=f"SPRINGBENCH_LOCKS: {value}: expected a folder"), alone(quiet):
+        pass
