@@ -162,6 +162,20 @@ COLUMNS = (
     Column("energy_pins", _REAL, "J", "pin penalty of the step's objective"),
     Column("energy_effects", _REAL, "J", "all other energies of the step's objective: bending, gas, damping and so on"),
     Column("objective", _REAL, "J", "the step's objective, the sum of all terms"),
+    Column(
+        "energy_gained",
+        _REAL,
+        "J",
+        "kinetic energy and potentials after the step, less those of the start and the work of sources; at most zero "
+        "where nothing makes energy",
+    ),
+    Column(
+        "energy_available",
+        _REAL,
+        "J",
+        "energy of the start, released potentials, work of sources, and what the load gives in one step; a larger gain "
+        "is energy growth",
+    ),
     Column("largest_strain", _REAL, "", "largest |length / rest length - 1| of a spring after the step"),
     Column(
         "strain_99",
@@ -232,8 +246,8 @@ COLUMNS = (
         "status",
         _TEXT,
         "",
-        "ok, unsupported, diverged, disputed (by the second opinion), failed (an error, or a crash), "
-        "time-limit, killed (from outside) or skipped",
+        "ok, unsupported, diverged, energy-growth (without a source), disputed (by the second opinion), failed (an "
+        "error, or a crash), time-limit, killed (from outside) or skipped",
     ),
     Column("reason", _TEXT, "", "why the status is not ok"),
     Column("time_limit", _REAL, "s", "wall time that the run might take; null: any"),

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 from harness.base.blame import where
 from harness.base.errors import RunFailed
 from harness.base.files import CannotWrite
+from harness.config.sweep import RunSpec
+from harness.simulation.energy_balance import Growth
 from harness.simulation.measure import Diverged, StepFailed
 from solvers.core.clearing import Blocked
 from solvers.problem import NotPositiveDefinite, Unsupported
@@ -24,6 +26,19 @@ def failure(error: BaseException, own: Collection[Path] = ()) -> dict[str, Any]:
     if isinstance(error, StepFailed) and error.__cause__:
         return failure(error.__cause__, own) | {"frame": error.frame}
     return {"phase": "run", "status": _STATUS.get(type(error), "failed"), "reason": _reason(error, own)}
+
+
+def grown(run: RunSpec, growth: Growth, by_frame: Mapping[int, Mapping[str, Any]]) -> dict[str, str]:
+    """The columns `status` and `reason` of a run that was done and whose energy has grown without a source."""
+    times = f"{growth.times:,.0f}" if growth.times >= 10.0 else f"{growth.times:.1f}"
+    said = f"energy has grown {times} times without a source, from frame {growth.first} on: "
+    own = run.integrator == "own"
+    if own or by_frame[growth.first]["stopped"] != "iterations":
+        method = run.solver.name if own else run.integrator
+        said += f"a step of {run.scene.time_step:.3g} s is too long for {method}"
+    else:
+        said += f"{run.solver.name} leaves the step unsolved; take more iterations, a tolerance, or another solver"
+    return {"status": "energy-growth", "reason": said}
 
 
 def _reason(error: BaseException, own: Collection[Path]) -> str:

@@ -6,7 +6,7 @@ final positions must equal the timed ones to the last bit. The rows are written 
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
+from collections.abc import Collection, Generator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -24,7 +24,7 @@ from harness.base.worker import Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.ability import of_this_machine
 from harness.experiments.code import TO_ERROR, code, parts, solver_class
-from harness.experiments.failure import failure
+from harness.experiments.failure import failure, grown
 from harness.experiments.plan import Files
 from harness.experiments.provenance import asked, common, tolerance
 from harness.record.base import Frame, FrameSamples, RecordingInfo
@@ -38,7 +38,8 @@ from harness.scenes.bind import Scene, build
 from harness.simulation import times
 from harness.simulation.algebraic import stop_rule
 from harness.simulation.clock import measured_again
-from harness.simulation.measure import Measured, Settings, digest, measure, roughly
+from harness.simulation.energy_balance import Growth
+from harness.simulation.measure import Measured, Settings, StepFailed, digest, measure, roughly
 from harness.simulation.observe import observe, require_numbers
 from harness.simulation.on_device import columns as device_columns
 from harness.simulation.step import prepare
@@ -67,7 +68,8 @@ def execute(
             raise
         except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
             turn.look()
-            found = [failure(error, sources.of_class(solver_class(run)))]
+            own = sources.of_class(solver_class(run))
+            found = [_earliest(run, failure(error, own), own)]
             for earlier in (files.recording, files.picture):  # of a time when it did not fail; they would hide this
                 earlier.unlink(missing_ok=True)
             if run.record and "frame" in found[0]:
@@ -99,18 +101,20 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None, turn
     by_frame = _second_pass(run, files, scene, measured, settings, tick, positions)
     told = told or times.rows(measured)
     require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=isinstance(run.tolerance, float))
-    stands = _standing(run)
+    stands = _standing(run, by_frame)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
     facts |= {"choice": measured.prepared.choice} | where | stands | how
     return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
 
 
-def _standing(run: RunSpec) -> dict[str, str]:
-    if not run.judge:
-        return {"status": "ok"}
-    from harness.experiments.standing import standing  # for which those whom nobody judges need not wait
+def _standing(run: RunSpec, by_frame: Mapping[int, Mapping[str, Any]]) -> dict[str, str]:
+    stands = {"status": "ok"}
+    if run.judge:
+        from harness.experiments.standing import standing  # for which those whom nobody judges need not wait
 
-    return standing(run)
+        stands = standing(run)
+    growth = Growth.of(by_frame) if stands["status"] == "ok" else None
+    return stands | (grown(run, growth, by_frame) if growth else {})
 
 
 @measured_again
@@ -193,13 +197,40 @@ def _second_pass(
         if measured.final is not None and found[run.frames]["digest"] != digest(measured.final):
             raise RunFailed("the recorded pass ended at other positions than the timed pass")
         if recorder and measured.final is not None:
-            recorder.close(times.milliseconds(measured, run.frames))
+            stands = _standing(run, found)
+            ended = {name: stands[name] for name in ("status", "reason")} if stands["status"] != "ok" else None
+            recorder.close(times.milliseconds(measured, run.frames), ended)
             due = {frame: scene.time(frame) for frame in samples.frames}
             motion = samples.positions | {run.frames: measured.final}
             found[run.frames]["recorded"] = require_frames(files.recording, recorder.info, due, motion)
     if positions and stored is not None:
         save_positions(positions, stored)
     return {frame: graded.found.get(frame, {}) | columns for frame, columns in found.items()}
+
+
+def _earliest(run: RunSpec, failed: dict[str, Any], own: Collection[Path]) -> dict[str, Any]:
+    """The row of a run that failed; where it diverged, that of the first frame in which it had. Timed passes see only
+    positions that are not finite, which may come later."""
+    if failed["status"] != "diverged" or "frame" not in failed:
+        return failed
+    settings = replace(_settings(run), frames=failed["frame"] - 1)
+    try:
+        scene = build(run.scene, run.size, run.integrator)
+        observe(
+            scene,
+            prepare(scene, _solver(run)),
+            settings,
+            recorder=None,
+            convergence=(),
+            stored=None,
+            judge=None,
+            tick=lambda: None,
+        )
+    except StepFailed as earlier:
+        return failure(earlier, own)
+    except Exception:  # what went wrong is known already
+        return failed
+    return failed
 
 
 def _record_until(run: RunSpec, files: Files, failed: dict[str, Any]) -> None:

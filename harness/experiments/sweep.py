@@ -125,4 +125,5 @@ def failures(table: pa.Table) -> list[str]:
     """Scene, size, solver, status and reason of the runs that failed."""
     ended = table.select(["scene", "size", "solver", "status", "reason"]).to_pylist()
     failed = [row for row in ended if row["status"] != "ok"]
-    return [f"{r['scene']} {r['size']} {r['solver']}: {r['status']}: {r['reason']}" for r in failed]
+    lines = [f"{r['scene']} {r['size']} {r['solver']}: {r['status']}: {r['reason']}" for r in failed]
+    return list(dict.fromkeys(lines))  # a run that was done to its end has a row for each step

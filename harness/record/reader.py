@@ -236,7 +236,7 @@ def properties(source: Source) -> tuple[str, dict[str, Any]]:
             name: cells.scalar(batch, name, 0).as_py()[0] for name in batch.schema.names if name != _ROW_ID
         }
         if chunk.entity_path == "/__properties/run":
-            facts = values
+            facts |= values  # what changed at the end comes last
         title = values.get(_NAME, title)
     return title, facts
 

@@ -125,8 +125,9 @@ class RerunRecorder:
             logarithms = rr.Scalars.columns(scalars=np.array([_log10(value) for value in values]))
             self._stream.send_columns(entity, self._times(np.array(numbers)), logarithms)
 
-    def close(self, milliseconds: Mapping[str, Sequence[float]]) -> Path:
-        """Write the milliseconds of each phase by frame, from frame 1; finish the file and return its path."""
+    def close(self, milliseconds: Mapping[str, Sequence[float]], ended: Mapping[str, str] | None = None) -> Path:
+        """Write the milliseconds of each phase by frame, from frame 1, and properties that its end has changed; finish
+        the file and return its path."""
         if not self._frames:
             self._begin()
         self._send_mesh()
@@ -137,6 +138,9 @@ class RerunRecorder:
         self._send_changes()
         self._arrows.close(self._at)
         self._log_scale()
+        if ended:
+            changed: dict[str, Any] = {name: [value] for name, value in ended.items()}
+            self._stream.send_property("run", rr.AnyValues(**changed))
         return self._file.finish(blueprint.blueprint(self._info, self._box, max(self._clock, default=0)))
 
     def abandon(self) -> None:

@@ -58,12 +58,13 @@ VALLEY = Outcome(
 SADDLE = Outcome("no minimum", "#b9a3d6", "stationary, but where the objective falls some way: a saddle")
 SHORT = Outcome("not converged", "#f2c45f", "finite, and not yet stationary, or not close to the reference")
 WRONG = Outcome("silently wrong", "#e0683c", "said of a step that it had converged, which the oracle finds untrue")
-DIVERGED = Outcome("diverged", "#d1495b", "positions are not finite any more")
+DIVERGED = Outcome("diverged", "#d1495b", "not finite any more, or far beyond the energy of its scene")
+GROWN = Outcome("energy growth", "#c98ba6", "finite, with more energy than the scene can have given it")
 LATE = Outcome("too slow", "#7b7f87", "did not end within its time limit")
 FAILED = Outcome("failed", "#23262b", "ended with an error")
 DISPUTED = Outcome("disputed", "#8a6d4b", "the second opinion finds the formulas of the steps themselves wrong")
 REFUSED = Outcome("refused", "#d9d9d6", "refused before it began, with a reason")
-OUTCOMES = (RIGHT, OTHER, VALLEY, SADDLE, SHORT, WRONG, DIVERGED, LATE, FAILED, DISPUTED, REFUSED)
+OUTCOMES = (RIGHT, OTHER, VALLEY, SADDLE, SHORT, WRONG, GROWN, DIVERGED, LATE, FAILED, DISPUTED, REFUSED)
 
 _CLAIMS = ("tolerance", "floor")
 """How a solve ends that takes itself for converged."""
@@ -71,10 +72,14 @@ _ENDED = {
     "time-limit": LATE,
     "unsupported": REFUSED,
     "diverged": DIVERGED,
+    "energy-growth": GROWN,
     "failed": FAILED,
     "killed": FAILED,
     "disputed": DISPUTED,
 }
+
+_WHOLE = ("disputed", "energy-growth")
+"""How runs stand that were done to their end, with a row for each step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +149,7 @@ def judged(run: Sequence[dict[str, Any]]) -> tuple[Outcome, float | None, str, s
     """The outcome of a run from its rows, one a step; its worst figure, what that is, and why it is not right."""
     first = run[0]
     if first["status"] != "ok":
-        where = f"frame {first['frame']}: " if first["frame"] and first["status"] != "disputed" else ""
+        where = f"frame {first['frame']}: " if first["frame"] and first["status"] not in _WHOLE else ""
         return _ENDED[first["status"]], None, "", where + first["reason"]
     farthest = max((away for row in run if (away := row["distance"]) is not None), default=None)
     lost = any(row["distance"] is None for row in run)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from harness.record.base import Frame, Recorder
 from harness.record.shading import strains
 from harness.scenes.bind import Scene
+from harness.simulation.energy_balance import BLOW_UP, Balance, EnergyBalance
 from harness.simulation.measure import NO_CLOCK, Diverged, Settings, StepFailed, digest, steps
 from harness.simulation.step import Step, start
 from harness.simulation.trace import EnergyNorm, trace
@@ -48,13 +49,16 @@ def observe(
 
     recorder: takes every frame, and how the solve converged in the frames `convergence`; stored: where to put the
     positions after each step, (frames, n, 3) [m]; sample: called with each frame and its positions (n, 3) [m]; judge:
-    adds what an oracle says of each step; tick: called after each step; clock: within which each is done.
+    adds what an oracle says of each step; tick: called after each step; clock: within which each is done. Raises
+    StepFailed, from Diverged where the energy blows up.
     """
     found: dict[int, dict[str, Any]] = {}
+    energy = EnergyBalance(scene)
 
-    def look(step: Step, residual: float) -> None:
+    def look(step: Step, residual: float, balance: Balance) -> None:
         terms = step.problem.terms(step.solution.positions)
         found[step.index] = told = columns(scene, step, terms, residual) | (judge(step) if judge else {})
+        told |= {"energy_gained": balance.gained, "energy_available": balance.available}
         if stored is not None:
             stored[step.index - 1] = step.positions
         if sample:
@@ -71,7 +75,10 @@ def observe(
             if looked:
                 looked.result()  # raises here what went wrong there
             # A solver's memory is one solve's: not beside the next step.
-            looked = beside.submit(look, step, returned_residual(prepared, step))
+            balance = energy.after(step)
+            if balance.exceeds(BLOW_UP):
+                raise StepFailed(step.index) from Diverged(f"from frame {step.index} on the motion has {balance}")
+            looked = beside.submit(look, step, returned_residual(prepared, step), balance)
             if recorder and step.index in convergence:
                 norm = EnergyNorm(step.problem.system)
                 curve = trace(prepared, step.problem, norm, step.solution.iterations)

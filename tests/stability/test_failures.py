@@ -105,7 +105,7 @@ class PastItsLimit:
 FAILURES = {
     "a factorisation fails": (Indefinite, "failed", "positive definite"),
     "memory runs out": (OutOfMemory, "failed", "Unable to allocate"),
-    "a solver diverges": (PastItsLimit, "diverged", "not finite from frame"),
+    "a solver diverges": (PastItsLimit, "diverged", "on the motion has"),
 }
 
 
@@ -125,7 +125,7 @@ def test_what_fails_in_a_frame_is_told_and_recorded_up_to_there(
     (broken,) = [row for row in rows if row["solver"] == "broken"]
     assert (broken["phase"], broken["status"]) == ("run", status)
     assert reason in broken["reason"]
-    assert broken["frame"] == BROKEN or (status == "diverged" and BROKEN < broken["frame"] < FRAMES)
+    assert broken["frame"] == BROKEN or (status == "diverged" and 1 < broken["frame"] < BROKEN)
     others = [row for row in rows if row["solver"] == "sparse"]
     assert {row["status"] for row in others} == {"ok"}
     assert {row["frame"] for row in others if row["phase"] == "step"} == set(range(1, FRAMES + 1))
