@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from harness.base.document import Document
 from harness.base.errors import InputError
 from harness.config import load
+from harness.config.options import DEFAULT_SOLVER, DEFAULT_STOP
 from harness.config.solvers import solvers_of
 from harness.record.base import Replay
 from harness.scenes.bind import build
@@ -76,12 +77,12 @@ class Simulation:
     def __init__(
         self,
         scene: SceneSpec,
-        solver: str | Solver = "hybrid",
+        solver: str | Solver = DEFAULT_SOLVER,
         *,
         size: int | None = None,
         integrator: str = "implicit-euler",
-        iterations: int = 500,
-        tolerance: float | None = 1e-4,
+        iterations: int = DEFAULT_STOP["iterations"],
+        tolerance: float | None = DEFAULT_STOP["tolerance"],
         first_guess: FirstGuess | None = None,
         parameters: Mapping[str, Any] | None = None,
     ) -> None:

@@ -75,7 +75,9 @@ def run(
     given: typer.Context,
     config: Config,
     results: Results = Path("results"),
-    solver: Annotated[list[str] | None, typer.Option(help="For a scene: solvers; repeatable.")] = None,
+    solver: Annotated[
+        list[str] | None, typer.Option(help="For a scene: solvers, the recommended one if left out; repeatable.")
+    ] = None,
     size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
     error: Error = None,
     horizon: Horizon = None,

@@ -14,7 +14,7 @@ from harness.base.errors import InputError, Mistake
 from harness.base.model import Model
 from harness.base.yaml import read_yaml
 from harness.config.expand import Expansion
-from harness.config.options import AUTO
+from harness.config.options import AUTO, DEFAULT_SOLVER, DEFAULT_STOP
 from harness.config.own import UnopenedEffect, UnopenedMesh, chosen, given, opened
 from harness.config.solvers import solvers_of
 from harness.config.sweep import Options, RunSpec, SweepFields
@@ -28,7 +28,8 @@ from harness.scenes.spec import NAME, SceneFile, SceneSpec
 from solvers.plugins import Plugin, found, load
 
 ASSIGNMENT_FRAMES = 30
-DEFAULT_SOLVER = "numba"
+ASSIGNMENT_SOLVER = "numba"
+"""What an assignment's scene is simulated by where nothing is stated, with the iterations of `Chosen`."""
 
 
 class AssignmentMesh(Model):
@@ -61,12 +62,14 @@ def load_any(
 ) -> Sweep:
     """The sweep in a file, or a sweep of the one scene in it.
 
-    For a scene, `solvers`, `sizes` and `options` (those of `harness.config.sweep.Options`, None for the default) say
-    what to run; a sweep says so itself. opens: whether code that it names is run; else its parameters are not checked.
+    For a scene, `solvers`, `sizes` and `options` (those of `harness.config.sweep.Options`, None as null in a sweep) say
+    what to run; a sweep says so itself. Where nothing is stated of how steps end, they end as `DEFAULT_STOP` states,
+    those of an assignment's scene as in a sweep. opens: whether code that it names is run; else its parameters are not checked.
     Raises InputError.
     """
     asked = {key: value for key, value in options.items() if value is not None}
-    document = Document(path, {}) if _is_assignment(path) else read_yaml(path)
+    assignment = _is_assignment(path)
+    document = Document(path, {}) if assignment else read_yaml(path)
     document.opens = opens
     if {"curves", "work"} & set(document.data):
         raise InputError(Mistake("is an accuracy config; run it with `springbench accuracy`", path))
@@ -76,10 +79,13 @@ def load_any(
         if solvers or sizes or asked:
             raise InputError(Mistake("is a sweep, which says itself what to run; change the file instead", path))
         return sweep_of(document)
-    if not _is_assignment(path) and "mesh" not in document.data:
+    if not assignment and "mesh" not in document.data:
         raise InputError(Mistake("is neither a scene (it has no `mesh`) nor a sweep (it has no `scenes`)", path))
-    scene = scene_from_assignment(path) if _is_assignment(path) else scene_of(document)
-    keys = {"scenes": [path.name], "sizes": list(sizes), "solvers": list(solvers) or [DEFAULT_SOLVER]}
+    scene = scene_from_assignment(path) if assignment else scene_of(document)
+    if not assignment and not {*DEFAULT_STOP, "accuracy"} & options.keys():
+        asked = DEFAULT_STOP | asked
+    usual = ASSIGNMENT_SOLVER if assignment else DEFAULT_SOLVER
+    keys = {"scenes": [path.name], "sizes": list(sizes), "solvers": list(solvers) or [usual]}
     alone = Document(path, {**keys, "options": {"threads": AUTO, **asked}}, opens=opens)
     return _expanded(alone, {path.stem: scene})
 

@@ -72,6 +72,11 @@ class Chosen(Model):
     solver; null leaves them as they are stated."""
 
 
+DEFAULT_SOLVER = "hybrid"
+DEFAULT_STOP: dict[str, Any] = {"iterations": 500, "tolerance": 1e-4}
+"""How one scene is simulated, without a sweep and in Python, where nothing is stated: by the recommended solver, to a
+tolerance. A sweep's own defaults, those of `Chosen`, are those of the assignment."""
+
 OF_ERROR: tuple[str, ...] = ("integrator", "iterations", "tolerance", "first_guess")
 """Those that an asked error chooses."""
 

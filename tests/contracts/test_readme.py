@@ -30,7 +30,7 @@ def test_the_sweep_of_the_readme_is_a_sweep(tmp_path: Path):
 def test_the_scene_of_the_readme_is_a_scene(tmp_path: Path):
     (tmp_path / "scene.yaml").write_text(example("configs/README.md", "Writing a scene", "yaml"))
     (run,) = load_any(tmp_path / "scene.yaml").runs()
-    assert (run.size, run.frames, run.solver.name) == (48, 90, "numba")
+    assert (run.size, run.frames, run.solver.name) == (48, 90, "hybrid")
     assert [type(effect).__name__ for effect in run.scene.effects] == ["Springs", "Gravity", "Wind", "Pins"]
 
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from harness.api import Simulation
 from harness.base.errors import InputError
 from harness.config.load import Sweep, load_any, load_scene, load_sweep
+from harness.config.options import DEFAULT_SOLVER, DEFAULT_STOP
 from harness.config.schema import schema
 from harness.config.sweep import RunSpec
 from harness.scenes.bind import build
@@ -107,16 +110,35 @@ def test_an_include_survives_the_excludes(folder: Path) -> None:
 
 def test_what_a_sweep_leaves_out_comes_from_the_scene_or_the_defaults(folder: Path) -> None:
     (run,) = load_any(folder / "cloth.yaml", sizes=[4]).runs()
-    assert (run.sweep, run.scene_name, run.solver.name, run.size) == ("cloth", "cloth", "numba", 4)
-    assert (run.iterations, run.tolerance, run.first_guess, run.threads) == (50, None, "current", "auto")
+    assert (run.sweep, run.scene_name, run.size) == ("cloth", "cloth", 4)
+    assert (run.first_guess, run.threads) == ("current", "auto")
     assert (run.frames, run.rounds, run.convergence_frames, run.strain_range) == (5, 2, None, None)
     assert run.scene.time_step == 1 / 30
     assert run.record
     assert run.pictures
 
 
+def stop(run: RunSpec) -> tuple[str, int, Any]:
+    return run.solver.name, run.iterations, run.tolerance
+
+
+def test_one_scene_is_solved_to_a_tolerance_by_the_recommended_solver_as_in_python(folder: Path) -> None:
+    scene = folder / "cloth.yaml"
+    (run,), (other,) = load_any(scene, sizes=[4]).runs(), load_any(scene, sizes=[4], solvers=["sparse"]).runs()
+    assert stop(run) == (DEFAULT_SOLVER, *DEFAULT_STOP.values()) == ("hybrid", 500, 1e-4)
+    assert stop(other) == ("sparse", 500, 1e-4)
+    usual = signature(Simulation).parameters
+    assert stop(run) == tuple(usual[name].default for name in ("solver", "iterations", "tolerance"))
+
+
+@pytest.mark.parametrize("options", [{"iterations": 7}, {"tolerance": None}, {"tolerance": 1e-3}, {"accuracy": 1e-2}])
+def test_what_is_stated_of_how_steps_end_means_what_it_means_in_a_sweep(folder: Path, options: dict[str, Any]) -> None:
+    (run,) = load_any(folder / "cloth.yaml", sizes=[4], **options).runs()
+    assert stop(run) == ("hybrid", options.get("iterations", 50), options.get("tolerance"))
+
+
 def test_options_of_the_command_line_make_the_grid_of_a_lone_scene(folder: Path) -> None:
-    runs = load_any(folder / "cloth.yaml", solvers=["dense", "sparse"], sizes=[4, 6], frames=2, tolerance=None).runs()
+    runs = load_any(folder / "cloth.yaml", solvers=["dense", "sparse"], sizes=[4, 6], frames=2).runs()
     assert [(run.size, run.solver.name, run.frames) for run in runs] == [
         (4, "dense", 2),
         (4, "sparse", 2),
@@ -192,7 +214,7 @@ def test_the_content_of_the_mesh_file_is_part_of_the_run_id(folder: Path) -> Non
 
 def test_a_label_names_the_run_and_fits_a_file_name(folder: Path) -> None:
     (run,) = load_any(folder / "cloth.yaml", sizes=[4]).runs()
-    assert run.label("m") == f"cloth-4-numba-{run.run_id('m')}"
+    assert run.label("m") == f"cloth-4-hybrid-{run.run_id('m')}"
     assert len(run.run_id("m")) == 12
     assert set(run.run_id("m")) <= set("0123456789abcdef")
 
@@ -257,7 +279,7 @@ def test_an_assignment_file_is_the_scene_with_its_conventions(name: str) -> None
     assert scene.forces == ()
     assert (spec.time_step, spec.frames, spec.first_guess) == (1 / 30, 30, "assignment")
     (run,) = load_any(ASSIGNMENT / f"{name}.json").runs()
-    assert (run.first_guess, run.iterations, run.size) == ("assignment", 50, 0)
+    assert (run.first_guess, stop(run), run.size) == ("assignment", ("numba", 50, None), 0)
 
 
 def test_mistakes_of_two_scenes_are_reported_together(folder: Path) -> None:

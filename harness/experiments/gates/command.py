@@ -33,10 +33,11 @@ def gate(
     files = what or []
     chosen = {"--solver": solver, "--size": size, "--iterations": iterations, "--tolerance": tolerance}
     if against is not None:
-        asked = {"iterations": iterations, "tolerance": tolerance}
+        given = {"iterations": iterations, "tolerance": tolerance}
+        stated = {name: value for name, value in given.items() if value is not None}
         options = _options(budget, limit, clock)
         raise typer.Exit(
-            _against(against, files, name, options, {"solvers": solver or [], "sizes": size or [], **asked})
+            _against(against, files, name, options, {"solvers": solver or [], "sizes": size or [], **stated})
         )
     if len(files) == 1 and files[0].suffix.lower() in (".yaml", ".yml"):
         for option, value in {**chosen, "--limit": limit, "--clock": clock, "-k": name}.items():

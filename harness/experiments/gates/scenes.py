@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from harness.base.errors import InputError
-from harness.config.load import DEFAULT_SOLVER, load_any, require_stated
+from harness.config.load import load_any, require_stated
+from harness.config.options import DEFAULT_SOLVER, Chosen
 from harness.config.sweep import RunSpec
 from harness.experiments.gates.abba import CALL, Clock, Timed
 from harness.scenes.bind import build
@@ -56,7 +57,8 @@ def _steps(scene: Path, given: Given, size: int | None, options: dict[str, Any])
     asked: list[Any] = [
         dict(given) if isinstance(given, Mapping) else given if isinstance(given, str) else DEFAULT_SOLVER
     ]
-    more: dict[str, Any] = {"threads": 1} | options
+    stated = {name: Chosen.model_fields[name].default for name in ("iterations", "tolerance")}
+    more: dict[str, Any] = {"threads": 1} | stated | options
     runs = load_any(scene, solvers=asked, sizes=[size] if size else [], **more).runs()
     if len(runs) != 1:
         raise InputError(f"{scene}: a gate is on one run; came {len(runs)}")
