@@ -35,6 +35,13 @@ COLUMNS = (
     Column("own_steps", pa.bool_(), "", "whether the solver integrates time in substeps of its own"),
     Column("vertices", _INT, "", "vertices of the mesh"),
     Column("springs", _INT, "", "springs of the mesh"),
+    Column(
+        "modulus_exponent",
+        _INT,
+        "",
+        "power of the mesh's spacing that the material's modulus (EA, E t or E) is proportional to, by the springs' "
+        "rule; 0: every size is the same material; null: no rule, or several",
+    ),
     Column("time_step", _REAL, "s", "the time step dt"),
     Column("integrator", _TEXT, "", "how time is integrated, by name: implicit-euler, bdf2, midpoint, sdirk-4, ..."),
     Column(

@@ -20,6 +20,7 @@ from harness.base import machine, rows
 from harness.base.errors import InputError, RunFailed
 from harness.base.files import replacing
 from harness.base.machine_lock import Turn, alone, beside, own_cores
+from harness.base.quantities import ms_per_step
 from harness.base.worker import Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.ability import of_this_machine
@@ -35,6 +36,8 @@ from harness.record.verify import require_frames
 from harness.reference.grade import Graded
 from harness.reference.judge import Judge, reference
 from harness.scenes.bind import Scene, build
+from harness.scenes.effects.springs import Springs
+from harness.scenes.material import modulus_exponent
 from harness.simulation import times
 from harness.simulation.algebraic import stop_rule
 from harness.simulation.clock import measured_again
@@ -103,8 +106,16 @@ def _passes(run: RunSpec, files: Files, tick: Tick, positions: Path | None, turn
     require_numbers(by_frame, minimises=minimises(_solver(run)), tolerance=isinstance(run.tolerance, float))
     stands = _standing(run, by_frame)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.facts.items()}
-    facts |= {"choice": measured.prepared.choice} | where | stands | how
+    facts |= {"choice": measured.prepared.choice, "modulus_exponent": _modulus_exponent(run, scene)}
+    facts |= where | stands | how
     return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
+
+
+def _modulus_exponent(run: RunSpec, scene: Scene) -> int | None:
+    """How the material of the scene's springs depends on the mesh; None without springs or with several rules."""
+    rules = {effect.rule for effect in run.scene.effects if isinstance(effect, Springs)}
+    found = {modulus_exponent(rule, scene.mesh.dimension) for rule in rules}
+    return found.pop() if len(found) == 1 else None
 
 
 def _standing(run: RunSpec, by_frame: Mapping[int, Mapping[str, Any]]) -> dict[str, str]:
@@ -135,7 +146,7 @@ def _to_error(
         save_positions(positions, seen[1:])
     if run.record:
         chosen = {name: told[0][name] for name in ("status", "integrator", "estimated")}
-        recorder = _recorder(run, files, found.scene, chosen | {"milliseconds_per_step": 1e3 * found.median}, seen[-1])
+        recorder = _recorder(run, files, found.scene, chosen | {"milliseconds_per_step": found.ms_per_step}, seen[-1])
         try:
             for k, p in enumerate(seen):
                 recorder.frame(Frame(k, found.scene.time(k), p, {}, float("nan"), 0))
@@ -176,7 +187,7 @@ def _second_pass(
         if run.record:
             assert measured.final is not None  # a sweep that is rough and records is refused
             seconds = [t.seconds for t in measured.timings if t.phase == "step"]
-            facts = {"status": "ok", "milliseconds_per_step": 1e3 * float(np.median(seconds))}
+            facts = {"status": "ok", "milliseconds_per_step": ms_per_step(seconds)}
             recorder = _recorder(run, files, scene, facts, measured.final)
             cleanup.callback(recorder.abandon)
         graded = Graded(measured.prepared, _solver(run), {1, (run.frames + 1) // 2, run.frames})

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 from harness.base import rows
 from harness.base.files import half_written
 from harness.base.progress import Effort
+from harness.base.quantities import ms_per_step
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.code import code, parts
@@ -83,5 +83,5 @@ def _abandoned(run: RunSpec, files: Files, status: str, reason: str) -> list[dic
 def _outcome(found: list[dict[str, Any]]) -> str:
     if found[0]["status"] != "ok":
         return f"{found[0]['status']}: {found[0]['reason']}"
-    middle = median(row["seconds"] for row in found if row["phase"] == "step")
-    return f"{1e3 * middle:.3g} ms a step"
+    taken = ms_per_step(row["seconds"] for row in found if row["phase"] == "step")
+    return f"{taken:.3g} ms a step"

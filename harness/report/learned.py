@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import shlex
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from glob import escape
 from pathlib import Path
 from textwrap import wrap
 
 import pyarrow as pa
 
-from harness.report.page import quantity
+from harness.report import equal_accuracy
+from harness.report.equal_accuracy import comparisons
 from harness.report.timing_table import WIDTH, RunTimes, labels, runs
-
-SAME = 10.0
-"""Residuals within this factor of the lowest are called equal, here and on the page."""
 
 GROWS = 1.5
 """The largest strain is said to grow where it does by this factor, and by as much more than what 99 % stay below."""
@@ -35,7 +34,7 @@ def closing(table: pa.Table, config: Path, results: Path, folder: Path) -> list[
 def sentences(found: Sequence[RunTimes]) -> list[str]:
     """What runs say of which solver is fastest, of how they stopped and of their strain; each a line or more."""
     fine, names = [run for run in found if run.status == "ok"], labels(found)
-    told = [*_fastest(fine, names), *_stopped(fine), *_strain(fine)]
+    told = [*_fastest(fine, names), *_stopped(fine), *_strain(fine, names)]
     return [line for sentence in told for line in wrap(sentence, WIDTH - 2, subsequent_indent="  ")]
 
 
@@ -46,7 +45,7 @@ def commands(found: Sequence[RunTimes], config: Path, results: Path, recordings:
     """
     told: list[tuple[str, Path | str, str]] = []
     if best := _to_see(found, recordings):
-        told.append(("springbench view", best, "replay the fastest run of the largest mesh"))
+        told.append(("springbench view", best, "replay a run of the largest mesh"))
     scenes = {run.scene: None for run in found}
     if scene := next(filter(None, (_scene(config, name) for name in scenes)), None):
         told.append(("springbench recommend --error 1e-2", scene, "the cheapest way to an error of 1 %"))
@@ -54,58 +53,68 @@ def commands(found: Sequence[RunTimes], config: Path, results: Path, recordings:
     return [line for words, path, why in told for line in (f"  # {why}", f"  {words} {shlex.quote(str(path))}")]
 
 
-def _fastest(fine: Iterable[RunTimes], names: dict[str, str]) -> Iterator[str]:
-    """For each scene, at the largest of the sizes that most solvers did on one machine: how much longer the others
-    took there."""
-    by_place: dict[str, dict[tuple[int, str, str], list[RunTimes]]] = defaultdict(lambda: defaultdict(list))
-    for run in fine:
-        if run.least:
-            by_place[run.scene][run.size, run.machine or "", run.node or ""].append(run)
-    for scene, sizes in by_place.items():
-        (size, *_), there = max(sizes.items(), key=lambda item: (len(item[1]), item[0]))
-        first, *others = sorted(there, key=lambda run: run.least or 0.0)
-        if others:
-            slower = [f"{names[r.run_id]} {quantity((r.least or 0.0) / (first.least or 1.0))} times" for r in others]
-            where = f"{scene} {size}" if size else scene
-            yield f"{where}, {_equal(there)}: a step by {names[first.run_id]} is shortest; {', '.join(slower)} as long."
-
-
-def _equal(runs: Iterable[RunTimes]) -> str:
-    residuals = [run.residual for run in runs if run.residual is not None]
-    if not residuals:
-        return "no residuals to compare"
-    low, high = min(residuals), max(residuals)
-    return f"equal residuals, {high:.1e}" if high <= SAME * low else f"unequal residuals, {low:.1e} to {high:.1e}"
+def _fastest(found: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:
+    return (words for compared in comparisons(found) for words, _ in equal_accuracy.sentences(compared, names))
 
 
 def _stopped(fine: Sequence[RunTimes]) -> Iterator[str]:
-    limited = [run for run in fine if run.stopped == "iterations"]
+    """How many runs the limit of iterations stopped above round-off."""
+    limited = [run for run in fine if run.stopped == "iterations" and not _at_round_off(run)]
     if limited:
         many = f"All {len(fine)} runs" if len(limited) == len(fine) else f"{len(limited)} of {len(fine)} runs"
         yield f"{many} stopped at the limit of iterations, at no tolerance: where they agree, all may be wrong alike."
 
 
-def _strain(fine: Iterable[RunTimes]) -> Iterator[str]:
-    """Where the largest strain tells of the mesh more than of the material."""
-    by_scene: dict[str, dict[int, tuple[float, float]]] = defaultdict(dict)
+def _at_round_off(run: RunTimes) -> bool:
+    return run.worst_residual is not None and run.worst_residual <= (run.round_off or 0.0)
+
+
+def _strain(fine: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:
+    """How the largest strain changes with the mesh, and whether the material does, by runs that differ in nothing
+    else and were solved to a tolerance or to round-off."""
+    sizes: dict[str, dict[str, dict[int, RunTimes]]] = defaultdict(lambda: defaultdict(dict))
     for run in fine:
-        if run.largest_strain is not None and run.strain_99:
-            by_scene[run.scene][run.size] = (run.largest_strain, run.strain_99)
-    for scene, sizes in by_scene.items():
-        (largest, most), (finer, below) = sizes[min(sizes)], sizes[max(sizes)]
-        if finer > GROWS * largest and finer / largest > GROWS * below / most:
-            low, high = f"{100 * most:.3g}", f"{100 * below:.3g}"
-            yield (
-                f"{scene}: the largest strain grows with the mesh, from {100 * largest:.3g} to {100 * finer:.3g} %, "
-                f"where 99 % of the springs stay below {low} and {high} %: the material is the same, "
-                "but a single vertex that bears a load, such as a pin, is a point load, near which strain has no limit."
-            )
+        solved = run.stopped in ("tolerance", "floor") or _at_round_off(run)
+        if solved and run.largest_strain is not None and run.strain_99:
+            sizes[run.scene][names[run.run_id]][run.size] = run
+    for scene, by_name in sizes.items():
+        of_one = max(by_name.values(), key=len)
+        coarse, fine_one = of_one[min(of_one)], of_one[max(of_one)]
+        if words := _strain_words(coarse, fine_one):
+            yield f"{scene}: {words}"
 
 
-def _to_see(found: Iterable[RunTimes], recordings: Path) -> Path | None:
-    """The recording of the fastest run of the largest mesh."""
-    order = sorted((run for run in found if run.least), key=lambda run: (-(run.vertices or 0), run.least))
-    there = (next(recordings.glob(f"*-{run.run_id}.rrd"), None) for run in order)
+def _strain_words(coarse: RunTimes, fine: RunTimes) -> str:
+    """What the strains of two sizes say; empty where they say nothing."""
+    largest, finest = coarse.largest_strain or 0.0, fine.largest_strain or 0.0
+    most, below = coarse.strain_99 or 1.0, fine.strain_99 or 1.0
+    change = f"from {100 * largest:.3g} to {100 * finest:.3g} %, from size {coarse.size} to {fine.size}"
+    if coarse.modulus_exponent and not 1 / GROWS <= finest / (largest or 1.0) <= GROWS:
+        power = "" if coarse.modulus_exponent == 1 else f"^{coarse.modulus_exponent}"
+        return (
+            f"the largest strain changes {change}, and so does the material: by the springs' rule its modulus is "
+            f"proportional to h{power}, h the spacing of the mesh; `rule: continuum` does not change it."
+        )
+    if finest <= GROWS * largest:
+        return ""
+    same = "the material is the same, but " if coarse.modulus_exponent == 0 else ""
+    bound = f"where 99 % of the springs stay below {100 * most:.3g} and {100 * below:.3g} %"
+    if finest / largest > GROWS * below / most:
+        return (
+            f"the largest strain grows with the mesh, {change}, {bound}: {same}a single vertex that bears a load, such "
+            "as a pin, is a point load, near which strain has no limit."
+        )
+    return (
+        f"the largest strain grows with the mesh, {change}, {bound}: {same}strains have not converged by these sizes."
+    )
+
+
+def _to_see(found: Sequence[RunTimes], recordings: Path) -> Path | None:
+    """A recording of the largest mesh: of the fastest at equal accuracy where runs were compared."""
+    best = {compared.equal[0].run_id for compared in comparisons(found) if compared.equal}
+    timed = [run for run in found if run.step]
+    order = sorted(timed, key=lambda run: (-(run.vertices or 0), run.run_id not in best, run.step))
+    there = (next(recordings.glob(f"*-{escape(run.run_id)}.rrd"), None) for run in order)
     return next(filter(None, there), None)
 
 

@@ -15,6 +15,8 @@ from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
+from harness.base.columns import SCHEMA
+from harness.base.quantities import SQL
 from harness.report.machines import foot
 from harness.report.machines import names as machine_names
 from harness.report.page import quantity, step_words
@@ -25,11 +27,12 @@ from harness.report.sql import answer
 class RunTimes(NamedTuple):
     """One run: what it was and where, and its times [ms]; None where the rows do not say.
 
-    cold and warm: of preparing; step: median, its quartiles and the least of all steps; local, global_:
-    medians of one such step; iterations: median of a step; stopped: what ended a step's iterations, the least welcome;
-    residual [J^(1/2)]: of the last step; largest_strain, and strain_99, which 99 % of the springs stay below: of the
-    whole run; interrupted: whether steps were, in any round; adds_up: whether the phases add up to an iteration. The
-    fields are the columns of `_SUMMARY`, in order.
+    cold and warm: of preparing; local, global_: medians of one such step; step, lower, upper, least, iterations,
+    residual, worst_residual, largest_strain, strain_99: see `harness.base.quantities`; stopped: what ended a step's
+    iterations, the least welcome, None where the solver has no limit of iterations and nothing else ended them;
+    interrupted: whether steps were, in any round; adds_up: whether the phases add up to an iteration; round_off
+    [J^(1/2)]: residuals below it are round-off (`ROUND_OFF`); distance: the largest over all frames, where each was
+    judged; modulus_exponent: of the rows. The fields are the columns of `_SUMMARY`, in order.
     """
 
     run_id: str
@@ -59,27 +62,45 @@ class RunTimes(NamedTuple):
     strain_99: float | None
     interrupted: bool | None
     adds_up: bool | None
+    frames: int | None
+    integrator: str | None
+    time_step: float | None
+    asked: float | None
+    worst_residual: float | None
+    round_off: float | None
+    distance: float | None
+    modulus_exponent: int | None
 
 
-_SUMMARY = """
+ROUND_OFF = 1e-12
+"""Of the residual at a step's start, and of the square root of the step's largest energy: below, all may be round-off
+of 1e-16 that the matrix has made larger."""
+
+_ENERGIES = ", ".join(
+    ["yardstick", *(f"sqrt(abs({name}))" for name in SCHEMA.names if name.startswith("energy_")), "0.0"]
+)
+
+_SUMMARY = f"""
 select run_id, any_value(scene), any_value("size"), any_value(solver), any_value(machine), any_value(node),
     any_value(vertices), any_value(springs),
     coalesce(any_value(status) filter (status <> 'ok'), 'ok'), any_value(reason) filter (status <> 'ok'),
-    any_value(to_json({'integrator': integrator, 'dt': time_step, 'guess': first_guess, 'iterations': max_iterations,
-                       'tolerance': tolerance, 'threads': threads, 'asked': asked})),
+    any_value(to_json({{'integrator': integrator, 'dt': time_step, 'guess': first_guess, 'iterations': max_iterations,
+                       'tolerance': tolerance, 'threads': threads, 'asked': asked}})),
     any_value(parameters),
     1e3 * min(seconds) filter (phase = 'prepare' and round = 0),
     1e3 * median(seconds) filter (phase = 'prepare' and round > 0),
-    1e3 * median(seconds) filter (phase = 'step'),
-    1e3 * quantile_cont(seconds, 0.25) filter (phase = 'step'),
-    1e3 * quantile_cont(seconds, 0.75) filter (phase = 'step'),
-    1e3 * min(seconds) filter (phase = 'step'),
+    {SQL["step"]}, {SQL["lower"]}, {SQL["upper"]}, {SQL["least"]},
     1e3 * median(seconds) filter (phase = 'local'),
     1e3 * median(seconds) filter (phase = 'global'),
-    median(iterations) filter (phase = 'step'),
-    arg_min(stopped, list_position(['iterations', 'stalled', 'tolerance', 'floor'], stopped)),
-    arg_max(residual, frame) filter (phase = 'step'),
-    max(largest_strain), max(strain_99), bool_or(interrupted) filter (phase = 'step'), bool_and(adds_up)
+    {SQL["iterations"]},
+    arg_min(stopped, list_position(['iterations', 'stalled', 'tolerance', 'floor'], stopped)) filter (
+        stopped <> 'iterations' or not coalesce(own_steps, false) and coalesce(iterations >= max_iterations, true)),
+    {SQL["residual"]}, {SQL["largest_strain"]}, {SQL["strain_99"]},
+    bool_or(interrupted) filter (phase = 'step'), bool_and(adds_up),
+    max(frame), any_value(integrator), any_value(time_step), any_value(asked), {SQL["worst_residual"]},
+    {ROUND_OFF} * max(greatest({_ENERGIES})),
+    case when bool_and(distance is not null) filter (phase = 'step') then max(distance) end,
+    any_value(modulus_exponent)
 from rows_of group by run_id order by min(place)
 """
 

@@ -136,4 +136,13 @@ def _liu2013(mesh: Mesh, family: str, reference: int | None) -> float:
     return (mesh.resolution - 1) / (reference - 1)
 
 
+def modulus_exponent(rule: str, dimension: int) -> int:
+    """Return the power of the spacing h that the modulus of a mesh's material is proportional to.
+
+    The modulus is EA of a chain (k h), E t of a sheet (k) and E of a solid (k / h), of springs of stiffness k along
+    its lines. With `continuum` it does not depend on h.
+    """
+    return {"continuum": 0, "fixed": 2 - dimension, "liu2013": 1 - dimension}[rule]
+
+
 RULES: dict[str, Scale] = {"fixed": _fixed, "continuum": _continuum, "liu2013": _liu2013}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,10 @@ from harness.report.learned import closing, sentences
 from harness.report.style import HEIGHT, WIDTH, marks
 from harness.report.timing_plot import draw_timing
 from harness.report.timing_table import APART, INTERRUPTED, labels, runs, summary_table
-from solvers.registry import EVERY
+from harness.scenes.material import RULES, modulus_exponent, spring_stiffness
+from harness.scenes.mesh.base import STRETCH
+from harness.scenes.mesh.mesh_names import MESHES
+from solvers.registry import EVERY, load
 
 ROOT = Path(__file__).parents[2]
 POWERS = {"sparse": 1.0, "dense": 2.0, "xpbd": 1.5}  # of the vertices, in the times of each solver
@@ -227,18 +230,123 @@ def test_the_summary_and_the_words_after_it_fit_a_hundred_columns() -> None:
     assert max(map(len, sentences(runs(table)))) <= 98, "two more go before each"
 
 
-def test_what_was_learned_is_told_and_what_is_not_so_is_not() -> None:
-    (speed, limit) = learned(sizes=(10, 20), failed=[(20, "dense")])
-    assert "cloth 10, equal residuals, 1.0e-04: a step by sparse is shortest; xpbd 10 times, dense 100" in speed
-    assert limit.startswith("All 5 runs stopped at the limit of iterations")
-    told = rows(sizes=(10, 20), solvers=("sparse", "dense")).to_pylist()
+def changed(solvers: Sequence[str], sizes: Sequence[int] = (20,), **by: Callable[[dict[str, Any]], Any]) -> list[str]:
+    """What is learned of rows whose columns are changed where they are not null."""
+    told = rows(sizes=sizes, solvers=solvers).to_pylist()
     for row in told:
-        row["stopped"] = row["stopped"] and "tolerance"
-        row["residual"] = row["residual"] and row["residual"] * (100 if row["solver"] == "dense" else 1)
-        row["largest_strain"] = row["largest_strain"] and row["largest_strain"] * row["size"]
-    (speed, strain) = learned_from(told)
-    assert "cloth 20, unequal residuals, 1.0e-04 to 1.0e-02" in speed
-    assert "grows with the mesh, from 400 to 800 %, where 99 % of the springs stay below 4 and 4 %" in strain
+        row |= {name: change(row) for name, change in by.items() if row[name] is not None}
+    return learned_from(told)
+
+
+def test_times_are_compared_at_equal_errors_by_the_median_step() -> None:
+    (speed, limit) = learned(sizes=(10, 20), failed=[(20, "dense")])
+    assert speed.startswith("cloth 10: fastest at equal accuracy is sparse, 0.1 ms a step; xpbd 10 times, dense 100")
+    assert "(largest residual 1.0e+00 to 10 times that" in speed
+    assert limit.startswith("All 5 runs stopped at the limit of iterations")
+    assert max(runs(rows()), key=lambda run: run.worst_residual or 0.0).worst_residual == 1.0, "of the first frame"
+
+
+def test_times_at_unequal_or_unknown_errors_are_not_compared() -> None:
+    worse = changed(
+        ("sparse", "dense"), residual=lambda row: row["residual"] * (100 if row["solver"] == "dense" else 1)
+    )
+    assert worse[0].startswith("cloth 20: most accurate is sparse, largest residual 1.0e+00; no other")
+    assert worse[1] == "cloth 20: not compared with it: dense (its error is 100 times as large)."
+    unknown = changed(("sparse", "xpbd"), residual=lambda row: None if row["solver"] == "xpbd" else row["residual"])
+    assert unknown[1] == "cloth 20: not compared with it: xpbd (its error is unknown)."
+    once = changed(("sparse", "xpbd"), residual=lambda row: None if row["frame"] == 2 else row["residual"])
+    assert once[0] == "cloth 20: times are not compared, for no run's error is known."
+    assert not [line for line in worse + unknown + once if "fastest" in line or "times as long" in line]
+
+
+def test_residuals_at_round_off_are_equal_and_their_runs_were_not_cut_short() -> None:
+    told = rows(sizes=(20,), solvers=("sparse", "dense")).to_pylist()
+    for row in told:
+        if row["phase"] == "step":
+            row |= {"residual": 0.0 if row["solver"] == "sparse" else 7e-16, "stopped": "iterations"}
+            row |= {"yardstick": 1e-3, "energy_force": -1e-6}  # round-off of both: 1e-15
+    (speed,) = learned_from(told)
+    assert "fastest at equal accuracy is sparse, 0.4 ms a step; dense 400 times as long" in speed
+    for row in told:
+        row["yardstick"] = 1e-6 if row["yardstick"] else None  # the energy's square root is what is left
+    assert len(learned_from(told)) == 1
+    for row in told:
+        row["energy_force"] = 0.0
+    assert learned_from(told)[1].endswith("dense (its error is 700 times as large).")
+
+
+def test_judged_runs_are_compared_by_their_distance_from_the_reference() -> None:
+    told = rows(sizes=(20,), solvers=("sparse", "dense")).to_pylist()
+    for row in told:
+        if row["phase"] == "step":
+            row["distance"] = 1e-3 if (row["solver"], row["frame"]) == ("dense", 3) else 1e-5
+    assert "largest distance from the reference 1.0e-05" in learned_from(told)[0]
+    assert "dense (its error is 100 times as large)" in learned_from(told)[1]
+
+
+def test_steps_of_other_lengths_or_integrators_are_not_compared() -> None:
+    told = rows(sizes=(20,), solvers=("sparse", "dense")).to_pylist()
+    for name, other in (("time_step", 0.02), ("integrator", "bdf2"), ("asked", 1e-3)):
+        mixed = [row | ({name: other} if row["solver"] == "dense" else {}) for row in told]
+        assert not [line for line in learned_from(mixed) if "fastest" in line or "compared" in line], name
+
+
+def test_a_limit_of_iterations_stops_only_what_has_one() -> None:
+    own = changed(("sparse", "xpbd"), own_steps=lambda row: True)
+    assert own[-1].startswith("All 2 runs stopped"), "of others it is not known"
+    told = rows(sizes=(20,), solvers=("sparse", "symplectic-euler")).to_pylist()
+    for row in told:
+        row["own_steps"] = row["solver"] == "symplectic-euler"
+    assert learned_from(told)[-1].startswith("1 of 2 runs stopped at the limit of iterations")
+    sparse, explicit = runs(pa.Table.from_pylist(told, schema=SCHEMA))
+    assert (sparse.stopped, explicit.stopped) == ("iterations", "tolerance")
+    for row in told:
+        row["iterations"] = row["iterations"] and 1  # of 10 that were allowed, as of one linear solve a step
+    assert not [line for line in learned_from(told) if "limit" in line]
+
+
+def strains(largest: Sequence[float], below: Sequence[float], exponent: int | None, stopped: str) -> list[str]:
+    """What is learned of one solver's strains at sizes 3 and 9."""
+    told = rows(sizes=(3, 9), solvers=("sparse",)).to_pylist()
+    for row in told:
+        k = int(row["size"] == 9)
+        if row["phase"] == "step":
+            row |= {"largest_strain": largest[k], "strain_99": below[k], "stopped": stopped}
+            row |= {"modulus_exponent": exponent, "residual": 1.0}
+    return learned_from(told)
+
+
+def test_strains_of_two_sizes_are_told_with_what_happens_to_the_material() -> None:
+    (point,) = strains((0.05, 0.2), (0.04, 0.04), 0, "tolerance")
+    assert "from 5 to 20 %, from size 3 to 9, where 99 % of the springs stay below 4 and 4 %: the material is" in point
+    (unknown,) = strains((0.05, 0.2), (0.04, 0.04), None, "tolerance")
+    assert "is a point load" in unknown
+    assert "material" not in unknown
+    (block,) = strains((0.05, 0.2), (0.04, 0.02), -1, "tolerance")
+    assert "so does the material: by the springs' rule its modulus is proportional to h^-1" in block
+    (chain,) = strains((0.085, 0.287), (0.08, 0.28), 1, "tolerance")
+    assert "proportional to h, h the spacing" in chain
+    (both,) = strains((0.085, 0.287), (0.08, 0.28), 0, "tolerance")
+    assert both.endswith("the material is the same, but strains have not converged by these sizes.")
+    assert strains((0.05, 0.06), (0.04, 0.05), 0, "tolerance") == []
+    (limit,) = strains((0.05, 0.2), (0.04, 0.04), 0, "iterations")
+    assert limit.startswith("All 2 runs"), "of strains that were not solved for nothing is said"
+
+
+def test_the_modulus_follows_the_spacing_by_rule_and_dimension() -> None:
+    for dimension, mesh in ((1, "chain"), (2, "grid"), (3, "block")):
+        for rule in RULES:
+            by_size: dict[int, float] = {}
+            for size in (3, 5):
+                made = load(MESHES[mesh]).model_validate({"kind": mesh}).build(size)
+                assert made.dimension == dimension
+                reference = 3 if rule == "liu2013" else None
+                k = spring_stiffness(made, rule=rule, stretch=7.0, shear=0.0, bend=0.0, reference=reference)
+                stretch = float(np.median(k[made.families[STRETCH]]))
+                by_size[size] = stretch * made.spacing ** (2 - dimension)  # EA = k h, E t = k, E = k / h
+                spacing = made.spacing
+            expected = 2.0 ** -modulus_exponent(rule, dimension)
+            assert by_size[5] / by_size[3] == pytest.approx(expected), (rule, mesh, spacing)
 
 
 def test_a_sweep_ends_with_three_commands_and_one_link(tmp_path: Path) -> None:

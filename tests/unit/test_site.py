@@ -18,6 +18,8 @@ from harness.base.columns import SCHEMA
 from harness.base.errors import InputError
 from harness.report.site import build, keep, update
 from harness.report.site.failures import Failed, causes
+from harness.report.site.folders import folder_of
+from harness.report.site.runs import table_of
 from harness.report.site.script import column
 from harness.report.site.sentences import sentences
 from tests import accuracy_rows, figure_results, gate_results, site_results
@@ -97,16 +99,22 @@ def test_all_that_is_shown_says_by_which_code_and_where(results: Path):
 
 
 def test_the_fastest_is_told_among_those_that_are_equally_accurate():
-    runs = [
-        {"run_id": name, "scene": "net", "size": 8, "label": name, "status": "ok", "least": least, "residual": residual}
-        | {"integrator": "euler", "time_step": 0.1, "stopped": "tolerance"}
-        for name, least, residual in (("slow", 4.0, 1e-6), ("fair", 2.0, 5e-6), ("hasty", 1.0, 1e-2))
-    ]
-    told = [said["words"] for said in sentences(runs)]
-    fastest = "net 8: fastest at equal accuracy is fair, 2 ms a step at the least; slow takes 2 times as long"
-    assert told[0].startswith(fastest)
-    assert "hasty is faster" in told[1]
-    assert len(told) == 2
+    told = site_results.rows(0)
+    made = []
+    for name, ms, residual in (("slow", 4.0, 1e-6), ("fair", 2.0, 5e-6), ("hasty", 1.0, 1e-2), ("blind", 0.5, None)):
+        own = {"run_id": name, "parameters": json.dumps({"kind": name})}
+        made += [row | own | {"seconds": 1e-3 * ms, "residual": residual} for row in told if row["phase"] == "step"]
+    columns = {field.name: [row.get(field.name) for row in made] for field in SCHEMA}
+    rows_of = pa.table(columns, schema=SCHEMA).append_column("file", [[row["file"] for row in made]])
+    found = table_of(folder_of(Path("made"), Path()), rows_of)
+    for one in found:
+        one["label"] = one["run_id"]
+    fastest, others, limit = sentences(found)
+    assert fastest["words"].startswith("hanging-cloth 8: fastest at equal accuracy is fair, 2 ms a step; slow 2 times")
+    assert fastest["runs"][:2] == ["fair", "slow"]
+    words = "not compared with it: hasty (its error is 10 000 times as large), blind (its error is unknown)."
+    assert others["words"].endswith(words.replace(" 000", "\u2009000"))
+    assert "4 of 4 runs ended a step at the limit" in limit["words"]
 
 
 def test_a_run_s_frames_are_a_script_of_their_own(results: Path):

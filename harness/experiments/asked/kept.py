@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from harness.base.errors import RunFailed
+from harness.base.quantities import ms_per_step
 from harness.base.worker import Tick
 from harness.config.sweep import RunSpec
 from harness.experiments.asked.search import Answer, foresee, search
@@ -35,9 +36,9 @@ class Kept:
         return self.rounds[0].positions
 
     @property
-    def median(self) -> float:
-        """Wall seconds of a frame."""
-        return float(np.median([seconds for path in self.rounds for seconds in path.frames]))
+    def ms_per_step(self) -> float:
+        """The run's ms a step, each frame being a step."""
+        return ms_per_step(seconds for path in self.rounds for seconds in path.frames)
 
     def rows(self) -> list[dict[str, Any]]:
         """A row for each frame of each round."""

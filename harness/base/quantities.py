@@ -1,0 +1,50 @@
+"""The quantities that tables, pictures, figures and pages state of a run: each has one definition and one name.
+
+    ms a step         median wall time of the timed steps, over all frames and rounds [ms]
+    least             the smallest of the same times [ms]
+    times as long     quotient of two runs' ms a step
+    iterations        median iterations of a step, over all frames and rounds
+    residual          that of the last frame [J^(1/2)]
+    largest residual  maximum over all frames, where each has one
+    largest strain    maximum of |length / rest length - 1| over all springs and all frames after the start
+    99 % below        maximum over these frames of what 99 % of the springs stay below
+
+`SQL` computes them from the rows of one run. A recording holds the strain of each frame, and the run's ms a step as
+a property that `ms_per_step` has computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+SQL = {
+    "step": "1e3 * median(seconds) filter (phase = 'step')",
+    "lower": "1e3 * quantile_cont(seconds, 0.25) filter (phase = 'step')",
+    "upper": "1e3 * quantile_cont(seconds, 0.75) filter (phase = 'step')",
+    "least": "1e3 * min(seconds) filter (phase = 'step')",
+    "iterations": "median(iterations) filter (phase = 'step')",
+    "residual": "arg_max(residual, frame) filter (phase = 'step')",
+    "worst_residual": "case when bool_and(residual is not null) filter (phase = 'step') then max(residual) end",
+    "largest_strain": "max(largest_strain)",
+    "strain_99": "max(strain_99)",
+}
+"""Aggregates over the rows of a run, by the names of the fields of `harness.report.timing_table.RunTimes`."""
+
+
+def ms_per_step(seconds: Iterable[float]) -> float:
+    """The ms a step of these steps' wall times [s], of all frames and rounds."""
+    return 1e3 * float(np.median(np.fromiter(seconds, float)))
+
+
+def times_as_long(run: float, other: float) -> float:
+    """How many times as long a run takes as another one, from their ms a step."""
+    return run / other
+
+
+def largest_strain(frames: NDArray[np.int64], strains: NDArray[np.float64]) -> float:
+    """The largest strain of a run, from that of each frame (k,); frame 0 is the start. NaN without a later frame."""
+    after = strains[frames > 0]
+    return float(after.max()) if len(after) else float("nan")
