@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import stat
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
@@ -80,6 +81,17 @@ def _kind(mode: int) -> str:
     """What a file is that is no plain one, in words."""
     kinds = {stat.S_IFIFO: "a pipe", stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFSOCK: "a socket"}
     return kinds.get(stat.S_IFMT(mode), "a device")
+
+
+def is_file_name(text: str) -> bool:
+    """Whether a text is the name of a file or of a folder, and no path."""
+    size = len(text.encode(errors="surrogateescape"))
+    return 0 < size <= 240 and "/" not in text and "\0" not in text and text not in (".", "..")
+
+
+def safe_name(text: str) -> str:
+    """The text as the name of a file in a folder, whatever it says: letters, digits and any of `._-` are left."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._")[:200] or "_"
 
 
 def users_cache(name: str) -> Path:

@@ -9,25 +9,30 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from harness.base import shelf, union
 from harness.base.columns import SCHEMA
 from harness.base.errors import InputError, Mistake
 from harness.base.files import replacing
+from harness.base.row_validation import invalid
 
 Row = Mapping[str, Any]
 
 
 MOST = 2_000_000
 """No file may hold more rows: a few bytes can claim any number of them."""
+_BYTES = 2**29
+"""No file may hold more bytes once it is unpacked."""
 _FEW = 8
 """So many units are read one by one, before DuckDB is loaded."""
 
@@ -63,18 +68,21 @@ def read(
     needed: Sequence[str] = (),
     promote: union.Promote = "default",
     named: bool = False,
+    left_out: Callable[[Mistake], None] | None = None,
 ) -> pa.Table:
     """All rows of units, in the order of their paths; those of an older schema get nulls.
 
     needed: columns without which a row is none of ours; promote: whether columns of one name may differ in type
-    ("permissive"); named: with a column of the units' names, shelf.FILE. Raises InputError that names all files that
-    are damaged, foreign or without rows.
+    ("permissive"); named: with a column of the units' names, shelf.FILE; left_out: called with each unit that has a
+    value which does not fit its column (`row_validation`) and is left out therefore. Raises InputError that names all
+    files that are damaged, foreign or without rows, and without `left_out` those with such values.
     """
     paths = list(paths)
     if len(paths) > _FEW:
         with suppress(union.Unfit):
-            return union.table(paths, schema, needed, most=MOST, promote=promote, named=named)
-    return read_each(paths, schema, needed=needed, promote=promote, named=named)
+            table, number = union.table(paths, schema, needed, most=MOST, promote=promote)
+            return _valid(paths, table, number, left_out, named=named)
+    return _valid(paths, *_each(paths, schema, needed, promote), left_out, named=named)
 
 
 def read_each(
@@ -86,19 +94,54 @@ def read_each(
     named: bool = False,
 ) -> pa.Table:
     """As `read`, by pyarrow, file by file: the reader against which what is written is compared."""
+    return _valid(paths, *_each(paths, schema, needed, promote), None, named=named)
+
+
+def _valid(
+    paths: Sequence[Path],
+    table: pa.Table,
+    number: NDArray[np.int64],
+    left_out: Callable[[Mistake], None] | None,
+    *,
+    named: bool,
+) -> pa.Table:
+    """The rows whose units have valid values alone, as `read` has it. number: of each row's unit."""
+    bad: dict[int, Mistake] = {}
+    what = "it is left out" if left_out else "take it out of the results"
+    for one in invalid(table):
+        unit = int(number[one.row])
+        if unit not in bad:
+            bad[unit] = Mistake(f"{one}; {what}", paths[unit], key=one.column)
+    if bad and not left_out:
+        raise InputError(list(bad.values()))
+    if bad and left_out:
+        for mistake in bad.values():
+            left_out(mistake)
+        valid = ~np.isin(number, list(bad))
+        fitting: Any = pa.array(np.flatnonzero(valid))
+        table, number = table.take(fitting), number[valid]
+    if named:
+        names, of_rows = pa.array([path.stem for path in paths], pa.string()), cast(Any, pa.array(number))
+        table = table.append_column(shelf.FILE, names.take(of_rows))
+    return table
+
+
+def _each(
+    paths: Sequence[Path], schema: pa.Schema, needed: Sequence[str], promote: union.Promote
+) -> tuple[pa.Table, NDArray[np.int64]]:
+    """All rows of units, and the number of each row's unit, by pyarrow. Raises InputError."""
     tables, mistakes = list[pa.Table](), list[Mistake]()
     packed = _packed(paths)
     for path in paths:
         try:
-            table = _one(path, schema, needed, packed)
-            names = pa.array([path.stem] * len(table) if named else [], pa.string())
-            tables.append(table.append_column(shelf.FILE, names) if named else table)
+            tables.append(_one(path, schema, needed, packed))
         except InputError as error:
             mistakes += error.mistakes
     if mistakes:
         raise InputError(mistakes)
+    number = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
     try:
-        return pa.concat_tables([schema.empty_table(), *tables], promote_options=promote)
+        return pa.concat_tables([schema.empty_table(), *tables], promote_options=promote), number
     except pa.ArrowException as error:  # two foreign columns of one name
         raise InputError(f"rows do not fit together ({error}); take the foreign files out of the results") from error
 
@@ -169,6 +212,7 @@ def _one(path: Path, schema: pa.Schema, needed: Sequence[str], packed: Mapping[P
     try:
         found = packed.get(path) or _file(path)
         table = pa.concat_tables([schema.empty_table(), found], promote_options="default")
+        table.validate(full=True)  # text is UTF-8
     except (pa.ArrowException, OSError) as error:
         raise InputError(Mistake(f"holds no rows ({error}); take it out of the results", path)) from error
     lacking = [name for name in needed if name not in table.column_names or table[name].null_count]
@@ -182,14 +226,40 @@ def _file(path: Path) -> pa.Table:
     if not path.is_file() and path.exists():  # a pipe would be waited for
         raise OSError("it is no plain file")
     try:
-        with path.open("rb") as content, pq.ParquetFile(content) as file:
-            if file.metadata.num_rows > MOST:
-                raise OSError(f"it claims {file.metadata.num_rows:,} rows, and at most {MOST:,} are read")
-            return file.read()
+        with path.open("rb") as content:
+            return _within_limits(content)
     except FileNotFoundError:  # it was packed a moment ago
         if found := _packed([path]).get(path):
             return found
         raise OSError("it is no plain file") from None
+
+
+def _within_limits(content: BinaryIO) -> pa.Table:
+    """A file's rows. Raises OSError where it has more of them, or more bytes, than a file may have."""
+    with pq.ParquetFile(content) as file:
+        told, fields = file.metadata, list[Any](file.schema_arrow)
+    names = [field.name for field in fields]
+    if len(set(names)) < len(names) or shelf.FILE in names:
+        raise OSError("its columns have the names of others")
+    if told.num_rows > MOST:
+        raise OSError(f"it claims {told.num_rows:,} rows, and at most {MOST:,} are read")
+    size = sum(told.row_group(k).total_byte_size for k in range(told.num_row_groups))
+    if size > _BYTES:
+        raise OSError(f"it claims {size:,} bytes, and at most {_BYTES:,} are read")
+    texts = [field.name for field in fields if pa.types.is_string(field.type)]
+    with pq.ParquetFile(content, read_dictionary=texts) as file:  # the same text many times takes no more memory
+        table = file.read()
+    size = sum(map(_bytes_as_text, table.itercolumns()))
+    if size > _BYTES:
+        raise OSError(f"its text takes {size:,} bytes, and at most {_BYTES:,} are read")
+    return table.cast(pa.schema(fields))
+
+
+def _bytes_as_text(column: Any) -> int:
+    """The bytes that a dictionary of texts takes with each text written out."""
+    if not pa.types.is_dictionary(column.type):
+        return 0
+    return sum(pc.sum(pc.binary_length(chunk.dictionary).take(chunk.indices)).as_py() or 0 for chunk in column.chunks)
 
 
 def same(one: pa.Table, other: pa.Table) -> bool:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness.base.errors import InputError, Mistake
+from harness.base.files import is_file_name
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -70,7 +71,10 @@ def _packed(path: Path, *state: int) -> frozenset[str]:
             names = pq.read_table(file, columns=[FILE], partitioning=None)[FILE]
         if names.null_count:
             raise OSError(f"rows without a {FILE}")
-        return frozenset(map(str, names.cast(pa.string()).unique().to_pylist()))
+        found = frozenset(map(str, names.cast(pa.string()).unique().to_pylist()))
+        if foreign := [name for name in found if not is_file_name(name) or name.startswith(".")]:
+            raise OSError(f"{foreign[0]!r} is the name of no unit")
+        return found
     except (pa.ArrowException, OSError, KeyError) as error:
         raise InputError(Mistake(f"holds no packed rows ({error}); take it out of the results", path)) from error
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from harness.base.shelf import FILE, Part, parts
 from harness.base.shelf import schema as schema_of
@@ -134,15 +135,16 @@ def table(
     *,
     most: int,
     promote: Promote = "default",
-    named: bool = False,
-) -> pa.Table:
-    """All rows of units, in their order. needed: columns that no row lacks; most: rows of one unit; named: with a
-    column FILE of the units' names.
+) -> tuple[pa.Table, NDArray[np.int64]]:
+    """All rows of units, in their order, and the number of each row's unit. needed: columns that no row lacks; most:
+    rows of one unit.
 
     Raises Unfit where a unit is damaged, has no rows or more than that, or lacks what is needed.
     """
     with connected() as connection:
         whole = union(connection, "files", asked, schema, promote)
+        if FILE in whole.schema.names:
+            raise Unfit(f"a file has a column {FILE} of its own")
         tables = [whole.schema.empty_table()]
         numbers = [np.empty(0, np.int64)]
         count, checked = 0, False
@@ -161,10 +163,10 @@ def table(
     lacking = [name for name in needed if name not in found.column_names or found[name].null_count]
     if lacking or len(np.unique(number)) < len(asked):
         raise Unfit(f"no {lacking[0]}" if lacking else "not all have rows")
-    if named:
-        names = pa.array([path.stem for path in asked], pa.string())
-        found = found.append_column(FILE, names.take(number))
-    return found if np.all(np.diff(number) >= 0) else found.take(np.argsort(number, kind="stable"))
+    if np.all(np.diff(number) >= 0):
+        return found, number
+    order = np.argsort(number, kind="stable")
+    return found.take(order), number[order]
 
 
 def _check_claims(files: Sequence[str], most: int) -> None:

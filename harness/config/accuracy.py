@@ -10,9 +10,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from harness.base.files import safe_name
 from harness.base.model import Many, Model
 from harness.config.options import OF_STEPS, Threads, lists, single
-from harness.config.sweep import SolverSpec, in_file_name
+from harness.config.sweep import SolverSpec
 from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, Size
 from solvers.plugins import identity
 
@@ -125,7 +126,7 @@ class CurveSpec:
 
     def label(self) -> str:
         """The name of its file; measured otherwise, it takes the place of what was there."""
-        solver = in_file_name(self.solver.name)
+        solver = safe_name(self.solver.name)
         return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{solver}-{_hash(self.point())}"
 
     def problem_label(self) -> str:
@@ -156,7 +157,7 @@ class WorkSpec:
 
     def label(self) -> str:
         """The name of its file; measured otherwise, it takes the place of what was there."""
-        return f"{self.case.scene_name}-{self.case.size}-work-{in_file_name(self.solver.name)}-{_hash(self.point())}"
+        return f"{self.case.scene_name}-{self.case.size}-work-{safe_name(self.solver.name)}-{_hash(self.point())}"
 
 
 def _hash(content: Any) -> str:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, SkipValidation
 
+from harness.base.files import safe_name
 from harness.base.model import Many, Model
 from harness.config.options import OPTIONS, Chosen, lists
 from harness.scenes.spec import SceneSpec, Size, named_in
@@ -172,13 +172,8 @@ class RunSpec(Kept, Chosen):
 
     def label(self, machine: str) -> str:
         """The run's name in the names of its files."""
-        return f"{self.scene_name}-{self.size}-{in_file_name(self.solver.name)}-{self.run_id(machine)}"
+        return f"{self.scene_name}-{self.size}-{safe_name(self.solver.name)}-{self.run_id(machine)}"
 
     def own(self) -> list[Plugin]:
         """Somebody's own code in the run: the solver, the integrator, the mesh, effects."""
         return found([self.solver.name, self.integrator, *(plugin for plugin, _ in self.scene.own.values())])
-
-
-def in_file_name(name: str) -> str:
-    """A name as part of the names of files: that of own code has no colon and no slash there."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).lstrip("._")

@@ -24,7 +24,8 @@ def older_runs(folder: Path, table: pa.Table) -> Collection[str]:
 
 def older_of(folder: Path) -> Collection[str]:
     """The same of all rows of a sweep's folder."""
-    return older_runs(folder, rows.read(shelf.units(folder / "rows"), needed=NEEDED))
+    table = rows.read(shelf.units(folder / "rows"), needed=NEEDED, left_out=lambda mistake: None)
+    return older_runs(folder, table)
 
 
 def _runs(folder: Path) -> list[RunSpec]:

@@ -12,10 +12,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
+import pyarrow as pa
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
+
+from harness.base.rows import read as read_rows
 
 Row = Mapping[str, Any]
 
@@ -28,7 +30,7 @@ PRICES = (
 
 def read(path: Path) -> list[dict[str, Any]]:
     """The rows of an ablation."""
-    return pq.read_table(path).to_pylist()
+    return read_rows([path], pa.schema([])).to_pylist()
 
 
 def of_kind(rows: Sequence[Row], kind: str) -> list[Row]:

@@ -28,7 +28,7 @@ def draw_devices(results: Path) -> Iterator[tuple[Path | None, list[str]]]:
     tell what its rows say; no picture where no run on one got to a residual."""
     for folder in shelf.folders(results, "rows"):
         try:
-            found = runs(rows.read(shelf.units(folder)))
+            found = runs(rows.read(shelf.units(folder), left_out=lambda mistake: None))
         except InputError:
             continue  # the page tells of damaged rows
         if said := words(found, config_of(folder.parent)):

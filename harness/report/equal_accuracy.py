@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from math import isfinite
+from math import inf, isfinite
 from typing import NamedTuple
 
 from harness.base.quantities import times_as_long
@@ -55,7 +55,7 @@ def comparisons(found: Iterable[RunTimes]) -> Iterator[Comparison]:
 def sentences(compared: Comparison, names: Mapping[str, str]) -> Iterator[tuple[str, list[str]]]:
     """What a comparison says, each sentence with the ids of its runs. names: of the runs, by their ids."""
     not_compared = [
-        *(f"{names[run.run_id]} (its error is {factor(by)} times as large)" for run, by in compared.worse),
+        *(f"{names[run.run_id]} (its error is {_times(by)} as large)" for run, by in compared.worse),
         *(f"{names[run.run_id]} (its error is unknown)" for run in compared.unknown),
     ]
     ids = [run.run_id for run in (*compared.equal, *(run for run, _ in compared.worse), *compared.unknown)]
@@ -79,6 +79,10 @@ def sentences(compared: Comparison, names: Mapping[str, str]) -> Iterator[tuple[
         )
     if not_compared:
         yield f"{compared.where}: not compared with it: {_listed(not_compared)}.", ids[-_LISTED:]
+
+
+def _times(by: float) -> str:
+    return f"{factor(by)} times" if isfinite(by) else "infinitely many times"
 
 
 def _listed(words: list[str]) -> str:
@@ -107,13 +111,17 @@ def _compared(group: list[RunTimes]) -> Comparison:
         what,
         lowest,
         [run for run in ordered if errors.get(run.run_id, limit + 1.0) <= limit],
-        [(run, errors[run.run_id] / max(lowest, floor)) for run in ordered if errors.get(run.run_id, 0.0) > limit],
+        [
+            (run, SAME * errors[run.run_id] / limit if limit else inf)
+            for run in ordered
+            if errors.get(run.run_id, 0.0) > limit
+        ],
         [run for run in ordered if run.run_id not in errors],
     )
 
 
 def _known(error: float | None) -> bool:
-    return error is not None and isfinite(error)
+    return error is not None and isfinite(error) and error >= 0.0
 
 
 def _worth(compared: Comparison) -> tuple[int, int]:

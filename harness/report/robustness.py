@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.box import SIMPLE_HEAD
+from rich.markup import escape
 from rich.table import Table
 
 from harness.base import rows, shelf
@@ -115,10 +116,11 @@ class Judged:
 def read_cells(folder: Path) -> list[Judged]:
     """The outcomes of the runs in a sweep's folder, the newest where one was repeated; by case, then by solver.
 
-    Raises InputError where no run was judged.
+    Units with invalid values are left out, as on the page, which names them. Raises InputError where no run was judged.
     """
     files = shelf.units(folder / "rows")
-    table = rows.read(files, needed=("run_id", "scene", "size", "solver", "phase", "status", "started")).to_pylist()
+    needed = "run_id", "scene", "size", "solver", "phase", "status", "started"
+    table = rows.read(files, needed=needed, left_out=lambda mistake: None).to_pylist()
     runs: dict[str, list[dict[str, Any]]] = {}
     for row in table:
         if row["phase"] == "run" or (row["phase"] == "step" and row["round"] == 0):
@@ -135,14 +137,14 @@ def read_cells(folder: Path) -> list[Judged]:
         run_id, reference = run[0]["run_id"], run[0]["reference"] or ""
         made = run[0]["cpu"] or "", run[0]["commit"] or ""
         cells[case, solver] = Judged(case, solver, outcome, worst, graded, reason, reference, run_id, *made)
-    order = [*SOLVERS, *OPTIONAL, *(first["solver"] for first in firsts)]
-    place = {solver: order.index(solver.split()[0]) for _, solver in cells}
+    order = {name: k for k, name in enumerate(dict.fromkeys([*SOLVERS, *OPTIONAL, *(r["solver"] for r in firsts)]))}
+    place = {_solver(first, firsts): order[first["solver"]] for first in firsts}
     return sorted(cells.values(), key=lambda cell: (_numbered(cell.case), place[cell.solver], cell.solver))
 
 
-def _numbered(name: str) -> list[int | str]:
+def _numbered(name: str) -> list[tuple[int, str]]:
     """By which names are sorted that have numbers in them: 8 before 16."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
+    return [(len(part.lstrip("0")) if k % 2 else 0, part) for k, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def judged(run: Sequence[dict[str, Any]]) -> tuple[Outcome, float | None, str, str]:
@@ -150,15 +152,16 @@ def judged(run: Sequence[dict[str, Any]]) -> tuple[Outcome, float | None, str, s
     first = run[0]
     if first["status"] != "ok":
         where = f"frame {first['frame']}: " if first["frame"] and first["status"] not in _WHOLE else ""
-        return _ENDED[first["status"]], None, "", where + first["reason"]
+        return _ENDED.get(first["status"], FAILED), None, "", where + (first["reason"] or first["status"])
     farthest = max((away for row in run if (away := row["distance"]) is not None), default=None)
     lost = any(row["distance"] is None for row in run)
     if all(row["stationarity"] is None for row in run):
         near = farthest is not None and not lost and farthest <= CLOSE
         why = "" if near else "there is no reference" if lost else "away from the reference"
         return (RIGHT if near else SHORT), farthest, "distance", why
-    worst = max((row["beyond"] for row in run), key=lambda value: (math.isnan(value), value))
-    missed = [row for row in run if not row["beyond"] <= SLACK * (row["tolerance"] or ASKED)]
+    beyond = [math.nan if row["beyond"] is None else row["beyond"] for row in run]
+    worst = max(beyond, key=lambda value: (math.isnan(value), value))
+    missed = [row for row, by in zip(run, beyond, strict=True) if not by <= SLACK * (row["tolerance"] or ASKED)]
     if missed:
         claimed = sum(row["stopped"] in _CLAIMS for row in missed)
         said = f", {claimed} of which said they had met it" if claimed else ""
@@ -188,8 +191,9 @@ def _case(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
 
 def _solver(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
     """The solver's name, with the parameters in which the runs of that name differ."""
-    others = [json.loads(text) for text in {run["parameters"] for run in runs if run["solver"] == row["solver"]}]
-    own = json.loads(row["parameters"])  # what a solver from outside was not given is not among them
+    stated = {run["parameters"] or "{}" for run in runs if run["solver"] == row["solver"]}
+    others = [json.loads(text) for text in stated]
+    own = json.loads(row["parameters"] or "{}")  # what a solver from outside was not given is not among them
     varied = [str(v) for key, v in own.items() if any(other.get(key) != v for other in others)]
     return " ".join([row["solver"], *varied])
 
@@ -240,5 +244,5 @@ def summary(cells: Sequence[Judged]) -> Table:
     for score in found:
         worst = "" if score.worst.worst is None else f"{score.worst.worst:.1e}"
         counts = (str(score.counts[k]) for k in there)
-        table.add_row(score.solver, *counts, percent(score.right), percent(score.finite), worst)
+        table.add_row(escape(score.solver), *counts, percent(score.right), percent(score.finite), worst)
     return table

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
+from rich.text import Text
 
 from harness.base.columns import SCHEMA
 from harness.base.quantities import SQL
@@ -184,7 +185,7 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
     names, scenes = labels(found), {run.scene for run in found}
     what, above = f"{scenes.pop()}: " if len(scenes) == 1 else "", list[str]()
     out = Table(
-        title=f"{what}times in milliseconds, medians over the rounds and over the steps",
+        title=f"{escape(what)}times in milliseconds, medians over the rounds and over the steps",
         title_justify="left",
         caption_justify="left",
         box=SIMPLE_HEAD,
@@ -221,7 +222,7 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
     ]
     marks[OTHER] = any(run.run_id in other_code for run in found)
     marks[SHARED.format(max(shared, default=0))] = bool(shared)
-    out.caption = "\n".join([*(words for words, there in marks.items() if there), *_methods(table), *foot(table)])
+    out.caption = Text("\n".join([*(words for words, there in marks.items() if there), *_methods(table), *foot(table)]))
     longest = max(map(len, [*names.values(), *scenes]), default=0)
     # Lines longer than a narrow terminal keep their numbers; Rich would cut them to ellipses.
     most = Measurement.get(wide := Console(width=1000), wide.options, out).maximum
@@ -231,7 +232,7 @@ def summary_table(table: pa.Table, other_code: Collection[str] = ()) -> Table:
 
 def _ended(run: RunTimes) -> str:
     """What ended the iterations of a run that succeeded; else how the run itself ended."""
-    return run.stopped or "ok" if run.status == "ok" else f"[bold red]{run.status}[/]"
+    return escape(run.stopped or "ok") if run.status == "ok" else f"[bold red]{escape(run.status)}[/]"
 
 
 def _apart(run: RunTimes, value: float | None) -> str:

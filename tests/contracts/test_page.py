@@ -269,3 +269,47 @@ def test_it_is_ready_within_seconds(tmp_path: Path, browser: Any, count: int, go
     tab.page.keyboard.press("End")
     assert tab.page.locator(".body .tr.active").count() == 1
     tab.close()
+
+
+FRAGMENTS = (
+    *("constructor", "toString", "__proto__", "hasOwnProperty?x=1", "valueOf", "", "?", "overview?__proto__=1"),
+    *("runs?run=__proto__", "runs?run=constructor/constructor", "runs?sort=constructor", "runs?sort=-__proto__"),
+    *("runs?sel=__proto__/x,made/none", "runs?status=constructor", "runs?max-step=1e999", "runs?q=%E0%A4%A"),
+    *("compare?sel=", "compare?sel=made/none,__proto__/x", "plots?sweep=__proto__", "plots?plot=constructor"),
+    *("plots?sweep=made&plot=toString", "plots?sweep=made&zoom=x:1e999,2", "plots?sweep=study&point=9.9"),
+    *("plots?sweep=study&plot=convergence&point=0.0&turn=1e999,nan", "plots?sweep=study&plot=convergence&x=__proto__"),
+    *("%00", "javascript:alert(1)", "<img src=x onerror=alert(1)>", "runs?run=<script>alert(1)</script>"),
+)
+
+
+def test_every_fragment_shows_something(tab: Tab, page: str):
+    tab.page.on("dialog", lambda dialog: tab.said.append(dialog.message))
+    for fragment in FRAGMENTS:
+        shown = tab.open(page, fragment)
+        words = shown.locator("#content").inner_text().strip()
+        assert words, f"#{fragment} is empty"
+        assert "cannot be shown" not in words, f"#{fragment}: {words}"
+
+
+HOSTILE = "javascript:document.title='taken'"
+
+
+def test_no_folder_or_name_runs_as_code(browser: Any, tmp_path: Path):
+    for name in (HOSTILE, "a b?c#d", "%2e%2e", "constructor"):
+        made = site_results.write(tmp_path, 4, name)
+        site_results.picture(made / "pictures" / f"{run(0)['file']}.png")
+    made = update(tmp_path)
+    tab = Tab(browser)
+    tab.page.on("dialog", lambda dialog: tab.said.append(dialog.message))
+    shown = tab.open(made.as_uri())
+    links = shown.evaluate("[...document.querySelectorAll('#content figure a')].map(a => [a.protocol, a.href])")
+    assert len(links) == 4
+    assert {protocol for protocol, _ in links} == {"file:"}
+    seen = "[...document.querySelectorAll('#content img')].every(i => { i.loading = 'eager'; return i.naturalWidth; })"
+    shown.wait_for_function(seen)
+    shown.locator("#content figure a").first.click()
+    assert tab.page.url.startswith("file:")
+    assert tab.page.url.endswith(".png")
+    tab.open(made.as_uri(), "runs").get_by_role("row").nth(1).click()
+    assert tab.page.title() != "taken"
+    tab.close()

@@ -230,7 +230,7 @@ def test_one_sweep_s_folder_has_a_page_of_its_own(tmp_path: Path):
     folder = site_results.write(tmp_path, 3)
     assert update(folder) == folder / "index.html"
     (sweep,) = read(folder, "index")["sweeps"]
-    assert (sweep["slug"], sweep["up"], sweep["name"]) == ("this", "", "made")
+    assert (sweep["slug"], sweep["up"], sweep["name"]) == ("this", "./", "made")
 
 
 def test_damaged_rows_keep_no_run_from_ending(tmp_path: Path):

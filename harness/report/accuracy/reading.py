@@ -28,15 +28,19 @@ _Row = dict[str, Any]
 _Label = Callable[[_Row], str]
 
 
-def read(folder: Path, files: Iterable[Path] | None = None) -> Measurements:
-    """The rows in these files, all under `folder`/accuracy if left out. Raises InputError where there are none."""
+def read(
+    folder: Path, files: Iterable[Path] | None = None, left_out: Callable[[Mistake], None] | None = None
+) -> Measurements:
+    """The rows in these files, all under `folder`/accuracy if left out; left_out: see `harness.base.rows.read`. Raises
+    InputError where there are none."""
     units = shelf.units(folder / "accuracy") if files is None else sorted(files)
     if not units:
         raise InputError(Mistake("holds no accuracy rows; run `springbench accuracy CONFIG` first", folder))
     kinds: dict[str, list[_Row]] = defaultdict(list)
     # In rows made before there were any.
     missing = dict.fromkeys(("family", "reference", "minimises", "own_steps", "code", "started", "commit"))
-    for row in read_rows(units, pa.schema([]), needed=("kind",), promote="permissive").to_pylist():
+    table = read_rows(units, pa.schema([]), needed=("kind",), promote="permissive", left_out=left_out)
+    for row in table.to_pylist():
         kinds[row["kind"]].append(missing | row)
     for rows in kinds.values():  # files come by their names, 122 before 22
         rows.sort(key=lambda row: (row["scene"], row["size"]))

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import re
+from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import quote
 
 from harness.base import shelf
 from harness.base.errors import InputError, Mistake
+from harness.base.files import safe_name
 
 KINDS = ("rows", "accuracy", "ablation")
 """The folders of rows that a sweep's folder may have, by what made them."""
@@ -16,8 +21,8 @@ _STORED = "*bit/[0-9][0-9][0-9][0-9]_*.json"
 
 
 class Folder(NamedTuple):
-    """A sweep's results. path; name: for people; slug: of its data, a name that files and URLs take; up: the way to it
-    from the page, with a slash at its end, or empty where the page lies in it."""
+    """A sweep's results. path; name: for people; slug: of its data, a name that files and URLs take; up: the relative
+    URL of its folder as seen from the page, escaped, with a slash at its end."""
 
     path: Path
     name: str
@@ -33,8 +38,18 @@ def stored(folder: Path) -> list[Path]:
 def folder_of(path: Path, results: Path) -> Folder:
     """A sweep's folder as the page in `results` sees it."""
     parts = path.relative_to(results).parts
-    up = f"{'/'.join(parts)}/" if parts else ""
-    return Folder(path, "/".join(parts) or path.resolve().name, "~".join(parts) or "this", up)
+    up = "".join(f"{quote(os.fsencode(part), safe='')}/" for part in parts)
+    name = os.fsencode("/".join(parts) or path.resolve().name).decode(errors="replace")
+    return Folder(path, name, _slug(parts), f"./{up}")
+
+
+def _slug(parts: tuple[str, ...]) -> str:
+    """A name for each folder, unlike any other's: its parts joined by ~, or a hash where that is not safe or unique."""
+    joined = "~".join(parts) or "this"
+    unique = joined.count("~") == max(len(parts) - 1, 0) and parts != ("this",)
+    if unique and re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,99}", joined):
+        return joined
+    return f"{safe_name(joined)[:80]}~~{sha256(os.fsencode('/'.join(parts))).hexdigest()[:12]}"
 
 
 def folders(results: Path) -> list[Folder]:

@@ -47,4 +47,4 @@ def write(folder: Folder, table: pa.Table, data: Path, wanted: Collection[str]) 
             where phase = 'step' and frame is not null and run_id in (select unnest($wanted)) group by run_id, frame
         ) select run_id, to_json({{'frame': list(frame order by frame), {outer}}}) from steps group by run_id"""
     for run, value in answer(sql, table, {"wanted": list(wanted)}):
-        script.write_text(data / "runs" / f"{run}.js", f"{folder.slug}/runs/{run}", value)
+        script.write_text(script.below(data / "runs", run), f"{folder.slug}/runs/{run}", value)

@@ -33,7 +33,7 @@ def write_last(folder: Folder, home: Path, units: Sequence[str], say: Say) -> se
     """The last frames of these runs, where they are not there yet; returns the units whose are there."""
     there: set[str] = set()
     for unit in units:
-        recording, target = folder.path / "recordings" / f"{unit}.rrd", home / "meshes" / f"{unit}.js"
+        recording, target = folder.path / "recordings" / f"{unit}.rrd", script.below(home / "meshes", unit)
         if not _fresh(target, recording):
             replay = _read(recording, [-1], say)
             if replay is None or not len(replay.frames):
@@ -48,7 +48,8 @@ def write_solves(folder: Folder, home: Path, table: Measurements, say: Say) -> d
     """The iterates of all solves that were recorded; returns the names of their scripts by their recordings."""
     written: dict[str, str] = {}
     for problem in table.problems:
-        curves = [c for c in table.curves if c.problem is problem and (folder.path / (c.recording or ".")).is_file()]
+        recorded = [curve for curve in table.curves if curve.problem is problem and curve.recording]
+        curves = [curve for curve in recorded if (folder.path / curve.recording).is_file()]
         ended = [curve for curve in curves if len(curve.largest) and np.isfinite(curve.largest[-1])]
         if ended:
             best = min(ended, key=lambda curve: curve.largest[-1])
@@ -59,15 +60,15 @@ def write_solves(folder: Folder, home: Path, table: Measurements, say: Say) -> d
 def write_recordings(folder: Folder, home: Path, recordings: Mapping[str, str]) -> dict[str, str]:
     """Recordings with their titles as scripts, where they are not there yet; returns the names of those by these."""
     there = {name: f"recordings/{Path(name).stem}" for name in recordings if (folder.path / name).is_file()}
-    for name, script_of in there.items():
-        write_recording(folder.path / name, home / f"{script_of}.js", recordings[name])
+    for name in there:
+        write_recording(folder.path / name, script.below(home / "recordings", Path(name).stem), recordings[name])
     return there
 
 
 def _solves(folder: Folder, home: Path, curves: Sequence[Curve], best: Curve, say: Say) -> dict[str, str]:
     """Those of one step; best: whose last iterate all are held against."""
     truth = folder.path / best.recording
-    targets = {curve.recording: home / "solves" / f"{Path(curve.recording).stem}.js" for curve in curves}
+    targets = {curve.recording: script.below(home / "solves", Path(curve.recording).stem) for curve in curves}
     stale = [name for name, target in targets.items() if not _fresh(target, folder.path / name, truth)]
     last = _read(truth, [-1], say) if stale else None
     for name in stale:

@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.base import rows, shelf
+from harness.base.errors import InputError, Mistake
 from harness.base.files import replacing
 from harness.report.devices import told as of_devices
 from harness.report.site import ablation, frames, hard, provenance, runs, speed
@@ -37,6 +38,9 @@ class Overview(NamedTuple):
     scripts: dict[str, Any]
 
 
+_Read = Callable[[Folder, Path, bool, Say], "_Told"]
+
+
 class _Told(NamedTuple):
     """What one kind of rows has to say."""
 
@@ -54,7 +58,7 @@ def overview(folder: Folder, home: Path, *, recorded: bool, say: Say) -> Overvie
     kinds = {"rows": _runs, "accuracy": _accuracy, "ablation": _ablation, "gates": _gates}
     there = [kind for kind in kinds if kind != "gates" and shelf.units(folder.path / kind)]
     there += ["gates"] if stored(folder.path) else []
-    told = [kinds[kind](folder, home, recorded, say) for kind in there]
+    told = [_of_kind(kind, kinds[kind], folder, home, recorded, say) for kind in there]
     made = [one for each in told for one in each.made]
     summary: dict[str, Any] = {
         "slug": folder.slug,
@@ -76,8 +80,17 @@ def overview(folder: Folder, home: Path, *, recorded: bool, say: Say) -> Overvie
     return Overview(summary, {name: value for each in told for name, value in each.scripts.items()})
 
 
+def _of_kind(kind: str, read: _Read, folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
+    """What one kind of rows has to say. Raises InputError for rows that do not belong together."""
+    try:
+        return read(folder, home, recorded, say)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        problem = f"holds rows of the kind {kind} that do not fit together ({type(error).__name__}: {error})"
+        raise InputError(Mistake(f"{problem}; take them out of the results", folder.path)) from error
+
+
 def _runs(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
-    table = runs.read(folder)
+    table = runs.read(folder, _remark(say))
     found = runs.table_of(folder, table)
     scripts: dict[str, Any] = {}
     findings = [{"words": words} for words in of_devices(table, provenance.config_of(folder.path))] + sentences(found)
@@ -149,7 +162,7 @@ def _accuracy(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
     from harness.report.accuracy.reading import read
     from harness.report.site.accuracy import charts
 
-    table = read(folder.path)
+    table = read(folder.path, left_out=_remark(say))
     scripts, facts = charts(table, folder.path), dict[str, Any]()
     if recorded:
         from harness.report.site.meshes import write_recordings, write_solves
@@ -166,7 +179,7 @@ def _accuracy(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
 
 
 def _ablation(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
-    table = _plain(folder, "ablation")
+    table = _plain(folder, "ablation", say)
     scripts, words = ablation.charts(table.to_pylist())
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
     said = [{"words": f"{one}.", "chapter": "Effects"} for one in words]
@@ -183,9 +196,14 @@ def _gates(folder: Folder, home: Path, recorded: bool, say: Say) -> _Told:
     return _Told(scripts, plots, found, [], gates.made(known), facts)
 
 
-def _plain(folder: Folder, kind: str) -> pa.Table:
+def _plain(folder: Folder, kind: str, say: Say = lambda words: None) -> pa.Table:
     units = shelf.units(folder.path / kind)
-    return rows.read(units, pa.schema([]), named=True, promote="permissive")
+    return rows.read(units, pa.schema([]), named=True, promote="permissive", left_out=_remark(say))
+
+
+def _remark(say: Say) -> Callable[[Mistake], None]:
+    """Says of each unit of rows that is left out why it is."""
+    return lambda mistake: say(f"not on the page: {mistake}")
 
 
 def title(run: dict[str, Any]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import pyarrow as pa
 
 from harness.base import rows, shelf
+from harness.base.errors import Mistake
 from harness.report.references import bibtex, cited
 from harness.report.site.folders import Folder
 from harness.report.site.marks import drawn
@@ -43,9 +44,10 @@ from rows_of group by run_id
 """
 
 
-def read(folder: Folder) -> pa.Table:
-    """The rows of a sweep, with the name of each one's unit. Raises InputError for damaged ones."""
-    return rows.read(shelf.units(folder.path / "rows"), needed=_NEEDED, named=True)
+def read(folder: Folder, left_out: Callable[[Mistake], None]) -> pa.Table:
+    """The rows of a sweep, with the name of each one's unit; left_out: called with each that is invalid. Raises
+    InputError for damaged ones."""
+    return rows.read(shelf.units(folder.path / "rows"), needed=_NEEDED, named=True, left_out=left_out)
 
 
 def table_of(folder: Folder, table: pa.Table) -> list[Run]:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.base.files import replacing
+from harness.base.files import is_file_name, replacing
+
+_PROTOTYPE = re.compile(r'(?<!\\)"__proto__":')
+"""A key of JSON that a script would take for the object's prototype."""
 
 
 def write(path: Path, name: str, value: Any) -> Path:
@@ -20,9 +24,17 @@ def write(path: Path, name: str, value: Any) -> Path:
 def write_text(path: Path, name: str, value: str) -> Path:
     """The same of a value that is JSON already. Raises CannotWrite."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    value = _PROTOTYPE.sub('["__proto__"]:', value)
     with replacing(path) as partial:
         partial.write_text(f"springbench.give({json.dumps(name)}, {value});\n", encoding="utf-8")
     return path
+
+
+def below(folder: Path, name: str) -> Path:
+    """The script of a name in a folder. Raises ValueError for what is no file's name."""
+    if not is_file_name(name):
+        raise ValueError(f"{name!r} is no file's name")
+    return folder / f"{name}.js"
 
 
 def number(value: Any) -> float | int | None:

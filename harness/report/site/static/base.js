@@ -26,6 +26,16 @@ window.springbench = (() => {
     return given.get(name);
   }
 
+  // The address of a file below a folder of the page, of the folder's escaped address `up` and a plain path; nothing
+  // where it would lead out of the page's own scheme, as a folder called "javascript:..." might.
+  function link(up, path) {
+    const made = up + path.split("/").map(encodeURIComponent).join("/");
+    return new URL(made, document.baseURI).protocol === location.protocol ? made : "";
+  }
+
+  // What an object of data holds under a name; nothing for names that every object has, such as "constructor".
+  const own = (object, name) => (object && Object.hasOwn(object, name) ? object[name] : undefined);
+
   // The selection: a view and its parameters, both in the fragment of the URL.
   function where() {
     const [view, query = ""] = location.hash.slice(1).split("?");
@@ -114,5 +124,5 @@ window.springbench = (() => {
     return chosen ? chosen === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   };
 
-  return { give, script, data, where, address, change, keep, element, put, tell, copy, save, isDark, views: {} };
+  return { give, script, data, link, own, where, address, change, keep, element, put, tell, copy, save, isDark, views: {} };
 })();

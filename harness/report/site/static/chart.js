@@ -1,7 +1,7 @@
 // One way to draw lines and points, for all plots: by Plotly, with a legend, a remark and keys of our own.
 "use strict";
 springbench.chart = (() => {
-  const { element, script, number, colour, glyph, keep, where } = springbench;
+  const { element, script, own, number, colour, glyph, keep, where } = springbench;
   const tip = element("div.tip", { hidden: true, role: "tooltip" });
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const at = (item, column, k) => (Array.isArray(item[column]) ? item[column][k] : item[column]);
@@ -31,7 +31,7 @@ springbench.chart = (() => {
   addEventListener("hashchange", hide);
 
   function trace(chart, item, x, y, panel, tail) {
-    const mark = chart.marks[item.label], ink = colour(mark.color), points = chart.shape === "points";
+    const mark = own(chart.marks, item.label), ink = colour(mark.color), points = chart.shape === "points";
     const ends = ["", "_low", "_high"].map(end => item[`${x.column}${end}`]), upright = ["", "_low", "_high"].map(end => item[`${y.column}${end}`]);
     const bars = some => (some[1] && some[2] ? {
       type: "data", symmetric: false, color: ink, thickness: 1.2, width: 3,
@@ -98,7 +98,7 @@ springbench.chart = (() => {
       for (const item of items) {
         if ((item.panel ?? "") !== panel || hidden.has(item.label)) continue;
         traces.push(trace(chart, item, x, y, panel, tail));
-        if (item.status && item.status !== "ok") traces.push(...failed(item, x, y, tail, colour(chart.marks[item.label].color)));
+        if (item.status && item.status !== "ok") traces.push(...failed(item, x, y, tail, colour(own(chart.marks, item.label).color)));
       }
     });
     zoom(layout, where().query.get(zoomKey));
@@ -151,7 +151,7 @@ springbench.chart = (() => {
   // Names with their marks; each is a switch.
   function legend(labels, chart, items, hidden, onChange) {
     return labels.map(label => {
-      const source = chart.references?.[label], drawn = items.some(item => item.label === label && item[chart.x[0].column].some(v => v !== null));
+      const source = own(chart.references, label), drawn = items.some(item => item.label === label && item[chart.x[0].column].some(v => v !== null));
       return element("li", {}, element("button", {
         type: "button", "aria-pressed": String(!hidden.has(label)), title: source?.cited,
         onclick: event => {
@@ -162,7 +162,7 @@ springbench.chart = (() => {
           } else if (!next.delete(label)) next.add(label);
           onChange(next);
         },
-      }, glyph(chart.marks[label]), element("span", {}, label, !drawn && element("span.muted", {}, " – nothing to draw"))));
+      }, glyph(own(chart.marks, label)), element("span", {}, label, !drawn && element("span.muted", {}, " – nothing to draw"))));
     });
   }
 

@@ -1,7 +1,7 @@
 // The runs of all sweeps as rows, and what is known of each.
 "use strict";
 Object.assign(springbench, (() => {
-  const { data } = springbench;
+  const { data, link, own } = springbench;
   let index = null;
   const tables = new Map();
 
@@ -17,8 +17,8 @@ Object.assign(springbench, (() => {
       const row = { sweep: sweep.name, slug: sweep.slug };
       for (let c = 0; c < names.length; c++) row[names[c]] = read[c](k);
       row.key = `${sweep.slug}/${row.run_id}`;
-      row.mark = table.marks[row.label];
-      row.cited = table.references[row.solver]?.cited;
+      row.mark = own(table.marks, row.label);
+      row.cited = own(table.references, row.solver)?.cited;
       return row;
     });
     tables.set(sweep.slug, rows);
@@ -39,8 +39,8 @@ Object.assign(springbench, (() => {
 
   const sweepOf = slug => index.sweeps.find(sweep => sweep.slug === slug);
   const references = async slug => (await data(`${slug}/runs`)).references;
-  const picture = row => (row.picture ? `${sweepOf(row.slug).up}pictures/${encodeURIComponent(row.unit)}.png` : "");
-  const recording = row => (row.recording ? `${sweepOf(row.slug).up}recordings/${encodeURIComponent(row.unit)}.rrd` : "");
+  const picture = row => (row.picture ? link(sweepOf(row.slug).up, `pictures/${row.unit}.png`) : "");
+  const recording = row => (row.recording ? link(sweepOf(row.slug).up, `recordings/${row.unit}.rrd`) : "");
   const title = row => `${row.scene}${row.size ? ` ${row.size}` : ""}, ${row.label}`;
 
   // A word as a shell takes it.
@@ -48,7 +48,7 @@ Object.assign(springbench, (() => {
 
   // The command line that does a run again: of its scene alone where the solver is called by its name, else the sweep.
   function command(row) {
-    const sweep = sweepOf(row.slug), scene = sweep.scenes[row.scene];
+    const sweep = sweepOf(row.slug), scene = own(sweep.scenes, row.scene);
     const whole = `springbench run ${quoted(sweep.config || `${sweep.name}.yaml`)}`;
     if (!scene || !row.plain || row.own) return `${whole} --again`;
     const chosen = row.asked !== null && row.asked !== undefined;
@@ -64,7 +64,14 @@ Object.assign(springbench, (() => {
   }
 
   // A file of the results, as commands call it.
-  const called = file => quoted(`${index.place === "." ? "" : `${index.place}/`}${decodeURI(file)}`);
+  const called = file => quoted(`${index.place === "." ? "" : `${index.place}/`}${plain(file).replace(/^\.\//, "")}`);
+  function plain(file) {
+    try {
+      return decodeURIComponent(file);
+    } catch {  // a name that is no UTF-8
+      return file;
+    }
+  }
 
   return { called, quoted, rows, rowOf, sweepOf, references, picture, recording, title, command };
 })());

@@ -1,7 +1,7 @@
 // One run: what it was, what became of it, its picture and recording, and the command that does it again.
 "use strict";
 Object.assign(springbench, (() => {
-  const { element, put, number, percent, fixed, step, day, commit, glyph, state, copy, title, picture, recording, command, rowOf, references, sweepOf } = springbench;
+  const { element, put, number, percent, fixed, step, day, commit, glyph, state, copy, link, own, title, picture, recording, command, rowOf, references, sweepOf } = springbench;
 
   const pair = ([name, value]) => [element("dt", {}, name), element("dd", {}, value ?? "–")];
   const list = pairs => element("dl", {}, ...pairs.filter(([, value]) => value !== null && value !== undefined && value !== "").flatMap(pair));
@@ -34,11 +34,11 @@ Object.assign(springbench, (() => {
   }
 
   function settings(row) {
-    const own = Object.entries(JSON.parse(row.parameters || "{}"));
+    const given = Object.entries(JSON.parse(row.parameters || "{}"));
     return list([
       ["mesh", `${number(row.vertices, 6)} vertices, ${number(row.springs, 6)} springs`], ["integrator", row.integrator], ["time step", row.time_step && step(row.time_step)],
       ["first guess", row.first_guess], ["iterations at most", row.max_iterations], ["tolerance", row.tolerance === 0 ? "auto" : row.tolerance], ["error asked", row.asked], ["estimated", row.estimated],
-      ["threads", row.threads], ["frames, rounds", row.frames && `${row.frames}, ${row.rounds}`], ...own.map(([name, value]) => [name, String(value)]),
+      ["threads", row.threads], ["frames, rounds", row.frames && `${row.frames}, ${row.rounds}`], ...given.map(([name, value]) => [name, String(value)]),
     ]);
   }
 
@@ -62,7 +62,7 @@ Object.assign(springbench, (() => {
       panel.append(shut, element("p", {}, `There is no run ${key} any more.`));
       return;
     }
-    const source = (await references(row.slug))[row.solver], src = picture(row), sweep = sweepOf(row.slug);
+    const source = own(await references(row.slug), row.solver), src = picture(row), sweep = sweepOf(row.slug);
     put(panel, shut, element("h2", {}, glyph(row.mark), ` ${row.scene}${row.size ? ` ${row.size}` : ""}`), element("p.label", {}, row.label),
       element("p.states", {}, state(row.status), row.outcome && state(row.outcome), row.by && element("span.code", {}, row.by)),
       row.reason && element("p.reason", {}, row.reason),
@@ -76,7 +76,7 @@ Object.assign(springbench, (() => {
         ["code", element("span", {}, element("code", {}, commit(row.commit)), ` (sources ${row.code})`)], ["machine", `${row.cpu || "unknown"} (${(row.machine || "").slice(0, 6)})`],
         ["on", (row.started || "").replace("T", " ").slice(0, 16)], ["timed", row.timing], ["own code", row.own],
       ]),
-      element("p", {}, element("a", { href: `${sweep.up}rows/${encodeURIComponent(row.unit)}.parquet` }, "Its rows (Parquet)"), " · ",
+      element("p", {}, element("a", { href: link(sweep.up, `rows/${row.unit}.parquet`) }, "Its rows (Parquet)"), " · ",
         element("a", { href: springbench.address("compare", { sel: key }) }, "Frame by frame")));
   }
 

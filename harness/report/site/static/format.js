@@ -1,7 +1,7 @@
 // Numbers, marks and names as people read them.
 "use strict";
 Object.assign(springbench, (() => {
-  const { element, isDark } = springbench;
+  const { element, isDark, own } = springbench;
   const power = text => text.replace(/e([-+]?)(\d+)/, (_, sign, digits) => `e${sign === "-" ? "−" : ""}${digits}`);
 
   // To three digits, with an exponent only where people would write one.
@@ -75,7 +75,7 @@ Object.assign(springbench, (() => {
     svg.setAttribute("viewBox", "-8 -8 16 16");
     svg.setAttribute("class", "glyph");
     svg.setAttribute("aria-hidden", "true");
-    path.setAttribute("d", SHAPES[mark?.symbol] || SHAPES.circle);
+    path.setAttribute("d", own(SHAPES, mark?.symbol) || SHAPES.circle);
     path.style.fill = colour(mark?.color || "#858585");
     svg.append(path);
     return svg;
@@ -84,8 +84,8 @@ Object.assign(springbench, (() => {
   // A word for how a run ended, with a sign beside the colour.
   const SIGNS = { ok: "✓", right: "✓", unsupported: "–", refused: "–", "another minimum": "≈", "not converged": "…" };
   function state(words, plain = "") {
-    const kind = words === "ok" || words === "right" ? "good" : words in SIGNS ? "mild" : "bad";
-    return element(`span.state.${kind}`, {}, element("span", { "aria-hidden": "true" }, `${SIGNS[words] || "×"} `), plain || words);
+    const kind = words === "ok" || words === "right" ? "good" : own(SIGNS, words) ? "mild" : "bad";
+    return element(`span.state.${kind}`, {}, element("span", { "aria-hidden": "true" }, `${own(SIGNS, words) || "×"} `), plain || words);
   }
 
   return { commit, madeBy, number, count, percent, fixed, many, duration, day, step, colour, glyph, state };

@@ -1,7 +1,7 @@
 // The map of hard cases: solvers across, cases down, what became of each; arrow keys go through the cells.
 "use strict";
 springbench.map = (chart, sweep) => {
-  const { element, address } = springbench;
+  const { element, own, address } = springbench;
   const at = new Map(chart.cells.map(cell => [`${cell[0]}\n${cell[1]}`, cell]));
   const dark = hex => [1, 3, 5].reduce((sum, k, i) => sum + [0.2126, 0.7152, 0.0722][i] * (parseInt(hex.slice(k, k + 2), 16) / 255) ** 2.2, 0) < 0.18;
   const tell = element("p", { role: "status" }, "Point at a cell, or go there by arrow keys, for its reason; it leads to the run.");
@@ -16,7 +16,7 @@ springbench.map = (chart, sweep) => {
     }, found[3] || "\u00a0"));
   }
 
-  const head = element("tr", {}, element("th", {}, element("b", {}, "case")), ...chart.solvers.map(name => element("th", { scope: "col", title: chart.references[name] }, element("span", {}, name))));
+  const head = element("tr", {}, element("th", {}, element("b", {}, "case")), ...chart.solvers.map(name => element("th", { scope: "col", title: own(chart.references, name) }, element("span", {}, name))));
   const shares = [["right", s => (s.right === null ? "" : `${Math.round(100 * s.right)} %`)], ["finite", s => (s.finite === null ? "" : `${Math.round(100 * s.finite)} %`)], ["worst", s => s.worst]].map(([name, words]) =>
     element("tr", {}, element("th", { scope: "row" }, element("b", {}, name)), ...chart.scores.map(s => element("td.share", {}, words(s)))));
   let family = "";

@@ -1,7 +1,7 @@
 // Meshes on a canvas, turned by dragging or by arrow keys, coloured by a number at each vertex; and solves, iterate by iterate.
 "use strict";
 Object.assign(springbench, (() => {
-  const { element, put, data, number, keep, where } = springbench;
+  const { element, put, data, link, own, number, keep, where } = springbench;
   // From near to far: a scale that is read in grey as well (viridis).
   const RAMP = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
   const ramp = t => {
@@ -96,23 +96,23 @@ Object.assign(springbench, (() => {
       .map(([words, value]) => [words, typeof value === "number" ? number(value) : value]));
     const made = item.made?.[k] || sweep.made[0] || {}, command = chart.command.replace("CONFIG", springbench.quoted(sweep.config || "CONFIG.yaml"));
     const settings = Object.entries(JSON.parse(item.parameters || "{}")).map(pair => pair.join(" ")).join(", ");
-    const scrub = element("div"), own = item.recording && sweep.up + item.recording;
-    put(box, shut, element("h2", {}, springbench.glyph(chart.marks[item.label]), ` ${item.label}`), element("p.label", {}, item.what),
+    const scrub = element("div"), file = item.recording && link(sweep.up, item.recording), replay = own(sweep.replays, item.recording);
+    put(box, shut, element("h2", {}, springbench.glyph(own(chart.marks, item.label)), ` ${item.label}`), element("p.label", {}, item.what),
       settings && element("p.muted", {}, settings), scrub,
       element("div.cols", {},
         element("div", {}, element("h3", {}, "At this point"), figures),
         element("div", {}, element("h3", {}, "Do it again"), springbench.commandBox(command, "Command that repeats the measurement"),
-          springbench.method(chart.references?.[item.label]),
-          own && element("h3", {}, `Recording of ${item.label}'s solve`), own && springbench.replayBox(item.recording, own, sweep.replays?.[item.recording] && `site/data/${encodeURIComponent(sweep.slug)}/${sweep.replays[item.recording]}.js`, `${item.label}: ${item.what}`),
+          springbench.method(own(chart.references, item.label)),
+          file && element("h3", {}, `Recording of ${item.label}'s solve`), file && springbench.replayBox(item.recording, file, replay && link("site/data/", `${sweep.slug}/${replay}.js`), `${item.label}: ${item.what}`),
           element("p.muted", {}, `Made by code ${springbench.commit(made.commit)} on ${made.cpu || "an unknown machine"}${sweep.made.length > 1 && !item.made ? `, and by ${sweep.made.length - 1} more (see the overview)` : ""}.`)),
-        item.picture && element("figure", {}, element("a", { href: sweep.up + item.picture.path }, element("img", { src: sweep.up + item.picture.path, alt: `The step's mesh, by ${item.picture.of}` })),
+        item.picture && element("figure", {}, element("a", { href: link(sweep.up, item.picture.path) }, element("img", { src: link(sweep.up, item.picture.path), alt: `The step's mesh, by ${item.picture.of}` })),
           element("figcaption", {}, `Not this point: the mesh where ${item.picture.of} came nearest the minimum of this step.`))));
     await scrubber(scrub, sweep, item, k);
   }
 
   // The mesh of the iterate beside the reference's, with the distance coloured, and a slider through the iterates.
   async function scrubber(box, sweep, item, k) {
-    const name = sweep.solves?.[item.recording], at = item.iteration?.[k];
+    const name = own(sweep.solves, item.recording), at = item.iteration?.[k];
     if (!name) {
       if (item.recording) box.append(element("p.muted", {}, "The meshes of its iterates are not in this page: ", element("code", {}, "springbench report"), " takes them from the recordings."));
       return;

@@ -1,7 +1,7 @@
 // The first view: what was run, by which code and where, what is known now, what failed and why.
 "use strict";
 (() => {
-  const { element, put, address, commit, many, count, duration, day, state } = springbench;
+  const { element, put, link, address, commit, many, count, duration, day, state } = springbench;
 
   function facts(sweep) {
     const told = [];
@@ -68,7 +68,7 @@
   function pictures(sweep) {
     if (!sweep.pictures.length) return null;
     return element("div.pictures", {}, ...sweep.pictures.map(p => element("figure", {},
-      element("a", { href: sweep.up + encodeURI(p.path) }, element("img", { src: sweep.up + encodeURI(p.path), alt: `Picture: ${p.words}`, loading: "lazy", decoding: "async" })),
+      element("a", { href: link(sweep.up, p.path) }, element("img", { src: link(sweep.up, p.path), alt: `Picture: ${p.words}`, loading: "lazy", decoding: "async" })),
       element("figcaption", {}, p.words))));
   }
 

@@ -1,7 +1,7 @@
 // All plots of the project, one at a time, with what they are drawn by in the URL; a point leads to its run.
 "use strict";
 (() => {
-  const { element, data, change, address, where, save } = springbench;
+  const { element, data, own, change, address, where, save } = springbench;
   const LOG = { type: "log" }, PLAIN = {};
   const axis = (column, title, how = LOG) => ({ column, title, axis: how });
 
@@ -35,11 +35,11 @@
       };
     });
     const hover = [["vertices", "vertices"], ["step", "ms a step"], ["least", "least ms"], ["iterations", "iterations"], ["residual", "last residual"], ["strain", "largest strain, %"]];
-    return { ...OF_RUNS[id], filters: ["scene"], hover, items, marks: table.marks, references: Object.fromEntries(items.map(item => [item.label, table.references[item.label.split(",")[0]]])) };
+    return { ...OF_RUNS[id], filters: ["scene"], hover, items, marks: table.marks, references: Object.fromEntries(items.map(item => [item.label, own(table.references, item.label.split(",")[0])])) };
   }
 
   const plotsOf = sweep => [...(sweep.runs ? Object.entries(OF_RUNS).map(([id, { title }]) => ({ id, title })) : []), ...sweep.plots];
-  const load = (sweep, id) => (id in OF_RUNS ? ofRuns(sweep, id) : data(`${sweep.slug}/${id}`));
+  const load = (sweep, id) => (own(OF_RUNS, id) ? ofRuns(sweep, id) : data(`${sweep.slug}/${id}`));
 
   springbench.views.plots = async (content, query, index) => {
     const sweeps = index.sweeps.filter(sweep => plotsOf(sweep).length);

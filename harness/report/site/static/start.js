@@ -1,7 +1,7 @@
 // The views, the way between them, and light or dark.
 "use strict";
 (() => {
-  const { element, data, where, views, isDark } = springbench;
+  const { element, data, own, where, views, isDark } = springbench;
   const content = document.getElementById("content"), toggle = document.getElementById("theme");
   const names = [["overview", "Overview"], ["runs", "Runs"], ["plots", "Plots"]];
   let shown = null;
@@ -20,7 +20,7 @@
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { theme(); dispatchEvent(new Event("recolour")); });
 
   async function show() {
-    const { view, query } = where(), address = location.hash, named = view in views ? view : "overview";
+    const { view, query } = where(), address = location.hash, named = own(views, view) ? view : "overview";
     const index = await data("index");
     for (const link of document.querySelectorAll("#views a")) {
       if (link.hash.startsWith(`#${named === "compare" ? "runs" : named}`)) link.setAttribute("aria-current", "page");

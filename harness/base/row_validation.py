@@ -1,0 +1,166 @@
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# pyarrow's stubs say little of columns.
+"""Checks of the values in rows, which may be somebody else's: names become files, text becomes links and JSON.
+
+A rule belongs to a column's name, whatever the kind of rows; a column without a rule may hold anything of its type.
+Null is valid everywhere: readers name the columns that they need.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import PurePosixPath
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from harness.base.files import is_file_name
+
+LONGEST = 100_000
+"""Characters of a text."""
+
+_SAID = 60
+"""Characters of a value that a message repeats."""
+
+
+class TextRule(NamedTuple):
+    """fits: whether a text is valid; wanted: what is, in words."""
+
+    fits: Callable[[str], bool]
+    wanted: str
+
+
+class Range(NamedTuple):
+    """The finite numbers from low to high."""
+
+    low: float
+    high: float
+
+    @property
+    def wanted(self) -> str:
+        """The range in words."""
+        return f"a number from {self.low:g} to {self.high:g}"
+
+
+def _is_id(text: str) -> bool:
+    return re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._ -]{0,127}", text) is not None
+
+
+def _is_line(text: str) -> bool:
+    return 0 < len(text) <= 300 and all(letter.isprintable() for letter in text)
+
+
+def _is_word(text: str) -> bool:
+    return re.fullmatch(r"[a-z][a-z -]{0,40}", text) is not None
+
+
+def is_path_below(text: str) -> bool:
+    """Whether a text is a path that leads from a folder to a file below it."""
+    return not text or (not text.startswith("/") and all(map(is_file_name, PurePosixPath(text).parts)))
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no JSON")
+
+
+def _object(text: str) -> dict[str, Any] | None:
+    """The JSON object that a text is; None for what is none."""
+    try:
+        found = json.loads(text, parse_constant=_refuse)
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _is_object(text: str) -> bool:
+    return _object(text) is not None
+
+
+def _is_reference(text: str) -> bool:
+    found = _object(text) or {}
+    lines = [found.get(name) for name in ("authors", "title")]
+    doi, year = found.get("doi"), found.get("year")
+    known = all(isinstance(line, str) and _is_line(line) for line in lines)
+    return known and isinstance(doi, str) and re.fullmatch(r"[!-~]{0,200}", doi) is not None and type(year) is int
+
+
+TEXTS: dict[str, TextRule] = {
+    **dict.fromkeys(("run_id", "unit"), TextRule(_is_id, "letters, digits, spaces and any of `._-`, at most 128")),
+    **dict.fromkeys(("scene", "sweep"), TextRule(is_file_name, "the stem of a file's name")),
+    **dict.fromkeys(("solver", "integrator", "phase"), TextRule(_is_line, "one line of at most 300 characters")),
+    **dict.fromkeys(("status", "kind"), TextRule(_is_word, "a word in small letters")),
+    "parameters": TextRule(_is_object, "a JSON object"),
+    "reference": TextRule(_is_reference, "a JSON object with authors, year, title and doi"),
+    "recording": TextRule(is_path_below, "a path in the folder of the results"),
+}
+"""By column."""
+
+
+def _is_short(text: str) -> bool:
+    return len(text) <= LONGEST
+
+
+_SHORT = TextRule(_is_short, f"at most {LONGEST:,} characters")
+
+RANGES: dict[str, Range] = {
+    **dict.fromkeys(("size", "frame", "round", "vertices", "springs"), Range(0, 1e12)),
+    **dict.fromkeys(("iterations", "max_iterations", "stages", "rounds", "frames"), Range(0, 1e12)),
+    **dict.fromkeys(("threads", "at_once", "cores"), Range(0, 1e6)),
+    **dict.fromkeys(("seconds", "cpu_seconds", "cold", "horizon", "seconds_per_simulated"), Range(0, 1e12)),
+    **dict.fromkeys(("cost", "cost_low", "cost_high"), Range(-1e12, 1e12)),
+    **dict.fromkeys(("tolerance", "asked", "estimated", "memory_gib"), Range(0, 1e12)),
+    "time_step": Range(1e-12, 1e9),
+    "mean_rest_length": Range(1e-300, 1e300),
+    **dict.fromkeys(("machine_bandwidth", "machine_flops", "machine_step", "device_bandwidth"), Range(0, 1e30)),
+}
+"""By column."""
+
+
+class Invalid(NamedTuple):
+    """A value that does not fit its column: the number of its row, the column, the value and what was wanted."""
+
+    row: int
+    column: str
+    value: Any
+    wanted: str
+
+    def __str__(self) -> str:
+        came = repr(self.value[:_SAID] if isinstance(self.value, str) else self.value)
+        return f"came {came if len(came) <= _SAID else came[:_SAID] + '…'}; wanted {self.wanted}"
+
+
+def invalid(table: pa.Table) -> Iterator[Invalid]:
+    """All values that do not fit their columns, column by column."""
+    for field in table.schema:
+        column = table[field.name]
+        if pa.types.is_string(field.type) or pa.types.is_large_string(field.type):
+            yield from _unfit_texts(field.name, column, TEXTS.get(field.name, _SHORT))
+        elif field.name in RANGES and (pa.types.is_integer(field.type) or pa.types.is_floating(field.type)):
+            yield from _unfit_numbers(field.name, column, RANGES[field.name])
+
+
+def _unfit_texts(name: str, column: Any, rule: TextRule) -> Iterator[Invalid]:
+    longer = pc.max(pc.binary_length(column)).as_py() or 0
+    if rule is _SHORT and longer <= LONGEST:
+        return
+    bad = [text for text in column.unique().to_pylist() if text is not None and not _fits(text, rule)]
+    if bad:
+        wanted = rule.wanted if max(map(len, bad)) <= LONGEST else _SHORT.wanted
+        rows = pc.is_in(column, pa.array(bad, column.type)).to_numpy(zero_copy_only=False)
+        yield from (Invalid(int(row), name, column[int(row)].as_py(), wanted) for row in np.flatnonzero(rows))
+
+
+def _fits(text: str, rule: TextRule) -> bool:
+    return len(text) <= LONGEST and rule.fits(text)
+
+
+def _unfit_numbers(name: str, column: Any, allowed: Range) -> Iterator[Invalid]:
+    values = pc.cast(column, pa.float64(), safe=False).to_numpy(zero_copy_only=False)  # NaN for null
+    known = ~column.is_null(nan_is_null=False).to_numpy()
+    outside = known & ~((values >= allowed.low) & (values <= allowed.high))
+    for row in np.flatnonzero(outside).tolist():
+        yield Invalid(row, name, column[row].as_py(), allowed.wanted)

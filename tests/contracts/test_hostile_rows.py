@@ -1,0 +1,152 @@
+"""Rows that somebody else may have made: what is invalid is named and left out, the rest is shown, none is trusted."""
+
+from __future__ import annotations
+
+import json
+from io import StringIO
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from rich.console import Console
+
+from harness.base.errors import InputError
+from harness.base.rows import read
+from harness.base.shelf import FILE
+from harness.report.learned import sentences
+from harness.report.medians import medians
+from harness.report.site.folders import folder_of
+from harness.report.site.script import write
+from harness.report.timing_plot import draw_timing
+from harness.report.timing_table import runs, summary_table
+from tests import accuracy_rows, site_results
+from tests.contracts.attempts import Outcome, attempt
+from tests.contracts.hostile_rows import LEFT_OUT, SHOWN, rows_with, write_cases
+
+
+def reported(folder: Path) -> Outcome:
+    found = attempt(folder, ["report", "results", "--without-viewer"])
+    assert not found.error, found.error
+    assert "Traceback" not in found.said
+    assert not found.outside
+    return found
+
+
+def test_rows_that_do_not_fit_are_named_and_left_out(tmp_path: Path):
+    files = write_cases(tmp_path / "results" / "cases", LEFT_OUT)
+    found = reported(tmp_path)
+    said = "".join(found.said.split())
+    assert found.code == 0
+    for file, (name, (column, _)) in zip(files, LEFT_OUT.items(), strict=True):
+        assert f"{file.name}:{column}:came" in said, name
+    assert not list(tmp_path.parent.rglob("evil*"))
+
+
+def test_odd_rows_that_fit_are_shown(tmp_path: Path):
+    write_cases(tmp_path / "results" / "cases", SHOWN)
+    found = reported(tmp_path)
+    assert found.code == 0
+    assert ".parquet" not in found.said
+    table = (tmp_path / "results" / "site" / "data" / "cases" / "runs.js").read_text()
+    assert f'"n":{2 * len(SHOWN)},' in table
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", SHOWN)
+def test_odd_rows_are_told_at_the_end_of_a_sweep(tmp_path: Path, name: str):
+    table = read(write_cases(tmp_path / "cases", {name: SHOWN[name]}))
+    Console(file=StringIO()).print(summary_table(table))
+    sentences(runs(table))
+    draw_timing(table, tmp_path / "timing.png", name)
+    medians(table, tmp_path)
+
+
+FILES = {
+    "a column twice": lambda path: pq.write_table(pa.table([["a"], ["b"]], names=["run_id", "run_id"]), path),
+    "a column of files": lambda path: pq.write_table(rows_with("reason", "").append_column(FILE, [["x"] * 32]), path),
+    "a size in words": lambda path: pq.write_table(pa.table({"run_id": ["a"], "size": ["four"]}), path),
+    "a status in a list": lambda path: pq.write_table(pa.table({"run_id": ["a"], "status": [["ok"]]}), path),
+    "text that is no UTF-8": lambda path: pq.write_table(
+        pa.table({"run_id": pa.array([b"\xff\xfe"], pa.binary()).cast(pa.string(), safe=False)}), path
+    ),
+    "a text of 1 MB a million times": lambda path: pq.write_table(
+        pa.table({"run_id": pa.DictionaryArray.from_arrays(pa.array([0] * 1_000_000, pa.int32()), ["x" * 10**6])}), path
+    ),
+    "3 million zeros": lambda path: pq.write_table(pa.table({"size": pa.array([0] * 3_000_000)}), path),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_hostile_file_of_rows_is_named_within_limits(tmp_path: Path, name: str):
+    folder = tmp_path / "results" / "a" / "rows"
+    folder.mkdir(parents=True)
+    FILES[name](folder / "hostile.parquet")
+    found = reported(tmp_path)
+    assert found.code == 2
+    assert "hostile.parquet" in "".join(found.said.split())
+
+
+@pytest.mark.parametrize("unit", ["../../evil", "/tmp/evil", "..", "", ".hidden", "a/b", "x" * 300, "a\0b"])
+def test_a_unit_of_packed_rows_is_no_path(tmp_path: Path, unit: str):
+    folder = site_results.write(tmp_path / "results", 2)
+    packed = pq.read_table(folder / "rows.parquet")
+    pq.write_table(
+        packed.set_column(packed.column_names.index(FILE), FILE, [[unit] * len(packed)]), folder / "rows.parquet"
+    )
+    found = reported(tmp_path)
+    assert found.code == 2
+    assert "rows.parquet" in "".join(found.said.split())
+
+
+@pytest.mark.parametrize(
+    "recording", ["/etc/hostname", "../../secret.rrd", "a/../../secret.rrd", "a\0b", "recordings/" + "x" * 300]
+)
+def test_a_recording_is_looked_for_below_its_folder(tmp_path: Path, recording: str):
+    told = accuracy_rows.problem("net", 6, "early") + list(accuracy_rows.curve("net", 6, "early", "numba"))
+    for row in told:
+        if row["kind"] == "curve":
+            row["recording"] = recording
+    accuracy_rows.write(tmp_path / "results" / "study", told)
+    found = reported(tmp_path)
+    assert "recording: came" in " ".join(found.said.split())
+
+
+def test_rows_of_accuracy_that_do_not_belong_together_are_refused(tmp_path: Path):
+    told = accuracy_rows.problem("net", 6, "early") + list(accuracy_rows.curve("net", 6, "early", "numba"))
+    for row in told:
+        row["g0"] = row["time_step"] = None
+    accuracy_rows.write(tmp_path / "results" / "study", told)
+    assert reported(tmp_path).code in (0, 2)
+
+
+def test_who_reads_without_leaving_out_is_told_of_every_file(tmp_path: Path):
+    files = write_cases(tmp_path / "cases", dict(list(LEFT_OUT.items())[:2]))
+    with pytest.raises(InputError) as told:
+        read(files)
+    assert [(mistake.key, mistake.file) for mistake in told.value.mistakes] == [("run_id", file) for file in files]
+
+
+def test_folders_have_safe_links_and_names_of_their_own():
+    names = ["javascript:alert(1)", "a b", "a~b", "a/b", "a", "this", "..x", "ä", "%2e%2e", "a?b#c", "x" * 200]
+    found = [folder_of(Path("results", name), Path("results")) for name in [*names, "."]]
+    assert len({folder.slug for folder in found}) == len(found)
+    for folder in found:
+        assert folder.up.startswith("./")
+        assert not set(folder.up) & set(":?#& "), folder.up
+        assert set(folder.slug) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789._~-"), (
+            folder.slug
+        )
+        assert len(folder.slug) < 120
+    assert found[0].up == "./javascript%3Aalert%281%29/"
+    assert [folder.slug for folder in found[3:5]] == ["a~b", "a"]
+
+
+def test_a_key_is_never_the_prototype_of_what_a_script_gives(tmp_path: Path):
+    value = {"__proto__": 1, 'a"__proto__': 2, "b": '"__proto__":'}
+    words = write(tmp_path / "x.js", "x", value).read_text()
+    assert words.count('["__proto__"]:') == 1
+    assert (
+        json.loads(words.partition(", ")[2].strip().removesuffix(");").replace('["__proto__"]:', '"__proto__":', 1))
+        == value
+    )
