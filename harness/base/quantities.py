@@ -15,7 +15,7 @@ a property that `ms_per_step` has computed.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +34,9 @@ SQL = {
 """Aggregates over the rows of a run, by the names of the fields of `harness.report.timing_table.RunTimes`."""
 
 
-def ms_per_step(seconds: Iterable[float]) -> float:
+def ms_per_step(seconds: Sequence[float]) -> float:
     """The ms a step of these steps' wall times [s], of all frames and rounds."""
-    return 1e3 * float(np.median(np.fromiter(seconds, float)))
+    return 1e3 * float(np.median(seconds))
 
 
 def times_as_long(run: float, other: float) -> float:

@@ -83,5 +83,5 @@ def _abandoned(run: RunSpec, files: Files, status: str, reason: str) -> list[dic
 def _outcome(found: list[dict[str, Any]]) -> str:
     if found[0]["status"] != "ok":
         return f"{found[0]['status']}: {found[0]['reason']}"
-    taken = ms_per_step(row["seconds"] for row in found if row["phase"] == "step")
+    taken = ms_per_step([row["seconds"] for row in found if row["phase"] == "step"])
     return f"{taken:.3g} ms a step"

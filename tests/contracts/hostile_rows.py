@@ -20,7 +20,7 @@ NO_SOURCE = {"authors": "A, B", "year": 2000, "title": "T", "doi": ""}
 
 LEFT_OUT: dict[str, tuple[str, Any]] = {
     "a way out": ("run_id", "../../../../evil"),
-    "an absolute way": ("run_id", "/tmp/evil"),
+    "an absolute way": ("run_id", "/evil"),
     "an id that is empty": ("run_id", ""),
     "an id of two dots": ("run_id", ".."),
     "an id of 1000 letters": ("run_id", "x" * 1000),

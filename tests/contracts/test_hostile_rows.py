@@ -87,7 +87,7 @@ def test_a_hostile_file_of_rows_is_named_within_limits(tmp_path: Path, name: str
     assert "hostile.parquet" in "".join(found.said.split())
 
 
-@pytest.mark.parametrize("unit", ["../../evil", "/tmp/evil", "..", "", ".hidden", "a/b", "x" * 300, "a\0b"])
+@pytest.mark.parametrize("unit", ["../../evil", "/evil", "..", "", ".hidden", "a/b", "x" * 300, "a\0b"])
 def test_a_unit_of_packed_rows_is_no_path(tmp_path: Path, unit: str):
     folder = site_results.write(tmp_path / "results", 2)
     packed = pq.read_table(folder / "rows.parquet")

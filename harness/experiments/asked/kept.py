@@ -38,7 +38,7 @@ class Kept:
     @property
     def ms_per_step(self) -> float:
         """The run's ms a step, each frame being a step."""
-        return ms_per_step(seconds for path in self.rounds for seconds in path.frames)
+        return ms_per_step([seconds for path in self.rounds for seconds in path.frames])
 
     def rows(self) -> list[dict[str, Any]]:
         """A row for each frame of each round."""
