@@ -95,7 +95,12 @@ def say(line: str) -> None:
     """Print a line to standard error, as it stands; no more of it than fits a screen."""
     from rich.markup import escape
 
-    err().print(escape(line if len(line) <= _LONGEST else line[:_LONGEST] + " ..."), highlight=False, soft_wrap=True)
+    err().print(
+        escape(line if len(line) <= _LONGEST else line[:_LONGEST] + " ..."),
+        highlight=False,
+        emoji=False,
+        soft_wrap=True,
+    )
 
 
 def show_log() -> None:

@@ -164,7 +164,8 @@ class Solid(Model):
         if self.frames:
             if len(points) != self.frames.stored.shape[1]:
                 came = f"{self.frames.stored.shape[1]:,} points for a mesh of {len(points):,}"
-                raise InputError(f"frames: came {came}; wanted as many")
+                path = self.frames.positions if isinstance(self.frames.positions, Path) else None
+                raise InputError(Mistake(f"came {came}; wanted as many", path, key="frames"))
             points = self.frames.stored[0]
         return self.scale * points + np.array(self.offset), triangles
 

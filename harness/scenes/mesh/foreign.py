@@ -10,10 +10,13 @@ in text must be ended.
 from __future__ import annotations
 
 import io
+import os
 import re
+import sys
 import warnings
-from collections.abc import Callable
-from contextlib import redirect_stdout
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, redirect_stdout
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, cast
 
@@ -65,7 +68,13 @@ class _Raw(Protocol):
 
 
 def read(path: Path) -> Found:
-    """What a mesh file holds; raises anything on a broken file, ValueError on one that was cut."""
+    """What a mesh file holds; raises anything on a broken file, ValueError on one that was cut, PermissionError on one
+    that refers to a file outside of its folder."""
+    with _confined_to(path):
+        return _read(path)
+
+
+def _read(path: Path) -> Found:
     suffix = path.suffix.lower()
     if suffix == ".vtp":
         return _of_vtp(vtp.read(path.read_bytes()))
@@ -83,6 +92,39 @@ def read(path: Path) -> Found:
     points = np.array(raw.points, np.float64)
     found = Found(points, kept, _groups(raw), _columns(raw.point_data, len(points)), _numbered(kept))
     return _without_stray(found) if suffix == ".msh" else found
+
+
+class _Confinement:
+    """An audit hook by which this process opens files in some folders alone, and writes none, while there are any."""
+
+    def __init__(self) -> None:
+        self.folders: tuple[Path, ...] = ()
+        sys.addaudithook(self._check)
+
+    def _check(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if event != "open" or not self.folders or isinstance(arguments[0], int):
+            return
+        name, mode, flags = arguments
+        path = Path(os.fsdecode(name)).resolve()
+        writes = set(mode or "") & set("wax+") or (flags or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+        if writes or not any(path.is_relative_to(folder) for folder in self.folders):
+            raise PermissionError(f"it refers to {path}, which lies outside of its folder")
+
+
+@cache
+def _confinement() -> _Confinement:
+    return _Confinement()
+
+
+@contextmanager
+def _confined_to(path: Path) -> Generator[None]:
+    """Let nothing be opened but what lies in the folder of a file, and what Python imports."""
+    code = {sys.prefix, sys.base_prefix, *filter(os.path.isabs, sys.path)}
+    _confinement().folders = (path.resolve(), path.parent.resolve(), *(Path(one).resolve() for one in code))
+    try:
+        yield
+    finally:
+        _confinement().folders = ()
 
 
 def _by_meshio(path: Path) -> _Raw:

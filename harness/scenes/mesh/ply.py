@@ -253,6 +253,8 @@ class _Binary:
         (value,) = self._taken(element, one.length, 1).tolist()
         if not 0 <= value < 2**32 or value != int(value):
             raise ValueError(f"a list of its {element.name} has the length {value:g}; wanted a whole number")
+        if len(self._content) - self._at < int(value) * np.dtype(one.type).itemsize:
+            raise _short(element)
         return int(value)
 
     def _taken(self, element: Element, kind: str, count: int) -> NDArray[np.generic]:
