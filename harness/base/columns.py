@@ -147,7 +147,8 @@ COLUMNS = (
         "graded",
         _REAL,
         "",
-        "in the first, middle and last frame, if the solver minimises: the stationarity by the oracle, judged or not",
+        "in the first, middle and last frame, but for solvers with steps of their own: the stationarity by the oracle, "
+        "judged or not",
     ),
     Column(
         "distance",

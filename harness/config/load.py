@@ -64,8 +64,8 @@ def load_any(
 
     For a scene, `solvers`, `sizes` and `options` (those of `harness.config.sweep.Options`, None as null in a sweep) say
     what to run; a sweep says so itself. Where nothing is stated of how steps end, they end as `DEFAULT_STOP` states,
-    those of an assignment's scene as in a sweep. opens: whether code that it names is run; else its parameters are not checked. Raises
-    InputError.
+    those of an assignment's scene as in a sweep. opens: whether code that it names is run; else its parameters are not
+    checked. Raises InputError.
     """
     asked = {key: value for key, value in options.items() if value is not None}
     assignment = _is_assignment(path)

@@ -5,6 +5,8 @@
 Where lengths are exact, a residual goes by the tensions of the method itself: what it says of the answer a judge tells.
 
 It is done in the second pass, where no clock runs. Whoever does nothing and reports that nothing is left is found out.
+Of a method whose iterations end elsewhere than at the minimum of the step's objective (`minimises = False`, and no
+steps of its own) nothing is refused; what is left is measured all the same.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from harness.base.errors import RunFailed
 from harness.reference.oracle import Oracle
 from harness.simulation.passing import Passing
 from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule
-from solvers.registry import minimises
+from solvers.registry import about, minimises, name_of
 
 SLACK = 10.0
 """A residual may be measured with a factor of few digits, or with a preconditioner that is like Q."""
@@ -34,7 +36,9 @@ class Graded(Passing):
     def __init__(self, prepared: Prepared, solver: Solver, frames: Collection[int]) -> None:
         """frames: counted from 1."""
         super().__init__(prepared)
-        self._frames, self._done = frames if minimises(solver) else (), 0
+        self._claims = minimises(solver)
+        own_steps = about(type(solver), name_of(solver)).own_steps
+        self._frames, self._done = frames if self._claims or not own_steps else (), 0
         self._begun = -np.inf
         self._name = type(solver).__name__
         self._oracles: dict[float, Oracle] = {}
@@ -57,6 +61,8 @@ class Graded(Passing):
             self._oracles[system.rate] = Oracle(system)
         oracle = self._oracles[system.rate]
         reached, round_off, _ = oracle.stationarity(problem, found.positions)
+        if not self._claims:
+            return {"graded": reached}
         yardstick = oracle.yardstick(problem)
         told, truth = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)", reached * yardstick
         if np.isnan(found.residual) and found.iterations:

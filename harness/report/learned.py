@@ -15,6 +15,9 @@ from harness.report import equal_accuracy
 from harness.report.equal_accuracy import comparisons
 from harness.report.timing_table import WIDTH, RunTimes, labels, runs
 
+SOLVED = 1e-2
+"""Of the residual at a step's start: where a method that does not minimise leaves more, that is said."""
+
 GROWS = 1.5
 """The largest strain is said to grow where it does by this factor, and by as much more than what 99 % stay below."""
 
@@ -34,7 +37,7 @@ def closing(table: pa.Table, config: Path, results: Path, folder: Path) -> list[
 def sentences(found: Sequence[RunTimes]) -> list[str]:
     """What runs say of which solver is fastest, of how they stopped and of their strain; each a line or more."""
     fine, names = [run for run in found if run.status == "ok"], labels(found)
-    told = [*_fastest(fine, names), *_stopped(fine), *_strain(fine, names)]
+    told = [*_fastest(fine, names), *_stopped(fine), *_unsolved(fine, names), *_strain(fine, names)]
     return [line for sentence in told for line in wrap(sentence, WIDTH - 2, subsequent_indent="  ")]
 
 
@@ -67,6 +70,17 @@ def _stopped(fine: Sequence[RunTimes]) -> Iterator[str]:
 
 def _at_round_off(run: RunTimes) -> bool:
     return run.worst_residual is not None and run.worst_residual <= (run.round_off or 0.0)
+
+
+def _unsolved(fine: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:
+    """Of methods that do not minimise: what they left of a step's residual, by the oracle."""
+    for run in fine:
+        if run.left is not None and run.left > SOLVED:
+            yield (
+                f"{names[run.run_id]} on {run.scene} {run.size or ''}".rstrip()
+                + f" does not converge to the minimum of a step's objective: up to {run.left:.1e} of the residual at a "
+                "step's start is left (column `graded`); more iterations need not lower it."
+            )
 
 
 def _strain(fine: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:

@@ -33,7 +33,8 @@ class RunTimes(NamedTuple):
     iterations, the least welcome, None where the solver has no limit of iterations and nothing else ended them;
     interrupted: whether steps were, in any round; adds_up: whether the phases add up to an iteration; round_off
     [J^(1/2)]: residuals below it are round-off (`ROUND_OFF`); distance: the largest over all frames, where each was
-    judged; modulus_exponent: of the rows. The fields are the columns of `_SUMMARY`, in order.
+    judged; modulus_exponent: of the rows; left: of a solver that does not minimise, the largest stationarity that the
+    oracle measured. The fields are the columns of `_SUMMARY`, in order.
     """
 
     run_id: str
@@ -71,6 +72,7 @@ class RunTimes(NamedTuple):
     round_off: float | None
     distance: float | None
     modulus_exponent: int | None
+    left: float | None
 
 
 ROUND_OFF = 1e-12
@@ -101,7 +103,7 @@ select run_id, any_value(scene), any_value("size"), any_value(solver), any_value
     max(frame), any_value(integrator), any_value(time_step), any_value(asked), {SQL["worst_residual"]},
     {ROUND_OFF} * max(greatest({_ENERGIES})),
     case when bool_and(distance is not null) filter (phase = 'step') then max(distance) end,
-    any_value(modulus_exponent)
+    any_value(modulus_exponent), max(graded) filter (not minimises)
 from rows_of group by run_id order by min(place)
 """
 

@@ -6,11 +6,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
+from harness.base.columns import SCHEMA
+from harness.config.load import load_any
 from harness.experiments import run as runs
 from harness.experiments.plan import Files
 from harness.experiments.run import execute
+from harness.report.learned import SOLVED, sentences
+from harness.report.timing_table import runs as runs_of
 from tests.own_solvers import OPTIONS, Own, own
 
 
@@ -127,3 +132,34 @@ def test_checks_take_no_timed_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     made = own(tmp_path, monkeypatch)
     rows_of(made, tmp_path)
     assert seen == [made.solver.stem]
+
+
+TURNING = """
+mesh:
+  kind: network
+  positions: [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]
+  springs: [[0, 1], [1, 3], [3, 2], [2, 0], [0, 3], [1, 2]]
+mass: 1
+time_step: 1/10
+frames: 3
+velocity: [0.0, 0.0, 10.0]
+effects:
+  - {kind: springs, stretch: 1000}
+  - {kind: pins, indices: [0], weight: exact}
+"""
+
+
+def test_of_a_solver_that_does_not_minimise_is_said_what_it_leaves_of_a_step(tmp_path: Path):
+    """Springs that turn: XPBD ends elsewhere than at the minimum, however many iterations it takes."""
+    (tmp_path / "scene.yaml").write_text(TURNING)
+    (tmp_path / "rows").mkdir()
+    asked: dict[str, Any] = {"solvers": ["xpbd", "newton"], "rounds": 1, "record": False, "iterations": 2000}
+    found = list[dict[str, Any]]()
+    for spec in load_any(tmp_path / "scene.yaml", **asked).runs():
+        found += execute(spec, Files.of(spec, tmp_path), lambda phase: None)
+    left = {row["solver"]: row["graded"] for row in found if row["phase"] == "step" and row["frame"] == 3}
+    assert left["newton"] < 1e-6 < SOLVED < left["xpbd"]
+    assert all(row.get("residual") is None for row in found if row["solver"] == "xpbd")
+    said = " ".join(sentences(runs_of(pa.Table.from_pylist(found, SCHEMA))))
+    assert "xpbd on scene does not converge to the minimum of a step's objective" in said
+    assert "newton on scene does not" not in said
