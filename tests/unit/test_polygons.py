@@ -13,6 +13,7 @@ from harness.config.load import load_scene
 from harness.scenes.bind import build
 from harness.scenes.mesh.files import File
 from harness.scenes.mesh.polygons import MAX_CONCAVE_CORNERS, triangulate, vertex_areas
+from harness.simulation.opinion.second import second_opinion
 
 ROUND_OFF = 1e-12
 """A few hundred additions of numbers of order one in float64."""
@@ -121,6 +122,16 @@ def test_forces_on_the_triangles_of_quadrangles_do_not_depend_on_the_first_corne
         found.append(total)
     for other in found[1:]:
         assert np.array_equal(other, found[0])
+
+
+@pytest.mark.parametrize("first", [0, 3])
+def test_the_second_opinion_agrees_on_concave_and_convex_faces(tmp_path, first):
+    faces = [np.roll([1, 2, 3, 4, 5, 6], first), np.roll([4, 3, 7, 5], first)]
+    path = obj(tmp_path, [*L, (2.5, 2, 0.5)], *(" ".join(map(str, face)) for face in faces))
+    wind = "{kind: wind, per: triangle, velocity: [3, 1, 2], lift: 0.3}"
+    effects = f"{{kind: springs, stretch: 10}}, {{kind: gravity}}, {wind}, {{kind: bending, stiffness: 0.1}}"
+    made = scene(tmp_path, path, effects, "mass_per_area: 0.3")
+    assert second_opinion(load_scene(tmp_path / "mesh.yaml"), made, "implicit-euler") == "agrees"
 
 
 @pytest.mark.parametrize(

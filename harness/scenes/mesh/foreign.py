@@ -107,7 +107,8 @@ class _Confinement:
         name, mode, flags = arguments
         path = Path(os.fsdecode(name)).resolve()
         writes = set(mode or "") & set("wax+") or (flags or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
-        if writes or not any(path.is_relative_to(folder) for folder in self.folders):
+        is_code = path.suffix in (".py", ".pyc")
+        if writes or not (is_code or any(path.is_relative_to(folder) for folder in self.folders)):
             raise PermissionError(f"it refers to {path}, which lies outside of its folder")
 
 
@@ -119,8 +120,8 @@ def _confinement() -> _Confinement:
 @contextmanager
 def _confined_to(path: Path) -> Generator[None]:
     """Let nothing be opened but what lies in the folder of a file, and what Python imports."""
-    code = {sys.prefix, sys.base_prefix, *filter(os.path.isabs, sys.path)}
-    _confinement().folders = (path.resolve(), path.parent.resolve(), *(Path(one).resolve() for one in code))
+    installed = (Path(sys.prefix).resolve(), Path(sys.base_prefix).resolve())
+    _confinement().folders = (path.resolve(), path.parent.resolve(), *installed)
     try:
         yield
     finally:

@@ -10,7 +10,8 @@ quadrangle, which is also what the bilinear map gives, and thirds in a triangle:
 
     a_i = (t_(i-1) + t_i)/3 + sum(t)/(3 k),     t_i the area of the mean of the k corners, corner i and corner i + 1
 
-Faces that are not convex give each corner a third of its triangles.
+The area of a face that is not flat is that of its triangles, which the sum of the a_i is scaled to. Faces that are not
+convex give each corner a third of its triangles.
 """
 
 from __future__ import annotations
@@ -110,6 +111,10 @@ def vertex_areas(rest: Points, polygons: Indices, surface: Surface) -> Points:
     p = p - p.mean(axis=1, keepdims=True)
     t = np.linalg.norm(np.cross(p, np.roll(p, -1, axis=1)), axis=2) / 2
     shares = (t + np.roll(t, 1, axis=1)) / 3 + t.sum(axis=1, keepdims=True) / (3 * faces.shape[1])
+    a, b, c = (rest[surface.triangles[surface.convex][..., i]] for i in range(3))
+    whole = np.linalg.norm(np.cross(b - a, c - a), axis=2).sum(axis=1) / 2
+    around = t.sum(axis=1)
+    shares *= np.divide(whole, around, out=np.zeros_like(whole), where=around > 0.0)[:, None]
     return areas + np.bincount(faces.ravel(), shares.ravel(), minlength=len(rest))
 
 
