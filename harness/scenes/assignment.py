@@ -61,7 +61,8 @@ def read_assignment(path: Path) -> Assignment:
         raise InputError(Mistake("has no faces (f lines), so there are no springs", obj))
     mesh = network(cells, "face_pairs", obj)
     fans = np.concatenate([NO_TRIANGLES, *map(fan, cells.polygons.values())])  # as the assignment's code cuts faces
-    mesh = replace(mesh, triangles=fans)
+    if len(fans) == len(mesh.triangles):  # else faces repeat others, which count once
+        mesh = replace(mesh, triangles=fans)
     pins = _pins(scene.b, len(mesh.rest), path)
     if scene.m is None:
         mass = voronoi_areas(mesh.rest, mesh.triangles)

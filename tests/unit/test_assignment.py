@@ -73,6 +73,12 @@ def test_pins_count_from_one(tmp_path):
     assert read_assignment(scene(tmp_path, b=[4, 1])).pins.tolist() == [3, 0]
 
 
+def test_a_repeated_face_weighs_once(tmp_path, caplog):
+    mass = read_assignment(scene(tmp_path, SQUARE + "f 2 3 4 1\n", m=None)).mesh.mass
+    assert mass == pytest.approx([0.25] * 4)
+    assert "6 repeats 5" in caplog.messages[0]
+
+
 def test_the_mass_of_a_right_triangulated_square_is_its_voronoi_area(tmp_path):
     mass = read_assignment(scene(tmp_path, m=None)).mesh.mass
     assert mass == pytest.approx([0.25] * 4)  # barycentric lumping would give 1/3, 1/6, 1/3, 1/6
@@ -156,7 +162,7 @@ def test_all_mistakes_come_at_once(tmp_path):
 @pytest.mark.parametrize(
     ("text", "line", "words"),
     [
-        ("", 1, "is no JSON"),
+        ("", None, "is empty"),
         ('{"obj": "mesh.obj",\n "k": 5,,}', 2, "is no JSON"),
         ("[1, 2]", None, "came a list"),
         ('{"k": 1, "k": 2}', None, "'k' comes twice"),
