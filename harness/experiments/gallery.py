@@ -42,7 +42,7 @@ def _tile(path: Path) -> Any:
 
     from harness.base import machine
     from harness.config.load import load_any
-    from harness.record.base import Replay
+    from harness.record.base import SELF_CONTACT, Replay
     from harness.record.local_origin import local_origin, store_relative
     from harness.record.obstacles import declared, listed
     from harness.record.shading import STRAIN_RANGE
@@ -76,6 +76,7 @@ def _tile(path: Path) -> Any:
         scalars={},
         properties={
             **declared(listed(run.scene.effects)),
+            SELF_CONTACT: scene.self_contact,
             "cpu": machine.describe().cpu,
             "commit": machine.commit(),
         },

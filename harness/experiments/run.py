@@ -28,7 +28,7 @@ from harness.experiments.code import TO_ERROR, code, parts, solver_class
 from harness.experiments.failure import failure, grown
 from harness.experiments.plan import Files
 from harness.experiments.provenance import asked, common, tolerance
-from harness.record.base import Frame, FrameSamples, RecordingInfo
+from harness.record.base import SELF_CONTACT, Frame, FrameSamples, RecordingInfo
 from harness.record.obstacles import listed
 from harness.record.rerun import RerunRecorder
 from harness.record.shading import strain_range
@@ -305,6 +305,7 @@ def _recorder(run: RunSpec, files: Files, scene: Scene, facts: Mapping[str, Any]
         "springs": len(scene.springs.edges),
         "frames": run.frames,
         **facts,
+        SELF_CONTACT: scene.self_contact,
         "cpu": here.cpu,
         "cores": here.cores,
         "memory_gib": here.memory_gib,

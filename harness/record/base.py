@@ -22,6 +22,9 @@ LAYOUT = 2
 """Of entities and columns: recordings of another one are not read."""
 
 
+SELF_CONTACT = "self_contact"
+"""The property of a recording that states whether an effect keeps the mesh from passing through itself."""
+
 SAMPLES = 8
 """Frames before the last that are read back: a recording wrong in half of its frames passes once in 256 runs."""
 

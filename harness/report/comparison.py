@@ -33,6 +33,7 @@ from harness.report.page import (
     text,
 )
 from harness.report.render import Studio, area_vectors, frame_all, natural_angles, shape, spacing, spring_strain
+from harness.report.self_contact import self_contact_words
 from harness.report.solids import framed, seen
 from harness.report.style import HEIGHT, MUTED, RC, RULE, WIDTH, Mark, marks
 
@@ -150,8 +151,8 @@ def _panel(
         x, y = left + column * (grid.width + _GAP), top + row * (grid.height + _CAPTION)
         if _ends_finite(replay):
             paste(page, studio.draw(replay, len(replay.frames) - 1, view), x, y)
-            for words in outside_words(framed(replay, [-1])):
-                text(page, x + 3, y + grid.height - 4, words, size=9, color=MUTED)
+            warnings = [*outside_words(framed(replay, [-1])), *self_contact_words(replay, [-1])]
+            text(page, x + 3, y + grid.height - 4, ", ".join(warnings), size=9, color=MUTED)
         else:
             first = replay.frames[len(drawable_frames(replay))]
             words = f"not finite\nfrom frame {first} on"

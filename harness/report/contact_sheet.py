@@ -21,6 +21,7 @@ from harness.record.framing import outside_words
 from harness.report.origin import machine_and_commit
 from harness.report.page import save
 from harness.report.render import Studio, area_vectors, frame_all, natural_angles
+from harness.report.self_contact import self_contact_words
 from harness.report.solids import framed, seen
 from harness.report.style import DPI, INK, MUTED, PAGE, RC, WIDTH
 
@@ -81,7 +82,7 @@ def abreast(count: int) -> int:
 
 
 def _words(tile: Tile) -> str:
-    return ", ".join([tile.effects, *outside_words(framed(tile.replay, [-1]))])
+    return ", ".join([tile.effects, *outside_words(framed(tile.replay, [-1])), *self_contact_words(tile.replay, [-1])])
 
 
 def _lines(effects: str, width: int) -> list[tuple[str, int, float, str]]:

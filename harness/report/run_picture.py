@@ -37,6 +37,7 @@ from harness.report.page import (
     text,
 )
 from harness.report.render import Studio, area_vectors, frame_all, natural_angles, shape
+from harness.report.self_contact import self_contact_words
 from harness.report.solids import framed, seen
 from harness.report.style import HEIGHT, INK, MUTED, PAGE, RC, RULE, WIDTH
 
@@ -94,7 +95,7 @@ def draw_run(replay: Replay, path: Path, *, camera: tuple[float, float] | None =
         replay = replace(replay, strain_range=shown_limit([replay] * len(shown), shown.tolist()))
     with matplotlib.rc_context(RC):
         page = new_page()
-        header(page, headline(replay), [*_facts(replay), *(outside_words(framed(replay, shown)) if len(shown) else [])])
+        header(page, headline(replay), [*_facts(replay), *(_warnings(replay, shown.tolist()) if len(shown) else [])])
         strain_scale(
             page, replay.strain_range, shown_ends([replay] * len(shown), shown.tolist()), pins=len(replay.pinned) > 0
         )
@@ -105,6 +106,10 @@ def draw_run(replay: Replay, path: Path, *, camera: tuple[float, float] | None =
         if len(good) < total:
             _notice(page, replay, len(good))
         save(page, path)
+
+
+def _warnings(replay: Replay, shown: list[int]) -> list[str]:
+    return [*outside_words(framed(replay, shown)), *self_contact_words(replay, shown)]
 
 
 def _facts(replay: Replay) -> list[str]:

@@ -61,6 +61,12 @@ class Scene:
     moving: tuple[tuple[NDArray[np.int64], KeyedMotion], ...] = ()
     start: Rest = AT_REST
     apart: tuple[Apart, ...] = ()
+
+    @property
+    def self_contact(self) -> bool:
+        """Whether an effect keeps the mesh from passing through itself."""
+        return any(one.beside is None for one in self.apart)
+
     alternate: Scene | None = None
     halved: Callable[[], Scene] | None = None
 

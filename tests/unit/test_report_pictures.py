@@ -23,6 +23,7 @@ from harness.report.comparison import draw_comparison
 from harness.report.frames import drawable_frames
 from harness.report.render import Studio, area_vectors, frame_all, natural_angles, spring_strain, vertex_strain
 from harness.report.run_picture import PixelBox, draw_run, layout
+from harness.report.self_contact import self_contact_words
 from harness.report.solids import framed, seen
 from harness.report.style import HEIGHT, PAGE, WIDTH
 
@@ -309,6 +310,30 @@ def test_what_leaves_the_others_far_behind_is_not_framed(vertices: slice, metres
     assert (np.ptp(points, axis=0).max() < 3.0) == (count > 0 or metres < 2.0)
     wanted = {0: [], 1: ["1 of 36 vertices is outside"]}.get(count, [f"{count} of 36 vertices are outside"])
     assert outside_words(found) == wanted
+
+
+SURFACES = {
+    "a cloth that is kept apart": (True, 0.0, []),
+    "a cloth that is not": (False, 0.0, ["no self-contact"]),
+    "folded through itself": (False, 0.5, ["no self-contact: passes through itself"]),
+}
+
+
+@pytest.mark.parametrize(("apart", "folded", "wanted"), SURFACES.values(), ids=SURFACES)
+def test_a_picture_says_of_a_surface_that_nothing_keeps_it_apart(apart: bool, folded: float, wanted: list[str]) -> None:
+    """Folded: one corner of the cloth is pushed through its middle."""
+    plain = cloth()
+    positions = plain.positions.copy()
+    positions[7, 35] = positions[7, 14] + [0.05, 0.05, -folded]
+    positions[7, 34] += [0, 0, np.float32(folded)]
+    replay = replace(plain, positions=positions, properties={**plain.properties, "self_contact": apart})
+    if not folded:
+        replay = replace(replay, positions=plain.positions)
+    assert self_contact_words(replay, [0, 7]) == wanted
+    assert apart or self_contact_words(replay, [0]) == ["no self-contact"]
+    assert self_contact_words(plain, [7]) == [], "a recording that does not say is not judged"
+    net = replace(replay, triangles=replay.triangles[:0])
+    assert self_contact_words(net, [7]) == [], "a net has no surface"
 
 
 def test_what_is_stretched_evenly_is_framed_whole() -> None:

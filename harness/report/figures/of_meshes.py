@@ -31,6 +31,7 @@ from harness.report.render import (
     spring_strain,
     vertex_strain,
 )
+from harness.report.self_contact import self_contact_words
 from harness.report.solids import framed, seen
 from harness.report.style import Mark, marks
 from harness.report.timing_table import RunTimes, labels, runs
@@ -120,6 +121,7 @@ def _made(of: tuple[str, ...], name: tuple[str, ...], path: Path, label: str, lo
         facts=(
             f"largest strain {100 * np.abs(spring_strain(replay, frame)).max(initial=0.0):.3g} %",
             *outside_words(framed(replay, [frame])),
+            *self_contact_words(replay, [frame]),
         ),
         look=look,
         machine=told,
