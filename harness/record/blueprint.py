@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import rerun.blueprint as rrb
 
 from harness.record import curves
@@ -13,10 +14,15 @@ from harness.record.base import RecordingInfo
 from harness.record.camera import Extent
 
 BACKGROUND = (38, 40, 46)
-_LEGEND = 0.55
-"""The share of a plot's data that its legend's place is wide."""
+_LEGEND = 1.2
+"""The height of the room for a legend above a plot's data, in that of the data."""
 _LISTED = 1.6
 """The height of a plot with a legend over that of one without: five names have their place at 800 pixels."""
+
+Ends = Mapping[str, tuple[float, float]]
+
+_SHARES = (-1.0, 1.0)
+"""Where nothing is known of the values."""
 
 COLOURS = (0xE69F00FF, 0x56B4E9FF, 0x009E73FF, 0xCC79A7FF, 0xF0E442FF, 0xD55E00FF, 0x0072B2FF, 0x999999FF)
 """Of the lines of a plot: the palette of Okabe and Ito, told apart by the colour-blind; clear on black first."""
@@ -53,22 +59,37 @@ def scene_view(root: str, name: str, box: Extent, *, springs_visible: bool) -> r
     )
 
 
-def plot(name: str, contents: Sequence[str], *, last: int, legend: bool = True) -> rrb.TimeSeriesView:
-    """One plot of everything under the given paths, to the `last` frame, and with room for the legend beyond."""
-    corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend)
-    beyond = math.ceil(last * (1 + _LEGEND)) + 1
-    ends = (rrb.TimeRangeBoundary.absolute(seq=at) for at in (0, beyond))
-    axis = rrb.TimeAxis(view_range=rrb.TimeRange(*ends)) if legend else None
-    return rrb.TimeSeriesView(origin="/", contents=list(contents), name=name, plot_legend=corner, axis_x=axis)
+def plot(
+    name: str, contents: Sequence[str], *, last: int, ends: tuple[float, float] | None = None
+) -> rrb.TimeSeriesView:
+    """Plot everything under the given paths, to the `last` frame.
+
+    ends: the smallest and the largest value; where they are given there is a legend, in room of its own above the data.
+    """
+    corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=ends is not None)
+    across = rrb.TimeRange(*(rrb.TimeRangeBoundary.absolute(seq=at) for at in (0, max(last, 1))))
+    height = None
+    if ends is not None and np.isfinite(ends).all() and ends[1] > ends[0]:
+        height = rrb.ScalarAxis(range=(ends[0], ends[1] + _LEGEND * (ends[1] - ends[0])))
+    axis = rrb.TimeAxis(view_range=across)
+    return rrb.TimeSeriesView(
+        origin="/", contents=list(contents), name=name, plot_legend=corner, axis_x=axis, axis_y=height
+    )
 
 
-def blueprint(info: RecordingInfo, box: Extent, last: int = 0) -> rrb.Blueprint:
-    """The layout of one recording; last: its last frame."""
+def blueprint(info: RecordingInfo, box: Extent, last: int = 0, ends: Ends | None = None) -> rrb.Blueprint:
+    """The layout of one recording; last: its last frame; ends: the smallest and largest value of groups of scalars."""
+    ends = ends or {}
     series = rrb.Vertical(
-        plot("Energies: change, by its largest", ["+ /energy_change/**"], last=last),
-        plot("log10 residual [J^(1/2)]", ["+ /residual/log10"], last=last, legend=False),
-        plot("Largest strain of a spring", ["+ /strain/largest"], last=last, legend=False),
-        plot("Milliseconds by phase", ["+ /milliseconds/**"], last=last),
+        plot(
+            "Energies: change, by its largest",
+            ["+ /energy_change/**"],
+            last=last,
+            ends=ends.get("/energy_change", _SHARES),
+        ),
+        plot("log10 residual [J^(1/2)]", ["+ /residual/log10"], last=last),
+        plot("Largest strain of a spring", ["+ /strain/largest"], last=last),
+        plot("Milliseconds by phase", ["+ /milliseconds/**"], last=last, ends=ends.get("/milliseconds", _SHARES)),
         row_shares=[_LISTED, 1.0, 1.0, _LISTED],
         name="By frame",
     )
@@ -78,7 +99,7 @@ def blueprint(info: RecordingInfo, box: Extent, last: int = 0) -> rrb.Blueprint:
         name="Convergence",
     )
     run = rrb.TextDocumentView(origin="/run", name="Run and machine")
-    tabs = (_solve(last),) if info.iterates else (series, convergence)
+    tabs = (_solve(last, ends),) if info.iterates else (series, convergence)
     return rrb.Blueprint(
         # A grid: in a window that is higher than wide, such as a phone's, the viewer puts the plots below the mesh.
         rrb.Grid(
@@ -91,12 +112,17 @@ def blueprint(info: RecordingInfo, box: Extent, last: int = 0) -> rrb.Blueprint:
     )
 
 
-def _solve(last: int) -> rrb.Vertical:
+def _solve(last: int, ends: Ends) -> rrb.Vertical:
     """The plots of a solve, by the number of the iterate."""
     return rrb.Vertical(
-        plot("log10 of gap and stationarity, relative", ["+ /solve/**"], last=last),
-        plot("Energies: change, by its largest", ["+ /energy_change/**"], last=last),
-        plot("Largest strain of a spring", ["+ /strain/largest"], last=last, legend=False),
+        plot("log10 of gap and stationarity, relative", ["+ /solve/**"], last=last, ends=ends.get("/solve", _SHARES)),
+        plot(
+            "Energies: change, by its largest",
+            ["+ /energy_change/**"],
+            last=last,
+            ends=ends.get("/energy_change", _SHARES),
+        ),
+        plot("Largest strain of a spring", ["+ /strain/largest"], last=last),
         row_shares=[1.0, _LISTED, 1.0],
         name="By iteration",
     )
@@ -126,7 +152,7 @@ def run_document(info: RecordingInfo) -> str:
 
 
 def panels(time_step: float, timeline: str = "frame") -> tuple[rrb.TimePanel, rrb.SelectionPanel, rrb.BlueprintPanel]:
-    """Time by frame or iteration, played in real time as far as a screen can show it; nothing else in the way."""
+    """Time by frame or iteration, played from the first on in real time as far as a screen can show it, in a loop."""
     fps = math.ceil(min(max(1 / time_step, 1.0), 120.0))
-    time = rrb.TimePanel(state="collapsed", timeline=timeline, fps=fps)
+    time = rrb.TimePanel(state="collapsed", timeline=timeline, fps=fps, play_state="playing", loop_mode="all")
     return time, rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="hidden")

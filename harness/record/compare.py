@@ -99,6 +99,7 @@ class _Run:
         self.entities: set[str] = set()
         self.last = self._vertices = 0
         self.curves = residuals(source)
+        self.ranges: dict[str, tuple[float, float]] = {}  # the smallest and the largest of what is compared
 
     def seen_in(self, source: Source, box: Extent | None, aspect: float) -> Extent | None:
         """The box, widened to the recording's positions; aspect: of its view."""
@@ -113,6 +114,16 @@ class _Run:
     def _strains(self, p: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Of the springs and of the vertices."""
         return strains(p.astype(float), self._springs, self._rest_lengths)
+
+    def measure(self, chunk: Chunk) -> None:
+        """Widen the range of a compared quantity to the values of a piece of a recording."""
+        if chunk.entity_path in _QUANTITIES:
+            batch = chunk.to_record_batch()
+            if "Scalars:scalars" in batch.schema.names:
+                values = cells.column(batch, "Scalars:scalars").flatten().to_numpy()
+                known = values[np.isfinite(values)]
+                low, high = self.ranges.get(chunk.entity_path, (np.inf, -np.inf))
+                self.ranges[chunk.entity_path] = float(known.min(initial=low)), float(known.max(initial=high))
 
     def coloured(self, chunk: Chunk) -> Chunk:
         """A piece of a recording; what shows strain by the scale of all."""
@@ -137,6 +148,7 @@ class _Run:
 def _copy(file: PartialFile, run: _Run, source: Source, look: Look, box: Extent | None) -> None:
     for chunk in source.chunks(content="/**"):
         run.entities.add(chunk.entity_path)
+        run.measure(chunk)
         file.stream.send_chunks(run.coloured(chunk).with_entity_path(run.root + chunk.entity_path))
     for entity in run.entities & set(_QUANTITIES):
         lines = rr.SeriesLines(names=run.name, colors=_colour(look), widths=1.5)
@@ -197,7 +209,10 @@ def _named(rows: Mapping[str, Sequence[Any]]) -> Iterator[rrb.Horizontal]:
 
 
 def _plot(runs: list[_Run], entity: str, name: str, last: int, *, legend: bool) -> rrb.TimeSeriesView:
-    return plot(name, [f"+ {run.root}{entity}" for run in runs if entity in run.entities], last=last, legend=legend)
+    drawn = [run for run in runs if entity in run.entities]
+    ends = [run.ranges[entity] for run in drawn if entity in run.ranges] if legend else []
+    low, high = (min(end[0] for end in ends), max(end[1] for end in ends)) if ends else (0.0, 0.0)
+    return plot(name, [f"+ {run.root}{entity}" for run in drawn], last=last, ends=(low, high) if legend else None)
 
 
 def _table(title: str, runs: list[_Run]) -> str:

@@ -70,6 +70,7 @@ class RerunRecorder:
         self._unseen = 1e-6 * info.mesh.size
         self._springs_shown = False
         self._ends = (0.0, 0.0)  # the smallest and the largest strain of a spring
+        self._ranges: dict[str, tuple[float, float]] = {}  # of what has a legend, by group
         self._curves: dict[int, tuple[Sequence[float], Sequence[float]]] = {}  # residual and objective, by frame
         self._energies: dict[str, dict[int, float]] = {}
         self._file = PartialFile(path, blueprint.application(info), info.run_id, info.title)
@@ -122,8 +123,10 @@ class RerunRecorder:
         for name, values in curves.items():
             entity = f"/solve/{name.replace(' ', '_')}"
             self._style(entity, f"log10 of the {name}")
-            logarithms = rr.Scalars.columns(scalars=np.array([_log10(value) for value in values]))
-            self._stream.send_columns(entity, self._times(np.array(numbers)), logarithms)
+            logarithms = np.array([_log10(value) for value in values])
+            self._widen("/solve", logarithms)
+            columns = rr.Scalars.columns(scalars=logarithms)
+            self._stream.send_columns(entity, self._times(np.array(numbers)), columns)
 
     def close(self, milliseconds: Mapping[str, Sequence[float]], ended: Mapping[str, str] | None = None) -> Path:
         """Write the milliseconds of each phase by frame, from frame 1, and properties that its end has changed; finish
@@ -133,6 +136,7 @@ class RerunRecorder:
         self._send_mesh()
         for phase, values in milliseconds.items():
             self._scalars[f"/milliseconds/{phase}"] = list(enumerate(values, start=1))
+            self._widen("/milliseconds", np.array([0.0, *values]))
         self._send_scalars()
         self._send_convergence()
         self._send_changes()
@@ -141,7 +145,7 @@ class RerunRecorder:
         if ended:
             changed: dict[str, Any] = {name: [value] for name, value in ended.items()}
             self._stream.send_property("run", rr.AnyValues(**changed))
-        return self._file.finish(blueprint.blueprint(self._info, self._box, max(self._clock, default=0)))
+        return self._file.finish(blueprint.blueprint(self._info, self._box, max(self._clock, default=0), self._ranges))
 
     def abandon(self) -> None:
         """Stop, and remove the partial file; nothing happens after `close`."""
@@ -246,8 +250,14 @@ class RerunRecorder:
             largest = float(np.nanmax(np.abs(change))) if np.isfinite(change).any() else 0.0
             if largest > 0.0:
                 self._style(f"/energy_change/{name}", f"{name}, of {largest:.2g} J")
+                self._widen("/energy_change", change / largest)
                 scaled = rr.Scalars.columns(scalars=change / largest)
                 self._stream.send_columns(f"/energy_change/{name}", self._times(frames), scaled)
+
+    def _widen(self, group: str, values: NDArray[np.float64]) -> None:
+        known = values[np.isfinite(values)]
+        low, high = self._ranges.get(group, (np.inf, -np.inf))
+        self._ranges[group] = float(known.min(initial=low)), float(known.max(initial=high))
 
     def _add(self, frame: int, values: Mapping[str, float]) -> None:
         for entity, value in values.items():

@@ -202,6 +202,23 @@ def test_forces_are_arrows_in_proportion_at_no_more_than_some_vertices(tmp_path:
     np.testing.assert_allclose(lengths, 0.05 * mesh.size * np.array([1, 2, 3, 1]), rtol=1e-5)  # float32
 
 
+def test_an_arrow_begins_at_its_vertex_and_points_along_its_force(tmp_path: Path):
+    of, size = info(), info().mesh.size
+    forces = np.zeros((36, 3))
+    forces[3], forces[7] = (0.0, -9.81, 0.0), (3.0, 0.0, 4.0)  # 9.81 N and 5 N; the longest arrow takes .15 of the size
+    recorder = RerunRecorder(tmp_path / "a.rrd", of)
+    (frame,) = waving(of, 1)
+    recorder.frame(replace(frame, forces={"external": forces}))
+    recorder.close({})
+    with open_recording(tmp_path / "a.rrd") as source:
+        found = [chunk.to_record_batch() for chunk in source.chunks(content="/scene/forces/external")]
+    (batch,) = [one for one in found if "Arrows3D:vectors" in one.schema.names]
+    vectors, origins = (cell(batch, f"Arrows3D:{name}").reshape(-1, 3) for name in ("vectors", "origins"))
+    wanted = 0.15 * size * np.array([[0.0, -1.0, 0.0], [0.6 * 5 / 9.81, 0.0, 0.8 * 5 / 9.81]])
+    np.testing.assert_allclose(vectors, wanted, rtol=1e-6)
+    np.testing.assert_allclose(origins, frame.positions[[3, 7]], rtol=1e-6)
+
+
 def test_a_small_recording_is_small(tmp_path: Path):
     size = record(tmp_path / "a.rrd", count=13).stat().st_size
     assert size < 300_000, "of 36 vertices; the index of what the file holds takes four tenths of it"

@@ -215,7 +215,8 @@ def _pictures(folder: Folder) -> list[dict[str, str]]:
     """The best of a sweep's pictures: solvers side by side before single runs, large meshes before small ones."""
     found = sorted((folder.path / "pictures").glob("*.png"), key=_worth, reverse=True)
     found += [p for name in ("convergence", "work") for p in sorted((folder.path / "report").glob(f"{name}/*.png"))][:2]
-    shown = [path for path in found if path.stem != "timing"][:_PICTURES]
+    times = [path for path in found if path.stem == "timing"]
+    shown = [*[path for path in found if path.stem != "timing"][: _PICTURES - len(times)], *times]
     return [
         {"path": p.relative_to(folder.path).as_posix(), "words": _HASH.sub("", p.stem).replace("-", " ")} for p in shown
     ]

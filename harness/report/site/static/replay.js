@@ -105,6 +105,8 @@ window.springbench ??= {};
     return "";
   }
 
+  // Milliseconds after which the viewer is shown in any case.
+  const OPENS = 20000;
   let ready;
 
   function viewer() {
@@ -124,13 +126,18 @@ window.springbench ??= {};
     const canvas = element("canvas", dialog.querySelector(".stage"), { tabIndex: 0 });
     canvas.setAttribute("aria-label", "Rerun viewer: space plays, the mouse turns and moves what is seen");
     const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+    let opened = () => {};
+    const seen = new Promise(done => { opened = done; });
+    // Until the recording is open the viewer shows its own welcome, which is not what was asked for.
+    canvas.style.visibility = "hidden";
     const handle = new WebHandle({
+      on_viewer_event: event => { if (JSON.parse(event).type === "recording_open") opened(); },
       url: [], render_backend: "webgl", hide_welcome_screen: true, enable_history: false, notebook: true, persist: false,
-      theme: document.documentElement.dataset.theme ?? (dark ? "dark" : "light"),
+      theme: document.documentElement.dataset.theme || (dark ? "dark" : "light"),
       panel_state_overrides: { top: "Hidden" },
     });
     await handle.start(canvas);
-    return handle;
+    return { handle, canvas, seen };
   }
 
   function stop() {
@@ -160,7 +167,7 @@ window.springbench ??= {};
       if (!title || title === runId) dialog.querySelector("h2").textContent = recording.title || runId;
       const rrd = await unpacked(recording.rrd);
       if (mine !== turn) return false;
-      const handle = await start();
+      const { handle, canvas, seen } = await start();
       if (mine !== turn) { handle.destroy(); handle.free(); return false; }
       const watch = setInterval(() => {
         if (handle.has_panicked()) {
@@ -172,6 +179,9 @@ window.springbench ??= {};
       handle.open_channel(runId, runId);
       handle.send_rrd_to_channel(runId, rrd);
       handle.close_channel(runId);
+      await Promise.race([seen, new Promise(done => setTimeout(done, OPENS))]);
+      if (mine !== turn) return false;
+      canvas.style.visibility = "";
       say("");
       return true;
     } catch (error) {

@@ -8,7 +8,8 @@
     return src ? element("img", { src, alt: "", loading: "lazy", decoding: "async", width: 64, height: 36 }) : element("span.noshot");
   };
   const marked = row => (row.by ? element("span.code", { title: row.by === "other code" ? "made by other code than the newest run of its scene and solver" : "made by an earlier commit than the newest run" }, row.by) : "");
-  const doubt = row => (row.interrupted ? element("span.doubt", { title: "the process was interrupted while steps were timed: its least time is nearest to the truth" }, " !") : "");
+  const DOUBT = "the process was interrupted while steps were timed: its least time is nearest to the truth";
+  const doubt = row => (row.interrupted ? element("span.doubt", { title: DOUBT }, " !") : "");
 
   // meaning: on pointing; show: of a row; numeric: to the right; spare: the higher, the sooner it goes where there is no room.
   const COLUMNS = [
@@ -85,7 +86,7 @@
       return { key, input, field: element("label.field", { for: input.id }, element("span", {}, title), input) };
     });
     const clear = element("button.quiet", { type: "button", onclick: () => { location.hash = address("runs", { sel: now.get("sel"), sort: now.get("sort") }); } }, "Clear");
-    const total = element("p.total", { role: "status" }), by = element("p.by");
+    const total = element("p.total", { role: "status" }), by = element("p.by"), note = element("p.note.muted");
     const downloads = element("span.downloads");
     const more = element("details.more", { open: LIMITS.some(([key]) => query.get(`max-${key}`)) }, element("summary", {}, "Limits"), element("div.fields", {}, ...limits.map(l => l.field)));
     const filters = element("details.filters", { open: innerWidth > 760 }, element("summary", {}, "Filters"),
@@ -107,7 +108,7 @@
     });
     const panel = element("aside.panel", { hidden: true, "aria-label": "Run", tabIndex: -1 });
     content.append(element("div.runs", {}, element("div.left", {}, element("h1.unseen", {}, "Runs"), filters,
-      element("div.toolbar", {}, total, by, downloads), table.grid, chosen), panel));
+      element("div.toolbar", {}, total, by, downloads), note, table.grid, chosen), panel));
     let opened = null, asked = null;
 
     async function update(next) {
@@ -122,6 +123,7 @@
         changes.sort = [sort.replace("-", ""), sort.startsWith("-")];
         total.textContent = shown.length === all.length ? many(all.length, "run") : `${count(shown.length)} of ${many(all.length, "run")}`;
         by.textContent = shown.length ? madeBy([...shown].sort((a, b) => (b.started || "").localeCompare(a.started || ""))) : "";
+        note.textContent = shown.some(row => row.interrupted) ? `! ${DOUBT}` : "";
         for (const { key, select } of facets) {
           const sizes = new Map();
           for (const row of all) if (fits(row, next, key)) sizes.set(value(row, key), (sizes.get(value(row, key)) || 0) + 1);
