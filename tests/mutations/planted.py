@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from tests.mutations.device import DEVICE
 from tests.mutations.energies import ENERGIES
 from tests.mutations.measuring import MEASURING
+from tests.mutations.pictures import PICTURES
 from tests.mutations.steps import STEPS
 
-TABLE = ENERGIES + STEPS + MEASURING
+TABLE = ENERGIES + STEPS + MEASURING + PICTURES + DEVICE

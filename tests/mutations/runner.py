@@ -117,6 +117,8 @@ class Copy:
             "NUMBA_CACHE_DIR": str(cache),
             "PYTHONDONTWRITEBYTECODE": "1",  # a lie and the truth may have one length, and one second
         }
+        if lie.file.startswith("solvers/cuda/"):
+            environment["NUMBA_ENABLE_CUDASIM"] = "1"
         try:
             done = subprocess.run(
                 [sys.executable, *command],

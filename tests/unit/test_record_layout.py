@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.record.blueprint import run_document, scale_name, scene_view, spring_cadence
+from harness.record.blueprint import panels, plot, run_document, scale_name, scene_view, spring_cadence
 from harness.record.camera import Extent
 from harness.record.shading import LEVELS
 from harness.scenes.mesh.grid import Grid
@@ -102,6 +102,18 @@ def test_the_camera_leaves_out_what_falls_away_and_says_so():
     assert box.outside() == ["1 of 7 vertices is outside"]
     assert scene_view("", "net", box, springs_visible=True).name == "net, 1 of 7 vertices is outside"
     assert scene_view("", "net", without, springs_visible=True).name == "net"
+
+
+def test_a_recording_opens_at_its_first_frame_playing():
+    time, *_ = panels(1 / 30)
+    assert (time.play_state, time.loop_mode, time.timeline) == ("playing", "all", "frame")
+
+
+def test_a_plot_ends_at_the_last_frame_and_its_legend_has_room_above_the_data():
+    drawn = plot("Energies", ["+ /energy/**"], last=40, ends=(-1.0, 3.0))
+    assert drawn.properties["TimeAxis"].view_range.as_arrow_array().to_pylist()[0]["end"] == 40
+    low, high = drawn.properties["ScalarAxis"].range.as_arrow_array().to_pylist()[0]
+    assert (low, high) == (-1.0, pytest.approx(3.0 + 1.2 * 4.0))
 
 
 def test_a_single_point_can_be_looked_at():
