@@ -215,7 +215,8 @@ COLUMNS = (
         "recorded",
         _TEXT,
         "",
-        "SHA-256 of the positions that the recording ends with, read back from its file (float32 bytes, relative to its origin)",
+        "SHA-256 of the positions that the recording ends with, read back from its file (float32 bytes, relative to "
+        "its origin)",
     ),
     Column("nnz_system", _INT, "", "stored entries of the system matrix Q"),
     Column("nnz_factor", _INT, "", "stored entries of its triangular factor, null where the library hides it"),
