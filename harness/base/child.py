@@ -14,8 +14,8 @@ import signal
 import struct
 import subprocess
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from threading import Timer
 from typing import Any, BinaryIO
@@ -169,6 +169,19 @@ def _answer(function: Callable[..., Any], arguments: tuple[Any, ...], limits: Al
     finally:
         for what in (resource.RLIMIT_CPU, resource.RLIMIT_DATA):
             limit(what, resource.RLIM_INFINITY)
+
+
+@contextmanager
+def memory_limited(bytes: int) -> Generator[None]:
+    """Let this process take at most so many bytes more for a while: what needs more raises MemoryError, or the error of
+    a library."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    wanted = data() + bytes
+    limit(resource.RLIMIT_DATA, wanted if soft == resource.RLIM_INFINITY else min(wanted, soft))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
 def limit(what: int, value: float) -> None:

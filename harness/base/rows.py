@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from harness.base import shelf, union
+from harness.base import child, shelf, union
 from harness.base.columns import SCHEMA
 from harness.base.errors import InputError, Mistake
 from harness.base.files import replacing
@@ -33,6 +33,8 @@ MOST = 2_000_000
 """No file may hold more rows: a few bytes can claim any number of them."""
 _BYTES = 2**29
 """No file may hold more bytes once it is unpacked."""
+_MEMORY, _EXPANDS = 7 * 2**28, 100
+"""Bytes of memory that reading units may take, and for each byte of their files."""
 _FEW = 8
 """So many units are read one by one, before DuckDB is loaded."""
 
@@ -80,9 +82,25 @@ def read(
     paths = list(paths)
     if len(paths) > _FEW:
         with suppress(union.Unfit):
-            table, number = union.table(paths, schema, needed, most=MOST, promote=promote)
+            with memory_for(paths):
+                table, number = union.table(paths, schema, needed, most=MOST, promote=promote)
             return _valid(paths, table, number, left_out, named=named)
     return _valid(paths, *_each(paths, schema, needed, promote), left_out, named=named)
+
+
+@contextmanager
+def memory_for(units: Sequence[Path]) -> Generator[None]:
+    """Limit the memory that reading units may take, for a while: a file of some kB can claim any number of GB. Raises
+    InputError where they take more."""
+    files = {*units, *(shelf.packed_file(folder) for folder in {unit.parent for unit in units})}
+    most = _MEMORY + _EXPANDS * sum(file.stat().st_size for file in files if file.is_file())
+    try:
+        with child.memory_limited(most):
+            yield
+    except MemoryError as error:
+        folder = units[0].parent if units else None
+        why = f"rows take more than {most / 2**30:.1f} GiB of memory to read; take out what is not yours"
+        raise InputError(Mistake(why, folder)) from error
 
 
 def read_each(
@@ -130,6 +148,13 @@ def _each(
     paths: Sequence[Path], schema: pa.Schema, needed: Sequence[str], promote: union.Promote
 ) -> tuple[pa.Table, NDArray[np.int64]]:
     """All rows of units, and the number of each row's unit, by pyarrow. Raises InputError."""
+    with memory_for(paths):
+        return _joined(paths, schema, needed, promote)
+
+
+def _joined(
+    paths: Sequence[Path], schema: pa.Schema, needed: Sequence[str], promote: union.Promote
+) -> tuple[pa.Table, NDArray[np.int64]]:
     tables, mistakes = list[pa.Table](), list[Mistake]()
     packed = _packed(paths)
     for path in paths:
@@ -183,20 +208,23 @@ def heads(
     found: dict[int, dict[str, Any]] = {}
     if len(paths) > _FEW:
         try:
-            found = union.heads(paths, columns, schema, needed)
+            with memory_for(paths):
+                found = union.heads(paths, columns, schema, needed)
         except union.Unfit as unfit:
             if unfit.damaged and len(unfit.damaged) < len(paths):
                 whole = [path for number, path in enumerate(paths) if number not in unfit.damaged]
                 bad = {paths[number]: first(paths[number], schema, needed=needed) for number in unfit.damaged}
                 found_of = heads(whole, columns, schema, needed=needed) | bad
                 return {path: found_of[path] for path in paths}
-    packed = _packed([path for number, path in enumerate(paths) if number not in found])
-    return {path: found.get(k) or _first(path, schema, needed, packed) for k, path in enumerate(paths)}
+    with memory_for(paths):
+        packed = _packed([path for number, path in enumerate(paths) if number not in found])
+        return {path: found.get(k) or _first(path, schema, needed, packed) for k, path in enumerate(paths)}
 
 
 def first(path: Path, schema: pa.Schema = SCHEMA, *, needed: Sequence[str] = ()) -> dict[str, Any] | str:
     """The first row of a unit, or in words what is wrong with its rows."""
-    return _first(path, schema, needed, _packed([path]))
+    with memory_for([path]):
+        return _first(path, schema, needed, _packed([path]))
 
 
 def _first(

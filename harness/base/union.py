@@ -74,7 +74,7 @@ def connected(memory: int = MEMORY) -> Generator[DuckDBPyConnection]:
         with duckdb.connect(config=settings) as connection:
             connection.execute("SET enable_external_file_cache = false; SET disable_parquet_prefetching = true")
             yield connection
-    except (duckdb.Error, pa.ArrowException) as error:
+    except (duckdb.Error, pa.ArrowException, OSError, MemoryError) as error:
         raise Unfit(str(error)) from error
 
 

@@ -123,7 +123,8 @@ def read(path: Path) -> dict[Key, StoredRun]:
             raise InputError(
                 Mistake("holds no rows (rows/*.parquet); wanted results that `springbench run` left", path)
             )
-        found = rows.read(files).to_pylist()
+        with rows.memory_for(files):
+            found = rows.read(files).to_pylist()
     runs: dict[Key, list[Row]] = defaultdict(list)
     for row in found:
         runs[tuple(row[name] for name in ASKED)].append(row)

@@ -28,7 +28,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from harness.base import child, columns, machine, rows, shelf, statistics
+from harness.base import columns, machine, rows, shelf, statistics
 from harness.base.claim import config_of
 from harness.base.errors import InputError, Mistake
 from harness.base.progress import Display
@@ -62,8 +62,6 @@ is not made again, and how the run was limited and timed."""
 
 _MOST_FILES, _MOST_SUMS, _MOST_TIMES = 200_000, 2**26, 200
 """Files of an archive, bytes of its checksums, and how many times as large as itself it may unpack to."""
-_READING = child.Allowance(600.0, 2**31)
-"""What reading an archive's rows may take."""
 _MOST_LOADED = 200
 """Configs are read with at most so many different options."""
 
@@ -206,13 +204,9 @@ _REPEATED = ("ok", "unsupported", "diverged", "disputed")
 
 def _rows(sweep: Path) -> list[Row]:
     """The rows of a sweep. Raises InputError for what takes too much."""
-    try:
-        found = child.call(rows.read, shelf.units(sweep / "rows"), limits=_READING)
-    except child.NoAnswer as error:
-        raise InputError(Mistake(str(error), sweep / "rows")) from error
-    if found["run_id"].null_count:
-        raise InputError(Mistake("holds rows without a run_id", sweep / "rows"))
-    return found.to_pylist()
+    units = shelf.units(sweep / "rows")
+    with rows.memory_for(units):
+        return rows.read(units, needed=("run_id", "status")).to_pylist()
 
 
 def _spec(config: Path, of_run: Sequence[Row], *, own_code: bool) -> RunSpec | None:
