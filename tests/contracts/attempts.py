@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,8 @@ def _attempt(folder: Path, arguments: list[str]) -> Outcome:
 
     files.SECONDS = 1.0  # some of these would be read for ever
     os.chdir(folder)
+    (folder / "temporary").mkdir(exist_ok=True)
+    tempfile.tempdir = os.environ["TMPDIR"] = str(folder / "temporary")  # what is left there is seen
     before = _state(folder)
     done = CliRunner().invoke(app, arguments)
     error = "" if done.exception is None or isinstance(done.exception, SystemExit) else repr(done.exception)

@@ -73,7 +73,7 @@ def publish(results: Path, archive: Path, say: Callable[[str], None], *, license
             refused += [Mistake(why, file) for file in files if (why := _unfit(file, config.parent))]
             content |= {f"configs/{name}/{os.path.relpath(file, config.parent)}": file for file in files}
             way = os.path.relpath(f"configs/{name}/{config.name}", f"results/{name}")
-            content[f"results/{name}/{CLAIM}"] = f"{way}\n".encode()
+            content[f"results/{name}/{CLAIM}"] = os.fsencode(f"{way}\n")
         else:
             gone = f"what it names as its config, {config}, is none" if config else "its config is not there any more"
             say(f"{folder}: {gone}, so nobody can do its runs again")

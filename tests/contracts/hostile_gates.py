@@ -1,0 +1,95 @@
+"""Inputs of gates that are damaged or made up: tables, records, histories, and tests that use the plug-in."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.contracts.hostile import BOMB
+from tests.contracts.hostile_more import stored
+
+TABLE = "gates:\n  - {scene: good.yaml, solver: sparse, against: dense, limit: 1}\n"
+
+
+def given(**values: str) -> str:
+    """A table of one gate with these keys."""
+    keys = {"scene": "good.yaml", "solver": "sparse", "against": "dense", "limit": "1"} | values
+    return "gates:\n  - {" + ", ".join(f"{key}: {value}" for key, value in keys.items()) + "}\n"
+
+
+TABLES: dict[str, str | bytes | Callable[[Path], object]] = {
+    "an empty table": "",
+    "a list": "- a\n",
+    "no gates": "gates: []\n",
+    "gates of a word": "gates: fast\n",
+    "gates of gates": "gates: [[[]]]\n",
+    "an unknown key": given(limt="1"),
+    "a scene that is missing": given(scene="none.yaml"),
+    "a scene of a device": given(scene="/dev/zero"),
+    "a scene of a pipe": given(scene="pipe"),
+    "a scene that is a sweep": given(scene="sweep.yaml"),
+    "a scene of code": given(scene="'!!python/name:os.system'"),
+    "a solver that is missing": given(solver="fastest-of-all"),
+    "a solver of a list": given(solver="[sparse]"),
+    "a solver without a name": given(solver="{iterations: 3}"),
+    "a parameter that is missing": given(solver="{name: sparse, speed: 9}"),
+    "code that is missing": given(solver="./none.py:Solver"),
+    "code elsewhere": given(solver="./../../etc/passwd.py:Solver"),
+    "a limit of zero": given(limit="0"),
+    "a limit of NaN": given(limit=".nan"),
+    "a limit of 1e999": given(limit="1e999"),
+    "an agreement of 2": given(agree="2"),
+    "an agreement of NaN": given(agree=".nan"),
+    "a size of 1e9": given(size="1e9"),
+    "a size of zero": given(size="0"),
+    "no iterations": given(iterations="0"),
+    "a tolerance below zero": given(tolerance="-1"),
+    "frames of 1e9": given(frames="1e9"),
+    "a clock of another kind": given(clock="sun"),
+    "a budget of NaN": given(budget=".nan"),
+    "a budget of infinity": given(budget=".inf"),
+    "an integrator of another program": given(integrator="rk4"),
+    "aliases": BOMB + TABLE,
+    "brackets": "gates: " + "[" * 100_000,
+    "text of another coding": TABLE.encode("utf-16"),
+    "a pipe": os.mkfifo,
+    "a device": lambda path: path.symlink_to("/dev/zero"),
+    "a folder": Path.mkdir,
+}
+
+RECORDS: dict[str, str | bytes | Callable[[Path], object]] = {
+    "a pipe": os.mkfifo,
+    "a device": lambda path: path.symlink_to("/dev/zero"),
+    "a folder": Path.mkdir,
+    "a link to itself": lambda path: path.symlink_to(path.name),
+    "a machine of lists": json.dumps(stored() | {"machine_info": {"cpu": {"brand_raw": ["a"], "count": {}}}}),
+    "a commit of a number": json.dumps(stored() | {"commit_info": {"id": 3, "time": 7}}),
+    "a date of a list": json.dumps(stored() | {"datetime": []}),
+    "names of markup": json.dumps(stored(fullname="[/bold][link=file:///etc/passwd]\x1b[2J")),
+    "a name of a lone surrogate": json.dumps(stored(fullname="\ud800")),
+    "a name of 1 MB": json.dumps(stored(fullname="x" * 1_000_000)),
+    "a time of 1e308": json.dumps(stored(stats={"min": 1e308})),
+    "a time of 1e-308": json.dumps(stored(stats={"min": 1e-308})),
+}
+
+PLUGIN = """
+import pytest
+WRONG = [
+    {"limit": float("nan")}, {"limit": 0.0}, {"limit": -1.0}, {"limit": float("inf")}, {"limit": "fast"},
+    {"limit": 1.0, "clock": "sun"}, {"limit": 1.0, "agree": -1.0}, {"limit": 1.0, "agree": float("nan")},
+    {"limit": 1.0, "error": 2.0}, {"limit": 1.0, "error": -1.0},
+]
+@pytest.mark.parametrize("given", WRONG)
+def test_race(race, given):
+    race(lambda: 1.0, lambda: 1.0, **given)
+@pytest.mark.parametrize("scene", ["none.yaml", "/dev/zero", "pipe", "sweep.yaml", ""])
+def test_solvers(race, scene):
+    race.solvers(scene, "sparse", "dense", limit=1.0)
+def test_wrong_answer(race):
+    race(lambda: 1.0, lambda: 2.0, limit=1.0)
+def test_no_answer(race):
+    race(lambda: None, lambda: None, limit=1.0)
+"""
+"""Tests that use the plug-in wrongly: each of them fails, and none breaks pytest."""
