@@ -89,7 +89,11 @@ def put(name: str, data: bytes | str | Callable[[], bytes]) -> Callable[[Content
 
 
 def without(*names: str) -> Callable[[Content], None]:
-    return lambda content: [content.pop(name) for name in names] and None
+    def change(content: Content) -> None:
+        for name in names:
+            del content[name]
+
+    return change
 
 
 def repeated_text(count: int, length: int) -> bytes:
