@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from tests.mutations.archive import ARCHIVE
 from tests.mutations.device import DEVICE
 from tests.mutations.energies import ENERGIES
+from tests.mutations.gates import GATES
 from tests.mutations.measuring import MEASURING
 from tests.mutations.pictures import PICTURES
 from tests.mutations.steps import STEPS
 
-TABLE = ENERGIES + STEPS + MEASURING + PICTURES + DEVICE
+TABLE = ENERGIES + STEPS + MEASURING + PICTURES + DEVICE + ARCHIVE + GATES

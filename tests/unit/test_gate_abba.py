@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import islice
 from random import Random
 
@@ -91,6 +92,20 @@ def test_a_slowdown_is_believed_when_a_second_start_has_it_too(ratios: tuple[flo
     assert found.answer is answer
     assert (tuple(started), found.starts) == (ratios, len(ratios))
     assert (found.interval.low, found.interval.high) == (pytest.approx(min(ratios)), pytest.approx(max(ratios)))
+
+
+def test_the_budget_is_that_of_both_races(monkeypatch: pytest.MonkeyPatch):
+    slow = confirmed(pairs(1.06, 1.05)[0], RULE, budget=60.0)  # type: ignore[arg-type]
+    budgets: list[float] = []
+
+    def raced(start: object, rule: Rule, budget: float) -> Result:
+        budgets.append(budget)
+        return replace(slow, rule=rule, elapsed=45.0)
+
+    monkeypatch.setattr("harness.experiments.gates.abba._raced", raced)
+    for budget in (60.0, 30.0):
+        confirmed(pairs(1.0)[0], RULE, budget=budget)  # type: ignore[arg-type]
+    assert budgets == [60.0, 15.0, 30.0, 0.0]
 
 
 def test_programs_are_started_anew_as_long_as_a_race_lasts(monkeypatch: pytest.MonkeyPatch):

@@ -57,7 +57,7 @@ def _compact(folder: Path, before: float, say: Callable[[str], None]) -> int:
     names = sorted(shelf.own_files(folder))
     old = [unit for name in names if (unit := folder / f"{name}.parquet").is_file() and unit.stat().st_mtime <= before]
     heads = rows.heads(old, ["started"], _STARTED)
-    whole = [unit for unit in old if isinstance(heads.get(unit), dict)]
+    whole = [unit for unit in old if isinstance(heads.get(unit), dict) and _is_text(unit.stem)]
     if damaged := len(old) - len(whole):
         say(f"{folder}: {damaged} damaged file{'s' * (damaged > 1)} left as {'they are' if damaged > 1 else 'it is'}")
     if not whole:
@@ -81,6 +81,15 @@ def _compact(folder: Path, before: float, say: Callable[[str], None]) -> int:
         unit.unlink()
     say(f"{folder}: {len(whole)} units packed into {packed.name}, which holds {len(asked)}")
     return len(whole)
+
+
+def _is_text(name: str) -> bool:
+    """Whether a name is UTF-8, which those of packed units have to be."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def fitting_schema(units: Sequence[Path], schema: pa.Schema = _ANY) -> pa.Schema:

@@ -1,0 +1,32 @@
+"""A table of gates: what each gate is asked, without timing one."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.experiments.gates import listed
+from harness.experiments.gates.sequential import Rule
+from tests.contracts.hostile import scene
+
+TABLE = """
+gates:
+  - {scene: cloth.yaml, solver: sparse, against: dense, limit: 1.5}
+  - {scene: cloth.yaml, solver: dense, against: sparse, limit: 2, budget: 7}
+"""
+
+
+def test_the_gates_of_a_table_share_its_error_and_each_may_have_a_budget_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "cloth.yaml").write_text(scene())
+    (tmp_path / "gates.yaml").write_text(TABLE)
+    asked: list[tuple[Rule, float]] = []
+
+    def confirmed(start: Any, rule: Rule, *, budget: float) -> str:
+        asked.append((rule, budget))
+        return "holds"
+
+    monkeypatch.setattr(listed, "confirmed", confirmed)
+    listed.run_table(tmp_path / "gates.yaml", 60.0, lambda line: None, alpha=0.01)
+    assert asked == [(Rule(1.5, 0.005), 60.0), (Rule(2.0, 0.005), 7.0)]
