@@ -179,6 +179,7 @@ def test_options_that_a_table_states_itself_are_refused(tmp_path: Path):
         ([[0.0, 1.0], [4.0, 2.0]], [[0.0, 1.0], [4.0, 2.0]], 0.0, ""),
         ([[0.0, 1.0], [4.1, 2.0]], [[0.0, 1.0], [4.0, 2.0]], 0.03, ""),
         ([[0.0], [4.1]], [[0.0], [4.0]], 0.02, "they lie 2.5e-02 of the answer's size apart, wanted 0.02"),
+        ([[996.0], [1000.1]], [[996.0], [1000.0]], 0.02, "they lie 2.5e-02 of the answer's size apart, wanted 0.02"),
         (3.0, 2.0, 0.1, "they lie 5.0e-01 of the answer's size apart, wanted 0.1"),
         (float("nan"), 2.0, 0.1, "they lie nan of the answer's size apart, wanted 0.1"),
         ([0.0], [0.0], 0.0, ""),
