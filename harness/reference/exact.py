@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.sparse import block_array, csr_array, diags_array, kron
 from scipy.sparse.linalg import splu
 
-from harness.reference.oracle import stiffness
+from harness.reference.oracle import Oracle, Reading, stiffness
 from solvers.energies.augmented import augmented, joined, penalties
 from solvers.energies.edges import directions
 from solvers.held import Lengths
@@ -79,6 +79,40 @@ class Exact:
         """Which limit holds each length: 1 the longest, -1 the shortest, 0 none."""
         x, pulled = self.lengths, length + tension / self._penalties
         return np.where((pulled > x.high) | (x.low == x.high), 1, np.where(pulled < x.low, -1, 0))
+
+
+class Stationarity:
+    """How stationary points of a run's steps are: of its systems, for a first or every second step may have another."""
+
+    def __init__(self) -> None:
+        self._oracles: dict[float, Oracle] = {}
+        self._exact: dict[float, Exact] = {}
+
+    def __call__(self, problem: StepProblem, p: Positions) -> Reading:
+        """As `Oracle.stationarity` has it; where lengths are exact, that of the Lagrangian with the tensions at p."""
+        exact = self.exact(problem.system)
+        if exact is None:
+            return self._oracle(problem.system).stationarity(problem, p)
+        stated = exact.lagrangian(problem, exact.tensions(problem, p))
+        return self._oracle(exact.augmented).stationarity(stated, p, self.yardstick(problem))
+
+    def yardstick(self, problem: StepProblem) -> float:
+        """As `Oracle.yardstick` has it, without tensions [J^(1/2)]."""
+        exact = self.exact(problem.system)
+        if exact is None:
+            return self._oracle(problem.system).yardstick(problem)
+        return self._oracle(exact.augmented).yardstick(exact.lagrangian(problem, np.zeros(len(exact.lengths.low))))
+
+    def exact(self, system: System) -> Exact | None:
+        """The lengths that a system keeps, None where it keeps none."""
+        if system.lengths and system.rate not in self._exact:
+            self._exact[system.rate] = Exact(system)
+        return self._exact.get(system.rate)
+
+    def _oracle(self, system: System) -> Oracle:
+        if system.rate not in self._oracles:
+            self._oracles[system.rate] = Oracle(system)
+        return self._oracles[system.rate]
 
 
 def _along(x: Lengths, n: Positions, vertices: int) -> csr_array:

@@ -2,7 +2,8 @@
 
     claimed >= |Q^-1 grad g(p)|_Q / SLACK,   p the answer, or the iterate before it, round-off apart
 
-Where lengths are exact, a residual goes by the tensions of the method itself: what it says of the answer a judge tells.
+Where lengths are exact, g is the Lagrangian with the tensions that leave least of its gradient at p
+(`harness.reference.exact`): by the tensions of a method itself it may vanish where lengths are wrong.
 
 It is done in the second pass, where no clock runs. Whoever does nothing and reports that nothing is left is found out.
 Of a method whose iterations end elsewhere than at the minimum of the step's objective (`minimises = False`, and no
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from harness.base.errors import RunFailed
-from harness.reference.oracle import Oracle
+from harness.reference.exact import Stationarity
 from harness.simulation.passing import Passing
 from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule
 from solvers.registry import about, minimises, name_of
@@ -41,7 +42,7 @@ class Graded(Passing):
         self._frames, self._done = frames if self._claims or not own_steps else (), 0
         self._begun = -np.inf
         self._name = type(solver).__name__
-        self._oracles: dict[float, Oracle] = {}
+        self._stationarity = Stationarity()
         self.found: dict[int, dict[str, Any]] = {}
         """By frame, the column `graded` of its row."""
 
@@ -50,20 +51,16 @@ class Graded(Passing):
         found = self._prepared.solve(problem, stop)
         if problem.start.time > self._begun:  # the first unknown of the next frame
             self._done, self._begun = self._done + 1, problem.start.time
-        if self._done in self._frames and not problem.system.lengths and np.isfinite(found.positions).all():
+        if self._done in self._frames and np.isfinite(found.positions).all():
             graded = self._graded(problem, found, stop)
             self.found[self._done] = max(graded, self.found.get(self._done, graded), key=lambda row: row["graded"])
         return found
 
     def _graded(self, problem: StepProblem, found: Solution, stop: StopRule) -> dict[str, Any]:
-        system = problem.system
-        if system.rate not in self._oracles:
-            self._oracles[system.rate] = Oracle(system)
-        oracle = self._oracles[system.rate]
-        reached, round_off, _ = oracle.stationarity(problem, found.positions)
+        reached, round_off, _ = self._stationarity(problem, found.positions)
         if not self._claims:
             return {"graded": reached}
-        yardstick = oracle.yardstick(problem)
+        yardstick = self._stationarity.yardstick(problem)
         told, truth = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)", reached * yardstick
         if np.isnan(found.residual) and found.iterations:
             raise RunFailed(f"{told}; wanted |Q^-1 grad g|_Q, which is {truth:.3g} (or `minimises = False`)")
@@ -72,9 +69,8 @@ class Graded(Passing):
         if found.stopped != "tolerance":
             enough = np.inf
         if claimed < reached or enough < reached:  # it may be the residual of the iterate before
-            least = min(
-                reached, *(oracle.residual(problem, p) / yardstick for p in self._before(problem, found)), np.inf
-            )
+            before = [self._stationarity(problem, p).reached for p in self._before(problem, found)]
+            least = min(reached, *before, np.inf)
             if claimed < least:
                 raise RunFailed(f"{told}, where |Q^-1 grad g|_Q is {truth:.3g}")
             if enough < least:

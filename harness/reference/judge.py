@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.reference.curvature import Curvature, curvature
-from harness.reference.exact import FIRM, Exact
+from harness.reference.exact import FIRM, Stationarity
 from harness.reference.minimiser import TO_THE_END
-from harness.reference.oracle import Oracle, Reading, sizes
+from harness.reference.oracle import Reading, sizes
 from harness.scenes.bind import Scene
 from harness.simulation.step import Step, prepare, simulate
-from solvers.problem import Positions, Solver, StepProblem, System
+from solvers.problem import Positions, Solver, StepProblem
 
 LOST = 1e-6
 """A reference step ends at most this far, in stationarity beyond round-off, from a stationary point."""
@@ -32,8 +32,7 @@ class Judge:
     def __init__(self, scene: Scene, reference: NDArray[np.float64] | None, *, minimises: bool) -> None:
         """reference: positions (frames, n, 3) [m], nan from the frame on in which there is none, None for none at all;
         minimises: whether the solver means to."""
-        self._oracles: dict[float, Oracle] = {}
-        self._exact: dict[float, Exact] = {}
+        self._stationarity = Stationarity()
         self._sizes = sizes(scene.system, scene.mesh.rest)
         self._reference, self._minimises = reference, minimises
 
@@ -53,27 +52,13 @@ class Judge:
         return row
 
     def stationarity(self, problem: StepProblem, p: Positions) -> Reading:
-        """As `Oracle` has it; a scene whose first step or every second one differs has two systems."""
-        exact = self._lengths(problem.system)
-        system = exact.augmented if exact else problem.system
-        if system.rate not in self._oracles:
-            self._oracles[system.rate] = Oracle(system)
-        oracle = self._oracles[system.rate]
-        if not exact:
-            return oracle.stationarity(problem, p)
-        tension = exact.tensions(problem, p)
-        slack = oracle.yardstick(exact.lagrangian(problem, np.zeros_like(tension)))
-        return oracle.stationarity(exact.lagrangian(problem, tension), p, slack)
+        """See `harness.reference.exact.Stationarity`."""
+        return self._stationarity(problem, p)
 
     def curvature(self, problem: StepProblem, p: Positions) -> Curvature:
         """That of the objective, or of a Lagrangian whose penalties are large."""
-        exact = self._lengths(problem.system)
+        exact = self._stationarity.exact(problem.system)
         return curvature(exact.lagrangian(problem, exact.tensions(problem, p), FIRM) if exact else problem, p)
-
-    def _lengths(self, system: System) -> Exact | None:
-        if system.lengths and system.rate not in self._exact:
-            self._exact[system.rate] = Exact(system)
-        return self._exact.get(system.rate)
 
 
 def reference(scene: Scene, solver: Solver, *, first_guess: str, frames: int) -> NDArray[np.float64]:

@@ -6,9 +6,11 @@ An edge of length l that is exact has a tension t [N] and a stiffness k [N/m]:
     t <- k (l + t/k - clip(l + t/k, low, high)),   k <- min(k + beta |l - clip(l, low, high)|, bound k_0)     after it
 
 so t tends to the Lagrange multipliers of the step (`solvers.energies.augmented`), and lengths to what they may be,
-whatever k is. Here beta = ramp k_0/high and k_0 = 1/(1/q_i + 1/q_j), what the ends hold themselves with, where the
-paper has a beta of 10 N/m^2 and begins with 1 N/m: so units of mass, length and time do not matter. A larger ramp mends
-lengths sooner, and leaves more of the gradient meanwhile.
+whatever k is. A solve ends by its tolerance where the gradient that the best multipliers leave is small enough
+(`solvers.core.multipliers`): the tensions t may cancel it while lengths are still wrong. Here beta = ramp k_0/high and
+k_0 = 1/(1/q_i + 1/q_j), what the ends hold themselves with, where the paper has a beta of 10 N/m^2 and begins with 1
+N/m: so units of mass, length and time do not matter. A larger ramp mends lengths sooner, and leaves more of the
+gradient meanwhile.
 
 A step begins with gamma t and max(gamma k, k_0) of the step before, which the solution keeps for it, gamma = `decay`.
 With `stabilisation` alpha limits are alpha times wider by what was off when the step began, l - alpha (l^t - clip l^t):
@@ -35,10 +37,13 @@ from numpy.typing import NDArray
 from solvers.about import About, Reference
 from solvers.core.bounds import is_bounded
 from solvers.core.driver import Iterating, Iterative
+from solvers.core.multipliers import Multipliers
 from solvers.energies.augmented import Augmented, augmented, joined, off, penalties
 from solvers.energies.springs import Springs
 from solvers.held import Lengths
 from solvers.kernels import avbd as kernels
+from solvers.kernels import loop
+from solvers.kernels.loop import Limits
 from solvers.methods.local_global_compiled import CompiledLocalGlobal
 from solvers.methods.vbd import PreparedVertexBlockDescent, Sweeps, VertexBlockDescent
 from solvers.problem import Positions, Prepared, StepProblem, System, Unsupported
@@ -125,6 +130,11 @@ class PreparedAugmented(Iterative):
     most: NDArray[np.float64]
     exact: NDArray[np.bool_]
 
+    @cached_property
+    def multipliers(self) -> Multipliers:
+        """Those of the exact lengths, by least squares."""
+        return Multipliers(self._with(np.zeros(len(self.least))), self._exact_lengths, self.least[self.exact])
+
     @property
     def choice(self) -> str:
         """See Prepared."""
@@ -149,9 +159,13 @@ class PreparedAugmented(Iterative):
 
     def _with(self, tension: NDArray[np.float64]) -> System:
         """The system of L, of exact lengths and the energies that there are."""
+        exact = self.exact
+        return augmented(self.system, self._exact_lengths, self.least[exact], tension[exact])
+
+    @cached_property
+    def _exact_lengths(self) -> Lengths:
         e, exact = self.edges, self.exact
-        lengths = Lengths(e.edges[exact], e.low[exact], e.high[exact], e.rest_direction[exact])
-        return augmented(self.system, lengths, self.least[exact], tension[exact])
+        return Lengths(e.edges[exact], e.low[exact], e.high[exact], e.rest_direction[exact])
 
     @cached_property
     def _gauge(self) -> Idle:
@@ -199,8 +213,34 @@ class Augmenting(Sweeps):
         return np.column_stack([self._duals.tension, self._duals.stiffness])
 
     def residual(self) -> float:
-        """See Iterating; with the tensions that it has."""
+        """With the tensions that it has: it may be small where lengths are wrong."""
         return self._augmented.residual(self._problem, self.positions, self._duals.tension)
+
+    def residual_of_step(self) -> float:
+        """The residual [J^(1/2)] with the multipliers of least squares, in which wrong lengths count."""
+        if not np.isfinite(self.positions).all():
+            return self.residual()
+        tension = np.zeros(len(self._duals.exact))
+        tension[self._duals.exact] = self._augmented.multipliers.at(self._problem, self.positions)
+        return self._augmented.residual(self._problem, self.positions, tension)
+
+    def iterate(self, limits: Limits) -> tuple[int, float, int]:
+        """See Iterating; the residual is that of the step.
+
+        It takes a factorisation, so it is looked at where that with the method's own tensions is small enough, and then
+        again whenever half as many iterations have been done since as at the last look.
+        """
+        count, residual, ended = super().iterate(limits)
+        if limits.wanted == loop.NEVER or not self._duals.exact.any():
+            return count, residual, ended
+        residual, since = self.residual_of_step(), 0
+        while ended == loop.TOLERANCE and not residual <= limits.limit:
+            some = min(1 + since // 2, limits.iterations - count)
+            if some == 0:
+                return count, residual, loop.ITERATIONS
+            self.sweep(some)
+            count, since, residual = count + some, since + some, self.residual_of_step()
+        return count, residual, ended
 
     def sweep(self, iterations: int) -> None:
         """That many, each with a dual step after it."""

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.base.errors import InputError
+from harness.base.errors import InputError, RunFailed
 from harness.config.load import load_scene
 from harness.reference.exact import Exact
+from harness.reference.grade import Graded
 from harness.reference.judge import Judge
 from harness.scenes.bind import Scene, build
 from harness.scenes.effects.gravity import Gravity
@@ -21,15 +22,17 @@ from harness.scenes.mesh.chain import Chain
 from harness.scenes.mesh.grid import Net
 from harness.scenes.spec import SceneSpec
 from harness.simulation.opinion.second import second_opinion
+from harness.simulation.passing import Passing
 from harness.simulation.step import prepare, simulate
 from solvers import registry
 from solvers.energies import springs
 from solvers.energies.augmented import joined, off
 from solvers.held import Lengths
 from solvers.methods.avbd import AugmentedVertexBlockDescent as Avbd
+from solvers.methods.avbd import PreparedAugmented
 from solvers.methods.newton import Newton
 from solvers.methods.vbd import VertexBlockDescent
-from solvers.problem import StepProblem, StopRule, Unsupported
+from solvers.problem import Solution, StepProblem, StopRule, Unsupported
 from tests.scenes import first_problem, scene
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "exact"
@@ -155,6 +158,99 @@ def test_softened_springs_end_at_the_minimum():
     stated = replace(stated, system=replace(stated.system, energies=(ratio,)))
     end = Newton().prepare(stated.system).solve(stated, StopRule(200)).positions
     assert np.abs(end - solved(stated, softened=True, ramp=1e6).positions).max() < 1e-6
+
+
+CLAIMS = {
+    "three links": lambda: chain(4, mass=1.0),
+    "nine links": lambda: chain(10, mass=1.0),
+    "limits": limited,
+}
+
+
+@pytest.mark.parametrize("case", CLAIMS)
+def test_a_step_that_ends_by_its_tolerance_has_no_more_of_the_gradient_left(case):
+    """By the tensions that are best at its end, which the method need not have reached yet."""
+    bound = CLAIMS[case]()
+    judge = Judge(bound, None, minimises=True)
+    for step in simulate(bound, prepare(bound, Avbd()), StopRule(20_000, 1e-6), first_guess="current", frames=6):
+        reached = judge.stationarity(step.problem, step.solution.positions).reached
+        assert step.solution.stopped == "tolerance"
+        assert reached <= 1.01e-6
+        np.testing.assert_allclose(step.solution.residual / step.solution.yardstick, reached, rtol=1e-3, atol=1e-12)
+
+
+def test_a_residual_without_a_tolerance_is_that_of_the_step_too():
+    bound = chain(9, mass=1.0)
+    stated = first_problem(bound)
+    found = Avbd().prepare(stated.system).solve(stated, StopRule(40))
+    judge = Judge(bound, None, minimises=True)
+    reading, scale = judge.stationarity(stated, found.positions), solved(stated).yardstick
+    np.testing.assert_allclose(found.residual, reading.reached * scale, rtol=1e-6)
+
+
+def test_multipliers_of_a_hanging_chain_are_what_hangs_below():
+    """At rest they are found by hand; a length that is off by e beside that asks for its stiffness times e."""
+    stated = first_problem(chain(4, DOWN, mass=1.0))
+    made = Avbd().prepare(stated.system)
+    assert isinstance(made, PreparedAugmented)
+    weight = 9.81 * np.cumsum(stated.system.mass[:0:-1])[::-1]
+    np.testing.assert_allclose(made.multipliers.at(stated, stated.current), weight, rtol=1e-9)
+
+
+def test_multipliers_of_limits_pull_where_a_limit_holds_and_nowhere_else():
+    """One vertex between two pins, pulled along the line to beyond one limit: that edge pulls, the other is slack."""
+    ends = Pins.model_validate({"at": ["ends"], "weight": "exact"})
+    limits = StrainLimits.model_validate({"stiffness": "exact", "longest": 1.05})
+    stated = first_problem(scene(Chain(length=2.0), Springs(stretch=1.0, rule="fixed"), limits, ends, size=3, mass=3.0))
+    m, dt = stated.system.mass[1], stated.system.time_step
+    p, target = stated.current.copy(), stated.current.copy()
+    p[1, 0] += 0.05
+    target[1, 0] += 0.05 + 4.0 * dt**2 / m
+    stated = replace(stated, target=target)
+    made = Avbd().prepare(stated.system)
+    assert isinstance(made, PreparedAugmented)
+    found = made.multipliers.at(stated, p)
+    np.testing.assert_allclose(found, [4.0 - 2.0 * 0.05, 0.0], atol=1e-9)  # less what both springs take of it
+
+
+@pytest.mark.parametrize("stabilisation", [0.0, 0.25, 1.0])
+def test_a_stabilised_step_keeps_that_part_of_the_error_it_begins_with(stabilisation):
+    """A link of 1 m that begins 0.1 m too long ends at 1 m and that part of 0.1 m."""
+    stated = first_problem(chain(2, mass=1.0))
+    begun = stated.start.positions.copy()
+    begun[1] = begun[0] + 1.1 * (begun[1] - begun[0])
+    stated = replace(stated, start=replace(stated.start, positions=begun))
+    found = Avbd(stabilisation=stabilisation).prepare(stated.system).solve(stated, StopRule(2000))
+    (away,) = off(joined(stated.system.lengths), found.positions)
+    np.testing.assert_allclose(away, stabilisation * 0.1, atol=1e-9)
+
+
+class _Claiming(Passing):
+    """Says of its answers that a part of the residual is left."""
+
+    def __init__(self, prepared, part: float) -> None:
+        super().__init__(prepared)
+        self._part = part
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        found = self._prepared.solve(problem, stop)
+        return replace(
+            found, residual=self._part * found.residual, stopped="tolerance" if stop.tolerance else found.stopped
+        )
+
+
+def test_a_false_residual_of_exact_lengths_is_found():
+    """One that is a hundred times too small, and an early end by a tolerance that was not reached."""
+    stated = first_problem(chain(4, mass=1.0))
+    made = Avbd().prepare(stated.system)
+    for part, stop, said in ((1.0, StopRule(8), ""), (0.01, StopRule(8), "where"), (1.0, StopRule(8, 1e-6), "left")):
+        graded = Graded(_Claiming(made, part), Avbd(), {1})
+        if said:
+            with pytest.raises(RunFailed, match=said):
+                graded.solve(stated, stop)
+        else:
+            graded.solve(stated, stop)
+            assert graded.found[1]["graded"] > 0.0
 
 
 HARD = {

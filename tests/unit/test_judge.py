@@ -14,6 +14,7 @@ from harness.config.load import load_any
 from harness.experiments.plan import Files
 from harness.experiments.run import execute
 from harness.record.reader import read_replay
+from harness.reference.curvature import curvature
 from harness.reference.judge import Judge, is_minimum, reference
 from harness.reference.oracle import Oracle
 from harness.report.robustness import (
@@ -34,11 +35,14 @@ from harness.report.robustness import (
 )
 from harness.report.robustness_map import draw_map, headline
 from harness.scenes.bind import Scene
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.mesh.chain import Chain
 from harness.simulation.step import simulate
 from solvers.methods.local_global import SparseLocalGlobal
 from solvers.methods.newton import Newton
 from solvers.problem import Positions, StepProblem, StopRule
-from tests.scenes import cloth, first_problem, random_problem
+from solvers.round_off import EPS
+from tests.scenes import cloth, first_problem, random_problem, scene
 
 
 def stated() -> StepProblem:
@@ -80,6 +84,14 @@ def walked(made: Scene, judge: Judge, tolerance: float) -> list[dict]:
     prepared = Newton().prepare(made.system)
     steps = simulate(made, prepared, StopRule(200, tolerance), first_guess="current", frames=4)
     return [judge(step) for step in steps]
+
+
+def test_the_doubt_of_a_curvature_is_four_roundings_of_its_sums():
+    """Without springs the Hessian is m/dt^2: exact, the same everywhere, and so is |x|'|H||x|."""
+    stated = first_problem(scene(Chain(), Gravity(), size=2, mass=6.0, time_step=0.1))
+    found = curvature(stated, stated.current)
+    np.testing.assert_allclose(found.smallest, 3.0 / 0.1**2, rtol=1e-12)
+    np.testing.assert_allclose(found.doubt, 4.0 * EPS * 3.0 / 0.1**2, rtol=1e-9)
 
 
 def test_a_converged_run_is_stationary_and_where_the_reference_is():

@@ -1,0 +1,91 @@
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# SciPy's stubs say little of sparse matrices.
+"""The multipliers of exact lengths at a point, by least squares: they say how far it is from a minimum of the step.
+
+    minimise grad g . d + |d|_Q^2 / 2   such that   low <= l + n . A d <= high
+
+    [ Q    J' ] [d]   [ -grad g   ]
+    [ J  -eps ] [t] = [ bound - l ]       of the lengths that a limit holds, J = n A
+
+(Nocedal and Wright 2006, section 18.1.) The multipliers t [N] leave the least gradient, in the norm of Q^-1, once the
+lengths are mended. A method's own multipliers may cancel the gradient while lengths are still wrong: a residual by them
+is not one of the step. Which limits hold, a primal-dual active set finds (Hintermueller, Ito and Kunisch 2002).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import block_array, coo_array, csc_array, csr_array, diags_array, kron
+from scipy.sparse.linalg import splu
+
+from solvers.energies.edges import directions
+from solvers.held import Lengths
+from solvers.matrices import assemble
+from solvers.problem import Positions, ProjectiveEnergy, StepProblem, System
+
+_COMPLIANCE = 1e-10
+"""Of 1/k, eps: lengths that follow from others make nothing singular. Refinement takes its effect out again."""
+_REFINEMENTS = 4
+_CHANGES = 50
+"""Of the active set, at most."""
+
+
+class Multipliers:
+    """The multipliers of a system's lengths."""
+
+    def __init__(self, augmented: System, lengths: Lengths, stiffness: NDArray[np.float64]) -> None:
+        """augmented: the system with penalties of these stiffnesses (m,) [N/m], which are in Q, and no exact lengths.
+        Raises NotPositiveDefinite."""
+        Q = assemble(augmented, [e for e in augmented.energies if isinstance(e, ProjectiveEnergy)])
+        free = augmented.free
+        self._lengths, self._stiffness = lengths, stiffness
+        self._Q = csr_array(kron(Q[free][:, free], np.eye(3)))
+        self._column = np.full((augmented.vertices, 3), -1)
+        self._column[free] = np.arange(3 * len(free)).reshape(-1, 3)
+        self._free = free
+
+    def at(self, problem: StepProblem, p: Positions) -> NDArray[np.float64]:
+        """The multipliers (m,) [N] of a step at p (n, 3) [m], zero where a length is within its limits."""
+        x, k = self._lengths, self._stiffness
+        length, n = directions(p[x.edges[:, 0]] - p[x.edges[:, 1]], x.rest_direction)
+        J, downhill = self._jacobian(n), -problem.gradient(p)[self._free].ravel()
+        tension = k * (length - np.clip(length, x.low, x.high))
+        active = self._active(length, tension)
+        for _ in range(_CHANGES):
+            (held,) = np.nonzero(active)
+            bound = np.where(active > 0, x.high, x.low)[held]
+            step, found = self._solved(J[held], k[held], downhill, bound - length[held])
+            tension = np.zeros(len(k))
+            tension[held] = found
+            before, active = active, self._active(length + J @ step, tension)
+            if np.array_equal(before, active):
+                break
+        return tension
+
+    def _active(self, length: NDArray[np.float64], tension: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The limit that holds each length: 1 the longest, -1 the shortest, 0 none."""
+        x, trial = self._lengths, length + tension / self._stiffness
+        return np.where((trial > x.high) | (x.low == x.high), 1, np.where(trial < x.low, -1, 0))
+
+    def _jacobian(self, n: Positions) -> csr_array:
+        """The derivatives of lengths (m, 3 f) by the coordinates of free vertices."""
+        columns = self._column[self._lengths.edges].reshape(len(n), 6)
+        rows = np.repeat(np.arange(len(n)), 6).reshape(-1, 6)
+        values, there = np.hstack([n, -n]), columns >= 0
+        shape = len(n), self._Q.shape[0]
+        return csr_array(coo_array((values[there], (rows[there], columns[there])), shape=shape))
+
+    def _solved(
+        self, J: csr_array, k: NDArray[np.float64], downhill: NDArray[np.float64], open: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """d [m] and t [N]."""
+        if not len(k):
+            return np.asarray(splu(csc_array(self._Q)).solve(downhill)), np.empty(0)
+        K = csc_array(block_array([[self._Q, J.T], [J, None]]))
+        right = np.concatenate([downhill, open])
+        compliance = np.concatenate([np.zeros(len(downhill)), -_COMPLIANCE / k])
+        factor, x = splu(csc_array(K + diags_array(compliance))), np.zeros_like(right)
+        for _ in range(_REFINEMENTS):
+            x += factor.solve(right - K @ x)
+        return x[: len(downhill)], x[len(downhill) :]
