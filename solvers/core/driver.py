@@ -32,6 +32,9 @@ _NEAR = 1e-12
 """Of `Iterative.scale`: what no round-off exceeds, by far. It is thousands of the last digits of all that is added up,
 whatever has most of them."""
 
+_DISTANT = 1e5
+"""Of the extent: from coordinates so large on, round-off at rest is told by what iterations still gain."""
+
 _CLOSE = 1e-5
 """A tolerance from which on the last point should be a minimum; a greater one asks for less than that."""
 
@@ -132,7 +135,8 @@ class Iterative(ABC):
         """As `run.iterate`, but FLOOR only where the gradient is round-off, vertex by vertex.
 
         That is looked at where the residual is near to it, and then again after one more iteration, and whenever half
-        as many have been done since as at the last look.
+        as many have been done since as at the last look. Far from the origin that bound is mostly the rounding of
+        coordinates whose differences are exact: there iterations go on while each halves the residual.
         """
         count, residual, ended = run.iterate(limits)
         since = 0
@@ -143,6 +147,12 @@ class Iterative(ABC):
             more, residual, ended = run.iterate(limits._replace(iterations=some, floor=0.0))
             count, since = count + more, since + more
             ended = loop.FLOOR if ended == loop.ITERATIONS else ended
+        while ended == loop.FLOOR and is_distant(run.positions) and count < limits.iterations:
+            more, less, ended = run.iterate(limits._replace(iterations=1, floor=0.0))
+            count, settled, residual = count + more, not less <= 0.5 * residual, less
+            ended = loop.TOLERANCE if ended == loop.TOLERANCE else loop.FLOOR
+            if settled:
+                break
         return count, residual, ended
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
@@ -183,6 +193,11 @@ class Substeps(Iterating):
         self._substeps += limits.iterations
         self.positions, self.velocity = self._step(self._problem, self._substeps)
         return limits.iterations, float("nan"), loop.ITERATIONS
+
+
+def is_distant(p: Positions) -> bool:
+    """Whether positions (n, 3) [m] are so far from the origin that their rounding exceeds that of their differences."""
+    return bool(np.abs(p).max(initial=0.0) > _DISTANT * np.ptp(p, axis=0).max(initial=0.0)) if len(p) else False
 
 
 def largest(problem: StepProblem) -> float:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from tests.mutations.archive import ARCHIVE
 from tests.mutations.device import DEVICE
 from tests.mutations.energies import ENERGIES
+from tests.mutations.energy_balance import ENERGY_BALANCE
+from tests.mutations.exact_lengths import EXACT_LENGTHS
 from tests.mutations.gates import GATES
 from tests.mutations.measuring import MEASURING
 from tests.mutations.pictures import PICTURES
 from tests.mutations.steps import STEPS
 
-TABLE = ENERGIES + STEPS + MEASURING + PICTURES + DEVICE + ARCHIVE + GATES
+TABLE = ENERGIES + STEPS + MEASURING + PICTURES + DEVICE + ARCHIVE + GATES + EXACT_LENGTHS + ENERGY_BALANCE

@@ -8,9 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from harness.config.load import load_scene
-from harness.scenes.bind import build
+from harness.scenes.bind import Scene, build
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.pins import Pins as PinsEffect
+from harness.scenes.effects.springs import Springs as SpringsEffect
+from harness.scenes.mesh.grid import Net
+from harness.simulation.step import prepare, simulate
 from harness.simulation.trace import EnergyNorm, trace
 from solvers.core.prefactored import only_springs
 from solvers.methods.lbfgs import Lbfgs
@@ -18,7 +24,7 @@ from solvers.methods.local_global import SparseLocalGlobal
 from solvers.methods.newton import Newton
 from solvers.problem import StepProblem, StopRule
 from solvers.round_off import FACTOR, at_rest, gradient_round_off, lengths
-from tests.scenes import BACKENDS, beside, cloth, first_problem, moved, random_problem
+from tests.scenes import BACKENDS, beside, cloth, first_problem, moved, random_problem, scene
 
 HARD = Path(__file__).resolve().parents[2] / "configs" / "hard"
 
@@ -180,3 +186,21 @@ def test_another_component_does_not_change_where_the_first_one_stops(method, awa
     bound = FACTOR * gradient_round_off(problem, ends[0])
     for p in ends:
         assert (lengths(problem.gradient(p)) <= bound)[problem.system.unpinned].all()
+
+
+@pytest.mark.parametrize("away", [3.2e7, 1e6])
+def test_a_tolerance_far_from_the_origin_ends_where_round_off_does(away: float):
+    """Beside the same motion at the origin: as near as steps without a tolerance come, and not at a bound of sums."""
+    corners = PinsEffect.model_validate({"at": ["corners"], "weight": "exact"})
+    here = scene(Net(), SpringsEffect(stretch=300.0), Gravity(), corners, size=8)
+    shift = np.array([away, 0.0, 0.0])
+    there = replace(here, mesh=replace(here.mesh, rest=here.mesh.rest + shift), pin_targets=here.pin_targets + shift)
+
+    def ended(bound: Scene, tolerance: float | None) -> NDArray[np.float64]:
+        rule = StopRule(100, tolerance)
+        run = simulate(bound, prepare(bound, Newton()), rule, first_guess="current", frames=9)
+        return np.array([step.positions for step in run])
+
+    best = ended(here, 1e-12)
+    with_tolerance, without = (np.abs(ended(there, t) - shift - best).max() for t in (1e-6, None))
+    assert with_tolerance <= 2.0 * without + 1e-7  # which the tolerance itself leaves at the origin

@@ -1,0 +1,50 @@
+"""Errors in the balance of energy: what a motion has, what sources give, and what becomes of a run that gains."""
+
+from __future__ import annotations
+
+from tests.mutations.base import Mutation
+
+_BALANCE, _TESTS = "harness/simulation/energy_balance.py", ("tests/unit/test_energy_balance.py",)
+
+ENERGY_BALANCE = (
+    Mutation(
+        "kinetic-energy-doubled", _BALANCE, "return 0.5 * float(self._mass @", "return float(self._mass @", _TESTS
+    ),
+    Mutation(
+        "velocity-as-claimed",
+        _BALANCE,
+        "speed = step.state.now.velocity, moved / stated.system.time_step",
+        "speed = step.state.now.velocity, 0.0 * moved",
+        _TESTS,
+    ),
+    Mutation(
+        "drag-as-source",
+        _BALANCE,
+        "work.append(min(float(np.mean(taken)), self._work_of_forces(step, moved)))",
+        "work.append(float(np.mean(taken)))",
+        _TESTS,
+    ),
+    Mutation(
+        "pins-give-nothing",
+        _BALANCE,
+        "work.append(_dot(self._pull(stated, x)[self._exact], moved[self._exact]))",
+        "work.append(0.0)",
+        _TESTS,
+    ),
+    Mutation(
+        "load-left-out",
+        _BALANCE,
+        "-_dot(self._load, (p - self._first)[self._free]),",
+        "0.0,",
+        _TESTS,
+    ),
+    Mutation("growth-of-a-thousand", _BALANCE, "GROWTH = 1.0", "GROWTH = 1e4", _TESTS),
+    Mutation(
+        "growth-is-ok",
+        "harness/experiments/failure.py",
+        '"status": "energy-growth"',
+        '"status": "ok"',
+        _TESTS,
+    ),
+    Mutation("no-blow-up", "harness/simulation/observe.py", "if balance.exceeds(BLOW_UP):", "if False:", _TESTS),
+)

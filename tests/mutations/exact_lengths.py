@@ -1,0 +1,54 @@
+"""Errors in exact lengths: their multipliers, the residual that ends a solve, and the dual step."""
+
+from __future__ import annotations
+
+from tests.mutations.base import Mutation
+
+_MULTIPLIERS, _AVBD, _GRADE = "solvers/core/multipliers.py", "solvers/methods/avbd.py", "harness/reference/grade.py"
+_TESTS = "tests/unit/test_avbd.py"
+
+EXACT_LENGTHS = (
+    Mutation(
+        "multipliers-of-one-limit",
+        _MULTIPLIERS,
+        "return np.where((trial > x.high) | (x.low == x.high), 1, np.where(trial < x.low, -1, 0))",
+        "return np.ones(len(trial), np.int64)",
+        (_TESTS,),
+    ),
+    Mutation("multipliers-halved", _MULTIPLIERS, "tension[held] = found", "tension[held] = 0.5 * found", (_TESTS,)),
+    Mutation(
+        "multipliers-of-lengths-unmended",
+        _MULTIPLIERS,
+        "right = np.concatenate([downhill, open])",
+        "right = np.concatenate([downhill, 0.0 * open])",
+        (_TESTS,),
+    ),
+    Mutation(
+        "ended-by-own-multipliers",
+        _AVBD,
+        "while ended == loop.TOLERANCE and not residual <= limits.limit:",
+        "while False:",
+        (_TESTS,),
+    ),
+    Mutation(
+        "exact-lengths-exempt",
+        _GRADE,
+        "if self._done in self._frames and np",
+        "if self._done in self._frames and not problem.system.lengths and np",
+        (_TESTS,),
+    ),
+    Mutation(
+        "stabilisation-halved",
+        _AVBD,
+        "past = method.stabilisation * np.where",
+        "past = 0.5 * method.stabilisation * np.where",
+        (_TESTS,),
+    ),
+    Mutation(
+        "doubt-a-hundredth",
+        "harness/reference/curvature.py",
+        "here = Curvature(smallest, 4.0 * (sums + moved), direction, solve)",
+        "here = Curvature(smallest, 0.04 * (sums + moved), direction, solve)",
+        ("tests/unit/test_judge.py",),
+    ),
+)
