@@ -26,6 +26,8 @@ from harness.record.reader import Summary, open_recording, read_replay, summary
 
 _SURFACE = (".obj", ".ply", ".stl", ".vtk", ".vtp")
 _LINES = (".vtk", ".vtp")
+_SINGLE = (".ply", ".stl")
+"""Formats of single precision, which does not resolve a mesh far from zero."""
 _MOST = 50
 """Recordings of a folder that are opened together."""
 _MILLISECONDS = "/milliseconds/"
@@ -173,6 +175,10 @@ def _export(replay: Replay, recording: Path, export: Path) -> None:
         which = "a surface" if len(replay.triangles) else "springs without a surface"
         problem = f"unknown suffix {export.suffix!r}; {recording.name} is {which}: one of {', '.join(allowed)}"
         raise InputError(Mistake(problem, file=export))
+    if replay.origin.any() and export.suffix in _SINGLE:
+        coarse = float(np.spacing(np.float32(np.abs(replay.origin).max()))) / 2
+        problem = f"has single precision, which moves vertices by up to {coarse:.2g} m this far from (0, 0, 0)"
+        raise InputError(Mistake(f"{problem}; export to .vtp, .vtk or .obj", file=export))
     import pyvista as pv  # slow to load, and most inspections export nothing
 
     from harness.report.render import spring_strain, vertex_strain

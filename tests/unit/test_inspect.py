@@ -22,7 +22,7 @@ from harness.record.reader import open_recording, read_replay
 from harness.report import inspect as module
 from harness.report.inspect import find_recordings, inspect, view
 from harness.scenes.mesh.files import File
-from tests.recordings import info, record
+from tests.recordings import MESHES, info, record, waving
 
 
 @pytest.fixture
@@ -80,6 +80,21 @@ def test_a_frame_is_exported_as_a_surface(suffix: str, cloth: Path, tmp_path: Pa
         assert np.abs(mesh.point_data["strain"]).max() == pytest.approx(
             replay.scalars["/strain/largest"][1][5], rel=1e-4
         )
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl", ".vtk", ".vtp"])
+def test_a_frame_far_from_zero_is_exported_in_double_precision_or_not_at_all(suffix: str, tmp_path: Path):
+    mesh = MESHES["cloth"]
+    of = replace(info(), mesh=replace(mesh, rest=mesh.rest + np.array([32e6, 0.0, 0.0])))
+    path, target = record(tmp_path / "a.rrd", of, count=3), tmp_path / f"mesh{suffix}"
+    if suffix in (".ply", ".stl"):
+        with pytest.raises(InputError, match=r"moves vertices by up to 1 m this far .* export to \.vtp"):
+            printed(path, export=target)
+        assert not target.exists()
+    else:
+        printed(path, export=target)
+        expected = [*waving(of, 3)][-1].positions
+        np.testing.assert_allclose(pv.read(target).points, expected, rtol=0, atol=1e-5)  # .obj: text
 
 
 def test_what_is_exported_is_read_as_a_mesh(cloth: Path, chain: Path, tmp_path: Path):

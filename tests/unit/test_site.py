@@ -19,6 +19,7 @@ from harness.base.errors import InputError
 from harness.report.site import build, keep, update
 from harness.report.site.failures import Failed, causes
 from harness.report.site.folders import folder_of
+from harness.report.site.overview import _pictures
 from harness.report.site.runs import table_of
 from harness.report.site.script import column
 from harness.report.site.sentences import sentences
@@ -44,6 +45,13 @@ def read(results: Path, name: str) -> Any:
     words = (results / "site" / "data" / f"{name}.js").read_text().strip()
     assert words.startswith(f"springbench.give({json.dumps(name)}, ")
     return json.loads(words.partition(", ")[2].removesuffix(");"))
+
+
+def test_the_overview_shows_times_beside_what_was_simulated(tmp_path: Path):
+    for name in ("timing", "net-9-numba-0123456789ab", "net-9-solvers", "net-5-solvers", "net-3-solvers"):
+        site_results.picture(tmp_path / "made" / "pictures" / f"{name}.png")
+    shown = _pictures(folder_of(tmp_path / "made", tmp_path))
+    assert [one["words"] for one in shown] == ["net 9 solvers", "net 5 solvers", "timing"]
 
 
 def cells(table: dict[str, Any], name: str) -> list[Any]:

@@ -20,7 +20,7 @@ from tests.browser import chromium
 from tests.recordings import record
 
 REPLAY = Path(viewer.__file__).parent / "static" / "replay.js"
-PAGE = '<!doctype html><html lang="en"><title>t</title><body><script src="site/replay.js"></script></body></html>'
+PAGE = '<!doctype html><html lang="en" data-theme=""><title>t</title><body><script src="site/replay.js"></script></body></html>'
 
 
 def test_the_viewer_is_the_one_that_the_page_was_written_for():
@@ -83,6 +83,17 @@ def colours(picture: bytes) -> int:
     return len(np.unique(np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).reshape(-1, 3), axis=0))
 
 
+def test_the_viewer_is_given_a_theme_that_it_knows_and_hidden_until_a_recording_is_open():
+    """A page that follows the system has an empty theme, of which the viewer complains; see the long test below too."""
+    text = REPLAY.read_text()
+    assert 'theme: document.documentElement.dataset.theme || (dark ? "dark" : "light")' in text
+    assert (
+        text.index('canvas.style.visibility = "hidden"')
+        < text.index("recording_open")
+        < text.index("await handle.start")
+    )
+
+
 @pytest.mark.long
 def test_a_page_replays_recordings_from_the_file_system_and_says_what_it_lacks(tmp_path: Path):
     page = site(tmp_path)
@@ -106,6 +117,7 @@ def test_a_page_replays_recordings_from_the_file_system_and_says_what_it_lacks(t
         said.clear()
         for _ in range(2):  # the second time without the first one's viewer in the way
             assert tab.evaluate(ask, ["site/a.js", "a.rrd"])
+            assert tab.evaluate("document.querySelector('.replay canvas').style.visibility") == ""
             assert tab.get_by_role("heading", name="cloth 6").is_visible()
             tab.wait_for_timeout(500)
             seen = 0
