@@ -20,7 +20,10 @@ from tests.browser import chromium
 from tests.recordings import record
 
 REPLAY = Path(viewer.__file__).parent / "static" / "replay.js"
-PAGE = '<!doctype html><html lang="en" data-theme=""><title>t</title><body><script src="site/replay.js"></script></body></html>'
+PAGE = (
+    '<!doctype html><html lang="en" data-theme=""><title>t</title>'
+    '<body><script src="site/replay.js"></script></body></html>'
+)
 
 
 def test_the_viewer_is_the_one_that_the_page_was_written_for():
