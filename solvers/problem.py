@@ -129,7 +129,8 @@ class Start:
     positions: p^t (n, 3) [m]; velocity: v^t, filters included, (n, 3) [m/s]; time: t [s]; origin (n, 3) [m] and rate
     [1/s]: the unknown x moves with the velocity rate (x - origin); until: the time of x [s] (nan, which spoils all that
     depends on it, where it is not told); ahead: how far [s] to extrapolate what is lagged; lagged: where it is taken
-    instead, (n, 3) [m]; acceleration: what the motion so far leads to expect, (n, 3) [m/s^2]; kept: by the last solve.
+    instead, (n, 3) [m]; acceleration: what the motion so far leads to expect, (n, 3) [m/s^2]; kept: by the last solve;
+    pressed: an iterate of x, (n, 3) [m], whose normal forces friction takes; None: those of the step's start.
     """
 
     positions: Positions
@@ -142,6 +143,7 @@ class Start:
     lagged: Positions | None = None
     acceleration: Positions | None = None
     kept: NDArray[np.float64] | None = None
+    pressed: Positions | None = None
 
     @property
     def expected(self) -> Positions:

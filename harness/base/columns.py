@@ -105,6 +105,19 @@ COLUMNS = (
         "stages", _INT, "", "unknowns of the step that were solved for, one after the other; energies are the last's"
     ),
     Column(
+        "friction_rounds",
+        _INT,
+        "",
+        "solves of the step, each with friction's normal forces from the one before; the most of its unknowns; null "
+        "without friction",
+    ),
+    Column(
+        "friction_change",
+        _REAL,
+        "",
+        "by what part of its largest force friction would change in a further round; the largest of its unknowns",
+    ),
+    Column(
         "stopped",
         _TEXT,
         "",

@@ -101,7 +101,7 @@ def moment_frames(violence: NDArray[np.float64], length: int) -> dict[str, int]:
 
 
 _ARRAYS = ("target", "force", "pin_targets", "current")
-_MAYBE = ("lagged", "acceleration", "kept")
+_MAYBE = ("lagged", "acceleration", "kept", "pressed")
 _START = tuple(field.name for field in fields(Start) if field.name not in _MAYBE)
 
 

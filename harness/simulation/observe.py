@@ -103,6 +103,8 @@ def columns(scene: Scene, step: Step, terms: Mapping[str, float], residual: floa
         "intersections": intersections(scene, p, scene.time(step.index)),
         "iterations": step.iterations,
         "stages": len(step.stages),
+        "friction_rounds": step.friction.rounds if step.friction else None,
+        "friction_change": step.friction.change if step.friction else None,
         "stopped": stopped(step),
         "residual": residual,
         "last_residual": s.residual,

@@ -36,7 +36,7 @@ class OnDevice(Passing):
 
     def keep(self, step: Step) -> None:
         """Take note of what a step took; steps come in their order."""
-        self._counts += [solution.iterations for _, solution in step.stages]
+        self._counts += step.counts
 
 
 class Staying(OnDevice):

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.scenes.bind import Scene
+from solvers.contact.friction_rounds import FrictionRounds, solve_with_friction
 from solvers.integrators import End, Motion, Solved, Staged, Unknown
 from solvers.problem import Positions, Prepared, Solution, Start, StepProblem, StopRule, Unsupported
 
@@ -23,11 +24,13 @@ Guess = Callable[[StepProblem], StepProblem]
 
 
 class Done(NamedTuple):
-    """Each unknown's problem and solution; how the step ends; all iterations."""
+    """Each unknown's problem and solution; how the step ends; the iterations of each solve; how friction was solved, of
+    the worst unknown."""
 
     stages: tuple[tuple[StepProblem, Solution], ...]
     end: End
-    iterations: int
+    counts: tuple[int, ...]
+    friction: FrictionRounds | None
 
 
 class Stages:
@@ -47,21 +50,23 @@ class Stages:
 
     def done(self, prepared: Prepared, stop: StopRule, guess: Guess) -> Done:
         """The step; prepared: for the scene's system."""
-        found, count, unknown = list[tuple[StepProblem, Solution]](), 0, next(self._unknowns)
+        found, counts, unknown = list[tuple[StepProblem, Solution]](), list[int](), next(self._unknowns)
+        friction = list[FrictionRounds]()
         while True:
-            stated = guess(self.stated(unknown))
-            solution = prepared.solve(stated, stop)
-            count += solution.iterations
+            solved = solve_with_friction(prepared, guess(self.stated(unknown)), stop)
+            counts += solved.counts
             for _ in range(self._again):
-                x = solution.positions
-                stated = replace(self.stated(unknown, x), first_guess=x)
-                solution = prepared.solve(stated, stop)
-                count += solution.iterations
+                x = solved.solution.positions
+                solved = solve_with_friction(prepared, replace(self.stated(unknown, x), first_guess=x), stop)
+                counts += solved.counts
+            stated, solution = solved.problem, solved.solution
             found.append((stated, solution))
+            friction += [solved.friction] if solved.friction else []
             try:
                 unknown = self._unknowns.send(self._solved(stated, solution))
             except StopIteration as ended:
-                return Done(tuple(found), self._ended(ended.value), count)
+                worst = FrictionRounds(*map(max, zip(*friction, strict=True))) if friction else None
+                return Done(tuple(found), self._ended(ended.value), tuple(counts), worst)
 
     def first(self) -> StepProblem:
         """The problem of the first unknown."""

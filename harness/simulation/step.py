@@ -15,6 +15,7 @@ from harness.scenes.bind import COARSEST, Scene
 from harness.simulation.algebraic import LocalErrors, Stated, Stop
 from harness.simulation.coarser import Coarser
 from harness.simulation.stages import Guess, Stages, require_mass
+from solvers.contact.friction_rounds import FrictionRounds, solve_with_friction
 from solvers.core.clearing import begun_free
 from solvers.core.driver import EXACT
 from solvers.integrators import IMPLICIT_EULER, Integrator, Motion
@@ -37,19 +38,26 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """A step that was done: its problem, its solution, the state after it and all of its iterations.
+    """A step that was done: its problem, its solution, the state after it and the iterations of each of its solves.
 
     A step of several unknowns has the problem and the solution of the last one; stages: those of all, in their order;
-    stop: by which each was solved; error: of the motion, by an embedded method, None without one.
+    stop: by which each was solved; friction: how friction was solved; error: of the motion, by an embedded method, None
+    without one.
     """
 
     problem: StepProblem
     solution: Solution
     state: State
-    iterations: int
+    counts: tuple[int, ...]
     stages: tuple[tuple[StepProblem, Solution], ...]
     stop: StopRule
+    friction: FrictionRounds | None = None
     error: Motion | None = None
+
+    @property
+    def iterations(self) -> int:
+        """Of all solves."""
+        return sum(self.counts)
 
     @property
     def index(self) -> int:
@@ -133,13 +141,14 @@ def simulate(
 def _single(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, state: State) -> Step:
     """The step of an integrator of one unknown."""
     stated = problem(scene, state, first_guess)
-    solution = prepared.solve(stated, stop)
+    solved = solve_with_friction(prepared, stated, stop)
+    stated, solution = solved.problem, solved.solution
     usual = scene.integrator
     assert isinstance(usual, Integrator)
     method = IMPLICIT_EULER if usual.history and state.before is None else usual
     before = Motion(stated.start.positions, stated.start.velocity)
     after = State(method.advance(stated.start, solution), before, state.index + 1, kept=solution.kept)
-    return Step(stated, solution, after, solution.iterations, ((stated, solution),), stop)
+    return Step(stated, solution, after, solved.counts, ((stated, solution),), stop, solved.friction)
 
 
 def _staged(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, state: State) -> Step:
@@ -147,7 +156,7 @@ def _staged(scene: Scene, prepared: Prepared, stop: StopRule, first_guess: str, 
     begun = _stages(scene, state)
     done = begun.done(prepared, stop, _of_stages(first_guess))
     after = State(done.end.motion, begun.now, state.index + 1, done.end.acceleration)
-    return Step(*done.stages[-1], after, done.iterations, done.stages, stop, done.end.error)
+    return Step(*done.stages[-1], after, done.counts, done.stages, stop, done.friction, done.end.error)
 
 
 def _stages(scene: Scene, state: State) -> Stages:

@@ -3,13 +3,14 @@
     E(x) = sum_i k_i/2 min(0, n_i.x_i - d_i)^2 + F_i h(|u_i|),   u_i = (I - n_i n_i')(x_i - a_i)
 
 n_i, d_i: the half-space that keeps the vertex out during this step (see `solvers.contact.planes`). a_i: where
-the vertex would be had it moved with the obstacle. F_i = mu k_i (depth at the step's start), so the normal force is
-lagged by one step (Kane et al. 1999, "Finite element analysis of nonsmooth contact"; Li et al. 2020, "Incremental
-potential contact", section 5). h is the length, rounded where a vertex slips by less than a step's `slip`:
+the vertex would be had it moved with the obstacle. F_i = mu k_i depth_i, with the depth at `Start.pressed`, an iterate
+of this step, or where that is None at the step's start (Li et al. 2020, "Incremental potential contact", section 5;
+`solvers.contact.friction_rounds` iterates it to convergence). h is the length, rounded where a vertex moves by less
+than `slip` = creep (t_x - t), with t_x the time of the unknown:
 
     h(u) = u^2/(2 slip) for u <= slip,   u - slip/2 beyond
 
-What sticks creeps by at most `slip` a step. Half-spaces, depth and friction refer to the end of the step: where the
+What sticks moves at most at the speed `creep`. Half-spaces, depth and friction refer to the end of the step: where the
 unknown is another time's position (see `solvers.integrators`), both are drawn nearer to the start in proportion.
 """
 
@@ -25,6 +26,7 @@ import scipy
 from numpy.typing import NDArray
 
 from solvers.contact import planes as contact_planes
+from solvers.contact.friction_rounds import ROUNDS
 from solvers.contact.law import LAW
 from solvers.contact.planes import HalfSpaces, Rounded
 from solvers.contact.touching import ContactRows
@@ -75,18 +77,21 @@ _NONE = Planes(np.empty(0, np.int64), _VECTORS, _NUMBERS, _VECTORS, _NUMBERS, _N
 class Contact:
     """Contact of all vertices with obstacles, at a thickness [m] from their surfaces.
 
-    friction: mu; stiffness: k (n,) [N/m]; slip [m]; margin [m]: how far forces may bring a vertex in one step beyond
-    where its velocity does; time_step: dt [s]; planes: of a step that has begun.
+    friction: mu; stiffness: k (n,) [N/m]; creep: speed below which a vertex sticks [m/s]; margin [m]: how far forces
+    may bring a vertex in one step beyond where its velocity does; time_step: dt [s]; friction_rounds: solves of a step
+    at most, each with the normal forces of the one before; planes, slip [m]: of a step that has begun.
     """
 
     obstacles: tuple[Obstacle, ...]
     thickness: float
     friction: float
     stiffness: Array
-    slip: float
+    creep: float
     margin: float
     time_step: float
+    friction_rounds: int = ROUNDS
     planes: Planes = field(default=_NONE)
+    slip: float = 0.0
 
     law: ClassVar[Law] = LAW
 
@@ -125,27 +130,42 @@ class Contact:
         way = contact_planes.near(p, v, self.time_step, frames, *self._near, touched)
         if way < 0.0:
             return self
-        when = (start.until - start.time) / self.time_step
-        found = [self._planes(p, v, self.obstacles[k], frames[k], way, when) for k in np.flatnonzero(touched)]
-        return replace(self, planes=Planes(*(np.concatenate(part) for part in zip(*found, strict=True))))
+        lasts = start.until - start.time
+        when, x = lasts / self.time_step, start.pressed
+        found = [self._planes(p, v, self.obstacles[k], frames[k], way, when, x) for k in np.flatnonzero(touched)]
+        planes = Planes(*(np.concatenate(part) for part in zip(*found, strict=True)))
+        return replace(self, planes=planes, slip=self.creep * lasts)
 
-    def _planes(self, p: Positions, v: Positions, obstacle: Obstacle, frames: Array, way: float, when: float) -> Planes:
-        """The half-spaces of one obstacle; when: the unknown's time within the step, 1 at its end."""
+    def _planes(
+        self,
+        p: Positions,
+        v: Positions,
+        obstacle: Obstacle,
+        frames: Array,
+        way: float,
+        when: float,
+        pressed: Positions | None,
+    ) -> Planes:
+        """The half-spaces of one obstacle; when: the unknown's time within the step, 1 at its end; pressed: where
+        friction's normal forces are taken (n, 3) [m], None for the step's start."""
         n, body = len(p), Rounded(obstacle.low, obstacle.high, obstacle.radius + self.thickness)
         found = HalfSpaces(np.empty(n, np.int64), np.empty((n, 3)), np.empty(n), np.empty((n, 3)))
         k = contact_planes.planes(p, v, self.time_step, frames, body, self.margin + way, found, np.empty((5, 3)))
         vertices, normal, offset, carried = found.vertices[:k], found.normal[:k], found.offset[:k], found.carried[:k]
-        depth, here = np.maximum(0.0, offset - _dots(normal, carried)), p[vertices]
-        stiffness = self.stiffness[vertices]
+        here, stiffness = p[vertices], self.stiffness[vertices]
         before = _dots(normal, here)
-        return Planes(
-            vertices,
-            normal,
-            before + when * (offset - before),
-            here + when * (carried - here),
-            stiffness,
-            self.friction * stiffness * when * depth,
-        )
+        depth, offset = when * (offset - _dots(normal, carried)), before + when * (offset - before)
+        if pressed is not None:
+            depth = offset - _dots(normal, pressed[vertices])
+        grip = self.friction * stiffness * np.maximum(0.0, depth)
+        return Planes(vertices, normal, offset, here + when * (carried - here), stiffness, grip)
+
+    def friction_gradient(self, p: Positions) -> Positions:
+        """The gradient of friction alone [N], shape (n, 3)."""
+        out = np.zeros_like(p)
+        if not self.idle():
+            self._add_friction_gradient(p, out)
+        return out
 
     def gap(self, p: Positions) -> Array:
         """n.x - d (k,) [m]."""
@@ -173,7 +193,10 @@ class Contact:
             return
         planes, gap = self.planes, self.gap(p)
         np.add.at(out, planes.vertices, (planes.stiffness * np.minimum(0.0, gap))[:, None] * planes.normal)
-        grips, u, length = self._slipped(p)
+        self._add_friction_gradient(p, out)
+
+    def _add_friction_gradient(self, p: Positions, out: Positions) -> None:
+        planes, (grips, u, length) = self.planes, self._slipped(p)
         np.add.at(out, planes.vertices[grips], (planes.grip[grips] / np.maximum(self.slip, length))[:, None] * u)
 
     def add_absolute_terms(self, p: Positions, out: Array) -> None:

@@ -1,10 +1,11 @@
-"""Coulomb friction of pairs, lagged by one step: a convex function of positions within the step.
+"""Coulomb friction of pairs with given normal forces: a convex function of positions within the step.
 
     E(p) = sum over pairs of mu F h(|u|),     u = (I - nn') sum_i c_i (x_i - x_i^t)
 
-F: the barrier's force at the step's start; c, n: where the pair is nearest there, and its direction (Li et al. 2020,
-"Incremental potential contact", section 5, with one lag a step: order 1 in the time step). h is the length, smoothed
-where a pair slips by less than s in a step; its slope is continuous, and below 1 there:
+F: the barrier's force at `Start.pressed`, an iterate of this step, or where that is None at the step's start; c, n:
+where the pair is nearest there, and its direction; x^t: the step's start (Li et al. 2020, "Incremental potential
+contact", section 5; `solvers.contact.friction_rounds` iterates them to convergence). h is the length, smoothed where a
+pair slips by less than s in a step; its slope is continuous, and below 1 there:
 
     h(u) = u^2/s - u^3/(3 s^2)  for u < s,     u - s/3 beyond
 """
@@ -37,12 +38,14 @@ class Grip(NamedTuple):
     slip: float
 
     @classmethod
-    def of(cls, contacts: Contacts, friction: float, slip: float) -> Self:
-        """What is in range at the step's start does in the step. slip: s [m]."""
-        between, force = contacts.between.copy(), np.empty(len(contacts.vertices))
+    def of(cls, contacts: Contacts, start: Positions, friction: float, slip: float) -> Self:
+        """The friction of contacts; start: all vertices' positions at the step's start [m]; slip: s [m]."""
+        between, force = contacts.between, np.empty(len(contacts.vertices))
         barrier.forces(contacts, force)
         normal = between / np.sqrt(np.einsum("ij,ij->i", between, between))[:, None]
-        return cls(contacts.vertices.copy(), contacts.weights.copy(), normal, between, friction * force, slip)
+        vertices, weights, anchor = contacts.vertices.copy(), contacts.weights.copy(), np.empty_like(between)
+        combine(vertices, weights, start, anchor)
+        return cls(vertices, weights, normal, anchor, friction * force, slip)
 
     def value(self, p: Positions) -> float:
         """The energy [J] at p (n, 3)."""
@@ -61,12 +64,26 @@ class Grip(NamedTuple):
 
 
 @inner
+def combined(x, c, p, axis):
+    """sum_i c_i p_i [m] along an axis."""
+    return c[0] * p[x[0], axis] + c[1] * p[x[1], axis] + c[2] * p[x[2], axis] + c[3] * p[x[3], axis]
+
+
+@kernel
+def combine(vertices, weights, p, out):
+    """Write sum_i c_i p_i [m] of each contact to `out`."""
+    for e in range(len(vertices)):
+        for axis in range(3):
+            out[e, axis] = combined(vertices[e], weights[e], p, axis)
+
+
+@inner
 def slipped(grip, p, e):
     """u and |u| [m] of contact e."""
     x, c, n = grip.vertices[e], grip.weights[e], grip.normal[e]
-    u0 = c[0] * p[x[0], 0] + c[1] * p[x[1], 0] + c[2] * p[x[2], 0] + c[3] * p[x[3], 0] - grip.anchor[e, 0]
-    u1 = c[0] * p[x[0], 1] + c[1] * p[x[1], 1] + c[2] * p[x[2], 1] + c[3] * p[x[3], 1] - grip.anchor[e, 1]
-    u2 = c[0] * p[x[0], 2] + c[1] * p[x[1], 2] + c[2] * p[x[2], 2] + c[3] * p[x[3], 2] - grip.anchor[e, 2]
+    u0 = combined(x, c, p, 0) - grip.anchor[e, 0]
+    u1 = combined(x, c, p, 1) - grip.anchor[e, 1]
+    u2 = combined(x, c, p, 2) - grip.anchor[e, 2]
     along = u0 * n[0] + u1 * n[1] + u2 * n[2]
     u0, u1, u2 = u0 - along * n[0], u1 - along * n[1], u2 - along * n[2]
     return u0, u1, u2, np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)

@@ -21,6 +21,7 @@ from solvers.contact import barrier, contacts, known
 from solvers.contact.blocks import Blocks, Room
 from solvers.contact.contacts import Contacts, Pairs, padded
 from solvers.contact.curvature import add_curvature, coupled, curvature, moving
+from solvers.contact.friction_rounds import ROUNDS
 from solvers.contact.grip import NO_GRIP, Grip
 from solvers.contact.known import Kept, Surfaces
 from solvers.problem import Positions, Start
@@ -49,11 +50,13 @@ class _Met(NamedTuple):
 class PairContact:
     """A barrier of pairs, and their friction. kept: what was found, the last first; met: at the last two positions that
     were asked about, for value, slopes and second derivatives are asked for in turn; room: for the latter; grip: of a
-    step that has begun; friction: mu; slip [m/s]: below it a pair counts as sticking."""
+    step that has begun; friction: mu; slip [m/s]: below it a pair counts as sticking; friction_rounds: solves of a step
+    at most, each with the normal forces of the one before."""
 
     surface: Surfaces
     friction: float = 0.0
     slip: float = 1e-3
+    friction_rounds: int = ROUNDS
     kept: list[Kept] = field(default_factory=list[Kept])
     met: list[_Met] = field(default_factory=list[_Met])
     room: Room = field(default_factory=Room)
@@ -65,17 +68,18 @@ class PairContact:
         return self.surface.thickness + self.surface.reach
 
     def begin_step(self, start: Start) -> Self:
-        """The energy of a step: what was in range at its start grips."""
+        """The energy of a step: what is in range where it is pressed grips."""
         if not self.friction:
             return self
-        grip = self._gripping(self.whole(start.positions), start)
+        begun = self.whole(start.positions)
+        grip = self._gripping(begun if start.pressed is None else self.whole(start.pressed), begun, start)
         return self if grip is self.grip else replace(self, grip=grip)
 
-    def _gripping(self, p: Positions, start: Start) -> Grip:
-        """p: all vertices at the step's start."""
+    def _gripping(self, p: Positions, begun: Positions, start: Start) -> Grip:
+        """p: all vertices where contacts and their normal forces are taken; begun: at the step's start."""
         if known.idle(self.surface, self.kept, p):
             return NO_GRIP
-        return Grip.of(self._at(p).contacts, self.friction, self.slip * (start.until - start.time))
+        return Grip.of(self._at(p).contacts, begun, self.friction, self.slip * (start.until - start.time))
 
     def whole(self, p: Positions) -> Positions:
         """Positions of all vertices that pairs name, those of the mesh (n, 3) first."""
@@ -110,9 +114,15 @@ class PairContact:
             if len(met.contacts.vertices):
                 out += met.gradient[:n]
         if len(self.grip.vertices):
-            total = np.zeros_like(p)
-            self.grip.add_gradient(p, total)
-            out += total[:n]
+            out += self.friction_gradient(p[:n])
+
+    def friction_gradient(self, p: Positions) -> Positions:
+        """The gradient of friction alone [N], shape (n, 3)."""
+        n, p = len(p), self.whole(p)
+        out = np.zeros_like(p)
+        if len(self.grip.vertices):
+            self.grip.add_gradient(p, out)
+        return out[:n]
 
     def blocks(self, p: Positions, keep: float = 1.0) -> Blocks:
         """The second derivatives of each contact in range at p (n, 3); keep: of what bends downwards."""
@@ -205,17 +215,21 @@ class ObstacleContact(PairContact):
     times: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(cls, surface: Surfaces, place: Place, carry: Carry, friction: float, slip: float) -> Self:
+    def of(
+        cls, surface: Surfaces, place: Place, carry: Carry, friction: float, slip: float, friction_rounds: int = ROUNDS
+    ) -> Self:
         """The contact at the time 0, before any step."""
         now = place(0.0)
-        return cls(surface, friction, slip, place=place, carry=carry, begun=now, placed=now, end=now)
+        return cls(surface, friction, slip, friction_rounds, place=place, carry=carry, begun=now, placed=now, end=now)
 
     def begin_step(self, start: Start) -> Self:
         """The energy of a step, with obstacles where they are at its end."""
         begun, end = self.place(start.time), self.place(start.until)
         step = replace(self, begun=begun, placed=end, end=end, times=(start.time, start.until))
         if self.friction:
-            step = replace(step, grip=step._gripping(np.concatenate([start.positions, begun]), start))
+            first = np.concatenate([start.positions, begun])
+            pressed = first if start.pressed is None else np.concatenate([start.pressed, end])
+            step = replace(step, grip=step._gripping(pressed, first, start))
         return step
 
     def whole(self, p: Positions) -> Positions:

@@ -28,13 +28,14 @@ _Rounded = planes.Rounded
 
 class Bodies(NamedTuple):
     """Of each obstacle: low, high (o, 3) and radius (o,) of its rounded box, thickness included [m]; margin (o,) [m],
-    friction (o,); stiffness (o, n) of each row [N/m]."""
+    friction (o,); creep (o,) [m/s]; stiffness (o, n) of each row [N/m]."""
 
     low: Any
     high: Any
     radius: Any
     margin: Any
     friction: Any
+    creep: Any
     stiffness: Any
 
 
@@ -49,12 +50,13 @@ def fastest(v, out):
 
 
 @cuda.jit
-def find(vertex, p, v, dt, when, square, frames, bodies, found, spaces):
+def find(vertex, p, v, dt, when, square, frames, bodies, found, rounds, pressed, spaces):
     """Write the half-spaces of the free rows, one for each obstacle; where a vertex comes near none of them it is
     empty. See `solvers.contact.energy.Contact`.
 
     p [m], v [m/s]: at the step's start, by vertices; when: the unknown's time within the step, 1 at its end; square: of
-    the largest speed; frames (o, 2, 4, 3): of obstacles; found: a view of `spaces`.
+    the largest speed; frames (o, 2, 4, 3): of obstacles; found: a view of `spaces`;
+    rounds: whether friction takes its normal forces at `pressed` (n, 3) [m], by vertices.
     """
     work = cuda.local.array((5, 3), np.float64)
     i, many = cuda.grid(1), bodies.radius.shape[0]
@@ -65,20 +67,23 @@ def find(vertex, p, v, dt, when, square, frames, bodies, found, spaces):
         for o in range(many):
             k, body = many * i + o, _Rounded(bodies.low[o], bodies.high[o], bodies.radius[o])
             if _plane(p, v, x, dt, frames[o], body, bodies.margin[o] + way, found, k, work):
-                before, lagged, stiffness = 0.0, 0.0, bodies.stiffness[o, i]
+                before, lagged, taken, stiffness = 0.0, 0.0, 0.0, bodies.stiffness[o, i]
                 for c in range(3):
                     n, here, carried = spaces.normal[k, c], p[x, c], spaces.anchor[k, c]
                     before += n * here
                     lagged += n * carried
+                    taken += n * pressed[x, c]
                     spaces.anchor[k, c] = here + when * (carried - here)
-                depth = max(0.0, spaces.offset[k] - lagged)
+                depth = when * (spaces.offset[k] - lagged)
                 spaces.offset[k] = before + when * (spaces.offset[k] - before)
-                spaces.stiffness[k], spaces.grip[k] = stiffness, bodies.friction[o] * stiffness * when * depth
+                depth = spaces.offset[k] - taken if rounds else depth
+                spaces.stiffness[k], spaces.slip[k] = stiffness, bodies.creep[o] * (when * dt)
+                spaces.grip[k] = bodies.friction[o] * stiffness * max(0.0, depth)
                 spaces.near[i] = True
             else:
                 for c in range(3):
                     spaces.normal[k, c], spaces.anchor[k, c] = 0.0, 0.0
-                spaces.offset[k], spaces.stiffness[k], spaces.grip[k] = -1.0, 0.0, 0.0
+                spaces.offset[k], spaces.stiffness[k], spaces.grip[k], spaces.slip[k] = -1.0, 0.0, 0.0, 1.0
         i += cuda.gridsize(1)
 
 

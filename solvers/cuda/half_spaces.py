@@ -38,14 +38,14 @@ class Spaces:
             up(np.array([one.radius + contact.thickness for contact, one in all_of])),
             up(np.array([contact.margin for contact, _ in all_of], np.float64)),
             up(np.array([contact.friction for contact, _ in all_of], np.float64)),
+            up(np.array([contact.creep for contact, _ in all_of], np.float64)),
             up(np.array([contact.stiffness[order] for contact, _ in all_of])),
         )
-        slots, slip = max(1, many * free), np.array([contact.slip for contact, _ in all_of])
+        slots = max(1, many * free)
         near: Any = stream.zeros(max(1, free), np.bool_)
         normal, anchor = (stream.zeros((slots, 3), np.float64) for _ in range(2))
-        offset, stiffness, grip = (stream.zeros(slots, np.float64) for _ in range(3))
+        offset, stiffness, grip, slip = (stream.zeros(slots, np.float64) for _ in range(4))
         first = up(many * np.arange(free + 1))
-        slip = up(np.resize(slip, slots))
         self.given = HalfSpaces(first, near, normal, anchor, offset, stiffness, grip, slip, both=False)
         given, one = self.given, stream.zeros(1, np.int64)
         self._found = planes.HalfSpaces(one, given.normal, given.offset, given.anchor)
@@ -62,7 +62,8 @@ class Spaces:
         half_space_kernels.fastest[self.over](step.velocity, self._square)
         half_space_kernels.find[self.over](
             self._vertex, step.positions, step.velocity, self._dt, (end - begin) / self._dt, self._square, self._frames,
-            self._bodies, self._found, self.given,
+            self._bodies, self._found, step.pressed is not None,
+            step.positions if step.pressed is None else step.pressed, self.given,
         )  # fmt: skip
 
     def add_gradient(self, rows: Any, out: Any) -> None:

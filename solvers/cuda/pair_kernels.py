@@ -26,7 +26,7 @@ _take, _press, _forces = shared(contacts.take), shared(barrier.press), shared(ba
 _terms, _weighed, _summed = shared(curvature.terms), shared(curvature.weighed), shared(curvature.summed)
 _crossed, _turned, _free = shared(mollifier.crossed), shared(mollifier.turned), shared(ways.free)
 _slipped, _rounded, _rate = shared(grip.slipped), shared(grip.rounded), shared(grip.rate)
-_bends, _bent = shared(grip.bends), shared(grip.bent)
+_bends, _bent, _combined = shared(grip.bends), shared(grip.bent), shared(grip.combined)
 _solved = shared(half_spaces.solved)
 _Pairs, _Contacts = Pairs, Contacts
 
@@ -150,8 +150,8 @@ def diagonal(found, terms, corner, i, work, out):
 
 
 @cuda.jit
-def hold(pairs, many, p, friction, grips, which, partials):
-    """Write which pairs grip in a step that starts at rows p; the first stage of how many."""
+def hold(pairs, many, p, begun, friction, grips, which, partials):
+    """Write which pairs grip at rows p in a step that starts at rows `begun`; the first stage of how many."""
     corner, one, tile, slot, found = space(pairs)
     force = cuda.local.array(1, np.float64)
     near, e = 0.0, cuda.grid(1)
@@ -162,11 +162,13 @@ def hold(pairs, many, p, friction, grips, which, partials):
             z, c = found.between[0], found.weights[0]
             length = math.sqrt(z[0] * z[0] + z[1] * z[1] + z[2] * z[2])
             for axis in range(3):
-                grips.anchor[e, axis], grips.normal[e, axis] = z[axis], z[axis] / length
+                grips.normal[e, axis] = z[axis] / length
             for k in range(4):
                 grips.weights[e, k] = 0.0
             for i in range(min(found.kind[0], 4)):
                 grips.weights[e, found.vertices[0, i]] = c[i]
+            for axis in range(3):
+                grips.anchor[e, axis] = _combined(grips.vertices[e], grips.weights[e], begun, axis)
             grips.force[e], grips.own[e] = friction * force[0], corners_of(found)
             near += 1.0
         e += cuda.gridsize(1)

@@ -89,24 +89,25 @@ class Touching:
         energy = self._energy
         return not isinstance(energy, ObstacleContact) or energy.place(0.0) is energy.place(1.0)
 
-    def begin(self, step: Step, start: Any, *everywhere: Any) -> None:
-        """A step: obstacles are where they are at its end in all these rows. start: rows of the mesh where it starts;
-        what is in range there grips."""
+    def begin(self, step: Step, start: Any, pressed: Any, *everywhere: Any) -> None:
+        """A step: obstacles are where they are at its end in all these rows but `start`, where it starts. What is in
+        range at the rows `pressed` grips, at its start where they are None."""
         (time, until), energy = step.times, self._energy
         if isinstance(energy, ObstacleContact):
-            for rows in everywhere:
+            for rows in everywhere if pressed is None else (pressed, *everywhere):
                 self._stream.put(energy.place(until), rows[self._first : self._first + self.obstacles])
             self._stream.put(energy.place(time), start[self._first : self._first + self.obstacles])
         self._gripping, self._grips = None, 0
         if not energy.friction:
             return
-        found, empty = self._candidates(start), self._stream.empty
+        p = start if pressed is None else pressed
+        found, empty = self._candidates(p), self._stream.empty
         room = max(1, found.many)
         weights, force, own = empty((room, 4), np.float64), empty(room, np.float64), empty(room, np.int64)
         grips = Grips(
             found.pairs.vertices, weights, empty((room, 3), np.float64), empty((room, 3), np.float64), force, own
         )
-        kernels.hold[self._sums.over](found.pairs, found.many, start, energy.friction, grips, 0, self._sums.partials)
+        kernels.hold[self._sums.over](found.pairs, found.many, p, start, energy.friction, grips, 0, self._sums.partials)
         self._grips = int(self._sums.read(1)[0])
         if self._grips:
             self._gripping = found, grips, self._room(found.many), energy.slip * (until - time)

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from solvers.contact.energy import Contact
+from solvers.contact.friction_rounds import has_friction
 from solvers.contact.self_contact import PairContact
 from solvers.core.driver import Iterating, Iterative
 from solvers.cuda import device, sums
@@ -198,6 +199,8 @@ def _constant(system: System, course: Course, *, own: bool) -> tuple[Positions, 
             if damps is None:
                 raise Unsupported(f"the host states {name} before each step: it couples velocities of vertices")
             drag += 0.0 if own else damps
+        elif has_friction(energy) and energy.friction_rounds > 1:
+            raise Unsupported(f"the host iterates the normal forces of {name}'s friction within each step")
         elif is_lagged(energy) and not isinstance(energy, Dashpots | Contact | PairContact):
             raise Unsupported(f"the host states {name} before each step")
         elif isinstance(energy, Quadratic):

@@ -29,7 +29,8 @@ class Step(NamedTuple):
     """On the device, by vertices. target, guess (n, 3) [m]; force (n, 3) [N], with that of forms; pins (q, 3): where
     they want their vertices [m], one row where there are none; origin, lagged (n, 3) [m]: of the unknown's velocity,
     and where dashpots take their directions, any of a network without these; positions [m], velocity [m/s]: at the
-    step's start (n, 3), any where a method that minimises touches nothing; times: of that, and of the unknown [s]."""
+    step's start (n, 3), any where a method that minimises touches nothing; times: of that, and of the unknown [s];
+    pressed (n, 3) [m]: where friction's normal forces are taken, None for the step's start."""
 
     target: Any
     force: Any
@@ -40,6 +41,7 @@ class Step(NamedTuple):
     positions: Any
     velocity: Any
     times: tuple[float, float]
+    pressed: Any = None
 
 
 class Places(NamedTuple):
@@ -92,7 +94,8 @@ class Uploaded:
         target, pins, start = up(problem.target), pins_of(problem, self.stream), problem.start
         lagged = (up(start.origin), up(start.expected)) if self.network.parts.dashpots else (target, target)
         begun = (up(start.positions), up(start.velocity)) if touches else (target, target)
-        return Step(target, up(force), up(guess), pins, *lagged, *begun, (start.time, start.until))
+        pressed = up(start.pressed) if touches and start.pressed is not None else None
+        return Step(target, up(force), up(guess), pins, *lagged, *begun, (start.time, start.until), pressed)
 
 
 def pin_numbers(system: System) -> NDArray[np.int32]:

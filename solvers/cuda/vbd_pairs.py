@@ -24,8 +24,8 @@ from solvers.kernels.line_search import DECREASE, falls, flattens
 
 
 class Guarded(StallingIterating):
-    """Rows (N, 3) [m]: p, where it is; older, the iterate before; q, where a way leads; trial; start, of the step; way:
-    from p. at: what pairs do at p, and at a trial."""
+    """Rows (N, 3) [m]: p, where it is; older, the iterate before; q, where a way leads; trial; start, of the step;
+    pressed: where friction's normal forces are taken; way: from p. at: what pairs do at p, and at a trial."""
 
     def __init__(self, made: Any, sweeps: Any) -> None:
         super().__init__(made.uploaded)
@@ -33,8 +33,8 @@ class Guarded(StallingIterating):
         stream, system, free = self.stream, made.system, made.made.free
         n, rows = system.vertices, system.vertices + pairs.obstacles(system)
         self._push = kernels.kernels(made.real).push
-        self._p, self._q, self._older, self._trial, self._start, self._way = (
-            stream.zeros((rows, 3), np.float64) for _ in range(6)
+        self._p, self._q, self._older, self._trial, self._start, self._pressed, self._way = (
+            stream.zeros((rows, 3), np.float64) for _ in range(7)
         )
         known = sum(hasattr(energy, "largest_step") for energy in system.energies)
         self._sums = pairs.Sums(stream, 1 + 3 * known, 4 * max(rows, len(made.uploaded.network.ends)))
@@ -61,8 +61,11 @@ class Guarded(StallingIterating):
         begun, over = self._sweeps.loaded, self._sums.over
         begun.take(step, self._p)
         kernels.by_rows[over](self.of.places.vertex, step.positions, self._start)
+        pressed = None if step.pressed is None else self._pressed
+        if pressed is not None:
+            kernels.by_rows[over](self.of.places.vertex, step.pressed, pressed)
         for pair in self._pairs:
-            pair.begin(step, self._start, self._p, self._q, self._older, self._trial)
+            pair.begin(step, self._start, pressed, self._p, self._q, self._older, self._trial)
         if self.at_rest:
             kernels.between[over](self._start, self._p, self._way)
             if self._reach(self._start, self._p) < 1.0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -67,7 +68,15 @@ def falls(made: Scene, drop: float, speed: float = 1.0) -> StepProblem:
     return problem(made, State(state.now._replace(positions=p, velocity=v), None, 0), "current")
 
 
+def pressed(made: StepProblem) -> StepProblem:
+    """The step with friction's normal forces where the processor is after some iterations."""
+    x = iterates(VertexBlockDescent(), made, ITERATIONS)[-1].copy()
+    return replace(made, first_guess=x, start=replace(made.start, pressed=x))
+
+
 PROBLEMS: dict[str, Callable[[], StepProblem]] = {
+    "a further round of friction": lambda: pressed(falls(sheets(APART), 0.066)),
+    "a further round of friction on a box that rises": lambda: pressed(falls(on_corner(RISES), 0.06)),
     "sheets in range": lambda: falls(sheets(APART), 0.066),
     "sheets that arrive from out of range": lambda: falls(sheets(APART), 0.0, 4.0),
     "a box that rises": lambda: falls(on_corner(RISES), 0.06),
@@ -131,7 +140,10 @@ def test_where_a_sweep_does_not_descend_rows_go_by_themselves(monkeypatch: pytes
 
 
 def test_steps_with_pairs_stay_there_and_are_the_processors() -> None:
-    made, settings = sheets(APART, apart=0.04), Settings(StopRule(2), "inertial", 2, 1)
+    made, settings = (
+        sheets(APART.model_copy(update={"friction_rounds": 1}), apart=0.04),
+        Settings(StopRule(2), "inertial", 2, 1),
+    )
     on_it, there = staying(made, VertexBlockDescent(device="cuda", precision="float64"), "inertial"), list[Any]()
     for step in steps(made, on_it, settings):
         on_it.keep(step)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
-from harness.simulation.step import State, problem, start
+from harness.simulation.measure import Settings, steps
+from harness.simulation.on_device import Replayed, on_device
+from harness.simulation.step import State, prepare, problem, start
 from solvers.contact.energy import Contact
 from solvers.methods.vbd import VertexBlockDescent
-from solvers.problem import StepProblem
+from solvers.problem import StepProblem, StopRule
 from tests import contacts
 from tests.cuda.near import iterates, same_iterates
 
@@ -32,6 +37,30 @@ def touching(name: str) -> StepProblem:
     return found
 
 
+@pytest.mark.parametrize("rounds", [1, 2])
 @pytest.mark.parametrize("name", ["plane", "capsule", "tilted box"])
-def test_iterates_against_an_obstacle_are_those_of_the_processor(name: str) -> None:
-    same_iterates(VertexBlockDescent, touching(name), ITERATIONS)
+def test_iterates_against_an_obstacle_are_those_of_the_processor(name: str, rounds: int) -> None:
+    found = touching(name)
+    if rounds > 1:
+        x = iterates(VertexBlockDescent(), found, ITERATIONS)[-1].copy()
+        found = replace(found, first_guess=x, start=replace(found.start, pressed=x))
+    same_iterates(VertexBlockDescent, found, ITERATIONS)
+
+
+def test_a_host_iterates_the_normal_forces_of_friction_and_timed_steps_repeat_its_rounds() -> None:
+    """The sheet lands: friction takes more than one solve, and each is replayed with its own iterations."""
+    made = contacts.sheet(
+        contacts.contact(contacts.OBSTACLES["plane"], friction=0.5), size=3, velocity=(0.5, -8.0, 0.0)
+    )
+    settings = Settings(StopRule(2), "current", 2, 1)
+    found = on_device(made, prepare(made, VertexBlockDescent(device="cuda", precision="float64")), "current")
+    assert isinstance(found, Replayed)
+    assert "normal forces of Contact's friction" in str(found.through_host)
+    first = list(steps(made, found, settings))
+    for step in first:
+        found.keep(step)
+    assert max(len(step.counts) for step in first) > 1
+    again = list(steps(made, found.again(), settings))
+    for one, other in zip(first, again, strict=True):
+        assert one.counts == other.counts
+        np.testing.assert_array_equal(one.positions, other.positions)

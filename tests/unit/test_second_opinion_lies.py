@@ -110,7 +110,10 @@ LIES: dict[str, Lie] = {
         integrator="bdf2",
     ),
     "friction at .9": Lie([SPRINGS, FLOOR], "contact", bound(Contact, scaled(friction=0.9))),
-    "friction that sticks half as long": Lie([SPRINGS, FLOOR], "contact", bound(Contact, scaled(slip=0.5))),
+    "friction of the step's start": Lie(
+        [SPRINGS, FLOOR], "friction's pressure", bound(Contact, lambda one: replace(one, friction_rounds=1))
+    ),
+    "friction that sticks half as long": Lie([SPRINGS, FLOOR], "contact", bound(Contact, scaled(creep=0.5))),
     "contact half as stiff": Lie([SPRINGS, FLOOR], "contact", bound(Contact, scaled(stiffness=0.5))),
     "contact a little thicker": Lie([SPRINGS, FLOOR], "contact", bound(Contact, scaled(thickness=1.01))),
     "half-spaces a micrometre too high": Lie(

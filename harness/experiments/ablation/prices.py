@@ -81,7 +81,7 @@ class _Run:
         self.spent += took
         if counts:
             self.seconds += took
-            self.iterations += done.solution.iterations
+            self.iterations += done.iterations
 
     @property
     def each(self) -> float:

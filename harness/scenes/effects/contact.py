@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from harness.base.errors import InputError
 from harness.base.model import Model
@@ -17,6 +17,7 @@ from harness.scenes.mesh.base import Mesh
 from harness.scenes.obstacles import AnyObstacle
 from harness.scenes.room import gap, looks, nearest
 from solvers.contact.energy import Contact as Energy
+from solvers.contact.friction_rounds import ROUNDS
 from solvers.matrices import assemble
 from solvers.problem import Energy as AnyEnergy
 from solvers.problem import Pins, Positions, ProjectiveEnergy, System
@@ -49,8 +50,11 @@ class Contact(Model):
     """How much nearer than `thickness` vertices may end a step [m]; a tenth of it if left out."""
     speed: PositiveFloat = 10.0
     """The largest speed [m/s] at which the tolerance is kept."""
-    creep: PositiveFloat = 2e-7
-    """How far a vertex that sticks may creep in a step, at most, as a part of the mean spacing."""
+    creep: PositiveFloat = 1e-5
+    """Vertices that slip slower than this [m/s] count as sticking, and creep."""
+    friction_rounds: PositiveInt = ROUNDS
+    """Solves of a step at most, each with the normal forces of the one before, until friction does not change; 1 takes
+    those of the step's start, which is of order 1 and misses the first step of contact."""
 
     @model_validator(mode="after")
     def _within(self) -> Contact:
@@ -79,8 +83,8 @@ class Contact(Model):
             held = System(mass, time_step, pins=Pins(everything, np.full(len(mass), np.inf)))
             resists = np.asarray(assemble(held, projective).diagonal(), np.float64)
             stiffness = _SAFETY * max(1.0, self.speed * time_step / self.depth) * resists
-            slip, margin = self.creep * mesh.spacing, _MARGIN * mesh.size
-            return (Energy(obstacles, self.thickness, self.friction, stiffness, slip, margin, time_step),)
+            rubs = self.creep, _MARGIN * mesh.size, time_step, self.friction_rounds
+            return (Energy(obstacles, self.thickness, self.friction, stiffness, *rubs),)
 
         return Contribution(derived=(derived,), checks=(partial(self._check, mesh),))
 

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat, PositiveFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from harness.base.errors import InputError
 from harness.base.model import Model
@@ -15,6 +15,7 @@ from harness.scenes.effects.base import Contribution, Pin, Seen
 from harness.scenes.intersections import Apart, crossings
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.touching import ENDS, outline, require_open, require_still, resisting, told
+from solvers.contact.friction_rounds import ROUNDS
 from solvers.contact.self_contact import SelfContact as Energy
 from solvers.contact.surface import Surface
 from solvers.problem import Energy as AnyEnergy
@@ -46,9 +47,12 @@ class SelfContact(Model):
     stiffness: PositiveFloat | None = None
     """The barrier's stiffness k [N/m] at each vertex; a tenth of what inertia and springs resist with if left out."""
     friction: NonNegativeFloat = 0.0
-    """Coulomb's coefficient mu, the same at rest and in motion; forces are those of the step's start (order 1)."""
+    """Coulomb's coefficient mu, the same at rest and in motion."""
     creep: PositiveFloat = 1e-3
     """Pairs that slip slower than this [m/s] count as sticking, and creep."""
+    friction_rounds: PositiveInt = ROUNDS
+    """Solves of a step at most, each with the normal forces of the one before, until friction does not change; 1 takes
+    those of the step's start, which is of order 1 and misses the first step of contact."""
 
     def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
         """The barrier as one energy, its stiffness by the other effects'; raises InputError for a mesh that touches
@@ -64,7 +68,7 @@ class SelfContact(Model):
             surface = Surface.of(rest, edges, faces, stiffness, self.thickness, reach)
             if (surface.near[1] <= 0.0).any():
                 raise InputError("self-contact: the mesh touches itself at rest; move what touches apart, or join it")
-            return Energy(surface, self.friction, self.creep)
+            return Energy(surface, self.friction, self.creep, self.friction_rounds)
 
         def derived(energies: Sequence[AnyEnergy]) -> tuple[AnyEnergy, ...]:
             return (energy(resisting(self.stiffness, mass, time_step, energies)),)

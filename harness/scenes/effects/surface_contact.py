@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat, PositiveFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from harness.base.errors import InputError
 from harness.base.model import Model
@@ -17,6 +17,7 @@ from harness.scenes.intersections import Apart
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.shapes import AnySurface, Shape, deforming, placed, shape
 from harness.scenes.touching import ENDS, outline, require_open, require_still, resisting, told
+from solvers.contact.friction_rounds import ROUNDS
 from solvers.contact.obstacles import Against, Side
 from solvers.contact.self_contact import ObstacleContact
 from solvers.problem import Energy, Positions
@@ -46,9 +47,12 @@ class SurfaceContact(Model):
     stiffness: PositiveFloat | None = None
     """The barrier's stiffness k [N/m] at each vertex; a tenth of what inertia and springs resist with if left out."""
     friction: NonNegativeFloat = 0.0
-    """Coulomb's coefficient mu, the same at rest and in motion; forces are those of the step's start (order 1)."""
+    """Coulomb's coefficient mu, the same at rest and in motion."""
     creep: PositiveFloat = 1e-3
     """Pairs that slip slower than this [m/s] count as sticking, and creep."""
+    friction_rounds: PositiveInt = ROUNDS
+    """Solves of a step at most, each with the normal forces of the one before, until friction does not change; 1 takes
+    those of the step's start, which is of order 1 and misses the first step of contact."""
 
     @property
     def reach(self) -> float:
@@ -90,7 +94,7 @@ class SurfaceContact(Model):
         def energy(stiffness: NDArray[np.float64]) -> ObstacleContact:
             own, others = Side.of(mesh.rest, edges, faces), Side.of(points, ends, triangles, n)
             against = Against(own, others, stiffness, self.thickness, self.reach)
-            return ObstacleContact.of(against, place, carry, self.friction, self.creep)
+            return ObstacleContact.of(against, place, carry, self.friction, self.creep, self.friction_rounds)
 
         def derived(energies: Sequence[Energy]) -> tuple[Energy, ...]:
             return (energy(resisting(self.stiffness, mass, time_step, energies)),)

@@ -6,7 +6,7 @@ Arrays may differ by the round-off of what was added up for them, energies and t
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +18,9 @@ from harness.simulation.opinion.outside import own_slope
 from harness.simulation.opinion.sides import Side
 from harness.simulation.opinion.steps import Stated
 from solvers.problem import Energy, StepProblem
+
+_SETTLED = 1e-3
+"""Of a slope, how much friction's normal forces may change it when rounds have ended."""
 
 
 class Finding(NamedTuple):
@@ -55,6 +58,11 @@ class Place:
         return max([size, held, *(blur(motion, size, end) / EPS for motion in moves)])
 
 
+def pressed(stated: Stated, problem: StepProblem, x: Array) -> Stated:
+    """The step with friction's normal forces at its unknown x (n, 3) [m], where the harness has a further round."""
+    return stated if problem.start.pressed is None else replace(stated, moment=replace(stated.moment, pressed=wide(x)))
+
+
 def differ(name: str, ours: Any, theirs: Any, size: float) -> Iterator[Finding]:
     """Arrays that differ by more than the round-off of numbers of a size."""
     ours, theirs = wide(ours), wide(theirs)
@@ -82,6 +90,8 @@ def steps(at: Place) -> Iterator[Finding]:
     yield from differ("filtered velocities", start.velocity, m.v, reach / dt)
     yield from differ("origin of velocities", start.origin, m.origin, reach)
     yield from differ("rate of velocities", [start.rate, system.rate], [m.rate, m.rate], m.rate)
+    if start.pressed is not None:
+        yield from differ("where friction is pressed", start.pressed, m.pressed, reach)
     yield from differ("times", [start.time, start.until], [m.time, m.until], max(m.until, dt))
     yield from differ("forces", problem.force, stated.force, stated.force_size * (1.0 + reach / at.side.shortest()))
     if system.pins.vertices.tolist() != stated.vertices:
@@ -114,6 +124,7 @@ def energies(at: Place) -> Iterator[Finding]:
                 yield Finding(f"{side.name(k)} (gradient against its own value)", wrong)
         else:
             told = tell(begin(stated.moment), x, d, _reach_of(at, k), side.shortest(k))
+            yield from _unsettled(at, k, told, x, d)
             if np.isfinite(told.value) or any(np.isfinite(energy.value(at.x)) for energy in own):
                 yield from _against(side.name(k), told, own, at.x, free)
         parts.append(told)
@@ -125,6 +136,17 @@ def energies(at: Place) -> Iterator[Finding]:
     value, slope = at.problem.value(at.x), float((at.problem.gradient(at.x) * free).sum())
     yield from _told("objective (value)", value, sum(part.value for part in parts), room[0] + reach * pulled)
     yield from _told("objective (gradient)", slope, sum(part.slope for part in parts), room[1] + pulled)
+
+
+def _unsettled(at: Place, k: int, told: Told, x: Any, d: Any) -> Iterator[Finding]:
+    """Friction of effect k with the normal forces of the step's start, where those at x are others."""
+    effect, m, begin = at.side.declared.effects[k], at.stated.moment, at.side.begins[k]
+    if m.pressed is not None or not getattr(effect, "friction", 0.0) or effect.friction_rounds == 1:
+        return
+    assert begin
+    own = tell(begin(replace(m, pressed=x)), x, d, _reach_of(at, k), at.side.shortest(k))
+    if not abs(own.slope - told.slope) <= _SETTLED * abs(own.slope) + own.allowed[1] + told.allowed[1]:
+        yield Finding(f"{at.side.name(k)} (friction's pressure)", _part(abs(own.slope - told.slope), abs(own.slope)))
 
 
 def _reach_of(at: Place, k: int) -> float:

@@ -2,7 +2,7 @@
 
     k_i/2 min(0, n.x_i - d)^2 + F_i h(|u_i|),   u_i = (I - nn')(x_i - a_i),   h(u) = u^2/(2 slip), beyond it u - slip/2
 
-    k_i = 4 Q_ii max(1, speed dt / tolerance)              F_i = mu k_i depth where the step starts
+    k_i = 4 Q_ii max(1, speed dt / tolerance)     slip = creep (time of x - start)     F_i = mu k_i depth at x itself
 
 The half-space n.x >= d touches an obstacle, R outwards, where Newton's method for f = R ends, f the distance to the
 obstacle along the straight way of the vertex in one step, both seen from the obstacle. Here obstacles are told by the
@@ -27,13 +27,12 @@ _THERE = 1e-6
 def contact(effect: Any, declared: Declared) -> Opinion:
     """Contact with every obstacle of the effect; its stiffness follows from what else resists."""
     depth = effect.thickness / 10 if effect.tolerance is None else effect.tolerance
-    slip = effect.creep * declared.mesh.spacing
 
     def needs(resists: Array) -> Begin:
         k = 4 * wide(resists) * max(1.0, effect.speed * declared.time_step / depth)
 
         def begin(moment: Moment) -> Values:
-            parts = [_of_obstacle(effect, one, k, slip, moment) for one in effect.obstacles]
+            parts = [_of_obstacle(effect, one, k, moment) for one in effect.obstacles]
             return lambda x: np.concatenate([values(x) for values in parts])
 
         return begin
@@ -41,19 +40,21 @@ def contact(effect: Any, declared: Declared) -> Opinion:
     return Opinion(needs=needs, shortest=depth, reach=max(map(_reach, effect.obstacles)))
 
 
-def _of_obstacle(effect: Any, one: Any, k: Wide, slip: float, moment: Moment) -> Values:
-    R = radius(one) + effect.thickness
+def _of_obstacle(effect: Any, one: Any, k: Wide, moment: Moment) -> Values:
+    R, slip = radius(one) + effect.thickness, effect.creep * (moment.until - moment.time)
     begun, ended = (place(one.motion, moment.time + dt) for dt in (0.0, moment.time_step))
     a, b = begun.back(moment.p), ended.back(moment.p + moment.time_step * moment.v)
     touched, out = _half_space(one, a, b, R)
     n = out @ ended.turn.T
     d = (n * ended.there(touched + R * out)).sum(axis=1)
     carried = ended.there(a)
-    depth = np.maximum(0, d - (n * carried).sum(axis=1))
     # Of the step's end; where x belongs to an earlier time, nearer to the start in proportion.
     w, started = moment.when, (n * moment.p).sum(axis=1)
     offset, anchor = started + w * (d - started), moment.p + w * (carried - moment.p)
-    grip = effect.friction * k * w * depth
+    depth = w * (d - (n * carried).sum(axis=1))
+    if moment.pressed is not None:
+        depth = offset - (n * moment.pressed).sum(axis=1)
+    grip = effect.friction * k * np.maximum(0, depth)
     grips = grip > 0
 
     def values(x: Wide) -> Wide:

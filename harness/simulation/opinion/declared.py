@@ -19,7 +19,8 @@ Array = NDArray[np.float64]
 class Moment:
     """One step: dt [s]; the unknown x moves with the velocity rate (x - origin), rate [1/s], and belongs to the time
     `until` [s], the fraction `when` of the step; p, v (n, 3): where the step starts, filtered, at `time` [s];
-    expected (n, 3) [m]: where what is lagged is taken."""
+    expected (n, 3) [m]: where what is lagged is taken; pressed (n, 3) [m]: where friction's normal forces are taken,
+    None for the step's start."""
 
     time_step: float
     rate: float
@@ -30,6 +31,7 @@ class Moment:
     v: Wide
     expected: Wide
     origin: Wide
+    pressed: Wide | None = None
 
 
 @dataclass(frozen=True, eq=False)

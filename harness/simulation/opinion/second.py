@@ -15,7 +15,7 @@ import numpy as np
 
 from harness.scenes.bind import Scene
 from harness.scenes.spec import SceneSpec
-from harness.simulation.opinion.compare import Finding, Place, differ, energies, steps
+from harness.simulation.opinion.compare import Finding, Place, differ, energies, pressed, steps
 from harness.simulation.opinion.declared import Array
 from harness.simulation.opinion.points import SamplePoint, points
 from harness.simulation.opinion.sides import Side, side
@@ -76,7 +76,7 @@ def _compared(sides: list[Side], scene: Scene, integrator: str, point: SamplePoi
     answer: Any = _Answer(lambda until: x, moves=integrator == "own")
     run = simulate(scene, answer, StopRule(), first_guess="current", frames=index + 1, state=point.state)
     done = next(run)
-    at = Place(own, stated, done.problem, x, point.direction)
+    at = Place(own, pressed(stated, done.problem, x), done.problem, x, point.direction)
     yield from steps(at)
     p, v = stated.after(x)
     after = done.state
@@ -108,7 +108,7 @@ def _staged(own: Side, scene: Scene, integrator: str, point: SamplePoint, time: 
         return
     reach = 0.0
     for (problem, _), stated, answered in zip(done.stages, wanted.stated, wanted.answers, strict=True):
-        at = Place(own, stated, problem, answered, point.direction)
+        at = Place(own, pressed(stated, problem, answered), problem, answered, point.direction)
         reach = max(reach, at.reach)
         yield from steps(at)
         yield from energies(at)

@@ -8,10 +8,10 @@ with u, v at rest in e, and the mean k of the four vertices, a tenth of the diag
 Where d at rest is below t + r, both t and r are smaller in proportion, less 1e-12. Here the places of the least
 distance come from all candidates, by comparison: inside, on every side and at every corner.
 
-Friction is that of pairs in range where the step starts (Li et al. 2020, section 5), F the barrier's force there:
+Friction is that of pairs in range at x itself (Li et al. 2020, section 5), F the barrier's force there:
 
     mu F h(|u|),   h(u) = u^2/s - u^3/(3 s^2) for u < s,  u - s/3 beyond,   s = creep dt
-    u = (I - nn')(z - z^t),   z = sum_i c_i x_i with the c_i of that time: dd/dx_i = c_i n
+    u = (I - nn')(z - z^t),   z = sum_i c_i x_i,   z^t = sum_i c_i x_i^t   with dd/dx_i = c_i n
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from harness.simulation.opinion.declared import Array, Begin, Declared, Moment, 
 from harness.simulation.opinion.derivatives import Values, Wide, length, wide
 
 Indices = NDArray[np.int64]
-Grip = tuple[Indices, Wide, Wide, Wide]
+Grip = tuple[Indices, Wide, Wide, Wide, Wide]
 _SIDES = ((1, 2), (1, 3), (2, 3))
 
 
@@ -49,8 +49,10 @@ def barriers(effect: Any, parts: Sequence[Touching]) -> Opinion:
             for part in parts:
                 found.append(part.values(t, r, k, moment.until))
                 if effect.friction:
-                    begun = part.whole(moment.p, moment.time)
-                    grips = [part.grip(begun, t, r, k, edges) for edges in (False, True)]
+                    begun = at = part.whole(moment.p, moment.time)
+                    if moment.pressed is not None:
+                        at = part.whole(moment.pressed, moment.until)
+                    grips = [part.grip(at, begun, t, r, k, edges) for edges in (False, True)]
                     found += [part.rubs(effect.friction, grip, slip, moment.until) for grip in grips]
             return lambda x: np.concatenate([values(x) for values in found])
 
@@ -133,8 +135,9 @@ class Touching:
         """What pairs that grip take to slip [J], at a time [s]."""
         return lambda x: friction * rubbed(self.whole(x, time), *grip, slip)
 
-    def grip(self, p: Wide, t: float, r: float, k: Array, edges: bool) -> Grip:
-        """Of pairs in range at p (N, 3) [m]: rows (g, 4), c (g, 4), z (g, 3) [m] and the force (g,) [N]."""
+    def grip(self, p: Wide, begun: Wide, t: float, r: float, k: Array, edges: bool) -> Grip:
+        """Of pairs in range at p (N, 3) [m]: rows (g, 4), c (g, 4), n (g, 3), z^t (g, 3) [m], the force (g,) [N]; begun
+        (N, 3) [m]: where the step starts."""
         rows = self.near(np.asarray(p, float), t + r)[int(edges)]
         z, four = _between(rows, p, edges), np.arange(4 * len(rows)).reshape(-1, 4)
         d = length(z)
@@ -150,7 +153,8 @@ class Touching:
         inside = (at > 0) & (at < 1)
         at = np.where(inside, at, 1)
         force = m * stiff * scale * r * ((1 - at) ** 2 / at - 2 * (1 - at) * np.log(at))
-        return rows, np.stack(weights, axis=1), z, np.where(inside, force, 0)
+        c = np.stack(weights, axis=1)
+        return rows, c, n, (c[:, :, None] * begun[rows]).sum(axis=1), np.where(inside, force, 0)
 
 
 def near(x: Array, one: Indices, two: Indices, reach: float) -> Indices:
@@ -171,10 +175,9 @@ def near(x: Array, one: Indices, two: Indices, reach: float) -> Indices:
     return rows[far < reach]
 
 
-def rubbed(x: Wide, rows: Indices, weights: Wide, z: Wide, force: Wide, slip: float) -> Wide:
+def rubbed(x: Wide, rows: Indices, weights: Wide, n: Wide, anchor: Wide, force: Wide, slip: float) -> Wide:
     """What pairs that grip take to slip (g,) [J], mu aside."""
-    u = (weights[:, :, None] * x[rows]).sum(axis=1) - z
-    n = z / length(z)[:, None]
+    u = (weights[:, :, None] * x[rows]).sum(axis=1) - anchor
     u = u - (u * n).sum(axis=1)[:, None] * n
     square = (u * u).sum(axis=1)
     sticks = square.real < slip**2

@@ -2,7 +2,7 @@
 with triangles both ways and edges with edges; k is the mean of the mesh's vertices in a pair.
 
 What triangles an obstacle has is declared (`harness.scenes.shapes`); where they are is told by the second opinion's own
-motion. In a step they are where they are at the unknown's time, and what grips was in range where both start.
+motion. In a step they are where they are at the unknown's time.
 """
 
 from __future__ import annotations

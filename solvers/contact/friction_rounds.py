@@ -1,0 +1,92 @@
+"""Friction with the normal forces of the step itself, by a fixed-point iteration around its solves.
+
+    x_0 = argmin E(x; N at the step's start),     x_{k+1} = argmin E(x; N(x_k)),     k + 1 < rounds
+
+Normal forces N, contact points and directions are fixed in a solve, so that friction has a potential (Li et al. 2020,
+"Incremental potential contact", section 5). With f(x; N) the gradient of friction, f(x_k; N(x_k)) - f(x_k; N(x_{k-1}))
+is what x_k lacks to solve the step with its own normal forces; the rounds end once its largest component is at most
+TOLERANCE times that of f, or after `friction_rounds` of the energies. The iteration need not converge where friction
+itself presses contacts together, as a wedge does; the change that was left is reported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
+
+import numpy as np
+
+from solvers.problem import Energy, Positions, Prepared, Solution, StepProblem, StopRule, System
+
+ROUNDS = 20
+"""Solves of a step at most, where an effect does not say."""
+
+TOLERANCE = 1e-4
+"""Of the largest force of friction: a smaller change ends the rounds."""
+
+
+@runtime_checkable
+class FrictionEnergy(Energy, Protocol):
+    """An energy whose friction depends on `Start.pressed`."""
+
+    friction: float
+    friction_rounds: int
+
+    def friction_gradient(self, p: Positions) -> Positions:
+        """The gradient of friction alone [N] at p (n, 3), in a step that has begun."""
+        ...
+
+
+class FrictionRounds(NamedTuple):
+    """How many rounds a step took, and the change of friction that was left, relative to its largest component."""
+
+    rounds: int
+    change: float
+
+
+class FrictionSolve(NamedTuple):
+    """A solved step: the problem of the last round, its solution, and the iterations of each; None for friction where
+    the scene has none."""
+
+    problem: StepProblem
+    solution: Solution
+    counts: tuple[int, ...]
+    friction: FrictionRounds | None
+
+
+def solve_with_friction(prepared: Prepared, problem: StepProblem, stop: StopRule) -> FrictionSolve:
+    """Solve a step until its friction has the normal forces of the solution; one solve where there is no friction."""
+    solution = prepared.solve(problem, stop)
+    rounds = _most_rounds(problem.system)
+    if not rounds:
+        return FrictionSolve(problem, solution, (solution.iterations,), None)
+    counts = [solution.iterations]
+    while True:
+        x = solution.positions
+        following = replace(problem, first_guess=x, start=replace(problem.start, pressed=x))
+        change = _friction_change(problem, following, x)
+        if not change > TOLERANCE or len(counts) >= rounds:  # not a number where the solve diverged
+            return FrictionSolve(problem, solution, tuple(counts), FrictionRounds(len(counts), change))
+        problem, solution = following, prepared.solve(following, stop)
+        counts.append(solution.iterations)
+
+
+def has_friction(energy: Energy) -> TypeGuard[FrictionEnergy]:
+    """Whether an energy has friction whose normal forces are found in rounds."""
+    return getattr(energy, "friction", 0.0) > 0.0 and hasattr(energy, "friction_rounds")
+
+
+def _most_rounds(system: System) -> int:
+    """The largest number of rounds, 0 without friction."""
+    return max((energy.friction_rounds for energy in system.energies if has_friction(energy)), default=0)
+
+
+def _friction_change(problem: StepProblem, following: StepProblem, x: Positions) -> float:
+    """The change of friction at x (n, 3) [m] from one problem to the next, relative to its largest component there."""
+    before, after = (
+        [energy.friction_gradient(x) for energy in each.energies if has_friction(energy)]
+        for each in (problem, following)
+    )
+    size = max(float(np.abs(force).max(initial=0.0)) for force in (*before, *after))
+    change = max(float(np.abs(b - a).max(initial=0.0)) for a, b in zip(before, after, strict=True))
+    return change / size if size else 0.0

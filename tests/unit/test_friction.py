@@ -1,0 +1,226 @@
+"""Friction against Coulomb's law in closed form: thresholds, slides, creep and refinement, for every solver."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.scenes.bind import Scene
+from harness.scenes.effects.contact import Contact
+from harness.scenes.effects.gravity import Gravity
+from harness.scenes.effects.self_contact import SelfContact
+from harness.scenes.effects.springs import Springs
+from harness.scenes.effects.surface_contact import SurfaceContact
+from harness.scenes.mesh.grid import Grid
+from harness.scenes.mesh.network import Network
+from harness.scenes.mesh.stack import Stack
+from harness.scenes.motion import Key, KeyedMotion
+from harness.scenes.obstacles import Plane
+from harness.scenes.shapes import Solid, Triangles
+from harness.simulation.observe import columns
+from harness.simulation.step import State, Step, prepare, simulate, start
+from solvers.integrators import Motion
+from solvers.methods.newton import Newton
+from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule
+from solvers.registry import SOLVERS, load
+from tests.effects import integrated
+from tests.scenes import scene
+from tests.self_contacts import TAKE_SURFACES
+
+G, SLOPE = 9.81, 0.5
+SIN, COS = SLOPE / np.hypot(1.0, SLOPE), 1.0 / np.hypot(1.0, SLOPE)
+DOWN = Gravity(acceleration=(G * SIN, -G * COS, 0.0))
+"""The frame is the slope's: gravity leans instead."""
+
+STICKS, SLIPS = 0.6, 0.4
+"""Coefficients on either side of the slope's tangent."""
+
+THICKNESS, EXACTLY = 0.005, StopRule(400, 1e-10)
+TAKE = ("sparse", "numba", "anderson", "chebyshev", "lbfgs", "vbd", "avbd", "hybrid", "newton", "newton-cg")
+"""The solvers that support contact with half-spaces."""
+
+
+def pebble(friction: float, dt: float = 1 / 60, integrator: str = "implicit-euler", **more: Any) -> Scene:
+    """A vertex of 1 kg at rest on a slope, just not pressed."""
+    ground = {"obstacles": [{"kind": "plane", "point": (0.0, -THICKNESS, 0.0)}], "thickness": THICKNESS}
+    rough = Contact.model_validate(ground | {"friction": friction} | more)
+    return integrated(scene(Network(positions=((0.0, 0.0, 0.0),)), DOWN, rough, size=0, time_step=dt), integrator)
+
+
+SURFACES: dict[str, Any] = {
+    "plane": Plane(point=(0.0, -0.0186, 0.0)),
+    "mesh": Solid(
+        mesh=Triangles(points=((-4.0, 0.0, -4.0), (-4.0, 0.0, 8.0), (8.0, 0.0, -4.0)), triangles=((0, 1, 2),)),
+        offset=(0.0, -0.0186, 0.0),
+    ),
+}
+"""A plane is two triangles, and the patch lies on their common side: some normals there lean a little."""
+
+
+def patch(
+    friction: float, surface: Any = SURFACES["mesh"], down: Gravity = DOWN, integrator: str = "implicit-euler"
+) -> Scene:
+    """A small sheet in the range of a slope's barrier."""
+    rough = SurfaceContact(thickness=0.01, friction=friction, stiffness=1000.0, obstacles=(surface,))
+    springs = Springs(stretch=100.0, shear=20.0)
+    made = scene(Grid(width=0.2, height=0.2), springs, down, rough, size=2, time_step=1 / 60)
+    return integrated(made, integrator)
+
+
+@cache
+def pressed() -> State:
+    """The sheet at rest where the slope carries it."""
+    made = patch(0.0, down=Gravity(acceleration=(0.0, -G * COS, 0.0)))
+    last = steps(made, 60)[-1].state.now
+    assert np.abs(last.velocity).max() < 1e-4
+    return State(Motion(last.positions, np.zeros_like(last.positions)), None, 0)
+
+
+def steps(
+    made: Scene, frames: int, solver: Solver | None = None, stop: StopRule = EXACTLY, state: State | None = None
+) -> list[Step]:
+    prepared = prepare(made, solver or Newton())
+    return list(simulate(made, prepared, stop, first_guess="current", frames=frames, state=state))
+
+
+def motion(made: Scene, run: list[Step]) -> np.ndarray:
+    """The mean velocity at the end of each step (frames, 3) [m/s]."""
+    weight = made.system.mass / made.system.mass.sum()
+    return np.array([weight @ step.state.now.velocity for step in run])
+
+
+def slid(run: list[Step]) -> float:
+    """How far the first vertex went down the slope [m]."""
+    return float(run[-1].positions[0, 0] - run[0].problem.start.positions[0, 0])
+
+
+@cache
+def of_name(solver: str) -> Solver:
+    return TAKE_SURFACES[solver] if solver in TAKE_SURFACES else load(SOLVERS[solver])()
+
+
+@pytest.mark.parametrize("solver", TAKE)
+def test_a_vertex_sticks_and_slides_from_the_first_step_on(solver):
+    """By implicit Euler n steps lead n (n + 1)/2 dt^2 g (sin - mu cos) down the slope."""
+    assert 0.0 < slid(steps(pebble(STICKS), 12, of_name(solver))) < 12 / 60 * 1e-5
+    found = slid(steps(pebble(SLIPS), 12, of_name(solver)))
+    # In the first step the normal force is less by what still moves into the slope, 1e-3 of it.
+    assert found == pytest.approx(78 / 60**2 * G * (SIN - SLIPS * COS), rel=1e-3)
+
+
+@pytest.mark.parametrize("solver", sorted(TAKE_SURFACES))
+def test_surfaces_exert_coulombs_force_of_the_steps_own_pressure(solver):
+    """What slips has m v_x = m g sin t - mu m (g cos t + v_y) at the end of each step, however its pressure changes."""
+    made = patch(SLIPS)
+    v, t = motion(made, steps(made, 6, of_name(solver), StopRule(2000, 1e-8))), np.arange(1, 7) / 60
+    np.testing.assert_allclose(v[:, 0], G * SIN * t - SLIPS * (G * COS * t + v[:, 1]), rtol=2e-3)
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
+def test_surfaces_hold_below_the_angle_of_friction_and_let_go_above(surface, integrator):
+    run = steps(patch(STICKS, SURFACES[surface], integrator=integrator), 12, state=pressed())
+    assert 0.0 < slid(run) < 12 / 60 * 1e-3
+    made = patch(SLIPS, SURFACES[surface], integrator=integrator)
+    v = motion(made, steps(made, 12, state=pressed()))[-1, 0]
+    assert v == pytest.approx(G * (SIN - SLIPS * COS) * 12 / 60, rel=1e-2 if surface == "mesh" else 0.1)
+
+
+@pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
+def test_other_integrators_take_the_pressure_of_their_unknown(integrator):
+    """Both are exact for a constant force, but for the first step of bdf2, which is of implicit Euler."""
+    assert 0.0 < slid(steps(pebble(STICKS, integrator=integrator), 12)) < 1.2 * 12 / 60 * 1e-5
+    found, wanted = slid(steps(pebble(SLIPS, integrator=integrator), 30)), 0.5 * G * (SIN - SLIPS * COS) / 4
+    assert found == pytest.approx(wanted, rel=2e-3 if integrator == "bdf2" else 1e-4)
+
+
+def test_a_slide_converges_with_order_1_by_implicit_euler():
+    wanted = 0.5 * G * (SIN - SLIPS * COS) / 4
+    coarse, fine = (abs(slid(steps(pebble(SLIPS, dt), round(0.5 / dt))) - wanted) for dt in (1 / 30, 1 / 60))
+    assert coarse / fine == pytest.approx(2.0, rel=0.02)
+
+
+@pytest.mark.parametrize("dt", [1 / 60, 1 / 960])
+def test_what_sticks_creeps_at_a_speed_whatever_the_step(dt):
+    """A vertex at y times `creep` is pulled back by y times the limit of friction."""
+    last = steps(pebble(STICKS, dt, creep=2e-4), 16)[-1]
+    assert last.state.now.velocity[0, 0] == pytest.approx(SLOPE / STICKS * 2e-4, rel=1e-3)
+
+
+def test_a_sheet_on_a_sheet_has_the_steps_own_pressure_too():
+    """Momentum law of the upper sheet, from its first step in range on."""
+    rough = SelfContact(thickness=0.01, friction=SLIPS)
+    two = Stack(width=0.2, height=0.2, apart=0.0186)
+    made = scene(two, Springs(stretch=100.0, shear=20.0), rough, size=2, time_step=1 / 60)
+    upper = made.mesh.parts["highest"]
+    velocity = np.zeros_like(made.mesh.rest)
+    velocity[upper] = (1.0, -0.5, 0.0)
+    begun = State(start(made).now._replace(velocity=velocity), None, 0)
+    run = list(simulate(made, prepare(made, Newton()), EXACTLY, first_guess="current", frames=3, state=begun))
+    for step in run:
+        v = step.state.now.velocity[upper].mean(axis=0)
+        assert 1.0 - v[0] == pytest.approx(SLIPS * (v[1] + 0.5), rel=0.02)  # some normals lean a little
+
+
+def test_a_floor_that_slides_takes_a_sheet_along_in_the_first_step():
+    """Obstacles' surfaces move by 0.5 m/s: friction accelerates the sheet by mu times its own normal force."""
+    belt = KeyedMotion(keys=(Key(time=0.0), Key(time=10.0, offset=(5.0, 0.0, 0.0))))
+    floor = SurfaceContact(
+        thickness=0.01, friction=0.2, obstacles=(SURFACES["mesh"].model_copy(update={"motion": belt}),)
+    )
+    springs, down = Springs(stretch=100.0, shear=20.0), Gravity()
+    made = scene(Grid(width=0.2, height=0.2), springs, down, floor, size=2, time_step=1 / 60)
+    v, t = motion(made, steps(made, 4)), np.arange(1, 5) / 60
+    np.testing.assert_allclose(v[:, 0], 0.2 * (9.81 * t + v[:, 1]), rtol=1e-3)
+
+
+class Counted:
+    """A prepared solver that counts its solves."""
+
+    def __init__(self, prepared: Prepared) -> None:
+        self.prepared, self.problems = prepared, list[StepProblem]()
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        self.problems.append(problem)
+        return self.prepared.solve(problem, stop)
+
+
+def solves(made: Scene, frames: int) -> tuple[list[StepProblem], list[Step]]:
+    counted: Any = Counted(prepare(made, Newton()))
+    return counted.problems, list(simulate(made, counted, EXACTLY, first_guess="current", frames=frames))
+
+
+def test_rounds_are_done_where_friction_acts_and_nowhere_else():
+    for made, rounds in ((pebble(0.0), 0), (pebble(SLIPS, friction_rounds=1), 1)):
+        problems, run = solves(made, 3)
+        assert len(problems) == 3
+        assert all(problem.start.pressed is None for problem in problems)
+        assert [step.friction.rounds if step.friction else 0 for step in run] == 3 * [rounds]
+    # With the pressure of the step's start the first step is without friction, and the row says what was left.
+    assert float(run[0].positions[0, 0]) == pytest.approx(G * SIN / 60**2, rel=1e-9)
+    assert run[0].friction is not None
+    assert run[0].friction.change == 1.0
+    problems, run = solves(pebble(SLIPS), 8)
+    assert [step.friction.rounds for step in run if step.friction][:2] == [2, 2]
+    assert run[-1].friction is not None
+    assert run[-1].friction.rounds == 1
+    assert all(step.friction.change < 1e-4 for step in run if step.friction)
+    last: Positions | None = run[1].problem.start.pressed
+    assert last is not None
+    assert np.abs(last - run[1].positions).max() < 1e-3
+
+
+def test_rows_tell_the_rounds_and_what_they_left():
+    made = pebble(SLIPS)
+    (step,) = steps(made, 1)
+    row = columns(made, step, step.problem.terms(step.solution.positions), step.solution.residual)
+    assert row["friction_rounds"] == len(step.counts) == 2
+    assert row["friction_change"] < 1e-4
+    made = pebble(0.0)
+    (step,) = steps(made, 1)
+    row = columns(made, step, step.problem.terms(step.solution.positions), step.solution.residual)
+    assert row["friction_rounds"] is None
+    assert row["friction_change"] is None
