@@ -81,7 +81,9 @@ def observe(
             looked = beside.submit(look, step, returned_residual(prepared, step), balance)
             if recorder and step.index in convergence:
                 norm = EnergyNorm(step.problem.system)
-                curve = trace(prepared, step.problem, norm, step.solution.iterations)
+                # A further round of friction starts where the one before ended: the first one is drawn.
+                shown = step.counts[0] if step.friction else step.solution.iterations
+                curve = trace(prepared, step.problem, norm, shown)
                 looked.result()
                 recorder.convergence(step.index, curve.residuals, curve.objective)
             tick()

@@ -74,11 +74,12 @@ class Replayed(OnDevice):
     def __init__(self, prepared: Prepared, usual: Remote, why: str) -> None:
         super().__init__(prepared, usual)
         self.through_host: str | None = why
-        self._left, self._told = iter(list[int]()), dict[str, float]()
+        self._left: Iterator[int] | None = None
+        self._told = dict[str, float]()
 
     def again(self) -> Replayed:
         """The same from the first step on."""
-        self._left: Iterator[int] = iter(list(self._counts))
+        self._left = iter(list(self._counts))
         return self
 
     def told(self) -> dict[str, float | None]:
@@ -87,7 +88,9 @@ class Replayed(OnDevice):
         return {**found}
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """So many iterations as before."""
+        """The solver's answer in the first pass; then the same iterations again."""
+        if self._left is None:
+            return self._prepared.solve(problem, stop)
         one: Any = self._prepared.of(problem) if isinstance(self._prepared, Turns) else self._prepared
         found, marks = one.replay(problem, next(self._left))
         for name, value in seconds(marks).items():

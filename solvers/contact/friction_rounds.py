@@ -45,8 +45,8 @@ class FrictionRounds(NamedTuple):
 
 
 class FrictionSolve(NamedTuple):
-    """A solved step: the problem of the last round, its solution, and the iterations of each; None for friction where
-    the scene has none."""
+    """A solved step: the problem of the last round with the first guess of the first one, its solution, and the
+    iterations of each; None for friction where the scene has none."""
 
     problem: StepProblem
     solution: Solution
@@ -60,12 +60,13 @@ def solve_with_friction(prepared: Prepared, problem: StepProblem, stop: StopRule
     rounds = _most_rounds(problem.system)
     if not rounds:
         return FrictionSolve(problem, solution, (solution.iterations,), None)
-    counts = [solution.iterations]
+    counts, guess = [solution.iterations], problem.first_guess
     while True:
         x = solution.positions
         following = replace(problem, first_guess=x, start=replace(problem.start, pressed=x))
         change = _friction_change(problem, following, x)
         if not change > TOLERANCE or len(counts) >= rounds:  # not a number where the solve diverged
+            problem = problem if len(counts) == 1 else replace(problem, first_guess=guess)
             return FrictionSolve(problem, solution, tuple(counts), FrictionRounds(len(counts), change))
         problem, solution = following, prepared.solve(following, stop)
         counts.append(solution.iterations)

@@ -91,8 +91,8 @@ _TABLE = (
     (
         "contact-friction",
         "solvers/contact/energy.py",
-        "self.friction * stiffness * when * depth",
-        "0.9 * self.friction * stiffness * when * depth",
+        "self.friction * stiffness * np.maximum(0.0, depth)",
+        "0.9 * self.friction * stiffness * np.maximum(0.0, depth)",
         f"{_U}/test_effect_contact.py",
     ),
     (

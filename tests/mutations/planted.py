@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.mutations.archive import ARCHIVE
+from tests.mutations.contact import CONTACT
 from tests.mutations.device import DEVICE
 from tests.mutations.energies import ENERGIES
 from tests.mutations.energy_balance import ENERGY_BALANCE
@@ -12,4 +13,4 @@ from tests.mutations.measuring import MEASURING
 from tests.mutations.pictures import PICTURES
 from tests.mutations.steps import STEPS
 
-TABLE = ENERGIES + STEPS + MEASURING + PICTURES + DEVICE + ARCHIVE + GATES + EXACT_LENGTHS + ENERGY_BALANCE
+TABLE = ENERGIES + CONTACT + STEPS + MEASURING + PICTURES + DEVICE + ARCHIVE + GATES + EXACT_LENGTHS + ENERGY_BALANCE

@@ -165,9 +165,9 @@ def test_a_sheet_on_a_sheet_has_the_steps_own_pressure_too():
         assert 1.0 - v[0] == pytest.approx(SLIPS * (v[1] + 0.5), rel=0.02)  # some normals lean a little
 
 
-def test_a_floor_that_slides_takes_a_sheet_along_in_the_first_step():
-    """Obstacles' surfaces move by 0.5 m/s: friction accelerates the sheet by mu times its own normal force."""
-    belt = KeyedMotion(keys=(Key(time=0.0), Key(time=10.0, offset=(5.0, 0.0, 0.0))))
+def test_a_floor_that_slides_and_rises_takes_a_sheet_along_from_the_first_step_on():
+    """At 0.5 m/s and 0.1 m/s: friction accelerates the sheet by mu times the normal force where the floor then is."""
+    belt = KeyedMotion(keys=(Key(time=0.0), Key(time=10.0, offset=(5.0, 1.0, 0.0))))
     floor = SurfaceContact(
         thickness=0.01, friction=0.2, obstacles=(SURFACES["mesh"].model_copy(update={"motion": belt}),)
     )

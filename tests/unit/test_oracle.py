@@ -63,7 +63,7 @@ def test_a_distance_counts_by_the_size_of_its_own_component():
     moved[0, 0] += 0.087
     state = State(Motion(moved, np.zeros_like(moved)), None, 1)
     solution = Solution(moved, 1, 0.0, 0.0, "iterations")
-    step = Step(stated, solution, state, 1, ((stated, solution),), StopRule())
+    step = Step(stated, solution, state, (1,), ((stated, solution),), StopRule())
     row = Judge(made, known[None], minimises=False)(step)
     assert row["distance"] == pytest.approx(0.087 / 3**0.5)
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from harness.scenes.intersections import crossings
-from solvers.contact.barrier import distances, press
+from solvers.contact.barrier import distances, forces, press
 from solvers.contact.blocks import Room
 from solvers.contact.contacts import Pairs, in_range, padded, room
+from solvers.contact.known import WIDE
 from solvers.contact.self_contact import SelfContact
 from solvers.contact.surface import Surface
 from solvers.core.fixed_objective import Objective
@@ -189,6 +190,23 @@ def test_what_was_kept_changes_no_bit():
         assert abs(contact.hessian(q) - fresh.hessian(q)).max() == 0.0
 
 
+def test_candidates_are_looked_up_again_before_what_was_out_of_reach_comes_into_range():
+    """Of three triangles above each other, two in range, the third comes down from where it is no candidate."""
+    layer = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
+    triangles, limit = np.arange(9).reshape(3, 3), THICKNESS + RANGE
+
+    def at(*heights: float) -> np.ndarray:
+        return np.concatenate([layer + np.array([0.0, 0.0, z]) for z in heights])
+
+    contact = SelfContact(Surface.of(at(0, 1, 2), sides(triangles), triangles, np.ones(9), THICKNESS, RANGE))
+    contact.value(at(0.0, 0.9 * limit, (0.9 + 1.02 * WIDE) * limit))
+    before = contact.kept[0]
+    assert len(before.pairs.vertices)
+    assert before.pairs.vertices.max() < 6
+    q = at(0.0, 0.9 * limit, (0.9 + 1.02 * WIDE - 0.6) * limit)
+    assert contact.value(q) == SelfContact(contact.surface).value(q) > contact.value(at(0.0, 0.9 * limit, 2.0))
+
+
 @pytest.mark.parametrize("fast", [1e-3, 0.05, 1.0])
 def test_no_gap_closes_within_the_largest_step_and_none_would_be_much_larger(fast):
     contact, p, triangles = touching(noise=1e-3)
@@ -234,6 +252,17 @@ def test_forces_are_the_slope_of_the_value_down_to_gaps_of_round_off(gap: float)
     assert out[0, 1] == pytest.approx(RANGE * slope, rel=1e-6)
     closed = p - [[0, 2 * gap * RANGE, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]]
     assert -2e6 * RANGE < pushed(pair(False), closed)[0, 1] < 0.0  # finite, and apart
+
+
+def test_friction_of_nearly_parallel_edges_has_the_barriers_force():
+    """Edges of a metre whose sine is the square root of e/2: the mollifier is (2 - 1/2)/2."""
+    sine = np.sqrt(0.5e-3)
+    away = 0.5 * np.array([np.sqrt(1.0 - sine**2), 0.0, sine])
+    apart = np.array([0.0, THICKNESS + 0.5 * RANGE, 0.0])
+    p = np.array([[-0.5, 0, 0], [0.5, 0, 0], apart - away, apart + away])
+    pairs, out = pair(True)._replace(parallel=np.array([1e-3])), np.empty(1)
+    forces(in_range(pairs, padded(p), room(1, THICKNESS, RANGE)), out)
+    assert out[0] == pytest.approx(0.75 * RANGE * 0.5 * (1.0 + 2.0 * np.log(2.0)), rel=1e-9)
 
 
 def test_values_are_infinite_where_a_gap_is_closed():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +32,7 @@ def scene() -> Scene:
 def solved(scene) -> list[tuple[StepProblem, Solution]]:
     prepared = prepare(scene, Newton())
     run = simulate(scene, prepared, STOP, first_guess="current", frames=FRAMES)
-    problems = [replace(step.problem, first_guess=step.problem.current) for step in run]
-    return [(problem, prepared.solve(problem, STOP)) for problem in problems]
+    return [(step.problem, prepared.solve(step.problem, STOP)) for step in run]
 
 
 def test_it_finds_the_minima_of_newtons_method_alone_in_less_than_half_of_the_iterations(scene, solved):

@@ -41,7 +41,7 @@ def contact(effect: Any, declared: Declared) -> Opinion:
 
 
 def _of_obstacle(effect: Any, one: Any, k: Wide, moment: Moment) -> Values:
-    R, slip = radius(one) + effect.thickness, effect.creep * (moment.until - moment.time)
+    R, slip = radius(one) + effect.thickness, float(effect.creep) * (moment.until - moment.time)
     begun, ended = (place(one.motion, moment.time + dt) for dt in (0.0, moment.time_step))
     a, b = begun.back(moment.p), ended.back(moment.p + moment.time_step * moment.v)
     touched, out = _half_space(one, a, b, R)
