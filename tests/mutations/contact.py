@@ -23,7 +23,7 @@ _TABLE = (
         f"{_C}/friction_rounds.py",
         "TOLERANCE = 1e-4",
         "TOLERANCE = 2.0",
-        f"{_FRICTION}::test_a_slide_converges_with_order_1_by_implicit_euler",
+        f"{_FRICTION}::test_a_vertex_sticks_and_slides_from_the_first_step_on[newton]",
     ),
     (
         "creep-per-step",
