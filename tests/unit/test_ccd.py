@@ -17,6 +17,7 @@ import pytest
 from solvers.contact import ways
 from solvers.contact.barrier import distances
 from solvers.contact.contacts import Pairs, padded
+from solvers.contact.known import WIDE
 from solvers.contact.self_contact import SelfContact
 from solvers.contact.surface import Surface
 
@@ -156,3 +157,24 @@ def test_what_is_kept_between_steps_bounds_them_as_well():
             contact.largest_step(rest, kept * d)
             step = Fraction(contact.largest_step(rest, d))
             assert step * Fraction(speed) <= (1 - LEFT) * gap
+
+
+@pytest.mark.parametrize("way", [0.5, 1.9])
+def test_candidates_that_are_kept_bound_no_step_that_leads_beyond_their_reach(way):
+    """Of three triangles above each other, two in range, the third is no candidate and comes down on them."""
+    layer, reach = np.array(TRIANGLE, float), 1 / 16
+    limit = THICKNESS + reach
+
+    def at(*heights: float) -> np.ndarray:
+        return np.concatenate([layer + np.array([0.0, 0.0, z]) for z in heights])
+
+    triangles = np.arange(9).reshape(3, 3)
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [0, 2]]])
+    contact = SelfContact(Surface.of(at(0, 1, 2), edges, triangles, np.ones(9), THICKNESS, reach))
+    apart = 1.02 * WIDE * limit
+    p = at(0.0, 0.5 * limit, 0.5 * limit + apart)
+    d = at(0.0, 0.0, -way * limit) - at(0.0, 0.0, 0.0)
+    contact.value(p)
+    assert contact.kept[0].pairs.vertices.max() < 6
+    step = contact.largest_step(p, d)
+    assert step == 1.0 if way < 1.0 else step * way * limit <= 0.95 * (apart - THICKNESS)
