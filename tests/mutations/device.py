@@ -32,8 +32,8 @@ DEVICE = (
     Mutation(
         "device-depth-of-the-other-side",
         "solvers/cuda/half_space_kernels.py",
-        "depth = max(0.0, spaces.offset[k] - lagged)",
-        "depth = max(0.0, lagged - spaces.offset[k])",
+        "depth = when * (spaces.offset[k] - lagged)",
+        "depth = when * (lagged - spaces.offset[k])",
         ("tests/cuda/test_touching.py",),
     ),
     Mutation(
