@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from pathlib import Path
-from time import sleep
+from time import monotonic, sleep
 
 from harness.base.worker import Tick
 from solvers.device import broken
@@ -100,3 +100,50 @@ def threads_after(path: Path, tick: Tick) -> int:
 
     record(path, count=2)
     return len(os.listdir("/proc/self/task"))
+
+
+def log_much(tick: Tick) -> float:
+    """Processor-light steps that write 18 kB each; the wall seconds of one."""
+    began = monotonic()
+    for _ in range(200):
+        print("x" * 18_000)
+    return (monotonic() - began) / 200
+
+
+def leave_processes(how: str, tick: Tick) -> int:
+    """Start a process that outlives this one, unless somebody ends it; its number."""
+    import subprocess
+
+    if how == "a child":
+        return subprocess.Popen(["sleep", "600"]).pid
+    if how == "a session of its own":
+        return subprocess.Popen(["sleep", "600"], start_new_session=True).pid
+    told = "import os, time; child = os.fork(); print(child, flush=True) if child else (os.setsid(), os.close(1), time.sleep(600))"
+    shell = subprocess.run([sys.executable, "-c", told], stdout=subprocess.PIPE, timeout=60, check=True)
+    return int(shell.stdout)
+
+
+def leave_processes_and_crash(how: str, path: Path, tick: Tick) -> None:
+    path.write_text(str(leave_processes(how, tick)))
+    ctypes.string_at(0)
+
+
+def swell_in_children(tick: Tick) -> None:
+    """Four processes, each of them within the limit of one."""
+    import subprocess
+
+    program = "import time; taken = bytearray(200 * 2**20); time.sleep(600)"
+    children = [subprocess.Popen([sys.executable, "-c", program]) for _ in range(4)]
+    children[0].wait()
+
+
+def close_all_files(tick: Tick) -> None:
+    os.closerange(0, 4096)
+
+
+def leave_the_folder(tick: Tick) -> None:
+    os.chdir("/")
+
+
+def folder(tick: Tick) -> str:
+    return os.getcwd()

@@ -92,6 +92,11 @@ class _Child:
             atexit.register(one.end)
         return one
 
+    @classmethod
+    def of_this_process(cls) -> int:
+        """Its process, 0 where none was started here."""
+        return cls._one._process.pid if cls._one and cls._one._owner == os.getpid() else 0
+
     def send(self, message: Any) -> None:
         assert self._process.stdin
         _write(self._process.stdin, message)
@@ -138,7 +143,7 @@ def _read(pipe: BinaryIO | Any) -> Any:
 
 def serve() -> None:
     """Serve calls until there are no more: what the child does. What readers print goes nowhere."""
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    without_core_dumps()
     calls, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_RDWR)
     for standard in range(3):
@@ -182,6 +187,16 @@ def memory_limited(bytes: int) -> Generator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+def reader() -> int:
+    """The process that reads for this one; 0 where there is none."""
+    return _Child.of_this_process()
+
+
+def without_core_dumps() -> None:
+    """Let this process and its children leave no dump of their memory when they crash."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def limit(what: int, value: float) -> None:

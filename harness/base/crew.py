@@ -20,12 +20,13 @@ _LOOK = 0.1
 
 
 class Task(NamedTuple):
-    """A piece of work, what it may take, to whom it ticks, and its group."""
+    """A piece of work, what it may take, to whom it ticks, its group, and the code of others that it runs."""
 
     piece: Piece
     tick: Tick
     limits: Limits
     group: Hashable = None
+    own: frozenset[Hashable] = frozenset()
 
 
 Start = Callable[[int], Task | None]
@@ -70,7 +71,7 @@ def done_by(
                     number = _next(left, member, [other.group for other in crew if other is not member])
                     member.number, member.group = number, left.pop(number)
                     if task := start(number):
-                        member.going = member.workers.doing(task.piece, task.tick, task.limits)
+                        member.going = member.workers.doing(task.piece, task.tick, task.limits, task.own)
             going = [member for member in crew if member.going]
             if not going:
                 return

@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from functools import partial
+from multiprocessing.connection import wait
+from pathlib import Path
 from typing import NamedTuple
 
+import psutil
 import pytest
 
 from harness.base.errors import InputError, Mistake
@@ -74,7 +77,7 @@ def test_a_worker_is_another_process_and_stays(workers: Workers):
 def test_a_worker_that_died_in_between_is_replaced(workers: Workers):
     first = workers.do(does.name, quiet, NONE)
     os.kill(first, 9)
-    os.waitid(os.P_PID, first, os.WEXITED | os.WNOWAIT)  # its last thread has gone, and nobody was told yet
+    psutil.wait_procs([psutil.Process(first)], timeout=10.0) if psutil.pid_exists(first) else None
     assert workers.do(does.name, quiet, NONE) != first
 
 
@@ -114,8 +117,70 @@ def test_errors_that_end_an_experiment_come_back_as_they_were(error: Exception, 
     assert getattr(found.value, "mistakes", None) == getattr(error, "mistakes", None)
 
 
-def test_all_ticks_arrive_and_what_is_said_is_passed_on(workers: Workers, capsys: pytest.CaptureFixture[str]):
+def test_all_ticks_arrive_and_what_is_said_is_passed_on(
+    workers: Workers, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     heard: list[str] = []
-    assert workers.do(does.chat, heard.append, NONE) == "said"
+    assert workers.do(does.chat, heard.append, Limits(log=tmp_path / "logs" / "said.txt")) == "said"
     assert [said for said in heard if said] == ["chatting"] * 5000
-    assert capsys.readouterr().err.count("x" * 99) == 5000
+    shown = capsys.readouterr().err
+    assert len(shown) < 70_000
+    assert shown.endswith(
+        f"[of 500000 bytes of output the first 65536 are shown; all of it is in {tmp_path}/logs/said.txt]\n"
+    )
+    assert (tmp_path / "logs" / "said.txt").read_text() == 5000 * ("x" * 99 + "\n")
+
+
+def test_writing_much_costs_a_piece_little(workers: Workers, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """18 kB take 4 us to write; a pipe of 64 kB that is read every 0.1 s makes it 28 ms."""
+    assert workers.do(does.log_much, quiet, Limits(log=tmp_path / "said.txt")) < 5e-3
+    assert (tmp_path / "said.txt").stat().st_size == 200 * 18_001
+
+
+HOW = ["a child", "a session of its own", "an orphan"]
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_what_a_piece_starts_ends_with_it(how: str, workers: Workers):
+    first = workers.do(partial(does.leave_processes, how), quiet, NONE)
+    assert workers.do(partial(does.double, 21), quiet, NONE) == 42
+    assert not psutil.pid_exists(first)
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_what_a_piece_starts_ends_where_it_crashes(how: str, workers: Workers, tmp_path: Path):
+    with pytest.raises(Lost, match="SIGSEGV"):
+        workers.do(partial(does.leave_processes_and_crash, how, tmp_path / "pid"), quiet, NONE)
+    assert not psutil.pid_exists(int((tmp_path / "pid").read_text()))
+
+
+def test_the_memory_of_what_a_piece_starts_counts(workers: Workers):
+    with pytest.raises(Lost, match=r"took more than 0.5 GiB with the processes it started"):
+        workers.do(does.swell_in_children, quiet, Limits(60.0, 0.5))
+
+
+def test_a_piece_that_closes_all_files_is_lost_alone(workers: Workers, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(Lost, match="ended its process"):
+        workers.do(does.close_all_files, quiet, Limits(20.0))
+    assert "Traceback" not in capsys.readouterr().err
+    assert workers.do(partial(does.double, 21), quiet, NONE) == 42
+
+
+def test_a_changed_folder_stays_with_its_piece(workers: Workers):
+    workers.do(does.leave_the_folder, quiet, NONE)
+    assert workers.do(does.folder, quiet, NONE) == os.getcwd()
+
+
+def test_pieces_with_others_code_share_no_worker_with_pieces_without(workers: Workers):
+    def name(*own: str) -> int:
+        going = workers.doing(does.name, quiet, NONE, frozenset(own))
+        while True:
+            try:
+                wait([next(going)])
+            except StopIteration as done:
+                return done.value
+
+    first = name()
+    assert name("mine.py") == name("mine.py") == first
+    assert name() != first
+    assert name("mine.py") != name("other.py")

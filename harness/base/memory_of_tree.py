@@ -1,0 +1,43 @@
+"""The memory of a process and of all that it started, as Linux tells it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+
+
+class TreeMemory:
+    """Whether the processes below one take more than a number of GiB together, beyond what they have now."""
+
+    def __init__(self, root: int, gib: float) -> None:
+        self._root, self._most = root, gib * 2**30
+        self._before = {process: _bytes(process, "status", ("VmData:",)) for process in _below(root)}
+
+    @property
+    def exceeded(self) -> bool:
+        """Asked of processes that were started since: those that were there limit themselves."""
+        new = set(found := list(_below(self._root))) - self._before.keys()
+        if not new:
+            return False
+        taken = sum(_bytes(process, "smaps_rollup", ("Private_Dirty:", "Pss_Shmem:")) for process in new)
+        taken += sum(
+            _bytes(process, "status", ("VmData:",)) - self._before.get(process, 0) for process in {*found} - new
+        )
+        return taken > self._most
+
+
+def _below(process: int) -> Iterator[int]:
+    with suppress(OSError):
+        for thread in os.listdir(f"/proc/{process}/task"):
+            with suppress(OSError), open(f"/proc/{process}/task/{thread}/children") as file:
+                for child in map(int, file.read().split()):
+                    yield child
+                    yield from _below(child)
+
+
+def _bytes(process: int, file: str, names: tuple[str, ...]) -> int:
+    """The sum of lines `name: ... kB`; 0 for a process that has ended."""
+    with suppress(OSError), open(f"/proc/{process}/{file}") as lines:
+        return sum(1024 * int(line.split()[1]) for line in lines if line.startswith(names))
+    return 0

@@ -1,0 +1,154 @@
+"""A process between a command and its worker, which runs nobody's code.
+
+It reads what the worker writes as soon as it is written, so that writing costs a worker next to nothing, however seldom
+the command looks. And it is the one whom Linux gives the processes whose parents ended, so it ends all that a worker
+has started when the worker ends, when the command asks for it (SIGTERM), and when the command is gone.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import select
+import signal
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from typing import NoReturn
+
+from harness.base.child import without_core_dumps
+from harness.base.worker import DUMP, adopt_orphans, has_children, serve, tie
+
+BUFFER = 2**25
+"""Bytes of output that wait for the command at most; what is more is left out."""
+_GRACE = 2.0
+"""Seconds that the end of a worker's processes may take, and that its last output may wait for the command."""
+_REAP = 1.0
+"""Seconds between two looks for ended processes whose parents ended before them."""
+
+
+def supervise(
+    calls: Connection, ticks: Connection, said: Connection, dump: Connection, ready: Callable[[], object], parent: int
+) -> None:
+    """In a child of the command: start a worker (`harness.base.worker.serve`), and end as it ends."""
+    tie(parent, signal.SIGTERM)
+    os.setsid()
+    adopt_orphans()
+    without_core_dumps()
+    output, theirs = os.pipe()
+    me = os.getpid()
+    signals = {signal.SIGINT, signal.SIGTERM, DUMP}
+    signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    worker = os.fork()
+    if worker == 0:
+        os.setsid()
+        os.close(output)
+        said.close()
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
+        serve(calls, ticks, theirs, dump, ready, me)
+        return
+    for end in (calls, ticks, dump):
+        end.close()
+    os.close(theirs)
+    _Supervisor(worker, output, said.fileno()).run(signals)
+
+
+class _Supervisor:
+    """worker: its process; output: the pipe that it writes to; command: the pipe to pass that on to."""
+
+    def __init__(self, worker: int, output: int, command: int) -> None:
+        self._worker, self._output, self._command = worker, output, command
+        self._waiting = bytearray()
+        self._left_out = 0
+
+    def run(self, signals: set[signal.Signals]) -> NoReturn:
+        """Pass on the worker's output until it ends; then end as it did."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, self._stop)
+        signal.signal(DUMP, lambda number, frame: os.kill(self._worker, DUMP))
+        ended = os.pidfd_open(self._worker)
+        for pipe in (self._output, self._command):
+            os.set_blocking(pipe, False)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
+        while not self._passed_on(ended, _REAP):
+            self._reap(sparing=self._worker)
+        _, status = os.waitpid(self._worker, 0)
+        self._end_all()
+        self._pass_on_rest()
+        if os.WIFSIGNALED(status):
+            signal.signal(os.WTERMSIG(status), signal.SIG_DFL) if os.WTERMSIG(status) != signal.SIGKILL else None
+            os.kill(os.getpid(), os.WTERMSIG(status))
+        os._exit(os.waitstatus_to_exitcode(status) & 0xFF)
+
+    def _stop(self, number: int, frame: object) -> NoReturn:
+        self._end_all()
+        self._pass_on_rest()
+        os._exit(0)
+
+    def _passed_on(self, ended: int | None, seconds: float) -> bool:
+        """Move what is written now; wait for it for some seconds at most. Whether `ended` is."""
+        poll = select.poll()
+        poll.register(self._output, select.POLLIN)
+        if ended is not None:
+            poll.register(ended, select.POLLIN)
+        if self._waiting:
+            poll.register(self._command, select.POLLOUT)
+        ready = dict(poll.poll(1e3 * seconds))
+        if self._output in ready:
+            self._read()
+        if self._waiting:
+            self._write()
+        return ended in ready
+
+    def _read(self) -> bool:
+        """Take what is in the worker's pipe; whether there was anything."""
+        try:
+            found = os.read(self._output, 2**20)
+        except OSError:
+            return False
+        room = max(0, BUFFER - len(self._waiting))
+        if self._left_out and room > len(found):
+            self._waiting += f"\n[{self._left_out} bytes are left out]\n".encode()
+            self._left_out = 0
+        self._waiting += found[:room]
+        self._left_out += len(found) - len(found[:room])
+        return bool(found)
+
+    def _write(self) -> None:
+        try:
+            del self._waiting[: os.write(self._command, self._waiting[: 2**20])]
+        except BlockingIOError:
+            pass
+        except OSError:  # the command is gone
+            self._waiting.clear()
+
+    def _pass_on_rest(self) -> None:
+        until = time.monotonic() + _GRACE
+        while self._read():
+            pass
+        while self._waiting and time.monotonic() < until:
+            select.select([], [self._command], [], 0.1)
+            self._write()
+
+    def _reap(self, sparing: int = 0) -> None:
+        """Let go of ended processes that are children of this one."""
+        with suppress(OSError):
+            while found := os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+                if found.si_pid == sparing:
+                    return
+                os.waitpid(found.si_pid, os.WNOHANG)
+
+    def _end_all(self) -> None:
+        """Kill all processes below this one, those included that they start meanwhile."""
+        if not has_children():
+            return
+        import psutil  # for those who left something
+
+        until = time.monotonic() + _GRACE
+        while time.monotonic() < until and has_children():
+            for process in psutil.Process().children(recursive=True):
+                with suppress(psutil.Error, OSError):
+                    process.kill()
+            self._reap()
+            time.sleep(0.001)
