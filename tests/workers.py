@@ -118,8 +118,10 @@ def leave_processes(how: str, tick: Tick) -> int:
         return subprocess.Popen(["sleep", "600"]).pid
     if how == "a session of its own":
         return subprocess.Popen(["sleep", "600"], start_new_session=True).pid
-    told = "import os, time; child = os.fork(); print(child, flush=True) if child else (os.setsid(), os.close(1), time.sleep(600))"
-    shell = subprocess.run([sys.executable, "-c", told], stdout=subprocess.PIPE, timeout=60, check=True)
+    program = (
+        "import os, time; child = os.fork(); print(child) if child else (os.setsid(), os.close(1), time.sleep(600))"
+    )
+    shell = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, timeout=60, check=True)
     return int(shell.stdout)
 
 

@@ -21,10 +21,8 @@ class TreeMemory:
         if not new:
             return False
         taken = sum(_bytes(process, "smaps_rollup", ("Private_Dirty:", "Pss_Shmem:")) for process in new)
-        taken += sum(
-            _bytes(process, "status", ("VmData:",)) - self._before.get(process, 0) for process in {*found} - new
-        )
-        return taken > self._most
+        others = [process for process in self._before if process in found]
+        return taken + sum(_bytes(one, "status", ("VmData:",)) - self._before[one] for one in others) > self._most
 
 
 def _below(process: int) -> Iterator[int]:

@@ -7,7 +7,6 @@ has started when the worker ends, when the command asks for it (SIGTERM), and wh
 
 from __future__ import annotations
 
-import ctypes
 import os
 import select
 import signal

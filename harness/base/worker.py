@@ -43,8 +43,8 @@ parent of all processes below it whose parents end."""
 
 
 class Limits(NamedTuple):
-    """What a piece may take: wall seconds, and GiB of memory beyond what a worker has anyway, the processes that it starts
-    included; None is any amount. log: the file for what it writes where that is too long to be shown."""
+    """What a piece may take: wall seconds, and GiB of memory beyond what a worker has anyway, with the processes that it
+    starts; None is any amount. log: the file for what it writes where that is too long to be shown."""
 
     seconds: float | None = None
     gib: float | None = None

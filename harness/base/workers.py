@@ -67,7 +67,7 @@ class Workers:
     def __init__(self, ready: Callable[[], object] = int, *, fork: bool = True) -> None:
         self._ready, self._fork = ready, fork
         self._worker: _Worker | None = None
-        self._own = frozenset[Hashable]()
+        self._own: frozenset[Hashable] = frozenset()
 
     def begin(self) -> None:
         """Start a worker where there is none; it gets ready while this process does something else."""
@@ -116,7 +116,7 @@ class Workers:
         """Let go of everything."""
         if self._worker:
             self._worker.end()
-            self._worker, self._own = None, frozenset()
+            self._worker, self._own = None, frozenset[Hashable]()
 
 
 class _Worker:
@@ -144,7 +144,7 @@ class _Worker:
     def ask(self, piece: Piece, tick: Tick, limits: Limits) -> Generator[Connection, None, PieceOutcome]:
         """The answer to a piece, in the end. Raises Lost."""
         heard, began = _Heard(self._ticks, self._said, tick, limits.log), monotonic()
-        memory = limits.gib and TreeMemory(self._process.pid or 0, limits.gib)
+        memory = TreeMemory(self._process.pid or 0, limits.gib) if limits.gib else None
         try:
             self._calls.send((piece, limits, heard.end))
             while not self._calls.poll():
