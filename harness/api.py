@@ -38,7 +38,7 @@ from solvers.registry import EVERY
 
 def load_scene(path: str | Path) -> SceneSpec:
     """The scene in a YAML file, or in an assignment's JSON file. Raises InputError."""
-    return load.load_scene(Path(path))
+    return load.opened_scene(Path(path))
 
 
 def make_scene(
@@ -164,7 +164,7 @@ def run(
         sweep = load.load_any(path)
     place = claimed(Path(results) / sweep.name, path)
     table = run_sweep(sweep.name, sweep.runs(), place, Lines(err()), lambda line: None, again=again)
-    draw_reports(sweep.reports, table, place)
+    draw_reports(sweep.reports, table, place, sweep.options.time_limit)
     return _frame(table)
 
 

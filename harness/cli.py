@@ -140,7 +140,7 @@ def _told(sweep: Sweep, table: pa.Table, config: Path, results: Path, folder: Pa
 
     out().print(summary_table(table, of_other_code(sweep.runs(), table)))
     _say(f"rows, recordings and pictures are in {folder}")
-    for path in draw_reports(sweep.reports, table, folder):
+    for path in draw_reports(sweep.reports, table, folder, sweep.options.time_limit):
         _say(f"reported in {path}")
     keep(results, folder, _say, quiet=True)
     failed = failures(table)

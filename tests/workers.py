@@ -118,10 +118,8 @@ def leave_processes(how: str, tick: Tick) -> int:
         return subprocess.Popen(["sleep", "600"]).pid
     if how == "a session of its own":
         return subprocess.Popen(["sleep", "600"], start_new_session=True).pid
-    program = (
-        "import os, time; child = os.fork(); print(child) if child else (os.setsid(), os.close(1), time.sleep(600))"
-    )
-    shell = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, timeout=60, check=True)
+    forks = "child = os.fork(); print(child) if child else (os.setsid(), os.close(1), time.sleep(600))"
+    shell = subprocess.run([sys.executable, "-c", f"import os, time; {forks}"], stdout=subprocess.PIPE, timeout=60)
     return int(shell.stdout)
 
 

@@ -10,6 +10,15 @@ from pathlib import Path
 from solvers import sources
 
 
+def said(error: BaseException) -> str:
+    """The type of an error and its message in one line, cut to a length that fits; other people's may fail to tell."""
+    try:
+        words = " ".join(str(error).split())[:300]
+    except Exception:
+        words = "its message cannot be had"
+    return f"{type(error).__name__}{f': {words}' if words else ''}"
+
+
 def where(error: BaseException, own: Collection[str]) -> str:
     """`file:line` of an error: the last line in the files `own`, else in those of other people, else of all; with the
     line that raised it behind that, where it is another."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import os
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeGuard, TypeVar, get_args
@@ -23,18 +24,40 @@ _CAME = "; should be "
 M = TypeVar("M", bound=BaseModel)
 
 
+def _nothing(said: str) -> None:
+    pass
+
+
+@dataclass(frozen=True, slots=True)
+class OwnCode:
+    """What becomes of code of others that a config names. opens: whether it is imported here, else it is told by its
+    files alone; tell: told what is about to be imported; stated: by solver, what its class states, where that is known;
+    kept: whether parameters of shipped solvers may be those of an earlier time."""
+
+    opens: bool = True
+    tell: Callable[[str], None] = _nothing
+    stated: Mapping[str, Mapping[str, Any]] = field(default_factory=dict[str, Mapping[str, Any]])
+    kept: bool = False
+
+
+IMPORTED = OwnCode()
+"""Code of others is imported."""
+UNOPENED = OwnCode(opens=False)
+"""Code of others stays what it is, files."""
+
+
 @dataclass(slots=True)
 class Document:
     """A config as plain data, the line of each key, and the mistakes found in it so far.
 
-    opens: whether code that the config names is imported; else it is told by its files alone.
+    own: what becomes of code that the config names.
     """
 
     path: Path
     data: dict[str, Any]
     lines: dict[Key, int] = field(default_factory=dict[Key, int])
     mistakes: list[Mistake] = field(default_factory=list[Mistake])
-    opens: bool = True
+    own: OwnCode = IMPORTED
 
     def report(self, problem: str, at: Key = ()) -> None:
         """Note a mistake at a key; a key that is not in the file gets the line of the mapping around it."""
@@ -60,6 +83,15 @@ class Document:
                 others = [problem.removeprefix(came) for problem in said[1:]]
                 self.report(" or ".join([said[0], *others]), at + key)
             return None
+
+    def with_paths(self, model: type[BaseModel], data: dict[str, Any], at: Key) -> dict[str, Any]:
+        """The data with its file names made relative to the config's folder; a missing file is a mistake."""
+        names = [k for k, f in model.model_fields.items() if f.annotation is Path and isinstance(data.get(k), str)]
+        for key in names:
+            data = data | {key: str(self.path.parent / data[key])}
+            if not os.path.isfile(data[key]):
+                self.report(f"there is no file {quote(data[key])}", (*at, key))
+        return data
 
     def choose(self, data: Any, table: Mapping[str, Any], tag: str, at: Key) -> tuple[str, dict[str, Any]] | None:
         """Split the mapping `data` into the name under its key `tag`, one of `table`, and its other keys."""

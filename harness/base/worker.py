@@ -20,7 +20,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, NamedTuple
 
-from harness.base.blame import where
+from harness.base.blame import said, where
 from harness.base.child import data, limit, reader, without_core_dumps
 from harness.base.console import write_plainly
 from harness.base.errors import SpringbenchError
@@ -43,8 +43,8 @@ parent of all processes below it whose parents end."""
 
 
 class Limits(NamedTuple):
-    """What a piece may take: wall seconds, and GiB of memory beyond what a worker has anyway, with the processes that it
-    starts; None is any amount. log: the file for what it writes where that is too long to be shown."""
+    """What a piece may take: wall seconds, and GiB of memory beyond what a worker has anyway, in all its processes;
+    None is any amount. log: the file for what it writes where that is too long to be shown."""
 
     seconds: float | None = None
     gib: float | None = None
@@ -129,8 +129,7 @@ def _answer(piece: Piece, limits: Limits, tick: Tick) -> PieceOutcome:
     except SpringbenchError as error:
         return PieceOutcome(None, error, clean=_as(before) and not broken())
     except BaseException as error:  # SystemExit and GeneratorExit too: whoever called is not to leave
-        said = " ".join(str(error).split())[:300]
-        why = f"raised {type(error).__name__}{f': {said}' if said else ''} ({where(error, ())})"
+        why = f"raised {said(error)} ({where(error, ())})"
         return PieceOutcome(None, why, clean=isinstance(error, Exception) and _as(before) and not broken())
     finally:
         limit(resource.RLIMIT_DATA, resource.RLIM_INFINITY)

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
-from harness.base.document import Document, Key, quote
+from harness.base.document import Document, Key, OwnCode, quote
 from harness.base.errors import InputError, Mistake, did_you_mean
 from harness.base.yaml import read_yaml
 from harness.config.accuracy import AccuracyFields, Case, CurveSpec, CurveStudy, How, Study, WorkSpec, WorkStudy
 from harness.config.expand import check_size
-from harness.config.load import check_name, misfits, scenes_of
+from harness.config.load import check_name, misfits_of, scenes_of, stated_by
 from harness.config.options import OF_STEPS
+from harness.config.own import MOST, tried
 from harness.config.solvers import solvers_of
 from harness.config.sweep import SolverSpec
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
-from solvers.registry import EVERY, load, minimises
+from solvers.plugins import found
 
 MAX_UNITS = 20_000
 
@@ -34,8 +36,22 @@ class Accuracy:
 
 
 def load_accuracy(path: Path) -> Accuracy:
-    """The accuracy config in a YAML file. Raises InputError."""
-    document = read_yaml(path)
+    """The accuracy config in a YAML file; code that it names was tried before (`harness.config.own`). Raises
+    InputError."""
+    return tried(partial(_load, path), _has_own, _stated, lambda accuracy: MOST)
+
+
+def _has_own(accuracy: Accuracy) -> bool:
+    units = (*accuracy.curves, *accuracy.work)
+    return any(unit.case.scene.own or found([unit.solver.name, unit.case.integrator]) for unit in units)
+
+
+def _stated(accuracy: Accuracy) -> dict[str, Any]:
+    return stated_by({unit.solver.name: None for unit in (*accuracy.curves, *accuracy.work)})
+
+
+def _load(path: Path, own: OwnCode) -> Accuracy:
+    document = replace(read_yaml(path), own=own)
     if not {"curves", "work"} & set(document.data):
         problem = "is no accuracy config: it has neither `curves` nor `work`; `springbench run` does scenes and sweeps"
         raise InputError(Mistake(problem, path))
@@ -60,7 +76,7 @@ def expand(
         document.report(f"asks for {len(curves) + len(work)} units of work; at most {MAX_UNITS} are allowed")
     for name, scene in scenes.items():
         sizes = [unit.case.size for unit in (*curves, *work) if unit.case.scene_name == name]
-        document.mistakes.extend(misfits(scene, sizes) if not document.mistakes else [])
+        document.mistakes.extend(misfits_of(document, name, scene, sizes) if not document.mistakes else [])
     if document.mistakes:
         raise document.error()
     return Accuracy(
@@ -93,7 +109,7 @@ class _Expansion:
         if "coarse" in study.first_guess:
             problem = "a curve's clock begins at its first guess, and this one is a solve itself; compare it in a sweep"
             self.document.report(f"coarse: {problem}", (*at, "first_guess"))
-        solvers = [solver for solver in self._solvers(study, at) if minimises(load(EVERY[solver.name]))]
+        solvers = [solver for solver in self._solvers(study, at) if solver.minimises]
         for case, moment, solver in product(self._cases(study, at), study.moment, solvers):
             if isinstance(moment, int) and moment > case.scene.frames:
                 problem = f"frame {moment} is not among the {case.scene.frames} frames of {case.scene_name}"

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from harness.base.document import Document, Key, is_list, key_text, quote
+from harness.base.document import IMPORTED, Document, Key, OwnCode, is_list, key_text, quote
 from harness.base.errors import InputError, Mistake
 from harness.base.model import Model
+from harness.base.stated import packages, stated
 from harness.base.yaml import read_yaml
 from harness.config.expand import Expansion
 from harness.config.options import AUTO, DEFAULT_SOLVER, DEFAULT_STOP
-from harness.config.own import UnopenedEffect, UnopenedMesh, chosen, given, opened
+from harness.config.own import BINDING, MOST, chosen, given, tried, within
 from harness.config.solvers import solvers_of
 from harness.config.sweep import Options, RunSpec, SweepFields
 from harness.scenes.assignment import FORCE, PIN_WEIGHT, TIME_STEP, read_assignment
@@ -24,6 +26,7 @@ from harness.scenes.effects import effect_names
 from harness.scenes.mesh import mesh_names
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.generator import Generator
+from harness.scenes.own import OwnEffect, OwnMesh, checked, opened
 from harness.scenes.spec import NAME, SceneFile, SceneSpec
 from solvers.plugins import Plugin, found, load
 
@@ -64,13 +67,18 @@ def load_any(
 
     For a scene, `solvers`, `sizes` and `options` (those of `harness.config.sweep.Options`, None as null in a sweep) say
     what to run; a sweep says so itself. Where nothing is stated of how steps end, they end as `DEFAULT_STOP` states,
-    those of an assignment's scene as in a sweep. opens: whether code that it names is run; else its parameters are not
-    checked. Raises InputError.
+    those of an assignment's scene as in a sweep. opens: whether code that it names is tried before, in a process of its
+    own; else its parameters are not checked. Raises InputError.
     """
+    load = partial(_any, path, solvers, sizes, options)
+    return _tried_sweep(load) if opens else load(OwnCode(opens=False, kept=True))
+
+
+def _any(path: Path, solvers: Sequence[str], sizes: Sequence[int], options: dict[str, Any], own: OwnCode) -> Sweep:
     asked = {key: value for key, value in options.items() if value is not None}
     assignment = _is_assignment(path)
     document = Document(path, {}) if assignment else read_yaml(path)
-    document.opens = opens
+    document.own = own
     if {"curves", "work"} & set(document.data):
         raise InputError(Mistake("is an accuracy config; run it with `springbench accuracy`", path))
     if "goals" in document.data:
@@ -78,7 +86,7 @@ def load_any(
     if "scenes" in document.data:
         if solvers or sizes or asked:
             raise InputError(Mistake("is a sweep, which says itself what to run; change the file instead", path))
-        return sweep_of(document)
+        return _sweep_of(document)
     if not assignment and "mesh" not in document.data:
         raise InputError(Mistake("is neither a scene (it has no `mesh`) nor a sweep (it has no `scenes`)", path))
     scene = scene_from_assignment(path) if assignment else scene_of(document)
@@ -86,7 +94,7 @@ def load_any(
         asked = DEFAULT_STOP | asked
     usual = ASSIGNMENT_SOLVER if assignment else DEFAULT_SOLVER
     keys = {"scenes": [path.name], "sizes": list(sizes), "solvers": list(solvers) or [usual]}
-    alone = Document(path, {**keys, "options": {"threads": AUTO, **asked}}, opens=opens)
+    alone = Document(path, {**keys, "options": {"threads": AUTO, **asked}}, own=own)
     return _expanded(alone, {path.stem: scene})
 
 
@@ -95,9 +103,43 @@ def load_sweep(path: Path) -> Sweep:
     return sweep_of(read_yaml(path))
 
 
-def load_scene(path: Path, *, opens: bool = True) -> SceneSpec:
-    """The scene in a YAML file, or in an assignment's JSON file; opens: see `load_any`. Raises InputError."""
-    return scene_from_assignment(path) if _is_assignment(path) else scene_of(replace(read_yaml(path), opens=opens))
+def _tried_sweep(load: Callable[[OwnCode], Sweep]) -> Sweep:
+    return tried(load, _has_own, _stated, lambda sweep: within(sweep.options.time_limit, sweep.options.memory_limit))
+
+
+def _has_own(sweep: Sweep) -> bool:
+    return bool(found(sweep.reports)) or any(run.own() for run in sweep.expanded)
+
+
+def _stated(sweep: Sweep) -> dict[str, Any]:
+    return stated_by({run.solver.name: None for run in sweep.expanded})
+
+
+def stated_by(solvers: Iterable[str]) -> dict[str, Any]:
+    """What those solvers among these state that are somebody's own; their code is imported."""
+    return {str(name): stated(name) | {"packages": packages(name)} for name in found(solvers)}
+
+
+def load_scene(path: Path) -> SceneSpec:
+    """The scene in a YAML file, or in an assignment's JSON file; code that it names was tried before, as it is for
+    `load_any`. Raises InputError."""
+    return tried(partial(_scene, path), lambda scene: bool(scene.own), _bound, lambda scene: MOST)
+
+
+def _bound(scene: SceneSpec) -> dict[str, Any]:
+    """Bind a scene at its own size; no solver states anything of it."""
+    if mistakes := misfits(scene, [scene.default_size or 0]):
+        raise InputError(mistakes)
+    return {}
+
+
+def opened_scene(path: Path) -> SceneSpec:
+    """The same with code that it names imported in this process. Raises InputError."""
+    return _scene(path, IMPORTED)
+
+
+def _scene(path: Path, own: OwnCode) -> SceneSpec:
+    return scene_from_assignment(path) if _is_assignment(path) else scene_of(replace(read_yaml(path), own=own))
 
 
 def scene_from_assignment(path: Path) -> SceneSpec:
@@ -162,7 +204,7 @@ def _digest(source: Any) -> str:
     return digest.hexdigest()
 
 
-_PARTS = {"mesh": (mesh_names.EVERY, UnopenedMesh), "effect": (effect_names.EVERY, UnopenedEffect)}
+_PARTS = {"mesh": (mesh_names.EVERY, OwnMesh), "effect": (effect_names.EVERY, OwnEffect)}
 
 
 def _part(document: Document, what: str, data: Any, at: Key, own: dict[str, tuple[Plugin, dict[str, Any]]]) -> Any:
@@ -177,26 +219,24 @@ def _part(document: Document, what: str, data: Any, at: Key, own: dict[str, tupl
     name, parameters = named
     if not isinstance(name, Plugin):
         model = load(table[name])
-        return document.check(model, _with_paths(document, model, data, at), at)
+        return document.check(model, document.with_paths(model, data, at), at)
     own[key_text(at)] = name, given(document, parameters)
-    if not document.opens:
-        return unopened(kind=str(name))
-    model = opened(document, name, what, (*at, "kind"))
-    return model and document.check(model, _with_paths(document, model, parameters, at), at)
-
-
-def _with_paths(document: Document, model: type[Model], data: dict[str, Any], at: Key) -> dict[str, Any]:
-    """The data with its file names made relative to the config's folder; a missing file is a mistake."""
-    names = [k for k, f in model.model_fields.items() if f.annotation is Path and isinstance(data.get(k), str)]
-    for key in names:
-        data = data | {key: str(document.path.parent / data[key])}
-        if not os.path.isfile(data[key]):
-            document.report(f"there is no file {quote(data[key])}", (*at, key))
-    return data
+    if not document.own.opens:
+        return unopened(kind=name, parameters=parameters, folder=str(document.path.parent.absolute()))
+    return checked(document, name, what, parameters, at)
 
 
 def sweep_of(document: Document) -> Sweep:
-    """The sweep in a document, its scenes read from the files that it names. Raises InputError."""
+    """The sweep in a document, its scenes read from the files that it names; code that it names was tried before.
+    Raises InputError."""
+    return _tried_sweep(partial(_sweep_by, document))
+
+
+def _sweep_by(document: Document, own: OwnCode) -> Sweep:
+    return _sweep_of(replace(document, own=own, mistakes=[]))
+
+
+def _sweep_of(document: Document) -> Sweep:
     return _expanded(document, scenes_of(document))
 
 
@@ -214,7 +254,7 @@ def scenes_of(document: Document) -> dict[str, SceneSpec]:
             document.report(f"two scenes are named {path.stem}; rename one of the files", at)
         else:
             try:
-                scenes[path.stem] = load_scene(path, opens=document.opens)
+                scenes[path.stem] = _scene(path, document.own)
             except InputError as error:
                 document.mistakes.extend(error.mistakes)
     return scenes
@@ -227,14 +267,14 @@ def _expanded(document: Document, scenes: dict[str, SceneSpec]) -> Sweep:
     if sweep is None or document.mistakes:
         raise document.error()
     runs = Expansion(document, document.path.stem, sweep, scenes, solvers).runs()
-    if document.opens:
+    if document.own.opens:
         for integrator in found({run.integrator: None for run in runs}):
             opened(document, integrator, "integrator", ("options", "integrator"))
         for report in found(sweep.reports):
             opened(document, report, "report", ("reports",))
     for name, scene in scenes.items():
         sizes = [run.size for run in runs if run.scene_name == name]
-        document.mistakes.extend(misfits(scene, sizes) if document.opens or not scene.own else [])
+        document.mistakes.extend(misfits_of(document, name, scene, sizes))
     if document.mistakes:
         raise document.error()
     return Sweep(document.path.stem, sweep.options, runs, sweep.reports)
@@ -246,6 +286,14 @@ def require_stated(runs: Iterable[RunSpec]) -> None:
         raise InputError(
             Mistake("chooses the steps of each run, which `springbench run` does; leave it out", key="accuracy")
         )
+
+
+def misfits_of(document: Document, name: str, scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:
+    """See `misfits`; of scenes with code of others only where that is imported."""
+    if not scene.own:
+        return misfits(scene, sizes)
+    document.own.tell(f"{BINDING}{name}")
+    return misfits(scene, sizes) if document.own.opens else []
 
 
 def misfits(scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:

@@ -1,22 +1,24 @@
-"""Somebody's own code in a config: named, told by its file, and opened where something is to run."""
+"""Somebody's own code in a config: named, told by its file, and tried in a process of its own before anything runs."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, is_dataclass
-from typing import Any, ClassVar, NoReturn
+from functools import partial
+from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+from harness.base.document import UNOPENED, Document, Key, OwnCode, is_mapping
+from harness.base.errors import InputError
+from harness.base.workers import Limits, Lost, Tick, Workers
+from harness.scenes.own import ABOUT
+from solvers.plugins import Plugin, Refused, Table
 
-from harness.base.document import Document, Key, is_mapping
-from harness.base.model import Model
-from harness.scenes.effects.base import Contribution
-from harness.scenes.mesh.base import Mesh
-from harness.scenes.mesh.generator import Generator
-from solvers import integrators
-from solvers.plugins import Plugin, Refused, Table, load
+MOST = Limits(60.0, 2.0)
+"""What importing and binding code of others may take before a command starts; a config may say less time, or another
+memory."""
+
+T = TypeVar("T")
+Load = Callable[[OwnCode], T]
 
 
 def chosen(document: Document, table: Table, data: Any, tag: str, at: Key) -> tuple[str, dict[str, Any]] | None:
@@ -43,69 +45,47 @@ def _with_digest(document: Document, value: Any) -> Any:
     return [value, hashlib.sha256(path.read_bytes()).hexdigest()] if path and path.is_file() else value
 
 
-def opened(document: Document, plugin: Plugin, what: str, at: Key) -> Any:
-    """What a plug-in leads to, one of WANTED; its code runs now. None after a mistake was noted."""
-    wanted, fits = WANTED[what]
+def tried(
+    load: Load[T], has_own: Callable[[T], bool], stated: Callable[[T], dict[str, Any]], limits: Callable[[T], Limits]
+) -> T:
+    """What a config loads to, where code of others stays unopened. Where it has some, that was opened before in a
+    process of its own, which found no mistakes, and told what solvers state.
+
+    load: pickles; has_own: whether there is code of others; stated: by solver, asked where its class is imported.
+    Raises InputError, also where that process is lost.
+    """
+    found = load(UNOPENED)
+    if not has_own(found):
+        return found
+    return load(OwnCode(opens=False, stated=_elsewhere(partial(_open, load, stated), limits(found))))
+
+
+def _open(load: Load[T], stated: Callable[[T], dict[str, Any]], tick: Tick) -> dict[str, Any]:
+    return stated(load(OwnCode(tell=tick)))
+
+
+def _elsewhere(piece: Callable[[Tick], Any], limits: Limits) -> Any:
+    does = "the code that the config names"
+
+    def hear(said: str) -> None:
+        nonlocal does
+        does = said.removeprefix("\0") if said.startswith((ABOUT, BINDING)) else does
+
+    workers = Workers()
     try:
-        made = load(plugin.target)
-    except Exception as error:  # it is somebody's code, and may fail in any way
-        document.report(f"{plugin} cannot be loaded: {type(error).__name__}: {error}", at)
-        return None
-    if not fits(made):
-        document.report(f"{plugin} is no {what}; wanted {wanted}", at)
-        return None
-    return made
+        return workers.do(piece, hear, limits)
+    except Lost as lost:
+        reason = str(lost).replace(", before its first step", "")
+        raise InputError(f"{does} {reason}") from None
+    finally:
+        workers.end()
 
 
-def _is_model(base: type[Model], method: str) -> Callable[[Any], bool]:
-    return lambda made: isinstance(made, type) and issubclass(made, base) and callable(getattr(made, method, None))
+def within(seconds: float | None, gib: float | None) -> Limits:
+    """MOST, with a config's limits."""
+    assert MOST.seconds
+    return Limits(min(MOST.seconds, seconds or MOST.seconds), gib or MOST.gib)
 
 
-WANTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "solver": (
-        "a frozen dataclass with a method `prepare`",
-        lambda made: isinstance(made, type) and is_dataclass(made) and callable(getattr(made, "prepare", None)),
-    ),
-    "effect": (
-        "a subclass of harness.base.model.Model with a method `bind` and a `kind`",
-        lambda made: _is_model(Model, "bind")(made) and hasattr(made, "model_fields") and "kind" in made.model_fields,
-    ),
-    "mesh": ("a subclass of harness.scenes.mesh.generator.Generator", _is_model(Generator, "generate")),
-    "report": ("a function of rows and a folder", callable),
-    "integrator": (
-        "an object of solvers.integrators.Integrator",
-        lambda made: isinstance(made, integrators.AnyIntegrator),
-    ),
-}
-"""What own code may be: in words, and by a test."""
-
-
-@dataclass(frozen=True, slots=True)
-class UnopenedEffect:
-    """An effect that is known by its name alone."""
-
-    kind: str
-
-    def bind(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> Contribution:
-        """Never asked for."""
-        return _unopened(self.kind)
-
-
-class UnopenedMesh(Generator):
-    """A mesh that is known by its name alone."""
-
-    kind: str
-    COUNTS: ClassVar[str] = "as its code says"
-    SPRINGS: ClassVar[int] = 1
-
-    def count(self, size: int) -> int:
-        """Unknown; taken for the size."""
-        return size
-
-    def generate(self, size: int) -> Mesh:
-        """Never asked for."""
-        return _unopened(self.kind)
-
-
-def _unopened(kind: str) -> NoReturn:
-    raise RuntimeError(f"{kind} was not opened")
+BINDING = "\0binding "
+"""What a process says, with the name of a scene behind it, before it binds one."""

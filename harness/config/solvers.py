@@ -17,11 +17,13 @@ from typing import Any, get_type_hints
 
 from pydantic import create_model
 
+from harness.base.blame import said, where
 from harness.base.document import Document, Key, is_list, is_mapping
 from harness.base.files import CannotWrite, replacing, users_cache
 from harness.base.model import Model
-from harness.config.own import chosen, opened
+from harness.config.own import chosen
 from harness.config.sweep import SolverSpec
+from harness.scenes.own import opened
 from solvers import sources
 from solvers.plugins import Plugin, load
 from solvers.registry import EVERY
@@ -48,25 +50,41 @@ def _solver(document: Document, entry: str | dict[str, Any], at: Key) -> SolverS
         return None
     name, asked = named
     own = isinstance(name, Plugin)
-    if own and not document.opens:
-        return SolverSpec(name, asked)
-    kept = None if own or asked or document.opens else _kept_file(name)
+    if own and not document.own.opens:
+        return SolverSpec(name, asked, document.own.stated.get(name, {}))
+    kept = None if own or asked or not document.own.kept else _kept_file(name)
     if kept is not None and (known := _read(kept)) is not None:
         return SolverSpec(name, known)
-    solver = opened(document, name, "solver", at) if own else load(EVERY[name])
-    parameters = solver and document.check(parameters_model(name, solver), asked, at)
+    if own:
+        _try(document, name, asked, at)
+        return SolverSpec(name, asked)  # as `list` has them
+    solver = load(EVERY[name])
+    parameters = document.check(parameters_model(name, solver), asked, at)
     if parameters is None:
         return None
     try:
         solver(**vars(parameters))
     except ValueError as error:
         document.report(str(error), at)
-    if own:
-        return SolverSpec(name, asked)  # as `list` has them
     found: dict[str, Any] = _stated(solver, parameters)
     if kept is not None:
         _keep(kept, found)
     return SolverSpec(name, found)
+
+
+def _try(document: Document, name: Plugin, asked: dict[str, Any], at: Key) -> None:
+    """Make a solver of somebody's own, and note what mistakes there are."""
+    solver = opened(document, name, "solver", at)
+    if solver is None:
+        return
+    try:
+        parameters = document.check(parameters_model(name, solver), asked, at)
+        if parameters is not None:
+            solver(**vars(parameters))
+    except ValueError as error:
+        document.report(str(error), at)
+    except Exception as error:
+        document.report(f"{name} cannot be made of these parameters: {said(error)} ({where(error, {name.source})})", at)
 
 
 def parameters_model(name: str, solver: type) -> type[Model]:

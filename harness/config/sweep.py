@@ -5,16 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, SkipValidation
 
 from harness.base.files import safe_name
 from harness.base.model import Many, Model
+from harness.base.stated import packages, stated
 from harness.config.options import OPTIONS, Chosen, lists
 from harness.scenes.spec import SceneSpec, Size, named_in
 from solvers.plugins import Plugin, Table, found, identity
+from solvers.registry import EVERY, load, minimises
 
 REPORTS: dict[str, str] = {
     "certificates": "harness.report.certificates:certificates",
@@ -118,10 +120,30 @@ class SweepFields(Model):
 
 @dataclass(frozen=True, slots=True)
 class SolverSpec:
-    """A solver's name and all of its parameters, defaults included."""
+    """A solver's name and all of its parameters, defaults included. stated: what the class of somebody's own states,
+    as `harness.base.stated` has it, its `packages` among it; nothing for shipped ones."""
 
     name: str
     parameters: Mapping[str, Any]
+    stated: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """The columns of what it states of itself; the class of somebody's own is not imported for them."""
+        if not isinstance(self.name, Plugin):
+            return stated(self.name)
+        return {name: value for name, value in self.stated.items() if name != "packages"}
+
+    @property
+    def minimises(self) -> bool:
+        """See `solvers.registry.minimises`."""
+        own = isinstance(self.name, Plugin)
+        return bool(self.stated.get("minimises", True)) if own else minimises(load(EVERY[self.name]))
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """The distributions of others that it is an interface to."""
+        return tuple(self.stated.get("packages", ())) if isinstance(self.name, Plugin) else packages(self.name)
 
 
 class RunSpec(Kept, Chosen):

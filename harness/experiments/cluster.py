@@ -34,7 +34,8 @@ from harness.base import machine
 from harness.base.errors import InputError, Mistake, RunFailed
 from harness.base.files import CannotWrite, replacing
 from harness.base.progress import Display, Effort
-from harness.base.workers import Lost, Workers
+from harness.base.workers import Lost, Tick, Workers
+from harness.config.own import MOST
 from harness.config.sweep import RunSpec
 from harness.experiments.core import TABLES, ready, watched
 from harness.experiments.plan import Files
@@ -157,13 +158,32 @@ def machines(client: Client, runs: Sequence[RunSpec], say: Callable[[str], None]
 
 def _about(plugins: Sequence[Plugin]) -> tuple[WorkerFacts, dict[str, str]]:
     """On a worker: what it is, and which plug-ins it has not, and why."""
+    missing = dict[str, str]()
+    if plugins:
+        _allow_children()
+        process = Workers(fork=False)
+        try:
+            missing = process.do(partial(_missing, plugins), lambda _: None, MOST)
+        except Lost as lost:
+            missing = {", ".join(plugins): f"the process that imports it {lost}"}
+        finally:
+            process.end()
+    return WorkerFacts.this(), missing
+
+
+def _missing(plugins: Sequence[Plugin], tick: Tick) -> dict[str, str]:
     missing = {}
     for plugin in plugins:
         try:
             load(plugin.target)
         except Exception as error:
             missing[str(plugin)] = f"{type(error).__name__}: {error}"
-    return WorkerFacts.this(), missing
+    return missing
+
+
+def _allow_children() -> None:
+    """Dask's nannies make their workers daemons, which may have no children; these end with their parent."""
+    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
 
 
 def do_on(
@@ -279,8 +299,7 @@ def _do(unit: RunUnit, folder: Path, token: str, code: str, tables: Sequence[Map
     me = distributed.get_worker().address
     if machine.code_hash() != code:
         return Done(me, useless=f"has other code, {machine.code_hash()} and not {code}")
-    # Dask's nannies make their workers daemons, which may have no children; these end with their parent by themselves.
-    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
+    _allow_children()
     process = _PROCESSES.pop() if _PROCESSES else Workers(partial(ready, tables), fork=False)
     try:
         with TemporaryDirectory(prefix="springbench-") as temporary:

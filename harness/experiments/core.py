@@ -75,6 +75,16 @@ class Sharing(Protocol):
         ...
 
 
+@runtime_checkable
+class Foreign(Protocol):
+    """What units have that run code of others; a unit that runs none of it is done in another process."""
+
+    @property
+    def own(self) -> frozenset[Hashable]:
+        """What tells that code from other code."""
+        ...
+
+
 class Filed(Unit, Protocol):
     """A unit that several commands may be about to do."""
 
@@ -136,7 +146,8 @@ def do_all(
             display.elsewhere(unit.title, unit.effort, why)
             return None
         run = runs[number] = display.run(unit.title, unit.ticks, unit.effort)
-        return Task(partial(watched, unit), run.tick, unit.limits)
+        own = unit.own if isinstance(unit, Foreign) else frozenset[Hashable]()
+        return Task(partial(watched, unit), run.tick, unit.limits, own=own)
 
     try:
         if not isolated:

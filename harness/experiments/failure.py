@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from harness.base.blame import where
-from harness.base.errors import RunFailed
+from harness.base.blame import said, where
+from harness.base.errors import InputError, RunFailed
 from harness.base.files import CannotWrite
 from harness.config.sweep import RunSpec
 from harness.simulation.energy_balance import Growth
@@ -43,6 +43,6 @@ def grown(run: RunSpec, growth: Growth, by_frame: Mapping[int, Mapping[str, Any]
 
 def _reason(error: BaseException, own: Collection[Path]) -> str:
     """An error of ours speaks for itself; of any other the row also says what it was and where it came from."""
-    if isinstance(error, (Unsupported, NotPositiveDefinite, Blocked, Diverged, RunFailed)):
+    if isinstance(error, (Unsupported, NotPositiveDefinite, Blocked, Diverged, RunFailed, InputError)):
         return str(error)
-    return f"{type(error).__name__}: {error} ({where(error, set(map(str, own)))})"
+    return f"{said(error)} ({where(error, set(map(str, own)))})"

@@ -49,6 +49,10 @@ class Files:
             folder / "pictures" / f"{label}.png",
         )
 
+    def absolute(self) -> Files:
+        """The same files, whatever the working folder becomes."""
+        return Files(self.rows.absolute(), self.recording.absolute(), self.picture.absolute())
+
 
 @dataclass(frozen=True, slots=True)
 class PlannedRun:

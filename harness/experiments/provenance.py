@@ -7,19 +7,15 @@ from datetime import UTC, datetime
 from typing import Any
 
 from harness.base import machine
-from harness.base.stated import packages, stated
 from harness.config.options import OPTIONS
-from harness.config.sweep import RunSpec
+from harness.config.sweep import RunSpec, SolverSpec
 
 
 def common(run: RunSpec) -> dict[str, Any]:
     """The columns that are the same in all rows of a run."""
     limits = {"time_limit": run.time_limit, "memory_limit": run.memory_limit, "timing": run.timing}
     return (
-        {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep}
-        | asked(run)
-        | limits
-        | provenance(run.solver.name)
+        {"run_id": run.run_id(machine.describe().id), "sweep": run.sweep} | asked(run) | limits | provenance(run.solver)
     )
 
 
@@ -31,7 +27,7 @@ def asked(run: RunSpec) -> dict[str, Any]:
         "solver": run.solver.name,
         "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
         "own": json.dumps([plugin.identity() for plugin in run.own()]) if run.own() else None,
-        **stated(run.solver.name),
+        **run.solver.columns,
         **{option.column: getattr(run, name) for name, option in OPTIONS.items() if option.column},
         "tolerance": tolerance(run.tolerance),
         "threads": machine.threads(run.threads).number,
@@ -43,7 +39,7 @@ def tolerance(stated: float | str | None) -> float | None:
     return 0.0 if isinstance(stated, str) else stated
 
 
-def provenance(solver: str = "") -> dict[str, Any]:
+def provenance(solver: SolverSpec | None = None) -> dict[str, Any]:
     """The columns that tell where, when and by which code something was measured; solver: of whose package the version
     is told, if it is an interface to one."""
     here = machine.describe()
@@ -54,7 +50,7 @@ def provenance(solver: str = "") -> dict[str, Any]:
         "cores": here.cores,
         "memory_gib": here.memory_gib,
         "system": here.system,
-        "versions": json.dumps(machine.versions(*packages(solver)), sort_keys=True),
+        "versions": json.dumps(machine.versions(*(solver.packages if solver else ())), sort_keys=True),
         "commit": machine.commit(),
         "code": machine.code_hash(),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),

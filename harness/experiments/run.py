@@ -66,12 +66,13 @@ def execute(
         with turn.ready():
             shared |= common(run) | {"code": code(parts(run))}
         try:
+            run = run.but(scene=run.scene.opened())
             found = _passes(run, files, tick, positions, turn)
-        except InputError:
-            raise
         except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
+            if isinstance(error, InputError) and not run.own():
+                raise
             turn.look()
-            own = sources.of_class(solver_class(run))
+            own = _own_files(run)
             found = [_earliest(run, failure(error, own), own)]
             for earlier in (files.recording, files.picture):  # of a time when it did not fail; they would hide this
                 earlier.unlink(missing_ok=True)
@@ -257,6 +258,14 @@ def _record_until(run: RunSpec, files: Files, failed: dict[str, Any]) -> None:
             scene, prepared, settings, recorder=recorder, convergence=(), stored=None, judge=None, tick=lambda: None
         )
         recorder.close({})
+
+
+def _own_files(run: RunSpec) -> frozenset[Path]:
+    """The files of the solver, whose lines are blamed first."""
+    try:
+        return sources.of_class(solver_class(run))
+    except Exception:  # it is somebody's own, and cannot be imported; that is the error
+        return frozenset()
 
 
 def _settings(run: RunSpec) -> Settings:

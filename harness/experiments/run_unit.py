@@ -50,8 +50,14 @@ class RunUnit:
 
     @property
     def limits(self) -> Limits:
-        """What the sweep says."""
-        return Limits(self.run.time_limit, self.run.memory_limit)
+        """What the sweep says; what the run writes is beside its rows."""
+        log = self.files.rows.parents[1] / "logs" / f"{self.files.rows.stem}.txt"
+        return Limits(self.run.time_limit, self.run.memory_limit, log)
+
+    @property
+    def own(self) -> frozenset[Hashable]:
+        """The code of others that it runs."""
+        return frozenset(tuple(plugin.identity()) for plugin in self.run.own())
 
     @property
     def group(self) -> Hashable:
@@ -62,7 +68,9 @@ class RunUnit:
         """See Unit."""
         from harness.experiments.run import execute  # brings along all that simulates and records
 
-        return _outcome(execute(self.run, self.files, tick, positions=self.positions, at_once=self.at_once))
+        files = self.files.absolute()  # code of others may change the folder
+        positions = self.positions and self.positions.absolute()
+        return _outcome(execute(self.run, files, tick, positions=positions, at_once=self.at_once))
 
     def lost(self, lost: Lost) -> str:
         """See Unit."""

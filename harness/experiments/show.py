@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from harness.base.console import say
 from harness.base.errors import InputError
+from harness.experiments.apart import apart
+
+if TYPE_CHECKING:
+    from harness.base.worker import Tick
+    from harness.config.sweep import RunSpec
 
 
 def show(
@@ -23,10 +29,18 @@ def show(
     if path.suffix != ".png" or not path.parent.is_dir() or path.is_dir():
         raise InputError(f"--output: came {path}; wanted a file that ends in .png, in a folder that exists")
 
+    from harness.config.load import load_any
+
+    run = load_any(scene, sizes=() if size is None else (size,)).runs()[0]
+    for line in apart(partial(_shown, run, path), run.own()):
+        say(line)
+
+
+def _shown(run: RunSpec, path: Path, tick: Tick) -> list[str]:
+    """Draw the scene of a run at its start; what is said of it."""
     import numpy as np
 
     from harness.base import machine
-    from harness.config.load import load_any
     from harness.record.base import Replay
     from harness.record.local_origin import local_origin, store_relative
     from harness.record.obstacles import declared, listed
@@ -36,19 +50,19 @@ def show(
     from harness.scenes.selection import selections
     from harness.simulation.step import start
 
-    run = load_any(scene, sizes=() if size is None else (size,)).runs()[0]
-    made = build(run.scene, run.size)
+    scene, told = run.scene.opened(), list[str]()
+    made = build(scene, run.size)
     mesh, choices = made.mesh, list[Choice]()
-    for k, effect in enumerate(run.scene.effects):
+    for k, effect in enumerate(scene.effects):
         for key, selection in selections(effect):
             name = f"effects[{k}] {effect.kind}{f': {key}' if key else ''}"
             choices.append(Choice(name, selection.told(), selection.chosen(mesh, name)))
     notes = _notes(mesh)
     for one in choices:
         some = ", ".join(map(str, one.vertices[:8].tolist())) + (", ..." if len(one.vertices) > 8 else "")
-        say(f"{one.name}: {len(one.vertices)} vertices ({one.how}): {some}")
+        told.append(f"{one.name}: {len(one.vertices)} vertices ({one.how}): {some}")
     for kind, words in notes:
-        say(f"{kind}: {words}")
+        told.append(f"{kind}: {words}")
     origin = local_origin(mesh.rest)
     replay = Replay(
         title=f"{run.scene_name}, size {run.size}" if run.size else run.scene_name,
@@ -63,7 +77,7 @@ def show(
         strain_range=run.strain_range or STRAIN_RANGE,
         scalars={},
         properties={
-            **declared(listed(run.scene.effects)),
+            **declared(listed(scene.effects)),
             "cpu": machine.describe().cpu,
             "commit": machine.commit(),
         },
@@ -76,9 +90,9 @@ def show(
     ]
     named = [i for one in choices for i in one.vertices.tolist()]
     facts += ["what is chosen twice has the later colour"] if len(set(named)) < len(named) else []
-    camera = run.scene.camera
+    camera = scene.camera
     draw_scene(replay, choices, facts, notes, path, camera=(camera.azimuth, camera.elevation) if camera else None)
-    say(f"the picture is {path}")
+    return [*told, f"the picture is {path}"]
 
 
 def _notes(mesh: Any) -> list[tuple[str, str]]:

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 import pyarrow as pa
 
 from harness.base.errors import RunFailed, SpringbenchError
+from harness.base.worker import Limits, Tick
+from harness.base.workers import Lost, Workers
 from harness.config.sweep import EVERY_REPORT
-from solvers.plugins import load
+from solvers.plugins import Plugin, load
+
+_SECONDS, _GIB = 600.0, 2.0
+"""What a report of somebody's own may take at most, and the memory [GiB] of it."""
 
 
 class Report(Protocol):
@@ -21,15 +27,38 @@ class Report(Protocol):
         ...
 
 
-def draw_reports(names: Iterable[str], table: pa.Table, folder: Path) -> list[Path]:
-    """The files that the named reports wrote. Raises RunFailed where one fails."""
+def draw_reports(names: Iterable[str], table: pa.Table, folder: Path, seconds: float | None = None) -> list[Path]:
+    """The files that the named reports wrote; somebody's own do so in a process of their own, within these
+    seconds at most. Raises RunFailed where one fails."""
     drawn: list[Path] = []
     for name in names:
-        report: Report = load(EVERY_REPORT[name])
-        try:
+        if isinstance(name, Plugin):
+            drawn += _elsewhere(name, table, folder, seconds)
+        else:
+            report: Report = load(EVERY_REPORT[name])
             drawn += report(table, folder)
-        except (SpringbenchError, OSError):
-            raise
-        except Exception as error:  # a report may be somebody's own
-            raise RunFailed(f"the report {name} failed: {type(error).__name__}: {error}") from error
     return drawn
+
+
+def _elsewhere(name: Plugin, table: pa.Table, folder: Path, seconds: float | None) -> list[Path]:
+    workers = Workers()
+    try:
+        limits = Limits(min(_SECONDS, seconds or _SECONDS), _GIB, folder / "logs" / "reports.txt")
+        return workers.do(partial(_reported, name, table, folder.absolute()), _quiet, limits)
+    except (Lost, SpringbenchError) as error:
+        raise RunFailed(f"the report {name} failed: {error}") from None
+    finally:
+        workers.end()
+
+
+def _reported(name: Plugin, table: pa.Table, folder: Path, tick: Tick) -> list[Path]:
+    report: Report = load(name.target)
+    wrote: object = report(table, folder)
+    paths: list[object] = list(wrote) if isinstance(wrote, list | tuple) else [None]  # pyright: ignore[reportUnknownArgumentType]
+    if not all(isinstance(path, Path | str) for path in paths):
+        raise RunFailed(f"it returned a {type(wrote).__name__}; wanted a list of the files that it wrote")
+    return [Path(str(path)) for path in paths]
+
+
+def _quiet(said: str) -> None:
+    pass

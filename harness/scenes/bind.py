@@ -6,12 +6,13 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from harness.base.errors import InputError, Mistake
+from harness.scenes import own
 from harness.scenes.effects.base import Contribution, Force, Pin, Steady, VelocityFilter
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.topology import by_area
@@ -114,7 +115,8 @@ def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Sce
 
     Raises InputError where the scene's parts do not fit together.
     """
-    mesh, method = spec.mesh.build(size), find(integrator)
+    spec = spec.opened()
+    mesh, method = _mesh(spec, size), find(integrator)
     mass = _mass(spec, mesh)
     parts = [_bound(spec, i, mesh, mass).by(method) for i in range(len(spec.effects))]
     _single(spec, parts)
@@ -159,9 +161,23 @@ def _halved(spec: SceneSpec, size: int, integrator: str) -> Callable[[], Scene] 
     return None if half < COARSEST or numbered else partial(build, spec, half, integrator)
 
 
-def _bound(spec: SceneSpec, i: int, mesh: Mesh, mass: NDArray[np.float64]) -> Contribution:
+def _mesh(spec: SceneSpec, size: int) -> Mesh:
+    if "mesh" not in spec.own:
+        return spec.mesh.build(size)
+    plugin, _ = spec.own["mesh"]
     try:
-        bound = spec.effects[i].bind(mesh, mass, spec.time_step)
+        with own.blaming(plugin, "generate"):
+            made: Any = spec.mesh.build(size)
+        return own.sound(plugin, made)
+    except InputError as error:
+        raise InputError([replace(one, key=one.key or "mesh") for one in error.mistakes]) from error
+
+
+def _bound(spec: SceneSpec, i: int, mesh: Mesh, mass: NDArray[np.float64]) -> Contribution:
+    effect, (plugin, _) = spec.effects[i], spec.own.get(f"effects[{i}]", (None, None))
+    try:
+        given = mesh, mass, spec.time_step
+        bound = effect.bind(*given) if plugin is None else own.bound(plugin, effect, *given)
     except InputError as error:
         raise InputError([replace(mistake, key=f"effects[{i}]") for mistake in error.mistakes]) from error
     if bound.empty:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +19,7 @@ from harness.base.model import Model
 from harness.scenes.effects.base import Effect
 from harness.scenes.mesh.base import Mesh
 from harness.scenes.mesh.generator import MAX_VERTICES
+from harness.scenes.own import OwnEffect, OwnMesh
 from harness.scenes.start import AnyStart
 from solvers import integrators, plugins
 from solvers.plugins import Plugin, Table
@@ -155,6 +157,23 @@ class SceneSpec(SceneFields):
         says = self.first_guess != "current" or isinstance(method, integrators.Integrator)
         return self.first_guess if says else "motion"
 
+    def of_effects(self, chosen: Sequence[int]) -> dict[str, Any]:
+        """The fields `effects` and `own` of the same scene with these effects alone, by their places."""
+        own = {place: told for place, told in self.own.items() if place == "mesh"}
+        places = {f"effects[{i}]": f"effects[{k}]" for k, i in enumerate(chosen)}
+        own |= {places[place]: told for place, told in self.own.items() if place in places}
+        return {"effects": tuple(self.effects[i] for i in chosen), "own": own}
+
+    def opened(self) -> SceneSpec:
+        """The same scene with what somebody's own code makes in place of its names; that code is imported. Raises
+        InputError."""
+        parts = (self.mesh, *self.effects)
+        if not any(isinstance(part, OwnEffect | OwnMesh) for part in parts):
+            return self
+        made = [_opened(part, f"effects[{i}]" if i >= 0 else "mesh") for i, part in enumerate(parts, -1)]
+        values: dict[str, Any] = {key: getattr(self, key) for key in SceneSpec.model_fields}
+        return SceneSpec.model_construct(None, **values | {"mesh": made[0], "effects": tuple(made[1:])})
+
     def stepped(self, time_step: float) -> SceneSpec:
         """The same scene with another time step [s], the same in all steps."""
         if time_step == self.time_step:
@@ -186,3 +205,13 @@ class SceneSpec(SceneFields):
         if self.alternate_time_step is not None:
             content["alternate_time_step"] = self.alternate_time_step
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _opened(part: Any, at: str) -> Any:
+    if not isinstance(part, OwnEffect | OwnMesh):
+        return part
+    try:
+        return part.opened()
+    except InputError as error:
+        found = [replace(one, key=".".join(filter(None, [at, one.key]))) for one in error.mistakes]
+        raise InputError(found) from error

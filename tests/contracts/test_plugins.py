@@ -228,7 +228,8 @@ def test_a_file_beside_the_config_travels_between_processes(beside: Path):
 
     run = load_any(configs(beside, WAYS["beside"])).runs()[0]
     (beside / "run.pickle").write_bytes(pickle.dumps(run))
-    program = "import pickle; run = pickle.load(open('run.pickle', 'rb')); print(run.scene.effects[1], run.identity())"
+    program = "import pickle; run = pickle.load(open('run.pickle', 'rb')); "
+    program += "print(run.scene.opened().effects[1], run.identity())"
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     told = subprocess.run([sys.executable, "-c", program], cwd=beside, env=env, capture_output=True, text=True)
     assert told.stdout.split(" ", 2)[:2] == ["kind='hum'", "force=0.5"], told.stderr
@@ -263,7 +264,7 @@ def test_code_elsewhere_is_refused(name: str, beside: Path):
 
 
 WRONG = {
-    ("solver", "./mine.py:Nothing"): "./mine.py:Nothing cannot be loaded: AttributeError",
+    ("solver", "./mine.py:Nothing"): "./mine.py:Nothing cannot be loaded: ./mine.py has no Nothing",
     ("solver", "./mine.py:tell"): "./mine.py:tell is no solver; wanted a frozen dataclass",
     ("effect", "./mine.py:Mine"): "./mine.py:Mine is no effect; wanted a subclass",
     ("mesh", "./mine.py:Hum"): "./mine.py:Hum is no mesh; wanted a subclass",

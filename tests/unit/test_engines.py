@@ -14,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from harness.cli import app
+from harness.config.sweep import SolverSpec
 from harness.experiments.provenance import provenance
 from harness.scenes.bind import Scene, build
 from harness.scenes.effects.bending import Bending
@@ -244,9 +245,9 @@ def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_num
 def test_rows_tell_the_version_of_the_engine(name: str):
     prepared = ready(name, made(*HANGING).system)
     package = load(OPTIONAL[name]).about.package
-    version = json.loads(provenance(name)["versions"])[package]
+    version = json.loads(provenance(SolverSpec(name, {}))["versions"])[package]
     assert f"{package} {version}," in prepared.choice
-    assert package not in json.loads(provenance("newton")["versions"])
+    assert package not in json.loads(provenance(SolverSpec("newton", {}))["versions"])
 
 
 @engines

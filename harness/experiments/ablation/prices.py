@@ -102,7 +102,8 @@ def only(scene: SceneSpec, *kinds: str) -> SceneSpec:
     """The scene with these effects alone, and the plain ones; with all of them where they are ALL."""
     if ALL in kinds:
         return scene
-    return scene.model_copy(update={"effects": tuple(e for e in scene.effects if e.kind in kinds or _plain(e))})
+    kept = [i for i, e in enumerate(scene.effects) if e.kind in kinds or _plain(e)]
+    return scene.model_copy(update=scene.of_effects(kept))
 
 
 def _plain(effect: Effect) -> bool:

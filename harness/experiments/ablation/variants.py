@@ -39,5 +39,5 @@ def effect_names(scene: SceneSpec) -> list[str]:
 
 def _without(scene: SceneSpec, out: tuple[int, ...]) -> SceneSpec:
     values = {key: getattr(scene, key) for key in SceneSpec.model_fields}
-    kept = tuple(effect for i, effect in enumerate(scene.effects) if i not in out)
-    return SceneSpec.model_construct(None, **values | {"effects": kept})
+    kept = [i for i in range(len(scene.effects)) if i not in out]
+    return SceneSpec.model_construct(None, **values | scene.of_effects(kept))

@@ -15,7 +15,6 @@ from typing import Any
 from harness.base import machine, rows
 from harness.base.errors import InputError
 from harness.base.progress import ANY_EFFORT, Effort
-from harness.base.stated import stated
 from harness.base.workers import Limits, Lost, Tick
 from harness.config.accuracy import Case, CurveSpec, WorkSpec, moment_name
 from harness.experiments.accuracy.accuracy_rows import SCHEMA
@@ -218,9 +217,9 @@ def _written(home: Home, spec: CurveSpec | WorkSpec, found: Sequence[Row]) -> st
         **_of_case(spec.case),
         "solver": spec.solver.name,
         "parameters": json.dumps(dict(spec.solver.parameters), sort_keys=True),
-        **stated(spec.solver.name),
+        **spec.solver.columns,
         "threads": spec.how.threads,
-        **provenance(spec.solver.name),
+        **provenance(spec.solver),
     }
     rows.write(home.rows(spec.label()), [shared | row for row in found], SCHEMA)
     bad = next((row for row in found if row["status"] != "ok"), None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from harness.base.stated import stated
 from harness.config.load import load_scene
 from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.accuracy.units import references
+from harness.experiments.apart import apart
 from harness.experiments.asked.known import Row, known, problem, promising, way_rows
 from harness.experiments.asked.peers import peers as peers_of
 from harness.experiments.asked.search import Answer, foresee, search
@@ -25,6 +27,7 @@ from harness.record.base import Frame, RecordingInfo
 from harness.record.rerun import RerunRecorder
 from harness.record.shading import strain_range
 from harness.reference.growth import Growth
+from harness.scenes.spec import SceneSpec
 from solvers.problem import Positions
 
 Say = Callable[[str], None]
@@ -54,7 +57,25 @@ def run_to_error(
     holds. Raises InputError, RunFailed.
     """
     _require(error, horizon, {**(others or {}), "second --size": sizes[1:]})
-    asked = Asked.of(load_scene(config), sizes[0] if sizes else None, horizon, say)
+    scene = load_scene(config)
+    given = config, scene, error, results, horizon, sizes[0] if sizes else None, check, peers, positions, again
+    return apart(partial(_done, *given), [plugin for plugin, _ in scene.own.values()], say)
+
+
+def _done(
+    config: Path,
+    scene: SceneSpec,
+    error: float,
+    results: Path,
+    horizon: float | None,
+    size: int | None,
+    check: bool,
+    peers: bool,
+    positions: Path | None,
+    again: bool,
+    say: Say,
+) -> bool:
+    asked = Asked.of(scene, size, horizon, say)
     folder = claimed(results / config.stem, config)
     with machine.pinned_threads(1):
         seen = foresee(asked, error, say)
