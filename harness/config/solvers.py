@@ -7,6 +7,7 @@ checkouts of other sources keep theirs beside it.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import time
 from contextlib import suppress
@@ -15,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from pydantic import create_model
+from pydantic import ConfigDict, Field, create_model
 
 from harness.base.blame import said, where
 from harness.base.document import Document, Key, is_list, is_mapping
@@ -88,12 +89,22 @@ def _try(document: Document, name: Plugin, asked: dict[str, Any], at: Key) -> No
 
 
 def parameters_model(name: str, solver: type) -> type[Model]:
-    """The model of a solver's parameters, made of the fields of its frozen dataclass."""
+    """The model of a solver's parameters, made of the fields of its frozen dataclass; of those of somebody's own fields
+    may be of any type, which no file can give, such as arrays."""
     hints = get_type_hints(solver, include_extras=True)
-    given: dict[str, Any] = {
-        f.name: (hints[f.name], ... if f.default is MISSING else f.default) for f in fields(solver)
-    }
-    return create_model(name, __base__=Model, __doc__=solver.__doc__, **given)
+    given: dict[str, Any] = {f.name: (hints[f.name], _default(f)) for f in fields(solver) if f.init}
+    base = _OfAnyType if isinstance(name, Plugin) else Model
+    return create_model(name, __base__=base, __doc__=solver.__doc__, **given)
+
+
+class _OfAnyType(Model):
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    if field.default_factory is not MISSING:
+        return Field(default_factory=field.default_factory)
+    return ... if field.default is MISSING else field.default
 
 
 def _stated(solver: type, parameters: Model) -> dict[str, Any]:

@@ -88,7 +88,7 @@ class Judged:
     """One run: its case, its solver, what became of it and why; worst: the largest `beyond` of a step, or where
     `graded` is "distance" the largest distance from the reference, None where there is none;
     reference: where the solver comes from, as rows have it; run_id: of the run; cpu and commit: where it was
-    done, and by which code."""
+    done, and by which code; name: the solver's, which may have spaces in it, without the parameters behind it."""
 
     case: str
     solver: str
@@ -100,6 +100,7 @@ class Judged:
     run_id: str = ""
     cpu: str = ""
     commit: str = ""
+    name: str = ""
 
     @property
     def figure(self) -> str:
@@ -136,10 +137,10 @@ def read_cells(folder: Path) -> list[Judged]:
         outcome, worst, graded, reason = judged(run)
         run_id, reference = run[0]["run_id"], run[0]["reference"] or ""
         made = run[0]["cpu"] or "", run[0]["commit"] or ""
-        cells[case, solver] = Judged(case, solver, outcome, worst, graded, reason, reference, run_id, *made)
+        named = *made, run[0]["solver"]
+        cells[case, solver] = Judged(case, solver, outcome, worst, graded, reason, reference, run_id, *named)
     order = {name: k for k, name in enumerate(dict.fromkeys([*SOLVERS, *OPTIONAL, *(r["solver"] for r in firsts)]))}
-    place = {_solver(first, firsts): order[first["solver"]] for first in firsts}
-    return sorted(cells.values(), key=lambda cell: (_numbered(cell.case), place[cell.solver], cell.solver))
+    return sorted(cells.values(), key=lambda cell: (_numbered(cell.case), order[cell.name], cell.solver))
 
 
 def _numbered(name: str) -> list[tuple[int, str]]:

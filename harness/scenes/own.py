@@ -37,16 +37,18 @@ def opened(document: Document, plugin: Plugin, what: str, at: Key) -> Any:
     document.own.tell(f"{ABOUT}{plugin}")
     try:
         made = load(plugin.target)
-        if fits(made):
-            return made
+        problem = "" if fits(made) else f"is no {what}; wanted {wanted}"
+        if lacks := sorted(getattr(made, "__abstractmethods__", ())):
+            problem = problem or f"has no method `{'`, `'.join(lacks)}`, which its base wants; write it"
     except AttributeError as error:
         missing = error.name == plugin.target.rpartition(":")[2] and error.obj is not None
-        why = f"{plugin.module} has no {error.name}" if missing else _said(error, plugin)
-        document.report(f"{plugin} cannot be loaded: {why}", at)
+        problem = f"cannot be loaded: {f'{plugin.module} has no {error.name}' if missing else _said(error, plugin)}"
     except Exception as error:  # it is somebody's code, and may fail in any way
-        document.report(f"{plugin} cannot be loaded: {_said(error, plugin)}", at)
+        problem = f"cannot be loaded: {_said(error, plugin)}"
     else:
-        document.report(f"{plugin} is no {what}; wanted {wanted}", at)
+        if not problem:
+            return made
+    document.report(f"{plugin} {problem}", at)
     return None
 
 

@@ -46,11 +46,11 @@ def together(grids: Sequence[CellMap]) -> CellMap:
 
 def _shares(cells: Sequence[Judged], other: Collection[str], told: str) -> Plot:
     found = sorted(scores(cells), key=lambda score: -(score.right or 0.0))
-    looks = marks(score.solver.split()[0] for score in found)
+    looks = marks(score.worst.name for score in found)
     mixed = {cell.solver for cell in cells if cell.run_id in other}
     series: list[Series] = []
     for k, score in enumerate(found):
-        look, y, older = looks[score.solver.split()[0]], np.array([float(k)]), np.array([score.solver in mixed])
+        look, y, older = looks[score.worst.name], np.array([float(k)]), np.array([score.solver in mixed])
         right, finite = (np.array([np.nan if s is None else s]) for s in (score.right, score.finite))
         series.append(Series(score.solver, look, right, y, right, finite, True, older, joined=False, setting="right"))
         ring = Mark(look.color, "|")

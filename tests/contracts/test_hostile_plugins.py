@@ -1,0 +1,62 @@
+"""Code of others may do anything: a command says what it did, does the other runs, and is what it was."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from pathlib import Path
+from time import monotonic
+
+import numpy as np
+import psutil
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from harness.cli import app
+from tests.contracts.hostile_plugins import FAILED, FINE, HOSTILE, MISTAKE, Hostile, write
+from tests.often import often
+
+SAMPLE = ["importing exits well", "an effect binds nothing", "a mesh has NaN", "solving nothing"]
+
+
+def state() -> tuple[object, ...]:
+    """Of this process: its folder, streams, functions and environment, which plug-ins change."""
+    return os.getcwd(), sys.stdout, sys.stderr, np.linalg.norm, dict(os.environ)
+
+
+@pytest.mark.parametrize("name", often(HOSTILE, SAMPLE))
+def test_a_command_survives_its_plugins(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    case = HOSTILE[name]
+    write(tmp_path, case)
+    began = monotonic()
+    monkeypatch.chdir(tmp_path)
+    before = state()
+    told = CliRunner().invoke(app, ["run", "sweep.yaml"])
+    said = re.sub(r"\s+", " ", told.output)
+    assert told.exit_code == case.code, told.output[-3000:]
+    assert told.exception is None or isinstance(told.exception, SystemExit)
+    assert "Traceback" not in said
+    assert case.said in said, told.output[-3000:]
+    assert len(told.output) < 100_000
+    assert state() == before
+    assert monotonic() - began < 26.0
+    assert not [child for child in psutil.Process().children(recursive=True) if child.name() == "sleep"]
+    assert {path.name for path in tmp_path.iterdir()} <= {"mine.py", "odd.yaml", "sound.yaml", "sweep.yaml", "results"}
+    if case.code != MISTAKE:
+        require_rows(tmp_path, case)
+
+
+def require_rows(folder: Path, case: Hostile) -> None:
+    """Each run has its rows; those that the plug-in has no part in are good."""
+    files = (folder / "results" / "sweep" / "rows").glob("*.parquet")
+    rows = [pq.read_table(path).to_pylist()[0] for path in files]
+    assert len(rows) == (1 if case.part == "report" else 2)
+    others = [row for row in rows if row["own"] is None]
+    assert len(others) == 1
+    assert [row["status"] for row in others] == ["ok"], others[0]["reason"]
+    if case.code == FAILED and case.part != "report":
+        assert [row["status"] == "ok" for row in rows if row["own"]] == [False]
+    if case.code == FINE:
+        assert {row["status"] for row in rows} == {"ok"}
