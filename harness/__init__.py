@@ -12,11 +12,41 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from harness.api import Picture, Simulation, draw, load_scene, make_scene, open_recording, rows, run
+    from harness.api import (
+        IntegratorName,
+        OptionKeys,
+        OwnName,
+        Picture,
+        SceneKeys,
+        Simulation,
+        SolverName,
+        SweepKeys,
+        draw,
+        load_scene,
+        make_scene,
+        open_recording,
+        rows,
+        run,
+    )
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-__all__ = ["Picture", "Simulation", "draw", "load_scene", "make_scene", "open_recording", "rows", "run"]
+__all__ = [
+    "IntegratorName",
+    "OptionKeys",
+    "OwnName",
+    "Picture",
+    "SceneKeys",
+    "Simulation",
+    "SolverName",
+    "SweepKeys",
+    "draw",
+    "load_scene",
+    "make_scene",
+    "open_recording",
+    "rows",
+    "run",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -8,21 +8,22 @@ positions = simulation.step()                        # (n, 3) [m], after 1/30 s
 
 from __future__ import annotations
 
-import json
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.base.document import Document
-from harness.base.errors import InputError
+from harness.base.document import Document, Key, key_text
+from harness.base.errors import InputError, Mistake
 from harness.config import load
+from harness.config.keys import IntegratorName, OptionKeys, OwnName, SceneKeys, SolverName, SweepKeys
 from harness.config.options import DEFAULT_SOLVER, DEFAULT_STOP
 from harness.config.solvers import solvers_of
 from harness.record.base import Replay
@@ -34,6 +35,23 @@ from harness.simulation.step import Step, prepare, simulate, start
 from solvers import plugins
 from solvers.problem import Positions, Solver, StopRule
 from solvers.registry import EVERY
+
+__all__ = [
+    "IntegratorName",
+    "OptionKeys",
+    "OwnName",
+    "Picture",
+    "SceneKeys",
+    "Simulation",
+    "SolverName",
+    "SweepKeys",
+    "draw",
+    "load_scene",
+    "make_scene",
+    "open_recording",
+    "rows",
+    "run",
+]
 
 
 def load_scene(path: str | Path) -> SceneSpec:
@@ -47,7 +65,7 @@ def make_scene(
     effects: Sequence[Mapping[str, Any] | Effect] = (),
     folder: str | Path = ".",
     name: str = "scene",
-    **fields: Any,
+    **fields: Unpack[SceneKeys],
 ) -> SceneSpec:
     """A scene written in Python, with the keys that its file would have.
 
@@ -57,7 +75,7 @@ def make_scene(
     listed = [dict(effect) if isinstance(effect, Mapping) else {"kind": "gravity"} for effect in effects]
     given = dict(mesh) if isinstance(mesh, Mapping) else {"kind": "grid"}
     data = {**fields, "mesh": given, "effects": listed}
-    checked = load.scene_of(Document(Path(folder) / f"{name}.yaml", json.loads(json.dumps(data))))
+    checked = load.scene_of(Document(Path(folder) / f"{name}.yaml", _plain(data)))
     own = tuple(
         made if isinstance(effect, Mapping) else effect for effect, made in zip(effects, checked.effects, strict=True)
     )
@@ -77,10 +95,10 @@ class Simulation:
     def __init__(
         self,
         scene: SceneSpec,
-        solver: str | Solver = DEFAULT_SOLVER,
+        solver: SolverName | OwnName | Solver = DEFAULT_SOLVER,
         *,
         size: int | None = None,
-        integrator: str = "implicit-euler",
+        integrator: IntegratorName | OwnName = "implicit-euler",
         iterations: int = DEFAULT_STOP["iterations"],
         tolerance: float | None = DEFAULT_STOP["tolerance"],
         first_guess: FirstGuess | None = None,
@@ -136,7 +154,7 @@ def _solver(name: str, parameters: Mapping[str, Any], path: Path) -> Solver:
 
 
 def run(
-    config: str | Path | Mapping[str, Any],
+    config: str | Path | SweepKeys,
     *,
     name: str = "",
     folder: str | Path = ".",
@@ -158,7 +176,7 @@ def run(
         if not name:
             raise InputError("a sweep that is a mapping needs a name: run({...}, name='mine')")
         path = Path(folder) / f"{name}.yaml"
-        sweep = load.sweep_of(Document(path, json.loads(json.dumps(dict(config)))))
+        sweep = load.sweep_of(Document(path, _plain(config)))
     else:
         path = Path(config)
         sweep = load.load_any(path)
@@ -166,6 +184,27 @@ def run(
     table = run_sweep(sweep.name, sweep.runs(), place, Lines(err()), lambda line: None, again=again)
     draw_reports(sweep.reports, table, place, sweep.options.time_limit)
     return _frame(table)
+
+
+def _plain(value: Any, at: Key = ()) -> Any:
+    """Data of a config as its file would have it: lists for tuples and arrays, texts for paths. Raises InputError for
+    what no file can hold."""
+    if isinstance(value, Mapping):
+        given = cast(Mapping[Any, Any], value)
+        return {str(key): _plain(one, (*at, str(key))) for key, one in given.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return cast(Any, value).tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(one, (*at, i)) for i, one in enumerate(cast(Sequence[Any], value))]
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, str | int | float):
+        return value
+    of = value if isinstance(value, type) else cast(object, value).__class__
+    came = f"the class {of.__name__}" if of is value else f"an object of {of.__name__}"
+    file = Path(getattr(sys.modules.get(of.__module__), "__file__", None) or "mine.py").name
+    wanted = f'its name; write the class into a file beside the scenes, and give "./{file}:{of.__name__}"'
+    raise InputError(Mistake(f"came {came}; wanted {wanted}", key=key_text(at)))
 
 
 def rows(folder: str | Path) -> Any:

@@ -27,6 +27,10 @@ ResidualOf = Literal["returned", "previous", "none"]
 """The iterate that a residual belongs to: what a solve returns, or the one before; none where there is no residual."""
 
 
+class WrongAnswer(Exception):
+    """A part of a solver of somebody's own gave something else than was asked; the message begins with its line."""
+
+
 class Unsupported(Exception):
     """A solver cannot minimise this system; the message says which part of it and why."""
 

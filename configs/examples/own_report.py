@@ -22,8 +22,13 @@ def iterations(rows: pa.Table, folder: Path) -> list[Path]:
 
 
 if __name__ == "__main__":
-    sweep = {"scenes": ["../scenes/hanging-cloth.yaml"], "sizes": [8], "solvers": ["sparse", "lbfgs"]}
-    options = {"frames": 3, "iterations": 300, "tolerance": 1e-3, "record": False, "pictures": False, "rounds": 1}
-    told = sweep | {"options": options, "reports": ["./own_report.py:iterations"]}
-    rows = harness.run(told, name="own-report", folder=Path(__file__).parent)
+    sweep: harness.SweepKeys = {
+        "scenes": ["../scenes/hanging-cloth.yaml"],
+        "sizes": [8],
+        "solvers": ["sparse", "lbfgs"],
+        "options": {"frames": 3, "iterations": 300, "tolerance": 1e-3, "record": False, "pictures": False, "rounds": 1},
+        "reports": [harness.OwnName("./own_report.py:iterations")],
+    }
+    here = Path(globals().get("__file__", "configs/examples/own_report.py")).parent  # a notebook is no file
+    rows = harness.run(sweep, name="own-report", folder=here)
     print(f"{len(rows)} rows, and results/own-report/iterations.png")

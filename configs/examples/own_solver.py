@@ -20,11 +20,12 @@ class HeavyBall(Formula):
 
 
 if __name__ == "__main__":
-    sweep = {
+    sweep: harness.SweepKeys = {
         "scenes": ["../scenes/hanging-cloth.yaml"],
         "sizes": [8],
-        "solvers": ["sparse", "./own_solver.py:HeavyBall"],
+        "solvers": ["sparse", harness.OwnName("./own_solver.py:HeavyBall")],
+        "options": {"frames": 3, "iterations": 500, "tolerance": 1e-4, "record": False, "pictures": False, "rounds": 1},
     }
-    options = {"frames": 3, "iterations": 500, "tolerance": 1e-4, "record": False, "pictures": False, "rounds": 1}
-    rows = harness.run(sweep | {"options": options}, name="heavy-ball", folder=Path(__file__).parent)
+    here = Path(globals().get("__file__", "configs/examples/own_solver.py")).parent  # a notebook is no file
+    rows = harness.run(sweep, name="heavy-ball", folder=here)
     print(rows.select(["solver", "iterations"]))

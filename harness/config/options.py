@@ -6,7 +6,7 @@ match, how runs are told apart where space is short, columns of their rows, and 
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
+from typing import Annotated, Any, Final, Literal, NamedTuple, get_type_hints
 
 from pydantic import Field, create_model
 
@@ -72,7 +72,7 @@ class Chosen(Model):
     solver; null leaves them as they are stated."""
 
 
-DEFAULT_SOLVER = "hybrid"
+DEFAULT_SOLVER: Final = "hybrid"
 DEFAULT_STOP: dict[str, Any] = {"iterations": 500, "tolerance": 1e-4}
 """How one scene is simulated, without a sweep and in Python, where nothing is stated: by the recommended solver, to a
 tolerance. A sweep's own defaults, those of `Chosen`, are those of the assignment."""

@@ -13,7 +13,7 @@ from harness.config.sweep import RunSpec
 from harness.simulation.energy_balance import Growth
 from harness.simulation.measure import Diverged, StepFailed
 from solvers.core.clearing import Blocked
-from solvers.problem import NotPositiveDefinite, Unsupported
+from solvers.problem import NotPositiveDefinite, Unsupported, WrongAnswer
 
 _STATUS: dict[type[BaseException], str] = {Unsupported: "unsupported", Diverged: "diverged"}
 
@@ -43,6 +43,6 @@ def grown(run: RunSpec, growth: Growth, by_frame: Mapping[int, Mapping[str, Any]
 
 def _reason(error: BaseException, own: Collection[Path]) -> str:
     """An error of ours speaks for itself; of any other the row also says what it was and where it came from."""
-    if isinstance(error, (Unsupported, NotPositiveDefinite, Blocked, Diverged, RunFailed, InputError)):
+    if isinstance(error, (Unsupported, NotPositiveDefinite, WrongAnswer, Blocked, Diverged, RunFailed, InputError)):
         return str(error)
     return f"{said(error)} ({where(error, set(map(str, own)))})"

@@ -23,6 +23,10 @@ from solvers.problem import Prepared, Solution, Solver, StepProblem, StopRule, S
 Arrays = dict[str, NDArray[Any]]
 
 
+_METHODS, _TOLD = ("iterates", "solve", "residual_at", "phases"), ("choice", "facts")
+"""What a prepared solver has (`solvers.problem.Prepared`)."""
+
+
 class Contract:
     """What a solver was given before it prepared itself."""
 
@@ -30,9 +34,15 @@ class Contract:
         self._system, self._solver = system, solver
         self._before = {name: array.copy() for name, array in _of_system(system).items()}
 
-    def checked(self, prepared: Prepared) -> Checked:
+    def checked(self, prepared: Any) -> Checked:
         """The prepared solver with a check around each solve. Raises RunFailed where preparing wrote to the system."""
-        self.require_untouched(_line(type(self._solver), "prepare"))
+        line = _line(type(self._solver), "prepare")
+        self.require_untouched(line)
+        lacks = [name for name in _METHODS if not callable(getattr(prepared, name, None))]
+        lacks += [name for name in _TOLD if not hasattr(prepared, name)]
+        if lacks:
+            came = "None" if prepared is None else f"a {type(prepared).__name__}"
+            raise RunFailed(f"{line}: `prepare` gave {came}, which has no `{'`, `'.join(lacks)}`")
         return Checked(prepared, self, frozenset(map(str, sources.of_class(type(self._solver)))))
 
     def require_untouched(self, line: str) -> None:

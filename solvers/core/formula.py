@@ -7,16 +7,18 @@ Local-global is p - Q^-1 grad g(p). Q is assembled of the projective energies an
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
 from solvers.core.driver import Iterating, Iterative
 from solvers.core.prefactored import PreparedLocalGlobal, prepared, projective
 from solvers.linear.factors import SparseLU
-from solvers.problem import Positions, ResidualOf, StepProblem, System
+from solvers.problem import Positions, ResidualOf, StepProblem, System, WrongAnswer
 
 
 class Formula(ABC):
@@ -33,6 +35,10 @@ class Formula(ABC):
     def prepare(self, system: System) -> Ready:
         """Raises Unsupported for energies that are not projective, NotPositiveDefinite."""
         name = type(self).__name__
+        try:
+            inspect.signature(self.formula).bind(None, None, None)
+        except TypeError:
+            raise WrongAnswer(f"{line_of(self.formula)}: `formula` should take p, before and correction") from None
         return Ready(prepared(system, projective(system, name), lambda Q: (SparseLU(Q), "SuperLU")), self.formula)
 
 
@@ -64,9 +70,22 @@ class _Running(Iterating):
         """See Iterating."""
         p, base = self.positions, self._ready.base
         self._correction = base.correction(self._problem.gradient(p), np.zeros_like(p))
-        self.positions, self._before = self._ready.formula(p, self._before, self._correction), p
+        self.positions, self._before = self._checked(self._ready.formula(p, self._before, self._correction)), p
         return True
+
+    def _checked(self, found: Any) -> Positions:
+        wanted = self._correction.shape
+        if isinstance(found, np.ndarray) and found.shape == wanted and found.dtype == np.float64:
+            return found
+        came = f"{found.dtype} of shape {found.shape}" if isinstance(found, np.ndarray) else f"a {type(found).__name__}"
+        raise WrongAnswer(f"{line_of(self._ready.formula)}: `formula` gave {came}; wanted float64 of shape {wanted}")
 
     def residual(self) -> float:
         """|Q^-1 grad g|_Q of the previous iterate."""
         return self._ready.base.residual(self._correction.copy())
+
+
+def line_of(function: Callable[..., Any]) -> str:
+    """`file:line` where a function or a method begins; its name where it is not written in Python."""
+    code = getattr(function, "__code__", None)
+    return f"{Path(code.co_filename).name}:{code.co_firstlineno}" if code else getattr(function, "__qualname__", "")

@@ -1,0 +1,80 @@
+"""The names and keys that configs written in Python have, as types: a type checker finds those that do not exist.
+
+They say no more than the models do; a test compares both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NewType, Required, TypedDict, TypeVar
+
+from harness.scenes.spec import FirstGuess
+
+SolverName = Literal[
+    "dense", "sparse", "numba", "anderson", "chebyshev", "lbfgs", "newton", "newton-cg", "hybrid", "xpbd",
+    "xpbd-small-steps", "vbd", "symplectic-euler", "velocity-verlet", "blanes-moan-4", "blanes-moan-6", "runge-kutta-4",
+    "tsitouras-5", "dormand-prince-8", "baraff-witkin", "ros2", "ros3p", "rodas", "pncg", "admm", "a-jacobi", "mgpbd",
+    "jgs2", "avbd", "eigen", "cholmod", "mujoco", "pypbd", "taichi", "newton-physics",
+]  # fmt: skip
+IntegratorName = Literal[
+    "implicit-euler", "bdf2", "midpoint", "generalised-alpha", "hht", "newmark", "sdirk-2", "tr-bdf2", "sdirk-3",
+    "esdirk-3", "sdirk-4", "esdirk-4", "own",
+]  # fmt: skip
+ReportName = Literal["certificates", "medians", "timing"]
+OwnName = NewType("OwnName", str)
+"""The name of code of one's own: `OwnName("./mine.py:Mine")`."""
+
+T = TypeVar("T")
+Some = T | Sequence[T]
+Number = float | str
+"""A number, or a fraction such as "1/30"."""
+
+
+class SceneKeys(TypedDict, total=False):
+    """The keys of a scene besides its mesh and effects; see `harness.scenes.spec.SceneFields`."""
+
+    description: str
+    mass: float | None
+    mass_per_area: float | None
+    time_step: Required[Number]
+    alternate_time_step: Number | None
+    frames: Required[int]
+    velocity: Sequence[float]
+    start: Mapping[str, Any] | None
+    default_size: int | None
+    camera: Mapping[str, float] | None
+
+
+class OptionKeys(TypedDict, total=False):
+    """The options of a sweep; see `harness.config.sweep.Options`."""
+
+    iterations: Some[int]
+    tolerance: Some[float | Literal["auto"] | None]
+    integrator: Some[IntegratorName | OwnName]
+    time_step: Some[Number | None]
+    first_guess: Some[FirstGuess | None]
+    threads: Some[int | Literal["auto"]]
+    frames: Some[int | None]
+    rounds: Some[int]
+    accuracy: Some[float | None]
+    convergence_frames: Sequence[int] | None
+    strain_range: float | None
+    record: bool
+    pictures: bool
+    judge: bool
+    timing: Literal["exclusive", "shared", "rough"]
+    time_limit: float | None
+    memory_limit: float | None
+
+
+class SweepKeys(TypedDict, total=False):
+    """The keys of a sweep; see `harness.config.sweep.SweepFields`. A solver with parameters is a mapping."""
+
+    description: str
+    scenes: Required[Sequence[str]]
+    sizes: Sequence[int]
+    solvers: Required[Sequence[SolverName | OwnName | Mapping[str, Any]]]
+    options: OptionKeys
+    exclude: Sequence[Mapping[str, Any]]
+    include: Sequence[Mapping[str, Any]]
+    reports: Sequence[ReportName | OwnName]

@@ -1,0 +1,73 @@
+"""Names and keys of configs written in Python: the types say what the models do, and pyright finds what they lack."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+import harness
+from harness.base.errors import InputError
+from harness.config.keys import IntegratorName, OptionKeys, ReportName, SceneKeys, SolverName, SweepKeys
+from harness.config.sweep import REPORTS, Options, SweepFields
+from harness.scenes.spec import SceneFields
+from solvers.integrators import INTEGRATORS
+from solvers.registry import OPTIONAL, SOLVERS
+
+ROOT = Path(__file__).resolve().parents[2]
+
+MISTAKEN = """
+import harness
+
+scene = harness.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames=3, mass=1.0)
+fine = harness.Simulation(scene, "newton", integrator="bdf2", tolerance=None)
+harness.Simulation(scene, "hybird")  # 6
+harness.Simulation(scene, integrator="implicit-eular")  # 7
+harness.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames=3, mass_per_aera=1.0)  # 8
+sweep: harness.SweepKeys = {"scenes": ["a.yaml"], "solvers": ["sparse"]}
+harness.run({"scenes": ["a.yaml"], "solvers": ["sparse"], "options": {"iteration": 3}}, name="a")  # 10
+harness.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames="many")  # 11
+harness.run({"scenes": ["a.yaml"], "solvers": ["sprase"]}, name="a")  # 12
+harness.run({"scenes": ["a.yaml"], "solvers": ["sparse"], "reports": ["timings"]}, name="a")  # 13
+"""
+
+
+def test_types_name_what_is_shipped():
+    assert set(get_args(SolverName)) == {*SOLVERS, *OPTIONAL}
+    assert set(get_args(IntegratorName)) == {*INTEGRATORS}
+    assert set(get_args(ReportName)) == {*REPORTS}
+
+
+def test_types_have_the_keys_of_the_models():
+    for keys, model in ((SceneKeys, SceneFields), (OptionKeys, Options), (SweepKeys, SweepFields)):
+        assert keys.__annotations__.keys() == model.model_fields.keys()
+
+
+@pytest.mark.long
+def test_a_type_checker_finds_names_and_keys_that_do_not_exist(tmp_path: Path):
+    (tmp_path / "mistaken.py").write_text(MISTAKEN)
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps({"extraPaths": [str(ROOT)], "typeCheckingMode": "strict"}))
+    command = [
+        Path(sys.executable).with_name("pyright"),
+        "--outputjson",
+        "--pythonpath",
+        sys.executable,
+        "-p",
+        tmp_path,
+    ]
+    told = json.loads(subprocess.run(command, capture_output=True, text=True, cwd=tmp_path).stdout)
+    found = {problem["range"]["start"]["line"] + 1 for problem in told["generalDiagnostics"]}
+    assert found == {i for i, line in enumerate(MISTAKEN.splitlines(), 1) if "  # " in line}, told
+
+
+class Mine:
+    """What somebody might give for a solver."""
+
+
+def test_a_class_in_a_sweep_is_answered_by_how_to_name_it():
+    with pytest.raises(InputError, match=r'solvers\[1\]: came the class Mine; wanted .* "./test_api_types.py:Mine"'):
+        harness.run({"scenes": ["a.yaml"], "solvers": ["sparse", Mine]}, name="a")  # type: ignore[list-item]
