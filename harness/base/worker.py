@@ -91,7 +91,7 @@ def serve(
             answer = _answer(piece, limits, lambda phase: ticks.send_bytes(phase.encode()))
             if os.getpid() != me:  # a copy of this process that the piece has made
                 os._exit(0)
-            with suppress(OSError, ValueError):  # closed by the piece
+            with suppress(OSError, ValueError, AttributeError):  # closed by the piece, or put away
                 sys.stdout.flush()
                 os.write(1, end)
             with suppress(OSError):

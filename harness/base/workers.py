@@ -44,7 +44,7 @@ _GRACE = 5.0
 """Seconds that a worker has to say where it is, or to end, before it is killed."""
 _KEPT = 2**14
 """So many of the last bytes that a worker said are kept."""
-_SHOWN = 2**16
+_SHOWN = 2**13
 """Bytes of what a piece writes that are shown; if there are more, all of them go to a file, `BUFFER` at most."""
 
 

@@ -21,7 +21,7 @@ from harness.config.solvers import solvers_of
 from harness.config.sweep import SolverSpec
 from harness.scenes.mesh.generator import Generator
 from harness.scenes.spec import SceneSpec
-from solvers.plugins import found
+from solvers.plugins import Plugin, found
 
 MAX_UNITS = 20_000
 
@@ -38,12 +38,13 @@ class Accuracy:
 def load_accuracy(path: Path) -> Accuracy:
     """The accuracy config in a YAML file; code that it names was tried before (`harness.config.own`). Raises
     InputError."""
-    return tried(partial(_load, path), _has_own, _stated, lambda accuracy: MOST)
+    return tried(partial(_load, path), _own, _stated, lambda accuracy: MOST)
 
 
-def _has_own(accuracy: Accuracy) -> bool:
+def _own(accuracy: Accuracy) -> list[Plugin]:
     units = (*accuracy.curves, *accuracy.work)
-    return any(unit.case.scene.own or found([unit.solver.name, unit.case.integrator]) for unit in units)
+    named = [name for unit in units for name in (unit.solver.name, unit.case.integrator)]
+    return found([*named, *(plugin for unit in units for plugin, _ in unit.case.scene.own.values())])
 
 
 def _stated(accuracy: Accuracy) -> dict[str, Any]:

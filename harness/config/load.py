@@ -104,11 +104,11 @@ def load_sweep(path: Path) -> Sweep:
 
 
 def _tried_sweep(load: Callable[[OwnCode], Sweep]) -> Sweep:
-    return tried(load, _has_own, _stated, lambda sweep: within(sweep.options.time_limit, sweep.options.memory_limit))
+    return tried(load, _own, _stated, lambda sweep: within(sweep.options.time_limit, sweep.options.memory_limit))
 
 
-def _has_own(sweep: Sweep) -> bool:
-    return bool(found(sweep.reports)) or any(run.own() for run in sweep.expanded)
+def _own(sweep: Sweep) -> list[Plugin]:
+    return [*(plugin for run in sweep.expanded for plugin in run.own()), *found(sweep.reports)]
 
 
 def _stated(sweep: Sweep) -> dict[str, Any]:
@@ -123,7 +123,9 @@ def stated_by(solvers: Iterable[str]) -> dict[str, Any]:
 def load_scene(path: Path) -> SceneSpec:
     """The scene in a YAML file, or in an assignment's JSON file; code that it names was tried before, as it is for
     `load_any`. Raises InputError."""
-    return tried(partial(_scene, path), lambda scene: bool(scene.own), _bound, lambda scene: MOST)
+    return tried(
+        partial(_scene, path), lambda scene: [plugin for plugin, _ in scene.own.values()], _bound, lambda scene: MOST
+    )
 
 
 def _bound(scene: SceneSpec) -> dict[str, Any]:

@@ -46,26 +46,30 @@ def _with_digest(document: Document, value: Any) -> Any:
 
 
 def tried(
-    load: Load[T], has_own: Callable[[T], bool], stated: Callable[[T], dict[str, Any]], limits: Callable[[T], Limits]
+    load: Load[T],
+    own: Callable[[T], list[Plugin]],
+    stated: Callable[[T], dict[str, Any]],
+    limits: Callable[[T], Limits],
 ) -> T:
     """What a config loads to, where code of others stays unopened. Where it has some, that was opened before in a
     process of its own, which found no mistakes, and told what solvers state.
 
-    load: pickles; has_own: whether there is code of others; stated: by solver, asked where its class is imported.
+    load: pickles; own: the code of others; stated: by solver, asked where its class is imported.
     Raises InputError, also where that process is lost.
     """
     found = load(UNOPENED)
-    if not has_own(found):
+    names = list(dict.fromkeys(own(found)))
+    if not names:
         return found
-    return load(OwnCode(opens=False, stated=_elsewhere(partial(_open, load, stated), limits(found))))
+    return load(OwnCode(opens=False, stated=_elsewhere(partial(_open, load, stated), limits(found), names)))
 
 
 def _open(load: Load[T], stated: Callable[[T], dict[str, Any]], tick: Tick) -> dict[str, Any]:
     return stated(load(OwnCode(tell=tick)))
 
 
-def _elsewhere(piece: Callable[[Tick], Any], limits: Limits) -> Any:
-    does = "the code that the config names"
+def _elsewhere(piece: Callable[[Tick], Any], limits: Limits, names: list[Plugin]) -> Any:
+    does = "loading"
 
     def hear(said: str) -> None:
         nonlocal does
@@ -76,7 +80,8 @@ def _elsewhere(piece: Callable[[Tick], Any], limits: Limits) -> Any:
         return workers.do(piece, hear, limits)
     except Lost as lost:
         reason = str(lost).replace(", before its first step", "")
-        raise InputError(f"{does} {reason}") from None
+        behind = "" if any(name in does for name in names) else f" with {', '.join(names)}"
+        raise InputError(f"{does}{behind} {reason}") from None
     finally:
         workers.end()
 

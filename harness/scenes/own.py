@@ -7,8 +7,9 @@ replaces them, in a process that may be lost. What their code returns is checked
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeGuard
@@ -36,7 +37,8 @@ def opened(document: Document, plugin: Plugin, what: str, at: Key) -> Any:
     wanted, fits = WANTED[what]
     document.own.tell(f"{ABOUT}{plugin}")
     try:
-        made = load(plugin.target)
+        with staying():
+            made = load(plugin.target)
         problem = "" if fits(made) else f"is no {what}; wanted {wanted}"
         if lacks := sorted(getattr(made, "__abstractmethods__", ())):
             problem = problem or f"has no method `{'`, `'.join(lacks)}`, which its base wants; write it"
@@ -72,6 +74,14 @@ def _is_model(base: type[Model], method: str) -> Callable[[Any], bool]:
     return lambda made: isinstance(made, type) and issubclass(made, base) and callable(getattr(made, method, None))
 
 
+def _is_sound(made: integrators.AnyIntegrator) -> bool:
+    if not isinstance(made, integrators.Integrator):
+        return True
+    numbers: tuple[Any, ...] = made.factor, made.when, made.ahead, made.order
+    known = all(isinstance(one, float | int) and math.isfinite(one) for one in numbers)
+    return known and made.factor > 0.0 and callable(made.predict)
+
+
 WANTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "solver": (
         "a frozen dataclass with a method `prepare`",
@@ -84,8 +94,8 @@ WANTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "mesh": ("a subclass of harness.scenes.mesh.generator.Generator", _is_model(generator.Generator, "generate")),
     "report": ("a function of rows and a folder", callable),
     "integrator": (
-        "an object of solvers.integrators.Integrator",
-        lambda made: isinstance(made, integrators.AnyIntegrator),
+        "an object of solvers.integrators.Integrator, of finite numbers, its `factor` above 0",
+        lambda made: isinstance(made, integrators.AnyIntegrator) and _is_sound(made),
     ),
 }
 """What own code may be: in words, and by a test."""
@@ -141,10 +151,22 @@ def _opened(part: OwnEffect | OwnMesh, what: str) -> Any:
 
 
 @contextmanager
+def staying() -> Generator[None]:
+    """Come back to the working folder."""
+    here = os.getcwd()
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            os.chdir(here)
+
+
+@contextmanager
 def blaming(plugin: Plugin, does: str) -> Generator[None]:
     """Turn whatever a plug-in raises, other than errors of ours, into InputError that names it and its line."""
     try:
-        yield
+        with staying():
+            yield
     except (SpringbenchError, MemoryError):
         raise
     except Exception as error:

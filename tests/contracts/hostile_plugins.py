@@ -135,7 +135,7 @@ IMPORTING = {
     "kills itself": Hostile("importing", "os.kill(os.getpid(), 9)", "effect", MISTAKE, "killed by SIGKILL"),
     "kills its parent": Hostile("importing", "os.kill(os.getppid(), 9); time.sleep(5)", "effect", MISTAKE, "SIGKILL"),
     "kills its group": Hostile("importing", "os.killpg(0, 9); time.sleep(5)", "effect", MISTAKE, "killed by SIGKILL"),
-    "swells": Hostile("importing", SWELL, "effect", MISTAKE, "raised MemoryError"),
+    "swells": Hostile("importing", SWELL, "effect", MISTAKE, "MemoryError"),
     "swells at once": Hostile("importing", SWELL_AT_ONCE, "mesh", MISTAKE, "MemoryError"),
     "raises": Hostile("importing", "raise ValueError('no luck')", "effect", MISTAKE, "ValueError: no luck (mine.py:"),
     "interrupts": Hostile("importing", "raise KeyboardInterrupt", "mesh", MISTAKE, "raised KeyboardInterrupt"),
@@ -172,7 +172,7 @@ IMPORTING = {
     ),
     "stops itself": Hostile("importing", "os.kill(os.getpid(), signal.SIGSTOP)", "effect", MISTAKE, LIMIT),
     "stops its parent": Hostile("importing", "os.kill(os.getppid(), signal.SIGSTOP)", "effect", FINE, ""),
-    "prints much": Hostile("importing", PRINT, "effect", FINE, "of output the first 65536 are shown"),
+    "prints much": Hostile("importing", PRINT, "effect", FINE, "of output the first 8192 are shown"),
     "prints for ever": Hostile("importing", "while True: print('x' * 9999)", "effect", MISTAKE, LIMIT),
     "leaves a process": Hostile("importing", STRAY, "effect", FINE, ""),
     "forks": Hostile("importing", "os.fork() or time.sleep(600)", "effect", FINE, ""),
@@ -180,7 +180,7 @@ IMPORTING = {
         "importing", "threading.Thread(target=time.sleep, args=(600,)).start()", "mesh", FINE, ""
     ),
     "changes the folder": Hostile("importing", "os.chdir('/')", "effect", FINE, ""),
-    "patches NumPy": Hostile("importing", "np.linalg.norm = np.zeros_like = None", "effect", MISTAKE, "mine.py"),
+    "patches NumPy": Hostile("importing", "np.zeros_like = None", "effect", MISTAKE, "mine.py"),
     "changes the environment": Hostile("importing", "os.environ.clear()", "effect", FINE, ""),
     "answers every name": Hostile("importing", "__getattr__ = print\ndel Model", "effect", MISTAKE, "NameError"),
 }
@@ -225,11 +225,10 @@ SOLVING = {
         "took more than 1 GiB with the processes it started",
     ),
     "processes": Hostile("solving", STRAY, "solver", FINE, ""),
-    "much output": Hostile("solving", PRINT, "solver", FINE, "of output the first 65536 are shown"),
+    "much output": Hostile("solving", PRINT, "solver", FINE, "of output the first 8192 are shown"),
     "a written problem": Hostile("solving", "problem.target[:] = 0", "solver", FAILED, "wrote to problem.target"),
     "closed files": Hostile("solving", "os.closerange(0, 4096)", "solver", FAILED, ""),
     "another folder": Hostile("solving", "os.chdir('/')", "solver", FINE, ""),
-    "a fault in its iterates": Hostile("iterating", "raise OSError('x')", "solver", FAILED, "OSError: x"),
     "a fault in its residual": Hostile("measuring", "return 'small'", "solver", FAILED, ""),
 }
 BINDING = {
@@ -353,7 +352,7 @@ OTHERS = {
     "a report that hangs": Hostile("reporting", HANG, "report", FAILED, LIMIT),
     "a report that crashes": Hostile("reporting", CRASH, "report", FAILED, "crashed by SIGSEGV"),
     "a report that swells": Hostile("reporting", SWELL, "report", FAILED, "MemoryError"),
-    "a report that prints much": Hostile("reporting", PRINT, "report", FINE, "of output the first 65536 are shown"),
+    "a report that prints much": Hostile("reporting", PRINT, "report", FINE, "of output the first 8192 are shown"),
     "a report elsewhere": Hostile("reporting", "os.chdir('/')", "report", FINE, ""),
 }
 GROUPS = {
@@ -381,8 +380,9 @@ def write(folder: Path, case: Hostile) -> Path:
     solvers = f"['{name}', sparse]" if case.part == "solver" else "[sparse]"
     integrators = f"[implicit-euler, '{name}']" if case.part == "integrator" else "implicit-euler"
     reports = f"reports: ['{name}']\n" if case.part == "report" else ""
+    limit = 6 if LIMIT in case.said else 120
     (folder / "sweep.yaml").write_text(
         f"scenes: {scenes}\nsolvers: {solvers}\n{reports}options: {{integrator: {integrators}, rounds: 1, "
-        "iterations: 3, record: false, pictures: false, time_limit: 6, memory_limit: 1}\n"
+        "iterations: 3, record: false, pictures: false, time_limit: " + f"{limit}, memory_limit: 1}}\n"
     )
     return folder / "sweep.yaml"
