@@ -37,7 +37,8 @@ def supervise(
     without_core_dumps()
     output, theirs = os.pipe()
     me = os.getpid()
-    signals = {signal.SIGINT, signal.SIGTERM, DUMP}
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the command's affair, which ends this
+    signals = {signal.SIGTERM, DUMP}
     signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     worker = os.fork()
     if worker == 0:
@@ -63,7 +64,6 @@ class _Supervisor:
 
     def run(self, signals: set[signal.Signals]) -> NoReturn:
         """Pass on the worker's output until it ends; then end as it did."""
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, self._stop)
         signal.signal(DUMP, lambda number, frame: os.kill(self._worker, DUMP))
         ended = os.pidfd_open(self._worker)
