@@ -93,6 +93,7 @@ def serve(
                 os._exit(0)
             with suppress(OSError, ValueError, AttributeError):  # closed by the piece, or put away
                 sys.stdout.flush()
+            with suppress(OSError):
                 os.write(1, end)
             with suppress(OSError):
                 os.chdir(here)

@@ -40,6 +40,8 @@ NO_FORK: set[str] = set()
 
 _LOOK = 0.1
 """Seconds between two looks at a worker that is at work."""
+_LATEST = 1.0
+"""Seconds that the last output of a piece may take to come, where the piece has closed or stopped what passes it on."""
 _GRACE = 5.0
 """Seconds that a worker has to say where it is, or to end, before it is killed."""
 _KEPT = 2**14
@@ -158,7 +160,7 @@ class _Worker:
                 if not self._process.is_alive() and not self._calls.poll():  # others may hold the pipe open
                     raise EOFError
             answer = self._calls.recv()
-            heard.listen_to_end(_GRACE)
+            heard.listen_to_end(_LATEST)
             return answer
         except (EOFError, OSError, UnpicklingError):
             raise self._ended(heard) from None
@@ -193,6 +195,8 @@ class _Worker:
         """End it and all that it started, at once. listen: takes what it said, which the supervisor still passes on."""
         if self._process.is_alive():
             self._process.terminate()
+            with suppress(OSError):
+                os.kill(self._process.pid or 0, signal.SIGCONT)  # for one that was stopped
             self._wait(_GRACE, listen)
         if self._process.is_alive():
             self._process.kill()
