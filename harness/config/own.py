@@ -5,15 +5,25 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from harness.base.document import UNOPENED, Document, Key, OwnCode, is_mapping
 from harness.base.errors import InputError
-from harness.base.workers import Limits, Lost, Tick, Workers
 from harness.scenes.own import ABOUT
 from solvers.plugins import Plugin, Refused, Table
 
-MOST = Limits(60.0, 2.0)
+if TYPE_CHECKING:  # for configs that name code of others
+    from harness.base.worker import Tick
+
+
+class Most(NamedTuple):
+    """Wall seconds, and GiB of memory."""
+
+    seconds: float
+    gib: float
+
+
+MOST = Most(60.0, 2.0)
 """What importing and binding code of others may take before a command starts; a config may say less time, or another
 memory."""
 
@@ -49,7 +59,7 @@ def tried(
     load: Load[T],
     own: Callable[[T], list[Plugin]],
     stated: Callable[[T], dict[str, Any]],
-    limits: Callable[[T], Limits],
+    limits: Callable[[T], Most],
 ) -> T:
     """What a config loads to, where code of others stays unopened. Where it has some, that was opened before in a
     process of its own, which found no mistakes, and told what solvers state.
@@ -68,7 +78,9 @@ def _open(load: Load[T], stated: Callable[[T], dict[str, Any]], tick: Tick) -> d
     return stated(load(OwnCode(tell=tick)))
 
 
-def _elsewhere(piece: Callable[[Tick], Any], limits: Limits, names: list[Plugin]) -> Any:
+def _elsewhere(piece: Callable[[Tick], Any], limits: Most, names: list[Plugin]) -> Any:
+    from harness.base.workers import Limits, Lost, Workers
+
     does = "loading"
 
     def hear(said: str) -> None:
@@ -77,7 +89,7 @@ def _elsewhere(piece: Callable[[Tick], Any], limits: Limits, names: list[Plugin]
 
     workers = Workers()
     try:
-        return workers.do(piece, hear, limits)
+        return workers.do(piece, hear, Limits(*limits))
     except Lost as lost:
         reason = str(lost).replace(", before its first step", "")
         behind = "" if any(name in does for name in names) else f" with {', '.join(names)}"
@@ -86,10 +98,9 @@ def _elsewhere(piece: Callable[[Tick], Any], limits: Limits, names: list[Plugin]
         workers.end()
 
 
-def within(seconds: float | None, gib: float | None) -> Limits:
+def within(seconds: float | None, gib: float | None) -> Most:
     """MOST, with a config's limits."""
-    assert MOST.seconds
-    return Limits(min(MOST.seconds, seconds or MOST.seconds), gib or MOST.gib)
+    return Most(min(MOST.seconds, seconds or MOST.seconds), gib or MOST.gib)
 
 
 BINDING = "\0binding "

@@ -34,7 +34,7 @@ from harness.base import machine
 from harness.base.errors import InputError, Mistake, RunFailed
 from harness.base.files import CannotWrite, replacing
 from harness.base.progress import Display, Effort
-from harness.base.workers import Lost, Tick, Workers
+from harness.base.workers import Limits, Lost, Tick, Workers
 from harness.config.own import MOST
 from harness.config.sweep import RunSpec
 from harness.experiments.core import TABLES, ready, watched
@@ -163,7 +163,7 @@ def _about(plugins: Sequence[Plugin]) -> tuple[WorkerFacts, dict[str, str]]:
         _allow_children()
         process = Workers(fork=False)
         try:
-            missing = process.do(partial(_missing, plugins), lambda _: None, MOST)
+            missing = process.do(partial(_missing, plugins), lambda _: None, Limits(*MOST))
         except Lost as lost:
             missing = {", ".join(plugins): f"the process that imports it {lost}"}
         finally:
