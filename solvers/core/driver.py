@@ -139,20 +139,19 @@ class Iterative(ABC):
         coordinates whose differences are exact: there iterations go on while each halves the residual.
         """
         count, residual, ended = run.iterate(limits)
-        since = 0
-        while ended == loop.FLOOR and not at_rest(problem, run.positions, floor):
-            some = min(1 + since // 2, limits.iterations - count)
-            if some == 0:
-                return count, residual, loop.ITERATIONS
-            more, residual, ended = run.iterate(limits._replace(iterations=some, floor=0.0))
-            count, since = count + more, since + more
-            ended = loop.FLOOR if ended == loop.ITERATIONS else ended
-        while ended == loop.FLOOR and is_distant(run.positions) and count < limits.iterations:
-            more, less, ended = run.iterate(limits._replace(iterations=1, floor=0.0))
-            count, settled, residual = count + more, not less <= 0.5 * residual, less
-            ended = loop.TOLERANCE if ended == loop.TOLERANCE else loop.FLOOR
-            if settled:
+        since, gains = 0, True
+        while ended == loop.FLOOR:
+            rests = at_rest(problem, run.positions, floor)
+            if rests and not (gains and is_distant(run.positions)):
                 break
+            some = min(1 if rests else 1 + since // 2, limits.iterations - count)
+            if some == 0:
+                return count, residual, loop.FLOOR if rests else loop.ITERATIONS
+            more, now, ended = run.iterate(limits._replace(iterations=some, floor=0.0))
+            gains = gains and (not rests or now < 0.5 * residual)
+            count, since, residual = count + more, since + more, now
+            if ended == loop.ITERATIONS or (rests and ended == loop.STALLED):
+                ended = loop.FLOOR
         return count, residual, ended
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
