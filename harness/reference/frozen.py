@@ -59,9 +59,9 @@ class Frozen:
         return guessed(self.problem, first_guess)
 
 
-def bind(spec: SceneSpec, size: int, integrator: str = "implicit-euler") -> Scene:
-    """The scene with all of its pins exact. Raises InputError."""
-    scene = build(spec, size, integrator)
+def bind(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, warns: bool = True) -> Scene:
+    """The scene with all of its pins exact; warns: see `build`. Raises InputError."""
+    scene = build(spec, size, integrator, warns=warns)
     vertices = scene.system.pins.vertices
     return replace(scene, system=replace(scene.system, pins=Pins(vertices, np.full(len(vertices), np.inf))))
 

@@ -125,7 +125,7 @@ def growth(spec: SceneSpec, size: int, horizon: float) -> Growth:
 
 def _motion(spec: SceneSpec, size: int, interval: float) -> tuple[Scene, State, Advance]:
     """The scene, its start, and what advances both motions."""
-    scene = bind(spec.stepped(interval), size, "own")
+    scene = bind(spec.stepped(interval), size, "own", warns=False)
     if not scene.forces and not scene.moving:
         try:
             ready = prepare(scene, BlanesMoan6(refine=_REFINE))

@@ -144,7 +144,7 @@ class Implicit(Follower):
     @property
     def order(self) -> int:
         """See Follower."""
-        return self.bound(self.horizon).integrator.order
+        return self.bound(self.horizon / self.frames).integrator.order
 
     def follow(self, setting: float, *, limit: float = inf) -> Path:
         """See Follower. Raises Unsupported for an integrator without an error, and for filters of the velocity."""

@@ -32,7 +32,7 @@ class ImplicitEven(Follower):
     @property
     def order(self) -> int:
         """See Follower."""
-        return self.bound(self.horizon).integrator.order
+        return self.bound(self.horizon / self.frames).integrator.order
 
     def follow(self, setting: float, *, limit: float = inf) -> Path:
         """See Follower. Raises Unsupported as the solver does."""

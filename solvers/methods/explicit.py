@@ -79,7 +79,11 @@ class Explicit(Precise):
             )
         soft = int((~system.pins.exact).sum())
         exact = f"; {soft} pins by penalty taken as exact" if soft else ""
-        told = f"steps by an error of {error:.3g}" if error else f"{needed:.0f} substeps"
+        told = (
+            f"steps by an error of {error:.3g}"
+            if error
+            else f"{needed:.0f} substeps of {system.time_step / needed:.2g} s"
+        )
         lengths = parts.springs.rest_length
         tolerance = error * (float(lengths.mean()) if len(lengths) else 1.0)
         choice = f"{told}, for vibrations of at most {omega:.3g} rad/s{exact}"

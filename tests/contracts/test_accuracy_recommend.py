@@ -23,6 +23,7 @@ from harness.experiments.accuracy import work
 from harness.experiments.accuracy.accuracy_rows import SCHEMA
 from harness.experiments.accuracy.recommend import Recommendation, recommend
 from harness.experiments.accuracy.units import references, trajectory_of
+from harness.reference.store import Store
 from tests.displays import Quiet
 
 SCENE = """
@@ -184,3 +185,26 @@ def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest
     row = work.work_rows(limited, trajectory_of(limited, references(scene.parent / "results")), lambda: None)[0]
     assert row["status"] == "ok", row
     assert not first
+
+
+def test_steps_that_a_solver_takes_within_a_frame_are_printed() -> None:
+    spec = next(one for one in module._grid(*_chain_grid()).work if one.solver.name == "velocity-verlet")
+    way = module.Recommended(spec, 1e-3, 1.0, "integrated", "1140 substeps of 2.9e-05 s")
+    assert str(way).startswith("solver velocity-verlet, 1140 substeps of 2.9e-05 s, in each frame of ")
+    assert "time step" not in str(way)
+
+
+def _chain_grid() -> tuple[Any, ...]:
+    path = Path(__file__).parents[2] / "configs" / "scenes" / "chain.yaml"
+    return path, load_scene(path), 4, 0.2, 60.0
+
+
+def test_without_a_horizon_it_is_the_longest_at_which_the_error_can_be_measured(tmp_path: Path) -> None:
+    path = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
+    spec, said = load_scene(path), list[str]()
+    longest = module._longest(path, spec, 12, 1e-7, Store(tmp_path), said.append)
+    assert 0.5 < longest < module.HORIZON
+    assert f"up to {longest:g} s" in said[0]
+    assert module._longest(path, spec, 12, 1e-2, Store(tmp_path), said.append) == module.HORIZON
+    with pytest.raises(RunFailed, match="cannot be reached or measured"):
+        module._longest(path, spec, 12, 1e-14, Store(tmp_path), said.append)

@@ -77,6 +77,7 @@ COLUMNS = (
     Column("truth", _TEXT, "", "what that reference is: integrated, or self-converged where there is contact"),
     Column("error_rms_m", _REAL, "m", "root mean square distance of a vertex from the reference at the horizon"),
     Column("iterations_done", _INT, "", "iterations done in all steps together"),
+    *as_in_runs("choice"),
     *as_in_runs(
         "asked", "estimated", "local_tolerance_m", "accepted", "rejected", "factorisations", "estimate_seconds"
     ),

@@ -15,7 +15,13 @@ def recommend(
     scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
     error: Annotated[float, typer.Option(help="The error wanted, relative to the displacement from the start.")],
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
-    horizon: Annotated[float, typer.Option(help="After how many simulated seconds the error counts.")] = 1.0,
+    horizon: Annotated[
+        float | None,
+        typer.Option(
+            help="After how many simulated seconds the error counts; if left out 1, or less where the motion cannot be "
+            "predicted for so long."
+        ),
+    ] = None,
     time_limit: Annotated[float, typer.Option(help="Wall seconds that a simulation may take.")] = 5.0,
     results: Results = Path("results"),
 ) -> None:
@@ -45,6 +51,7 @@ def recommend(
     points = [RunnerUp(way.spec.solver.name, way.error, way.cost, str(way)) for way in found.ways]
     title = f"Ways to an error of {100 * error:g} %: {scene.stem} {found.best.spec.case.size or ''}".rstrip()
     folder = results / f"recommend-{scene.stem}" / "pictures"
+    horizon = found.best.spec.horizon
     name = f"ways-{scene.stem}-{found.best.spec.case.size}-{error:g}-{horizon:g}".replace(".", "_")
     facts = [f"{horizon:g} s simulated", "time stepping and solver together"]
     facts += [] if integrated else [f"by a {found.checked.truth} reference"]

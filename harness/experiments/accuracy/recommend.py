@@ -23,7 +23,7 @@ from harness.base.errors import InputError, Mistake, RunFailed
 from harness.base.progress import Display
 from harness.config.accuracy import AccuracyFields, Case, How, WorkSpec
 from harness.config.accuracy_load import Accuracy, expand
-from harness.config.load import load_scene
+from harness.config.load import load_scene, misfits
 from harness.config.options import OF_STEPS
 from harness.config.solvers import solvers_of
 from harness.config.sweep import SolverSpec
@@ -42,6 +42,8 @@ from solvers.registry import EVERY, SOLVERS, about, load, minimises
 REFINEMENTS = (0.5, 1, 2, 4, 8)
 """Steps in the horizon, relative to those of the scene's own time step."""
 
+HORIZON = 1.0
+"""Seconds after which the error counts, if nothing else is said."""
 _SAID = 2.0
 """Seconds between two remarks on the reference."""
 _SAME, _APART = 1e-6, 1.3
@@ -69,16 +71,19 @@ def candidates() -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Recommended:
-    """A way to simulate the scene, its relative error, its wall seconds per simulated second, and what kind of truth it
-    errs from."""
+    """A way to simulate the scene, its relative error, its wall seconds per simulated second, what kind of truth it errs
+    from, and what the solver chose by itself."""
 
     spec: WorkSpec
     error: float
     cost: float
     truth: str
+    choice: str
 
     def __str__(self) -> str:
         u = self.spec
+        if about(load(EVERY[u.solver.name]), u.solver.name).own_steps:
+            return f"solver {u.solver.name}, {self.choice}, in each frame of {u.case.scene.time_step:.6g} s"
         tolerance = u.options["tolerance"]
         stop = f"{u.options['iterations']} iterations" if tolerance is None else f"tolerance {tolerance:g}"
         return f"{u.case.integrator}, time step {u.case.scene.time_step:.6g} s, {stop}, solver {u.solver.name}"
@@ -127,7 +132,7 @@ def recommend(
     error: float,
     *,
     size: int | None,
-    horizon: float,
+    horizon: float | None,
     time_limit: float,
     results: Path,
     display: Display,
@@ -135,20 +140,23 @@ def recommend(
 ) -> Recommendation:
     """The cheapest way to a relative `error` after `horizon` seconds of the scene in a file.
 
-    size: of the mesh, the scene's default if left out; time_limit: seconds that a simulation may take; results: the
+    size: of the mesh, the scene's default if left out; horizon: `HORIZON` if left out, or the longest at which the error
+    can be measured, where that is shorter; time_limit: seconds that a simulation may take; results: the
     folder that holds a folder for each config. Raises InputError; RunFailed where nothing keeps to the error.
     """
     for key, value in (("--error", error), ("--horizon", horizon), ("--time-limit", time_limit)):
-        if not 0 < value < math.inf:
+        if value is not None and not 0 < value < math.inf:
             raise InputError(Mistake(f"came {value:g}; wanted a number above 0", key=key))
     scene = load_scene(path)
     scene.require_even_steps()
     size = (size or scene.default_size or 0) if isinstance(scene.mesh, Generator) else 0
+    store = references(results)
+    if horizon is None:
+        horizon = _longest(path, scene, size, error, store, say)
     try:
         asked = _grid(path, scene, size, horizon, time_limit)
     except InputError as refused:  # the studies are ours; what is wrong came with an option
         raise InputError(list(dict.fromkeys(map(_of_option, refused.mistakes)))) from refused
-    store = references(results)
     _referenced(scene, size, error, horizon, store, say)
     ways, reasons = _known(path.stem, scene, size, horizon, results)
     if not any(way.error <= error for way in ways):
@@ -162,6 +170,25 @@ def recommend(
     best = within[0]
     say(f"checking {best}")
     return Recommendation(tuple(ways), best, _check(best, store))
+
+
+def _longest(path: Path, scene: SceneSpec, size: int, error: float, store: Store, say: Callable[[str], None]) -> float:
+    """The horizon [s] where none is given. Raises InputError, Unpredictable."""
+    if mistakes := misfits(scene, [size]):
+        raise InputError(mistakes)
+    if touches(bind(scene, size).system):
+        return HORIZON
+    seen = store.growth(scene, size, HORIZON)
+    if seen.least <= error:
+        return HORIZON
+    longest = seen.longest(error)
+    if not longest:
+        seen.require(error)
+    say(
+        f"{path.stem} {size or ''}: an error of {error:g} can be measured up to {longest:g} s, for a perturbation of "
+        f"1e-12 of the size grows to {seen.grown[-1]:.1e} of the displacement after {HORIZON:g} s"
+    )
+    return longest
 
 
 def _referenced(
@@ -238,7 +265,9 @@ def _check(best: Recommended, store: Store) -> Recommended:
 
 
 def _recommended(spec: WorkSpec, row: dict[str, Any]) -> Recommended:
-    return Recommended(spec, row["error"], row["seconds_per_simulated"], row["truth"] or "integrated")
+    return Recommended(
+        spec, row["error"], row["seconds_per_simulated"], row["truth"] or "integrated", row["choice"] or ""
+    )
 
 
 def _nothing(ways: list[Recommended], without: list[dict[str, Any]], error: float, horizon: float) -> str:

@@ -60,7 +60,7 @@ def _simulated(spec: WorkSpec, trajectory: Trajectory, tick: Callable[[], None])
     scene = bind(case.scene, case.size, case.integrator)
     solver: Solver = load(EVERY[spec.solver.name])(**spec.solver.parameters)
     prepared = prepare(scene, solver)
-    row: Row = {"vertices": scene.system.vertices, "springs": len(scene.springs.edges)}
+    row: Row = {"vertices": scene.system.vertices, "springs": len(scene.springs.edges), "choice": prepared.choice}
     row["stiffness_ratio"] = stiffness_ratio(scene.system, scene.springs.stiffness)
     frames = round(spec.horizon / case.scene.time_step)
     seconds: list[float] = []

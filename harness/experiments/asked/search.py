@@ -215,16 +215,14 @@ class _Search:
         return replace(one, estimated=estimated if estimated < inf else inf)
 
     def _measured(self, one: Found, closer: Found) -> Found:
-        """One with its estimated error; of steps of one length, with its order by half of them, and where it errs too
-        much, those."""
+        """One with its estimated error; where steps of one length err too much, half of them, with their order."""
         one = self._graded(one, closer)
-        if not one.way.follower.even:
+        if not one.way.follower.even or one.estimated <= self._error:
             return one
         try:
-            half = _of_order(one, self._graded(self._run(one.way, 2.0 * one.setting), closer))
+            return _of_order(one, self._graded(self._run(one.way, 2.0 * one.setting), closer))
         except Stuck:
             return one
-        return half if one.estimated > self._error else replace(one, order=half.order)
 
     def _apart(self, p: Positions, q: Positions) -> float:
         return float(np.linalg.norm((p - q)[self._free]))

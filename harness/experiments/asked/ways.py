@@ -62,7 +62,7 @@ class Asked:
 
     def bound(self, time_step: float, integrator: str) -> Scene:
         """The scene with steps of a length [s] and an integrator by name."""
-        return bind(self.scene.stepped(time_step), self.size, integrator)
+        return bind(self.scene.stepped(time_step), self.size, integrator, warns=False)
 
     @property
     def frame(self) -> float:
