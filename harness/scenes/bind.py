@@ -113,7 +113,8 @@ class Scene:
 def build(spec: SceneSpec, size: int, integrator: str = "implicit-euler", *, warns: bool = True) -> Scene:
     """Bind a scene to a mesh of one size, which means nothing to a mesh from a file, and to an integrator by name.
 
-    warns: whether what is allowed and seldom meant is logged; not where the program chooses the time step. Raises InputError where the scene's parts do not fit together.
+    warns: whether what is allowed and seldom meant is logged; not where the program chooses the time step. Raises
+    InputError where the scene's parts do not fit together.
     """
     spec = spec.opened()
     mesh, method = _mesh(spec, size), find(integrator)

@@ -18,6 +18,7 @@ from harness.base.errors import InputError, RunFailed
 from harness.base.yaml import scalar
 from harness.cli import main
 from harness.config.load import load_any, load_scene
+from harness.config.sweep import SolverSpec
 from harness.experiments.accuracy import recommend as module
 from harness.experiments.accuracy import work
 from harness.experiments.accuracy.accuracy_rows import SCHEMA
@@ -188,15 +189,12 @@ def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest
 
 
 def test_steps_that_a_solver_takes_within_a_frame_are_printed() -> None:
-    spec = next(one for one in module._grid(*_chain_grid()).work if one.solver.name == "velocity-verlet")
-    way = module.Recommended(spec, 1e-3, 1.0, "integrated", "1140 substeps of 2.9e-05 s")
-    assert str(way).startswith("solver velocity-verlet, 1140 substeps of 2.9e-05 s, in each frame of ")
-    assert "time step" not in str(way)
-
-
-def _chain_grid() -> tuple[Any, ...]:
     path = Path(__file__).parents[2] / "configs" / "scenes" / "chain.yaml"
-    return path, load_scene(path), 4, 0.2, 60.0
+    spec = module._grid(path, load_scene(path), 4, 0.2, 60.0).work[0]
+    spec = replace(spec, solver=SolverSpec("velocity-verlet", {}))
+    way = module.Recommended(spec, 1e-3, 1.0, "integrated", "1140 substeps of 2.9e-05 s")
+    assert str(way).startswith(f"solver {spec.solver.name}, 1140 substeps of 2.9e-05 s, in each frame of ")
+    assert "time step" not in str(way)
 
 
 def test_without_a_horizon_it_is_the_longest_at_which_the_error_can_be_measured(tmp_path: Path) -> None:

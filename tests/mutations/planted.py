@@ -7,6 +7,7 @@ from tests.mutations.contact import CONTACT
 from tests.mutations.device import DEVICE
 from tests.mutations.energies import ENERGIES
 from tests.mutations.energy_balance import ENERGY_BALANCE
+from tests.mutations.error_control import ERROR_CONTROL
 from tests.mutations.exact_lengths import EXACT_LENGTHS
 from tests.mutations.gates import GATES
 from tests.mutations.measuring import MEASURING
@@ -14,3 +15,4 @@ from tests.mutations.pictures import PICTURES
 from tests.mutations.steps import STEPS
 
 TABLE = ENERGIES + CONTACT + STEPS + MEASURING + PICTURES + DEVICE + ARCHIVE + GATES + EXACT_LENGTHS + ENERGY_BALANCE
+TABLE += ERROR_CONTROL

@@ -71,8 +71,8 @@ def candidates() -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Recommended:
-    """A way to simulate the scene, its relative error, its wall seconds per simulated second, what kind of truth it errs
-    from, and what the solver chose by itself."""
+    """A way to simulate the scene, its relative error, its wall seconds per simulated second, what kind of truth it
+    errs from, and what the solver chose by itself."""
 
     spec: WorkSpec
     error: float
@@ -140,9 +140,9 @@ def recommend(
 ) -> Recommendation:
     """The cheapest way to a relative `error` after `horizon` seconds of the scene in a file.
 
-    size: of the mesh, the scene's default if left out; horizon: `HORIZON` if left out, or the longest at which the error
-    can be measured, where that is shorter; time_limit: seconds that a simulation may take; results: the
-    folder that holds a folder for each config. Raises InputError; RunFailed where nothing keeps to the error.
+    size: of the mesh, the scene's default if left out; horizon: `HORIZON` if left out, or the longest at which the
+    error can be measured, where that is shorter; time_limit: seconds that a simulation may take; results: the folder
+    that holds a folder for each config. Raises InputError; RunFailed where nothing keeps to the error.
     """
     for key, value in (("--error", error), ("--horizon", horizon), ("--time-limit", time_limit)):
         if value is not None and not 0 < value < math.inf:

@@ -1,0 +1,66 @@
+"""Errors planted in error control: name, file, fragment, replacement, tests."""
+
+from __future__ import annotations
+
+from tests.mutations.base import Mutation
+
+_SEARCH, _GROWTH = "harness/experiments/asked/search.py", "harness/reference/growth.py"
+_FORMULAS = "tests/contracts/test_search.py"
+_ASKED = "tests/contracts/test_asked_error.py"
+_GROWS = f"{_ASKED}::test_the_estimated_growth_is_that_of_perturbed_integrations"
+
+_TABLE = (
+    (
+        "control-power",
+        "harness/simulation/controlled.py",
+        "setting * ratio ** ((order + 1.0) / order)",
+        "setting * ratio ** (order / (order + 1.0))",
+        f"{_ASKED}::test_a_tolerance_is_changed_by_the_order_of_a_step",
+    ),
+    (
+        "control-measured",
+        _SEARCH,
+        "log(before.estimated / after.estimated) / shorter",
+        "log(before.estimated / after.estimated) / (2.0 * shorter)",
+        _FORMULAS,
+    ),
+    ("control-promise", _SEARCH, "stepping * part ** (-1.0 / one.order)", "stepping * part ** -1.0", _FORMULAS),
+    (
+        "control-fallback",
+        _SEARCH,
+        "if found.estimated <= self._error:",
+        "if found.estimated < 10.0 * self._error:",
+        _FORMULAS,
+    ),
+    (
+        "growth-rescaled",
+        _GROWTH,
+        "one + (two - one) * (first / apart), factor * apart / first",
+        "one + (two - one) * (first / apart), factor",
+        _GROWS,
+    ),
+    ("growth-not-rescaled", _GROWTH, "if apart > _LINEAR * first:", "if apart > 1e30 * first:", _GROWS),
+    (
+        "growth-longest",
+        _GROWTH,
+        "self.times[self.grown <= _SURE * MARGIN * error]",
+        "self.times[self.grown <= error]",
+        f"{_ASKED}::test_a_refusal_names_the_longest_horizon_that_works",
+    ),
+    (
+        "growth-at-rest",
+        _GROWTH,
+        "moved.max() > unit * max(1, half) ** 0.5",
+        "moved.max() > 0.0",
+        f"{_ASKED}::test_what_only_round_off_moves_is_at_rest",
+    ),
+    (
+        "error-doubt",
+        _SEARCH,
+        "DOUBT * self._apart(p[-1], q[-1]) / moved",
+        "0.5 * self._apart(p[-1], q[-1]) / moved",
+        _FORMULAS,
+    ),
+)
+
+ERROR_CONTROL = tuple(Mutation(name, file, old, new, (tests,)) for name, file, old, new, tests in _TABLE)
