@@ -188,7 +188,7 @@ class _Following:
         scene, prepared = self._ladder.at(self._level)
         h, time = scene.system.time_step, self._time(self._ticks)
         done = Stages(scene, self._now, self._acceleration, time).done(prepared, self._stop(h), FIRST_GUESSES["motion"])
-        self._iterations += done.iterations
+        self._iterations += sum(done.counts)
         ratio = self._ratio(done)
         if not ratio <= 1.0:
             self._rejected += 1

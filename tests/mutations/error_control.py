@@ -7,7 +7,7 @@ from tests.mutations.base import Mutation
 _SEARCH, _GROWTH = "harness/experiments/asked/search.py", "harness/reference/growth.py"
 _FORMULAS = "tests/contracts/test_search.py"
 _ASKED = "tests/contracts/test_asked_error.py"
-_GROWS = f"{_ASKED}::test_the_estimated_growth_is_that_of_perturbed_integrations"
+_GROWS = f"{_ASKED}::test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_known"
 
 _TABLE = (
     (
