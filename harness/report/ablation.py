@@ -88,7 +88,18 @@ def _relative(value: float) -> str:
 def ablation_table(rows: Sequence[Row]) -> Table:
     """A row an effect: its price, and what leaving it out changes."""
     (whole,) = of_kind(rows, "whole")
-    headings = ("without", "ms a step", "% of the step", "95 %", "KiB", "nnz(L)", "largest", "RMS", "energy", "centre")
+    headings = (
+        "without",
+        "CPU ms a step",
+        "% of the step",
+        "95 %",
+        "KiB",
+        "nnz(L)",
+        "largest",
+        "RMS",
+        "energy",
+        "centre",
+    )
     table = Table(box=SIMPLE_HEAD, caption=CAPTION)
     for i, heading in enumerate(headings):
         table.add_column(heading, justify="right" if i else "left")

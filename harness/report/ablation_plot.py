@@ -35,7 +35,7 @@ def draw_ablation(rows: Sequence[Row], path: Path) -> None:
     with matplotlib.rc_context(RC):
         page = new_page()
         facts = [
-            f"{whole['solver']}, {quantity(1e3 * whole['seconds'])} ms a step",
+            f"{whole['solver']}, {quantity(1e3 * whole['seconds'])} CPU ms a step",
             f"{whole['vertices']} vertices",
             f"{whole['frames']} steps of {quantity(1e3 * whole['time_step'])} ms, {whole['rounds']} rounds",
         ]

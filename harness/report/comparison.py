@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 
 from harness.record.base import Replay
 from harness.record.framing import outside_words
-from harness.report.frames import drawable_frames, shown_ends, shown_limit
+from harness.report.frames import drawable_frames, largest_strain, shown_limit, strain_ends
 from harness.report.origin import made_by
 from harness.report.page import (
     count,
@@ -32,7 +32,7 @@ from harness.report.page import (
     strain_scale,
     text,
 )
-from harness.report.render import Studio, area_vectors, frame_all, natural_angles, shape, spacing, spring_strain
+from harness.report.render import Studio, area_vectors, frame_all, natural_angles, shape, spacing
 from harness.report.self_contact import self_contact_words
 from harness.report.solids import framed, seen
 from harness.report.style import HEIGHT, MUTED, RC, RULE, WIDTH, Mark, marks
@@ -76,7 +76,7 @@ def draw_comparison(replays: Mapping[str, Replay], path: Path) -> None:
         strain_scale(
             page,
             limit,
-            shown_ends(finite, [-1] * len(finite)),
+            strain_ends(finite),
             pins=any(len(replay.pinned) for replay in replays.values()),
         )
         for k, (heading, panel) in enumerate(panels.items()):
@@ -116,7 +116,7 @@ def _layout(panels: int, tiles: int, aspect: float) -> _Grid:
 
 
 def _title(page: Figure, panels: Mapping[str, Sequence[tuple[str, Replay]]]) -> None:
-    meaning = "distance: of the farthest vertex from the run of the lowest residual, in mean rest lengths"
+    meaning = "largest strain: all frames; distance: farthest vertex from the run of lowest residual, mean rest lengths"
     if len(panels) > 1:
         header(page, "Solvers side by side", [meaning])
         return
@@ -180,13 +180,11 @@ def _solver(label: str, replay: Replay) -> str:
 
 
 def _facts(replay: Replay, best: Replay) -> dict[str, str]:
-    final = len(replay.frames) - 1
-    finite = _ends_finite(replay)
-    strain = np.abs(spring_strain(replay, final)).max(initial=0.0) if finite else np.nan
+    strain = largest_strain(replay)
     cost = replay.properties.get("milliseconds_per_step")
     return {
         "ms a step": "–" if cost is None else quantity(float(cost)),
-        "largest strain": f"{100 * strain:.3g} %" if finite else "–",
+        "largest strain": f"{100 * strain:.3g} %" if np.isfinite(strain) else "–",
         "residual": _last(replay, "residual"),
         "distance": distance_words(replay, best),
     }

@@ -65,7 +65,7 @@ def sentences(compared: Comparison, names: Mapping[str, str]) -> Iterator[tuple[
     first, *others = compared.equal
     error = f"{compared.what} {compared.lowest:.1e}"
     if others:
-        slower = [f"{names[run.run_id]} {factor(_ratio(run, first))} times" for run in others]
+        slower = [f"{names[run.run_id]} {quantity(_ratio(run, first))} times" for run in others]
         words = f"fastest at equal accuracy is {names[first.run_id]}, {quantity(first.step or 0.0)} ms a step"
         yield (
             f"{compared.where}: {words}; {_listed(slower)} as long ({error} to {SAME:g} times that, or round-off).",

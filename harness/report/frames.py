@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.base import quantities
 from harness.record.base import Replay
 from harness.record.shading import scale_end
 from harness.report.render import spacing, spring_strain, vertex_strain
@@ -28,8 +29,24 @@ def shown_limit(replays: Sequence[Replay], frames: Sequence[int]) -> float:
     return scale_end(np.concatenate([vertex_strain(r, k) for r, k in zip(replays, frames, strict=True)]))
 
 
-def shown_ends(replays: Sequence[Replay], frames: Sequence[int]) -> tuple[float, float]:
-    """The smallest and the largest strain of a spring in these frames; 0 where there is none below, or above."""
-    strain = np.concatenate([spring_strain(r, k) for r, k in zip(replays, frames, strict=True)] or [np.zeros(0)])
-    known = strain[np.isfinite(strain)]
-    return float(known.min(initial=0.0)), float(known.max(initial=0.0))
+def largest_strain(replay: Replay) -> float:
+    """The run's largest strain, as its rows have it; NaN where no frame after the start was recorded."""
+    if "/strain/largest" in replay.scalars:
+        return quantities.largest_strain(*replay.scalars["/strain/largest"])
+    strains = [np.abs(spring_strain(replay, k)).max(initial=0.0) for k in range(len(replay.frames))]
+    return quantities.largest_strain(replay.frames, np.array(strains))
+
+
+def strain_ends(replays: Sequence[Replay]) -> tuple[float, float]:
+    """The smallest and the largest strain of a spring in all frames after the start that can be drawn; 0 where there is
+    none below, or above. That of larger magnitude is the run's largest strain."""
+    low = high = 0.0
+    for replay in replays:
+        shown = [int(k) for k in drawable_frames(replay) if replay.frames[k] > 0]
+        strain = np.concatenate([spring_strain(replay, k) for k in shown] or [np.zeros(0)])
+        known = strain[np.isfinite(strain)]
+        ends = float(known.min(initial=0.0)), float(known.max(initial=0.0))
+        if len(shown) == (replay.frames > 0).sum() and np.isfinite(largest := largest_strain(replay)):
+            ends = (ends[0], largest) if ends[1] >= -ends[0] else (-largest, ends[1])  # not rounded to single precision
+        low, high = min(low, ends[0]), max(high, ends[1])
+    return low, high

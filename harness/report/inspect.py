@@ -21,8 +21,10 @@ from rich.table import Table
 from rich.text import Text
 
 from harness.base.errors import InputError, Mistake, RunFailed
+from harness.base.quantities import times_as_long
 from harness.record.base import Replay
 from harness.record.reader import Summary, open_recording, read_replay, summary
+from harness.report.page import quantity
 
 _SURFACE = (".obj", ".ply", ".stl", ".vtk", ".vtp")
 _LINES = (".vtk", ".vtp")
@@ -113,7 +115,7 @@ def _print_summary(found: Summary, console: Console) -> None:
         (entity, *_spread(values)) for entity, values in series.items() if _MILLISECONDS in entity and len(values)
     ]
     if phases:
-        console.print(_table(("milliseconds", "min", "median", "p95"), phases))
+        console.print(_table(("milliseconds of frames, medians over rounds", "min", "median", "p95"), phases))
     others = [
         (entity, f"{values[0]:.6g}", f"{values[-1]:.6g}", f"{np.abs(values).max():.6g}")
         for entity, values in series.items()
@@ -147,8 +149,13 @@ def _print_difference(paths: list[Path], console: Console) -> None:
     rows = [
         (entity, *(f"{np.median(of[entity]):.4g}" for of in times), f"{_ratio(times, entity):.4g}") for entity in phases
     ]
+    whole = [found.properties.get("milliseconds_per_step") for found in (first, second)]
+    if None not in whole:
+        a, b = (float(value or 0.0) for value in whole)
+        rows = [("ms a step", quantity(a), quantity(b), quantity(times_as_long(b, a)) if a else "–"), *rows]
+    heading = "milliseconds: medians over frames of medians over rounds"
     if rows:
-        console.print(_table(("median milliseconds", "first", "second", "second / first"), rows))
+        console.print(_table((heading, "first", "second", "second / first"), rows))
 
 
 def _ratio(times: list[dict[str, NDArray[np.float64]]], entity: str) -> float:

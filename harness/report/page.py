@@ -76,13 +76,13 @@ def header(page: Figure, headline: str, facts: Sequence[str], *, letters: int = 
 
 def strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, pins: bool) -> None:
     """The colour bar in the upper right corner: percent ticks below, what they mean in words above. ends: the smallest
-    and the largest strain of a spring, told above; where the bar does not reach them it ends in a tip."""
+    and the largest strain of a spring in all frames, told above; where the bar does not reach them it ends in a tip."""
     left, top, width = 1180, 50, 380
     bar = axes(page, left, top, width, 12)
     bar.imshow(np.linspace(0, 1, 512)[None], cmap=STRAIN_MAP, aspect="auto", interpolation="bilinear")
     bar.set_axis_off()
     for place, word, end, align in ((0.0, "compressed", ends[0], "left"), (1.0, "stretched", ends[1], "right")):
-        told = f"{word}, to {percent(end, 2)}" if end else f"{word}: none"
+        told = f"{word}, to {percent(end)}" if end else f"{word}: none"
         text(page, left + place * width, top - 8, told, size=9.5, ha=align)
     text(page, left + width / 2, top - 8, "at rest", size=9.5, ha="center")
     for place, beyond, tip in ((0.0, ends[0] < -limit, -14), (1.0, ends[1] > limit, 14)):

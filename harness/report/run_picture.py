@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from harness.record.base import Replay
 from harness.record.framing import outside_words
-from harness.report.frames import drawable_frames, shown_ends, shown_limit
+from harness.report.frames import drawable_frames, largest_strain, shown_limit, strain_ends
 from harness.report.origin import made_by
 from harness.report.page import (
     clock,
@@ -96,9 +96,7 @@ def draw_run(replay: Replay, path: Path, *, camera: tuple[float, float] | None =
     with matplotlib.rc_context(RC):
         page = new_page()
         header(page, headline(replay), [*_facts(replay), *(_warnings(replay, shown.tolist()) if len(shown) else [])])
-        strain_scale(
-            page, replay.strain_range, shown_ends([replay] * len(shown), shown.tolist()), pins=len(replay.pinned) > 0
-        )
+        strain_scale(page, replay.strain_range, strain_ends([replay]), pins=len(replay.pinned) > 0)
         made_by(page, [replay], HEIGHT - 12)
         if len(shown):
             _frames(page, replay, shown, camera)
@@ -118,6 +116,8 @@ def _facts(replay: Replay) -> list[str]:
     facts.append(f"{count(replay.positions.shape[1])} vertices, {count(len(replay.springs))} springs")
     if "milliseconds_per_step" in known:
         facts.append(f"{quantity(float(known['milliseconds_per_step']))} ms a step")
+    if np.isfinite(strain := largest_strain(replay)):
+        facts.append(f"largest strain {100 * strain:.3g} %")
     return facts
 
 

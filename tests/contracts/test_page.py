@@ -199,7 +199,7 @@ def test_a_run_says_what_it_was_and_how_to_repeat_it_by_keys_alone(tab: Tab, pag
     shown.keyboard.press("Space")
     shown.get_by_role("link", name="Compare").press("Enter")
     shown.get_by_role("heading", name="Comparison").wait_for()
-    assert "times the first" in shown.inner_text("table")
+    assert "times as long as the first" in shown.inner_text("table")
 
 
 @pytest.mark.parametrize("view", list(VIEWS.values()), ids=list(VIEWS))

@@ -18,7 +18,7 @@ from harness.report.comparison import distance_words, reference
 from harness.report.figures.entry import Entry
 from harness.report.figures.of_runs import sweep_rows
 from harness.report.figures.panel import Picture, Renderer
-from harness.report.frames import drawable_frames, shown_limit
+from harness.report.frames import drawable_frames, largest_strain, shown_limit
 from harness.report.origin import NEEDED, measured_on
 from harness.report.page import clock, count, quantity
 from harness.report.render import (
@@ -28,7 +28,6 @@ from harness.report.render import (
     frame_all,
     natural_angles,
     shape,
-    spring_strain,
     vertex_strain,
 )
 from harness.report.self_contact import self_contact_words
@@ -119,7 +118,7 @@ def _made(of: tuple[str, ...], name: tuple[str, ...], path: Path, label: str, lo
         *(replay.triangles, vertex_strain(replay, frame), limit, aspect),
         render=_Render(replace(replay, strain_range=limit), frame, frame_all(points, aspect=aspect, angles=angles)),
         facts=(
-            f"largest strain {100 * np.abs(spring_strain(replay, frame)).max(initial=0.0):.3g} %",
+            f"largest strain {100 * largest_strain(replay):.3g} %",
             *outside_words(framed(replay, [frame])),
             *self_contact_words(replay, [frame]),
         ),

@@ -8,18 +8,17 @@
   ];
   const CURVES = [["ms", "ms a step", { type: "log" }], ["residual", "residual, J^½", { type: "log" }], ["iterations", "iterations", {}], ["strain", "largest strain, %", {}], ["objective", "objective, J", {}], ["distance", "from the reference, sizes", { type: "log" }]];
 
-  // The median over frames of a ratio with its 95 % interval, by resampling the frames (seeded, so it repeats).
-  function interval(logs) {
-    const middle = some => { const s = Float64Array.from(some).sort(), h = s.length >> 1; return s.length % 2 ? s[h] : (s[h - 1] + s[h]) / 2; };
+  const middle = some => { const s = Float64Array.from(some).sort(), h = s.length >> 1; return s.length % 2 ? s[h] : (s[h - 1] + s[h]) / 2; };
+
+  // The 95 % interval of the quotient of two runs' ms a step, by resampling the frames (seeded, so it repeats).
+  function interval(frames, first) {
+    const pairs = frames.ms.map((v, k) => [v, first.ms[k]]).filter(([a, b]) => a > 0 && b > 0);
+    if (pairs.length < 2) return null;
     let seed = 12345;
     const random = () => { seed = (1103515245 * seed + 12345) % 2147483648; return seed / 2147483648; };
-    const found = Float64Array.from({ length: logs.length > 1 ? 1000 : 1 }, () => middle(logs.map(() => logs[Math.floor(random() * logs.length)]))).sort();
-    return [middle(logs), found[Math.floor(0.025 * found.length)], found[Math.min(found.length - 1, Math.floor(0.975 * found.length))]].map(Math.exp);
-  }
-
-  function ratio(frames, first) {
-    const logs = frames.least.map((v, k) => Math.log(v / first.least[k])).filter(Number.isFinite);
-    return logs.length ? interval(logs) : null;
+    const quotient = some => middle(some.map(([v]) => v)) / middle(some.map(([, v]) => v));
+    const found = Float64Array.from({ length: 1000 }, () => quotient(pairs.map(() => pairs[Math.floor(random() * pairs.length)]))).sort();
+    return [found[25], found[974]];
   }
 
   function table(rows, series) {
@@ -27,13 +26,15 @@
     const same = FIELDS.filter(field => !differing.includes(field)).map(([key, words]) => [words, rows[0][key]]).filter(([key, v]) => v !== null && v !== undefined && v !== "{}").map(([words, v]) => [words, words === "commit" ? springbench.commit(v) : v]);
     const line = (words, cells) => element("tr", {}, element("th", { scope: "row" }, words), ...cells.map(cell => element("td", {}, cell ?? "–")));
     const against = rows.map((row, k) => {
-      const found = k && series[k] && series[0] ? ratio(series[k], series[0]) : null;
-      return k ? (found ? `${number(found[0])} (${number(found[1])} to ${number(found[2])})` : "–") : "1";
+      if (!k) return "1";
+      if (!row.step || !rows[0].step) return "–";
+      const found = series[k] && series[0] ? interval(series[k], series[0]) : null;
+      return `${number(row.step / rows[0].step)}${found ? ` (${number(found[0])} to ${number(found[1])})` : ""}`;
     });
     const body = [
       ...differing.map(([key, words]) => line(words, rows.map(row => (key === "commit" ? springbench.commit(row[key]) : key === "parameters" ? Object.entries(JSON.parse(row[key])).map(pair => pair.join(" ")).join(", ") || "–" : String(row[key] ?? "–"))))),
       line("status", rows.map(row => state(row.status))), line("ms a step, quartiles", rows.map(row => (row.step === null ? "–" : `${number(row.step)} (${number(row.lower)} to ${number(row.upper)})`))),
-      rows.length > 1 && line("times the first, frame by frame, 95 %", against), line("least ms", rows.map(row => number(row.least))), line("prepare ms, cold, warm", rows.map(row => `${number(row.cold)}, ${number(row.warm)}`)),
+      rows.length > 1 && line("times as long as the first, 95 % by frames", against), line("least ms", rows.map(row => number(row.least))), line("prepare ms, cold, warm", rows.map(row => `${number(row.cold)}, ${number(row.warm)}`)),
       line("iterations, stopped by", rows.map(row => `${number(row.iterations)}, ${row.stopped || "–"}`)), line("last residual", rows.map(row => fixed(row.residual))), line("largest strain", rows.map(row => percent(row.largest_strain))),
       rows.length > 1 && line("last positions", rows.map((row, k) => (k ? (row.digest && row.digest === rows[0].digest ? "equal to the bit" : "differ") : ""))),
     ];

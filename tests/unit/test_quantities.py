@@ -1,0 +1,124 @@
+"""One run's quantities have the same value wherever they are stated, each by a hand-computed case."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from rich.console import Console
+
+from harness.base.columns import SCHEMA
+from harness.base.quantities import largest_strain as largest_of
+from harness.base.quantities import ms_per_step, times_as_long
+from harness.record.base import Replay
+from harness.report import comparison
+from harness.report.equal_accuracy import comparisons
+from harness.report.equal_accuracy import sentences as compared
+from harness.report.figures.of_runs import timing
+from harness.report.frames import largest_strain, strain_ends
+from harness.report.medians import medians
+from harness.report.render import spacing
+from harness.report.site import update
+from harness.report.timing_table import labels, runs, summary_table
+from tests import site_results
+
+MILLISECONDS = {"sparse": [1.0, 2.0, 9.0, 3.0, 4.0, 50.0], "numba": [1.5, 0.5, 0.25, 2.0, 40.0, 1.0]}
+"""Of two rounds of three frames: medians 3.5 and 1.25, means 11.5 and 7.5, least 1 and 0.25."""
+STRAINS = (0.389, 0.284, 0.2)
+
+
+def rows_of(solver: str) -> list[dict[str, Any]]:
+    number = site_results.SOLVERS.index(solver)
+    same = site_results.run(number) | {"phase": "step", "iterations": 5, "stopped": "tolerance", "residual": 1e-6}
+    return [
+        same
+        | {"frame": k % 3 + 1, "round": k // 3, "seconds": 1e-3 * ms}
+        | {"largest_strain": STRAINS[k % 3], "strain_99": 0.1}
+        for k, ms in enumerate(MILLISECONDS[solver])
+    ]
+
+
+def replay_of(solver: str) -> Replay:
+    """A single spring of length 1, stretched in each frame as the rows say, and more at the start."""
+    stretched = np.array([[[0, 0, 0], [1 + strain, 0, 0]] for strain in (0.9, *STRAINS)], np.float32)
+    own = {"scene": "hanging-cloth", "size": 8, "solver": solver}
+    return Replay(
+        title="", run_id="", frames=np.arange(4), times=np.arange(4.0), positions=stretched,
+        triangles=np.zeros((0, 3), np.int64), springs=np.array([[0, 1]]), rest_lengths=np.ones(1),
+        pinned=np.zeros(0, np.int64), strain_range=0.1,
+        scalars={"/strain/largest": (np.arange(4), np.array([0.9, *STRAINS])), "/residual": (np.arange(1), np.ones(1))},
+        properties=own | {"milliseconds_per_step": ms_per_step([1e-3 * ms for ms in MILLISECONDS[solver]])},
+    )  # fmt: skip
+
+
+def test_every_place_states_the_same_numbers_of_a_run(tmp_path: Path):
+    told = rows_of("sparse") + rows_of("numba")
+    table = pa.table({field.name: [row.get(field.name) for row in told] for field in SCHEMA}, schema=SCHEMA)
+    (tmp_path / "made" / "rows").mkdir(parents=True)
+    pa.parquet.write_table(table, tmp_path / "made" / "rows" / "all.parquet")
+
+    sparse, numba = runs(table)
+    assert (sparse.step, numba.step) == pytest.approx((3.5, 1.25))
+    assert sparse.least == pytest.approx(1.0)
+    assert sparse.largest_strain == pytest.approx(0.389)
+
+    console = Console(width=200, record=True, file=StringIO())
+    console.print(summary_table(table))
+    assert re.search(r"8 sparse +– +– +3\.5 +1 .* 38\.9 % +10 %", console.export_text())
+
+    for run in (sparse, numba):
+        facts = comparison._facts(replay_of(run.solver), replay_of("sparse"))  # pyright: ignore[reportPrivateUsage]
+        assert facts["ms a step"] == {"sparse": "3.5", "numba": "1.25"}[run.solver]
+        assert facts["largest strain"] == "38.9 %"
+
+    ((words, _),) = [said for one in comparisons(runs(table)) for said in compared(one, labels(runs(table)))]
+    assert "fastest at equal accuracy is numba, 1.25 ms a step; sparse 2.8 times as long" in words
+
+    update(tmp_path)
+    page = (tmp_path / "site" / "data" / "made" / "runs.js").read_text()
+    columns = json.loads(page.partition(", ")[2].strip().removesuffix(");"))["columns"]
+    assert columns["step"] == [1.25, 3.5]
+    assert columns["largest_strain"] == [0.389, 0.389]
+    index = (tmp_path / "site" / "data" / "index.js").read_text()
+    assert "numba, 1.25 ms a step; sparse 2.8 times as long" in index
+
+    (path,) = medians(table, tmp_path)
+    with path.open() as file:
+        assert {row["solver"]: float(row["median_seconds"]) for row in csv.DictReader(file)} == pytest.approx(
+            {"sparse": 3.5e-3, "numba": 1.25e-3}
+        )
+    plot: Any = next(entry for entry in timing(tmp_path / "made", lambda rows: ()) if "step" in entry.name).make()
+    assert sorted(float(series.x[0]) for series in plot.series) == pytest.approx([1.25e-3, 3.5e-3])
+
+
+def test_the_largest_strain_leaves_the_start_out_and_no_frame_after_it():
+    replay = replay_of("sparse")
+    assert largest_strain(replay) == 0.389
+    assert strain_ends([replay]) == pytest.approx((0.0, 0.389), abs=1e-12)
+    bare = replace(replay, scalars={})
+    assert largest_strain(bare) == pytest.approx(0.389, abs=1e-6)
+    squeezed = replace(bare, positions=replay.positions * np.float32(0.5))
+    assert strain_ends([squeezed, replay]) == pytest.approx((-0.4, 0.389), abs=1e-6)
+    assert np.isnan(largest_of(np.array([0]), np.array([0.9])))
+
+
+def test_times_as_long_is_the_quotient_of_ms_a_step():
+    assert times_as_long(3.5, 1.25) == pytest.approx(2.8)
+    assert ms_per_step([0.001, 0.002, 0.009]) == pytest.approx(2.0), "the median, where the mean is 4"
+
+
+def test_a_distance_in_pictures_is_the_largest_in_mean_rest_lengths():
+    line = np.array([[[0, 0, 0], [1, 0, 0], [2, 0, 0], [12, 0, 0]]], np.float32)
+    springs, lengths = np.array([[0, 1], [1, 2], [2, 3]]), np.array([1.0, 1.0, 10.0])
+    best = replace(replay_of("sparse"), frames=np.array([3]), positions=line, springs=springs, rest_lengths=lengths)
+    moved = replace(best, positions=line + np.array([[0, 0, 0], [0, 0, 0], [0, 2, 0], [0, 6, 0]], np.float32))
+    assert spacing(best) == pytest.approx(4.0), "the mean of 1, 1 and 10; the median is 1"
+    assert comparison.distance_words(moved, best) == "1.5", "6 m of 4; the mean distance is 2"
