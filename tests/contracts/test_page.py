@@ -282,6 +282,12 @@ FRAGMENTS = (
 )
 
 
+def test_the_ratio_of_two_runs_is_that_of_their_ms_a_step(tab: Tab, page: str):
+    shown = tab.open(page, f"compare?sel=made/{run(0)['run_id']},made/{run(1)['run_id']}")
+    row = shown.locator("table tr", has_text="times as long as the first")
+    assert row.locator("td").all_inner_texts() == ["1", "0.2 (0.2 to 0.2)"], "5 ms and 1 ms for 100 vertices"
+
+
 def test_every_fragment_shows_something(tab: Tab, page: str):
     tab.page.on("dialog", lambda dialog: tab.said.append(dialog.message))
     for fragment in FRAGMENTS:

@@ -20,12 +20,14 @@ from harness.base.quantities import largest_strain as largest_of
 from harness.base.quantities import ms_per_step, times_as_long
 from harness.record.base import Replay
 from harness.report import comparison
+from harness.report.ablation import ablation_table
 from harness.report.equal_accuracy import comparisons
 from harness.report.equal_accuracy import sentences as compared
 from harness.report.figures.of_runs import timing
 from harness.report.frames import largest_strain, strain_ends
 from harness.report.medians import medians
 from harness.report.render import spacing
+from harness.report.robustness import OTHER, RIGHT, judged
 from harness.report.site import update
 from harness.report.timing_table import labels, runs, summary_table
 from tests import site_results
@@ -122,3 +124,20 @@ def test_a_distance_in_pictures_is_the_largest_in_mean_rest_lengths():
     moved = replace(best, positions=line + np.array([[0, 0, 0], [0, 0, 0], [0, 2, 0], [0, 6, 0]], np.float32))
     assert spacing(best) == pytest.approx(4.0), "the mean of 1, 1 and 10; the median is 1"
     assert comparison.distance_words(moved, best) == "1.5", "6 m of 4; the mean distance is 2"
+
+
+def test_the_share_of_an_effect_is_of_the_whole_step():
+    plain = {"bytes": 1024, "nnz_factor": None, "status": "ok", "name": "wind", "largest": 1.0, "rms": 1.0}
+    plain |= {"energy": 0.1, "centre": 0.1, "cost": 5e-4, "cost_low": 4e-4, "cost_high": 6e-4, "seconds": 2e-3}
+    table = ablation_table([plain | {"kind": "whole"}, plain | {"kind": "without"}])
+    console = Console(width=200, record=True, file=StringIO())
+    console.print(table)
+    # 0.5 ms of 2; of the 1.5 that are left it would be a third.
+    assert re.search(r"wind +0\.5 +25\.0 +20\.0 to 30\.0", console.export_text())
+
+
+def test_a_motion_within_one_percent_of_the_reference_is_the_same():
+    solved = {"status": "ok", "stationarity": 1e-9, "beyond": 1e-9, "tolerance": 1e-6, "minimum": True, "flat": False}
+    for distance, outcome in ((0.0, RIGHT), (0.0099, RIGHT), (0.0101, OTHER), (0.03, OTHER)):
+        frames = [solved | {"stopped": "tolerance", "distance": way} for way in (0.0, distance, 0.0)]
+        assert judged(frames)[0] == outcome, distance

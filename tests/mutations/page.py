@@ -1,0 +1,72 @@
+"""Lies in what tables, pictures, figures and the page state of runs."""
+
+from __future__ import annotations
+
+from tests.mutations.base import Mutation
+
+_QUANTITIES, _RENDER = "harness/base/quantities.py", "harness/report/render.py"
+_STATED, _TIMES = "tests/unit/test_quantities.py", "tests/unit/test_report_timing.py"
+_PAGE, _SITE, _ROWS = "tests/contracts/test_page.py", "tests/unit/test_site.py", "tests/contracts/test_hostile_rows.py"
+_STATIC = "harness/report/site/static"
+
+PAGE = (
+    Mutation(
+        "picture-distance-mean",
+        "harness/report/comparison.py",
+        "np.linalg.norm(away, axis=1).max(initial=0.0)",
+        "np.linalg.norm(away, axis=1).mean()",
+        (_STATED,),
+    ),
+    Mutation(
+        "ablation-share-of-variant",
+        "harness/report/ablation.py",
+        'share = [100 * row[key] / whole["seconds"] for key',
+        'share = [100 * row[key] / (whole["seconds"] - row["cost"]) for key',
+        (_STATED,),
+    ),
+    Mutation(
+        "rest-length-median",
+        _RENDER,
+        "float(replay.rest_lengths.mean())",
+        "float(np.median(replay.rest_lengths))",
+        (_STATED,),
+    ),
+    Mutation("step-mean-of-rows", _QUANTITIES, "1e3 * median(seconds)", "1e3 * avg(seconds)", (_STATED,)),
+    Mutation("step-mean-of-recording", _QUANTITIES, "float(np.median(seconds))", "float(np.mean(seconds))", (_STATED,)),
+    Mutation("map-same-5-percent", "harness/report/robustness.py", "\nSAME = 1e-2\n", "\nSAME = 5e-2\n", (_STATED,)),
+    Mutation("strain-of-last-frame", _QUANTITIES, "float(after.max())", "float(after[-1])", (_STATED,)),
+    Mutation("strain-of-start", _QUANTITIES, "strains[frames > 0]", "strains[frames >= 0]", (_STATED,)),
+    Mutation(
+        "ratio-of-others",
+        _QUANTITIES,
+        "return run / other",
+        "return other / run",
+        (_STATED, f"{_TIMES}::test_times_are"),
+    ),
+    Mutation(
+        "unknown-error-is-equal",
+        "harness/report/equal_accuracy.py",
+        "errors.get(run.run_id, limit + 1.0) <= limit",
+        "errors.get(run.run_id, 0.0) <= limit",
+        (_TIMES,),
+    ),
+    Mutation(
+        "figure-of-times-scaled",
+        "harness/report/figures/of_runs.py",
+        "values = [1e-3 * np.array(",
+        "values = [1e-2 * np.array(",
+        (_STATED,),
+    ),
+    Mutation(
+        "page-frame-longest", "harness/report/site/frames.py", "1e3 * median(seconds)", "1e3 * max(seconds)", (_SITE,)
+    ),
+    Mutation("page-folder-unescaped", "harness/report/site/folders.py", "safe=''", "safe=':()'", (_ROWS,)),
+    Mutation("page-inherited-names", f"{_STATIC}/base.js", "Object.hasOwn(object, name)", "name in object", (_PAGE,)),
+    Mutation(
+        "page-ratio-inverted",
+        f"{_STATIC}/compare.js",
+        "number(row.step / rows[0].step)",
+        "number(rows[0].step / row.step)",
+        (_PAGE,),
+    ),
+)

@@ -1,0 +1,51 @@
+"""Counts that pages state and code decides."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from harness.config.load import load_any
+from solvers.about import ENGINE
+from solvers.integrators import INTEGRATORS, OWN
+from solvers.registry import EVERY, OPTIONAL, SOLVERS, about, load
+
+ROOT = Path(__file__).parents[2]
+WORDS = {
+    4: "four", 5: "five", 11: "eleven", 12: "twelve", 13: "thirteen", 24: "twenty-four", 25: "twenty-five",
+    26: "twenty-six", 30: "thirty", 31: "thirty-one", 32: "thirty-two", 33: "thirty-three", 34: "thirty-four",
+}  # fmt: skip
+ENGINES = {name for name in OPTIONAL if about(load(EVERY[name]), name).family == ENGINE}
+OURS = {*SOLVERS, *OPTIONAL} - ENGINES
+
+
+def said(page: str) -> str:
+    return " ".join((ROOT / page).read_text(encoding="utf-8").split())
+
+
+def test_the_first_page_counts_solvers_engines_and_integrators():
+    integrators = len(set(INTEGRATORS) - {"own"})
+    assert OWN is INTEGRATORS["own"]
+    words = f"any of {WORDS[len(OURS)]} solvers, {WORDS[len(ENGINES)]} outside engines and {WORDS[integrators]} time"
+    assert words in said("README.md")
+
+
+def test_the_page_of_configs_counts_the_solvers_of_the_hard_cases():
+    runs = load_any(ROOT / "configs" / "hard.yaml", opens=False).runs()
+    names = {run.solver.name for run in runs}
+    words = f"by {WORDS[len(names & OURS)]} of the shipped solvers and {WORDS[len(names & ENGINES)]} outside engines"
+    assert words in said("configs/README.md")
+    scenes = len({run.scene_name for run in runs})
+    assert f"{scenes} scenes by {len(names & OURS)} solvers and `numba` in float32" in said("results/README.md")
+
+
+def test_the_table_of_hard_cases_adds_up():
+    text = said("results/README.md")
+    found = re.search(
+        r"Of (\d+) runs (\d+) are right, (\d+) at another certified minimum, (\d+) in a valley, (\d+) stationary where "
+        r"no minimum is, (\d+) not converged, (\d+) refused; (\d+) diverged \(.*?\), (\d+) failed and (\d+) is",
+        text,
+    )
+    assert found
+    total, *parts = map(int, found.groups())
+    assert sum(parts) == total == 111 * 26
