@@ -11,8 +11,9 @@ from tests.mutations.error_control import ERROR_CONTROL
 from tests.mutations.exact_lengths import EXACT_LENGTHS
 from tests.mutations.gates import GATES
 from tests.mutations.measuring import MEASURING
+from tests.mutations.page import PAGE
 from tests.mutations.pictures import PICTURES
 from tests.mutations.steps import STEPS
 
 TABLE = ENERGIES + CONTACT + STEPS + MEASURING + PICTURES + DEVICE + ARCHIVE + GATES + EXACT_LENGTHS + ENERGY_BALANCE
-TABLE += ERROR_CONTROL
+TABLE += ERROR_CONTROL + PAGE
