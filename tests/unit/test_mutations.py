@@ -26,7 +26,8 @@ def test_there_are_sixty_of_them_and_each_has_a_name_of_its_own():
 @pytest.mark.parametrize("lie", TABLE, ids=lambda lie: lie.name)
 def test_each_can_be_planted_and_names_tests_that_exist(lie: Mutation):
     changed = lie.applied(ROOT)
-    ast.parse(changed)
+    if lie.file.endswith(".py"):
+        ast.parse(changed)
     assert changed != (ROOT / lie.file).read_text()
     for test in lie.tests:
         path, _, name = test.partition("::")
