@@ -41,7 +41,7 @@ PAGE = (
         _QUANTITIES,
         "return run / other",
         "return other / run",
-        (_STATED, f"{_TIMES}::test_times_are"),
+        (_STATED,),
     ),
     Mutation(
         "unknown-error-is-equal",
