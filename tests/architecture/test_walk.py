@@ -123,6 +123,4 @@ def test_a_run_enters_few_modules_and_seldom_changes_them(walk: list[Call]):
     before = [call for call in walk if "harness.report" not in call.by and "harness.report" not in call.of]
     modules = {call.of for call in before}
     assert len(modules) <= 100, "100 when this was counted last"
-    assert len(before) <= 1460, (
-        "1,447 when this was counted last, with the balance of energy and frames that are read back"
-    )
+    assert len(before) <= 1460, "1,447 when this was counted last, friction and the balance of energy among them"
