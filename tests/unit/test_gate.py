@@ -124,7 +124,7 @@ def test_a_foreign_file_is_the_users_mistake(content: str | None, told: str, tmp
 def test_files_without_a_common_benchmark_tell_nothing(tmp_path: Path):
     code, text = judged(stored(tmp_path / "a.json", benchmark("a")), stored(tmp_path / "b.json", benchmark("b")))
     assert code == 3
-    assert "no benchmark in common" in text
+    assert "no benchmark in common" in " ".join(text.split())  # long paths wrap
 
 
 @pytest.mark.parametrize(("new", "code"), [(1.0, 0), (1.5, 1), (None, 2)])
