@@ -33,6 +33,9 @@ def suggested(page: Path) -> list[str]:
     return list(dict.fromkeys(_COMMAND.sub("", part) for part in parts if _COMMAND.match(part)))
 
 
+GROUP = get_command(app)
+assert isinstance(GROUP, TyperGroup)
+
 COMMANDS = [(page, command) for page in PAGES for command in suggested(page)]
 
 
@@ -43,9 +46,7 @@ def test_there_are_commands_in_the_pages():
 @pytest.mark.parametrize(("page", "command"), COMMANDS, ids=lambda value: getattr(value, "name", value))
 def test_a_command_of_a_page_has_its_options_and_its_files(page: Path, command: str):
     name, *arguments = shlex.split(command.replace("[", "").replace("]", ""))
-    group = get_command(app)
-    assert isinstance(group, TyperGroup)
-    found = group.commands[name]
+    found = GROUP.commands[name]
     if isinstance(found, TyperGroup):
         name, *arguments = arguments
         found = found.commands[name]
