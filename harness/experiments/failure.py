@@ -10,10 +10,12 @@ from harness.base.blame import said, where
 from harness.base.errors import InputError, RunFailed
 from harness.base.files import CannotWrite
 from harness.config.sweep import RunSpec
+from harness.experiments.code import solver_class
 from harness.simulation.energy_balance import Growth
 from harness.simulation.measure import Diverged, StepFailed
 from solvers.core.clearing import Blocked
 from solvers.problem import NotPositiveDefinite, Unsupported, WrongAnswer
+from solvers.registry import minimises
 
 _STATUS: dict[type[BaseException], str] = {Unsupported: "unsupported", Diverged: "diverged"}
 
@@ -32,12 +34,13 @@ def grown(run: RunSpec, growth: Growth, by_frame: Mapping[int, Mapping[str, Any]
     """The columns `status` and `reason` of a run that was done and whose energy has grown without a source."""
     times = f"{growth.times:,.0f}" if growth.times >= 10.0 else f"{growth.times:.1f}"
     said = f"energy has grown {times} times without a source, from frame {growth.first} on: "
-    own = run.integrator == "own"
-    if own or by_frame[growth.first]["stopped"] != "iterations":
-        method = run.solver.name if own else run.integrator
-        said += f"a step of {run.scene.time_step:.3g} s is too long for {method}"
-    else:
+    step = by_frame[growth.first]
+    if step["stopped"] == "iterations" and step["iterations"] >= run.iterations and run.integrator != "own":
         said += f"{run.solver.name} leaves the step unsolved; take more iterations, a tolerance, or another solver"
+    else:
+        integrates = run.integrator == "own" or not minimises(solver_class(run))  # a method with steps of its own
+        method = run.solver.name if integrates else run.integrator
+        said += f"a step of {run.scene.time_step:.3g} s is too long for {method}"
     return {"status": "energy-growth", "reason": said}
 
 

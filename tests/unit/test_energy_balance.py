@@ -11,6 +11,8 @@ import pytest
 
 from harness.base import rows
 from harness.config.load import load_any
+from harness.config.sweep import RunSpec, SolverSpec
+from harness.experiments.failure import grown
 from harness.experiments.plan import Files
 from harness.experiments.run import execute
 from harness.experiments.sweep import failures
@@ -22,6 +24,7 @@ from harness.scenes.effects.gravity import Gravity
 from harness.scenes.effects.pins import Pins
 from harness.scenes.effects.springs import Springs
 from harness.scenes.mesh.chain import Chain
+from harness.scenes.spec import SceneSpec
 from harness.simulation.energy_balance import BLOW_UP, GROWTH, UNCERTAINTY, Balance, EnergyBalance, Growth
 from harness.simulation.step import Step, prepare, simulate
 from solvers import integrators
@@ -236,6 +239,23 @@ def test_a_run_whose_energy_grows_says_so_in_all_rows(tmp_path: Path, record: st
     if record == "true":
         facts = read_replay(files.recording).properties
         assert (facts["status"], facts["solver"]) == ("energy-growth", "newton")
+
+
+@pytest.mark.parametrize(
+    ("integrator", "solver", "iterations", "words"),
+    [
+        ("implicit-euler", "rodas", 1, "a step of 0.1 s is too long for rodas"),
+        ("own", "velocity-verlet", 60, "a step of 0.1 s is too long for velocity-verlet"),
+        ("midpoint", "newton", 3, "a step of 0.1 s is too long for midpoint"),
+        ("implicit-euler", "xpbd", 60, "xpbd leaves the step unsolved; take more iterations"),
+        ("implicit-euler", "sparse", 60, "sparse leaves the step unsolved; take more iterations"),
+    ],
+)
+def test_the_reason_of_growth_is_the_step_or_its_iterations(integrator: str, solver: str, iterations: int, words: str):
+    scene = SceneSpec.model_construct(time_step=0.1)
+    run = RunSpec.model_construct(integrator=integrator, solver=SolverSpec(solver, {}), iterations=60, scene=scene)
+    by_frame = {7: {"stopped": "iterations", "iterations": iterations}}
+    assert words in grown(run, Growth(7, 2.0), by_frame)["reason"]
 
 
 def test_the_same_steps_by_implicit_euler_are_ok(tmp_path: Path):
