@@ -9,6 +9,7 @@ import re
 import shlex
 import shutil
 from pathlib import Path
+from typing import cast
 
 import pytest
 from typer.core import TyperGroup
@@ -33,8 +34,7 @@ def suggested(page: Path) -> list[str]:
     return list(dict.fromkeys(_COMMAND.sub("", part) for part in parts if _COMMAND.match(part)))
 
 
-GROUP = get_command(app)
-assert isinstance(GROUP, TyperGroup)
+GROUP = cast("TyperGroup", get_command(app))
 
 COMMANDS = [(page, command) for page in PAGES for command in suggested(page)]
 
