@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
@@ -65,7 +66,7 @@ def test_every_place_states_the_same_numbers_of_a_run(tmp_path: Path):
     told = rows_of("sparse") + rows_of("numba")
     table = pa.table({field.name: [row.get(field.name) for row in told] for field in SCHEMA}, schema=SCHEMA)
     (tmp_path / "made" / "rows").mkdir(parents=True)
-    pa.parquet.write_table(table, tmp_path / "made" / "rows" / "all.parquet")
+    pq.write_table(table, tmp_path / "made" / "rows" / "all.parquet")
 
     sparse, numba = runs(table)
     assert (sparse.step, numba.step) == pytest.approx((3.5, 1.25))

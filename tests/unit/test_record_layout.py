@@ -110,7 +110,7 @@ def test_a_recording_opens_at_its_first_frame_playing():
 
 
 def test_a_plot_ends_at_the_last_frame_and_its_legend_has_room_above_the_data():
-    drawn = plot("Energies", ["+ /energy/**"], last=40, ends=(-1.0, 3.0))
+    drawn: Any = plot("Energies", ["+ /energy/**"], last=40, ends=(-1.0, 3.0))
     assert drawn.properties["TimeAxis"].view_range.as_arrow_array().to_pylist()[0]["end"] == 40
     low, high = drawn.properties["ScalarAxis"].range.as_arrow_array().to_pylist()[0]
     assert (low, high) == (-1.0, pytest.approx(3.0 + 1.2 * 4.0))
