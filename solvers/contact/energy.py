@@ -160,11 +160,12 @@ class Contact:
         grip = self.friction * stiffness * np.maximum(0.0, depth)
         return Planes(vertices, normal, offset, here + when * (carried - here), stiffness, grip)
 
-    def friction_gradient(self, p: Positions) -> Positions:
-        """The gradient of friction alone [N], shape (n, 3)."""
+    def friction_gradient(self, p: Positions) -> Positions | None:
+        """The gradient of friction alone [N], shape (n, 3); None where nothing is in contact."""
+        if self.idle():
+            return None
         out = np.zeros_like(p)
-        if not self.idle():
-            self._add_friction_gradient(p, out)
+        self._add_friction_gradient(p, out)
         return out
 
     def gap(self, p: Positions) -> Array:

@@ -32,8 +32,8 @@ class FrictionEnergy(Energy, Protocol):
     friction: float
     friction_rounds: int
 
-    def friction_gradient(self, p: Positions) -> Positions:
-        """The gradient of friction alone [N] at p (n, 3), in a step that has begun."""
+    def friction_gradient(self, p: Positions) -> Positions | None:
+        """The gradient of friction alone [N] at p (n, 3), in a step that has begun; None where it is zero."""
         ...
 
 
@@ -88,6 +88,14 @@ def _friction_change(problem: StepProblem, following: StepProblem, x: Positions)
         [energy.friction_gradient(x) for energy in each.energies if has_friction(energy)]
         for each in (problem, following)
     )
-    size = max(float(np.abs(force).max(initial=0.0)) for force in (*before, *after))
-    change = max(float(np.abs(b - a).max(initial=0.0)) for a, b in zip(before, after, strict=True))
+    size = max(map(_largest, (*before, *after)))
+    change = max(
+        _largest(a if b is None else b) if a is None or b is None else _largest(b - a)
+        for a, b in zip(before, after, strict=True)
+    )
     return change / size if size else 0.0
+
+
+def _largest(force: Positions | None) -> float:
+    """The largest component, 0 without a force."""
+    return 0.0 if force is None else float(np.abs(force).max(initial=0.0))

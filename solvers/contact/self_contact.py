@@ -113,15 +113,17 @@ class PairContact:
             met = self._at(p)
             if len(met.contacts.vertices):
                 out += met.gradient[:n]
-        if len(self.grip.vertices):
-            out += self.friction_gradient(p[:n])
+        friction = self.friction_gradient(p[:n])
+        if friction is not None:
+            out += friction
 
-    def friction_gradient(self, p: Positions) -> Positions:
-        """The gradient of friction alone [N], shape (n, 3)."""
+    def friction_gradient(self, p: Positions) -> Positions | None:
+        """The gradient of friction alone [N], shape (n, 3); None where nothing is in contact."""
+        if not len(self.grip.vertices):
+            return None
         n, p = len(p), self.whole(p)
         out = np.zeros_like(p)
-        if len(self.grip.vertices):
-            self.grip.add_gradient(p, out)
+        self.grip.add_gradient(p, out)
         return out[:n]
 
     def blocks(self, p: Positions, keep: float = 1.0) -> Blocks:
