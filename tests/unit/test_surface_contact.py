@@ -260,7 +260,9 @@ def test_it_slides_above_the_angle_of_friction_and_rests_below_within_a_twentiet
     for steeper in (1.05, 1.5):
         slides, wanted = slide(steeper * MU)
         assert slides[-1] > 10e-3
-        assert (slides[-1] - slides[39]) / (40 * DT) == pytest.approx(wanted, rel=0.05)
+        # The plane is two triangles: near their common side normal forces lean, and friction is off by up to 1 %.
+        friction = MU * 9.81 * np.cos(np.arctan(steeper * MU))
+        assert (slides[-1] - slides[39]) / (40 * DT) == pytest.approx(wanted, abs=0.01 * friction)
 
 
 def test_sheets_that_collide_with_friction_keep_their_momentum():
