@@ -47,7 +47,7 @@ CASES = {
     "a kill": Case("import os; os.kill(os.getpid(), 9)", "killed", "was killed by SIGKILL"),
     "a loop": Case("while True: hang = 1", "time-limit", "did not end within 8 s", "time_limit: 8"),
     "too much memory": Case(
-        "swollen = [bytes(2**20) for _ in range(2**12)]", "failed", "MemoryError:  ({line})", "memory_limit: 0.5"
+        "swollen = [bytes(2**20) for _ in range(2**12)]", "failed", "MemoryError ({line})", "memory_limit: 0.5"
     ),
 }
 
