@@ -132,7 +132,7 @@ def test_no_worker_stays_behind(how: signal.Signals, tmp_path: Path, monkeypatch
     parent, workers = psutil.Process(process.pid), []
     while not workers and process.poll() is None:
         sleep(0.01)
-        workers = [child for child in parent.children() if child.name() == parent.name() and busy(child)]
+        workers = [child for child in parent.children(recursive=True) if child.name() == parent.name() and busy(child)]
     assert workers, "it ended before it had a worker"
     process.send_signal(how)
     process.wait()
