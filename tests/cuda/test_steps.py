@@ -41,7 +41,8 @@ ASKED = {"newton-cg", "pncg", "lbfgs", "tsitouras-5"}
 """Methods of which a few numbers go to the host and back within a step, of a search or of steps that are chosen."""
 
 UP = {"keys": [{"time": 0}, {"time": 1, "offset": (0, 3, 0)}]}
-RISING = contact({"kind": "sphere", "center": (0.0, -0.46, 0.2), "radius": 0.43, "motion": UP}, friction=0.3)
+RISING = contact({"kind": "sphere", "center": (0.0, -0.46, 0.2), "radius": 0.43, "motion": UP}, friction=0.0)
+"""Without friction: a host states steps that iterate it."""
 FILTERS = EtherDrag(rate=0.5), AirDrag(law="quadratic", coefficient=0.3)
 DRAGS = *FILTERS, AirDrag(coefficient=0.3)
 
