@@ -38,7 +38,7 @@ ROUNDS = 3
 
 def run(solver: str, **parameters: Any) -> RunSpec:
     """A run of the yardstick cloth under another solver's name."""
-    (made,) = load_any(SCENE, solvers=["sparse"], sizes=[4], rounds=ROUNDS, threads=1).runs()
+    (made,) = load_any(SCENE, solvers=["sparse"], sizes=[4], rounds=ROUNDS, threads=1, iterations=50).runs()
     return made.but(solver=SolverSpec(solver, parameters))
 
 
