@@ -17,9 +17,8 @@ def main() -> None:
         from harness.cli import main as run_command
 
         run_command()
-    except (
-        BaseException
-    ) as end:  # cleaning up may raise anything after Ctrl-C, and Typer answers that with an exit code
+    except BaseException as end:
+        # Cleaning up may raise anything after Ctrl-C, and Typer turns a KeyboardInterrupt into an exit code.
         if interrupts.is_interrupted() or isinstance(end, KeyboardInterrupt):
             interrupts.exit_process()
         raise
