@@ -21,7 +21,8 @@ from harness.scenes.motion import Key, KeyedMotion
 from harness.scenes.obstacles import Plane
 from harness.scenes.shapes import Solid, Triangles
 from harness.simulation.observe import columns
-from harness.simulation.step import State, Step, prepare, simulate, start
+from harness.simulation.step import State, Step, prepare, problem, simulate, start
+from solvers.contact.friction_rounds import solve_with_friction
 from solvers.integrators import Motion
 from solvers.methods.newton import Newton
 from solvers.problem import Positions, Prepared, Solution, Solver, StepProblem, StopRule
@@ -224,3 +225,54 @@ def test_rows_tell_the_rounds_and_what_they_left():
     row = columns(made, step, step.problem.terms(step.solution.positions), step.solution.residual)
     assert row["friction_rounds"] is None
     assert row["friction_change"] is None
+
+
+class Recited:
+    """A prepared solver that returns given positions of a pebble, round by round, again and again."""
+
+    def __init__(self, *positions: tuple[float, float]) -> None:
+        self.positions, self.solves = positions, 0
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        x, y = self.positions[self.solves % len(self.positions)]
+        self.solves += 1
+        return Solution(np.array([[x, y, 0.0]]), 1, 0.0, 1.0, "tolerance")
+
+
+SLID, STUCK, BETWEEN = (2e-3, -2e-3), (1e-7, 1e-4), (1e-3, -1e-3)
+"""Of a pebble in a round: pressed, out of range of contact, pressed less."""
+
+
+@pytest.mark.parametrize(
+    ("cycle", "rounds", "end", "change"), [((SLID, STUCK), 4, STUCK, 1.0), ((SLID, BETWEEN, STUCK), 5, BETWEEN, 0.5)]
+)
+def test_rounds_that_repeat_end_where_most_friction_acts_and_say_what_is_left(cycle, rounds, end, change):
+    made = pebble(1e3)
+    recited: Any = Recited(*cycle)
+    solved = solve_with_friction(recited, problem(made, start(made), "current"), EXACTLY)
+    assert recited.solves == len(solved.counts) == rounds
+    assert tuple(solved.solution.positions[0, :2]) == end
+    assert solved.friction is not None
+    assert solved.friction.rounds == rounds
+    assert solved.friction.change == pytest.approx(change)
+
+
+@pytest.mark.parametrize("factor", [-0.5, 0.5, -0.9])
+def test_rounds_that_converge_however_slowly_are_not_cut_short(factor):
+    made = pebble(SLIPS, friction_rounds=20)
+    recited: Any = Recited(*((2e-3, -2e-3 * (1.0 + 0.5 * factor**k)) for k in range(20)))
+    solved = solve_with_friction(recited, problem(made, start(made), "current"), EXACTLY)
+    assert solved.friction is not None
+    assert solved.friction.rounds == 20 or solved.friction.change <= 1e-4
+    assert solved.friction.rounds > 8
+
+
+def test_a_sheet_on_a_slope_with_very_large_friction_takes_few_rounds():
+    """A corner that touches first alternates between sticking out of range and sliding in range."""
+    slope = Plane(point=(0.0, -0.32, 0.0), normal=(0.5, 1.0, 0.0))
+    rough = SurfaceContact(thickness=0.01, friction=1e3, obstacles=(slope,))
+    made = scene(Grid(), Springs(stretch=300.0, shear=60.0), Gravity(), rough, size=6, time_step=1 / 30)
+    last = steps(made, 3, stop=StopRule(400, 1e-6))[-1]
+    assert last.friction is not None
+    assert 2 < last.friction.rounds <= 8
+    assert last.friction.change > 0.5
