@@ -23,6 +23,7 @@ def recommend(
         ),
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Wall seconds that a simulation may take.")] = 5.0,
+    budget: Annotated[float, typer.Option(help="Wall seconds that all simulations together may take.")] = 60.0,
     results: Results = Path("results"),
 ) -> None:
     """Find the cheapest integrator, time step, tolerance and solver that keep to an error, and check them."""
@@ -38,6 +39,7 @@ def recommend(
         size=size,
         horizon=horizon,
         time_limit=time_limit,
+        budget=budget,
         results=results,
         display=display(err()),
         say=say,

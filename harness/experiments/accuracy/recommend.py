@@ -28,7 +28,8 @@ from harness.config.options import OF_STEPS
 from harness.config.solvers import solvers_of
 from harness.config.sweep import SolverSpec
 from harness.experiments.accuracy.accuracy_rows import SCHEMA
-from harness.experiments.accuracy.studies import run_accuracy
+from harness.experiments.accuracy.best_first import SLOWER, Omitted, search
+from harness.experiments.accuracy.studies import measuring
 from harness.experiments.accuracy.units import references, trajectory_of
 from harness.experiments.accuracy.work import work_rows
 from harness.reference.frozen import bind
@@ -44,6 +45,8 @@ REFINEMENTS = (0.5, 1, 2, 4, 8)
 
 HORIZON = 1.0
 """Seconds after which the error counts, if nothing else is said."""
+BUDGET = 60.0
+"""Wall seconds that measurements may take together, if nothing else is said."""
 _SAID = 2.0
 """Seconds between two remarks on the reference."""
 _SAME, _APART = 1e-6, 1.3
@@ -72,13 +75,14 @@ def candidates() -> list[dict[str, Any]]:
 @dataclass(frozen=True, slots=True)
 class Recommended:
     """A way to simulate the scene, its relative error, its wall seconds per simulated second, what kind of truth it
-    errs from, and what the solver chose by itself."""
+    errs from, what the solver chose by itself, and the study that measured it."""
 
     spec: WorkSpec
     error: float
     cost: float
     truth: str
     choice: str
+    sweep: str = ""
 
     def __str__(self) -> str:
         u = self.spec
@@ -137,14 +141,17 @@ def recommend(
     results: Path,
     display: Display,
     say: Callable[[str], None],
+    budget: float = BUDGET,
 ) -> Recommendation:
     """The cheapest way to a relative `error` after `horizon` seconds of the scene in a file.
 
     size: of the mesh, the scene's default if left out; horizon: `HORIZON` if left out, or the longest at which the
     error can be measured, where that is shorter; time_limit: seconds that a simulation may take; results: the folder
-    that holds a folder for each config. Raises InputError; RunFailed where nothing keeps to the error.
+    that holds a folder for each config; budget: wall seconds that all measurements may take together. Raises
+    InputError; RunFailed where nothing keeps to the error.
     """
-    for key, value in (("--error", error), ("--horizon", horizon), ("--time-limit", time_limit)):
+    asked_for = {"--error": error, "--horizon": horizon, "--time-limit": time_limit, "--budget": budget}
+    for key, value in asked_for.items():
         if value is not None and not 0 < value < math.inf:
             raise InputError(Mistake(f"came {value:g}; wanted a number above 0", key=key))
     scene = load_scene(path)
@@ -159,14 +166,14 @@ def recommend(
         raise InputError(list(dict.fromkeys(map(_of_option, refused.mistakes)))) from refused
     _referenced(scene, size, error, horizon, store, say)
     ways, reasons = _known(path.stem, scene, size, horizon, results)
-    if not any(way.error <= error for way in ways):
-        count = len(asked.work)
-        say(f"nothing measured of {path.stem} {size or ''} keeps to an error of {error:g}: measuring {count} ways")
-        run_accuracy(asked, claimed(results / asked.name, path), display, say)
+    omitted: Omitted | None = None
+    if not any(way.error <= error and way.sweep != asked.name for way in ways):
+        omitted = _measured(asked, ways, reasons, error, claimed(results / asked.name, path), display, say, budget)
+        say(f"{path.stem} {size or ''}: {omitted}")
         ways, reasons = _known(path.stem, scene, size, horizon, results)
     within = [way for way in ways if way.error <= error]
     if not within:
-        raise RunFailed(_nothing(ways, reasons, error, horizon))
+        raise RunFailed(_nothing(ways, reasons, error, horizon, omitted))
     best = within[0]
     say(f"checking {best}")
     return Recommendation(tuple(ways), best, _check(best, store))
@@ -206,6 +213,34 @@ def _referenced(
             say(f"  motion {motion} of 2, at {time:.3g} of {horizon:g} s")
 
     store.trajectory(scene, size, [horizon], error=error, told=told)
+
+
+def _measured(
+    asked: Accuracy,
+    ways: list[Recommended],
+    without: list[dict[str, Any]],
+    error: float,
+    folder: Path,
+    display: Display,
+    say: Callable[[str], None],
+    budget: float,
+) -> Omitted:
+    """Measure what may be the cheapest way to the error, where it is not known yet. Raises InputError, CannotWrite."""
+    known: dict[str, dict[str, Any]] = {
+        way.spec.label(): {"status": "ok", "error": way.error, "seconds_per_simulated": way.cost} for way in ways
+    }
+    failed, here = {row["unit"]: row for row in without}, machine.describe().id
+    say(
+        f"measuring up to {len(asked.work)} settings, cheap ones first, for at most {budget:g} s (--budget); a "
+        f"simulation ends once it is {SLOWER:g} times as slow as the best that keeps to the error"
+    )
+    with measuring(asked.work, folder, display) as measure:
+
+        def look_up(spec: WorkSpec) -> dict[str, Any]:
+            return known.get(spec.label()) or failed.get(spec.unit_id(here)) or measure(spec)
+
+        best = min((way.cost for way in ways if way.error <= error), default=math.inf)
+        return search(asked.work, error, best, look_up, budget)
 
 
 def _grid(path: Path, scene: SceneSpec, size: int, horizon: float, time_limit: float) -> Accuracy:
@@ -266,12 +301,24 @@ def _check(best: Recommended, store: Store) -> Recommended:
 
 def _recommended(spec: WorkSpec, row: dict[str, Any]) -> Recommended:
     return Recommended(
-        spec, row["error"], row["seconds_per_simulated"], row["truth"] or "integrated", row["choice"] or ""
+        spec,
+        row["error"],
+        row["seconds_per_simulated"],
+        row["truth"] or "integrated",
+        row["choice"] or "",
+        row.get("sweep") or "",
     )
 
 
-def _nothing(ways: list[Recommended], without: list[dict[str, Any]], error: float, horizon: float) -> str:
+def _nothing(
+    ways: list[Recommended], without: list[dict[str, Any]], error: float, horizon: float, omitted: Omitted | None
+) -> str:
     """Why there is no answer, and what to do."""
+    if omitted and not omitted.complete:
+        return (
+            f"nothing that was measured keeps to an error of {error:g} over {horizon:g} s, and settings remain "
+            f"({omitted}): the same command with a larger --budget goes on where this one ended"
+        )
     if ways:
         nearest = min(ways, key=lambda way: way.error)
         return (

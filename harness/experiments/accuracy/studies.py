@@ -5,19 +5,21 @@ A unit that the config asks for in another way by now, or of another frozen step
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from harness.base import holding, machine, rows
-from harness.base.progress import Display
+from harness.base.progress import Display, Effort
+from harness.base.workers import Lost, Workers
 from harness.config.accuracy import CurveSpec, WorkSpec
 from harness.config.accuracy_load import Accuracy
 from harness.experiments.accuracy.accuracy_rows import SCHEMA
-from harness.experiments.accuracy.units import CurveUnit, Home, StepsUnit, WorkUnit
-from harness.experiments.core import do_all, require_threads
+from harness.experiments.accuracy.units import CurveUnit, Home, Row, StepsUnit, WorkUnit
+from harness.experiments.core import TABLES, do_all, ready, require_threads, watched
 from harness.experiments.resume import Standing, standings, wanted
 from harness.reference.frozen import bind
 from harness.reference.self_converged import told_once, touches
@@ -66,6 +68,37 @@ def run_accuracy(
         do_all([p.unit for p in todo], display, isolated=isolated)
     paths = [home.rows(label) for p in planned for label in _labels(p.unit.spec)]
     return list(dict.fromkeys(paths))
+
+
+@contextmanager
+def measuring(work: Sequence[WorkSpec], folder: Path, display: Display) -> Generator[Callable[[WorkSpec], Row]]:
+    """A function that measures one simulation of these at a time, in a worker, and returns its row.
+
+    folder: of the results, as in `run_accuracy`. Raises InputError, CannotWrite.
+    """
+    home = Home(folder.name, folder)
+    require_threads({spec.how.threads for spec in work})
+    (folder / "accuracy").mkdir(parents=True, exist_ok=True)
+    workers = Workers(partial(ready, [dict(table) for table in TABLES]))
+
+    def measure(spec: WorkSpec) -> Row:
+        unit = WorkUnit(spec, home)
+        run = display.run(unit.title, unit.ticks, unit.effort)
+        try:
+            outcome = workers.do(partial(watched, unit), run.tick, unit.limits)
+        except Lost as lost:
+            outcome = unit.lost(lost)
+        run.finished(outcome)
+        return rows.read([home.rows(spec.label())], SCHEMA).to_pylist()[0]
+
+    with holding.alone(folder):
+        # No run that ends is of this kind, so no time left is estimated: most of these are omitted in the end.
+        display.begin([Effort("omitted")] * len(work))
+        try:
+            yield measure
+        finally:
+            workers.end()
+            display.end()
 
 
 def failures(files: Sequence[Path]) -> list[str]:

@@ -1,0 +1,165 @@
+"""Best-first search for the cheapest setting of a study that meets an error, with the settings that it omits.
+
+A method is a solver with an integrator; its settings are time steps and tolerances. Shorter steps and smaller
+tolerances are taken to cost more, so that a method's last cost bounds those that follow, and the method with the least
+bound is measured next. Omitted are
+
+    smaller tolerances at a time step    once one meets the error, or smaller ones no longer change it
+    the rest of a method                 once it costs more than SLOWER times the best that meets the error
+    everything                           once the budget of wall seconds is used up
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from heapq import heapify, heappop, heappush
+from itertools import groupby
+from math import inf
+from time import monotonic
+from typing import Any
+
+from harness.config.accuracy import WorkSpec
+
+SLOWER = 1.5
+"""Times the cost of the best: above it a method is given up. Shorter steps may take fewer iterations each."""
+
+LEAST_LIMIT = 0.2
+"""Seconds that any simulation may take, however fast the best is: an interruption must not cost a candidate."""
+
+UNCHANGED = 0.1
+"""Of the error in excess: a smaller change from one tolerance to the next is none that further ones can make up for."""
+
+OVER_BUDGET = "the budget was used up"
+
+
+@dataclass(frozen=True, slots=True)
+class Omitted:
+    """How many settings were measured or known, how many there are, and the omitted ones by their reasons."""
+
+    measured: int
+    settings: int
+    reasons: Mapping[str, int]
+
+    @property
+    def complete(self) -> bool:
+        """Whether the search ended before its budget did."""
+        return OVER_BUDGET not in self.reasons
+
+    def __str__(self) -> str:
+        reasons = "".join(f"; {count} not: {reason}" for reason, count in self.reasons.items())
+        return f"{self.measured} of {self.settings} settings measured{reasons}"
+
+
+@dataclass(slots=True)
+class _Method:
+    """grid: settings by time step, the longest first, and in each by tolerance, the largest first; errors: at the
+    present time step; loosest: the cost of its largest tolerance; bound: on the costs that follow."""
+
+    grid: list[list[WorkSpec]]
+    errors: list[float] = field(default_factory=list[float])
+    loosest: float = 0.0
+    bound: float = 0.0
+
+    @property
+    def left(self) -> int:
+        return sum(map(len, self.grid))
+
+    def next_step(self) -> int:
+        """Go on to the next time step; how many tolerances this leaves out."""
+        left = len(self.grid.pop(0))
+        self.errors, self.bound = [], max(self.bound, self.loosest)
+        return left
+
+    def drop(self) -> int:
+        """Give the method up; how many settings this leaves out."""
+        left = self.left
+        self.grid = []
+        return left
+
+
+def search(
+    work: Iterable[WorkSpec],
+    error: float,
+    best: float,
+    measure: Callable[[WorkSpec], Mapping[str, Any]],
+    budget: float,
+) -> Omitted:
+    """Measure settings until none that is left can be the cheapest that meets an error.
+
+    Args:
+        work: the settings.
+        error: relative.
+        best: wall seconds per simulated second of the best known, infinite without one.
+        measure: returns a setting's row; its time limit is what it may still take.
+        budget: wall seconds; no simulation starts after them.
+    """
+    methods = _methods(work)
+    settings, measured, reasons, end = sum(one.left for one in methods), 0, Counter[str](), monotonic() + budget
+    heap = [(0.0, number) for number in range(len(methods))]
+    heapify(heap)
+    while heap:
+        bound, number = heappop(heap)
+        one = methods[number]
+        if bound > SLOWER * best:
+            reasons[_slow(error)] += one.drop()
+            continue
+        if monotonic() > end:
+            reasons[OVER_BUDGET] += one.drop()
+            continue
+        spec = one.grid[0].pop(0)
+        row = measure(_limited(spec, best))
+        measured += 1
+        found, cost = _outcome(row)
+        if found <= error:
+            best = min(best, cost)
+        if not one.errors:
+            one.loosest = cost if cost < inf else one.bound
+        late = row["status"] == "time-limit" or SLOWER * best < cost < inf
+        if row["status"] == "unsupported":
+            reasons["the solver does not support it"] += one.drop()
+        elif late and not one.errors:
+            reasons[_slow(error)] += one.drop()
+        elif late:
+            reasons[_slow(error)] += one.next_step()
+        elif found <= error:
+            reasons["a larger tolerance meets the error"] += one.next_step()
+        elif one.errors and abs(one.errors[-1] - found) <= UNCHANGED * (found - error) < inf:
+            reasons["a smaller tolerance does not change the error"] += one.next_step()
+        elif not one.grid[0]:
+            one.next_step()
+        else:
+            one.errors.append(found)
+            one.bound = max(one.bound, cost) if cost < inf else one.bound
+        if one.left:
+            heappush(heap, (one.bound, number))
+    return Omitted(measured, settings, {reason: count for reason, count in reasons.items() if count})
+
+
+def _slow(error: float) -> str:
+    return f"they or their faster neighbours take {SLOWER:g} times as long as the best within {error:g}, or too long"
+
+
+def _outcome(row: Mapping[str, Any]) -> tuple[float, float]:
+    """Error and cost, infinite where there are none."""
+    return (row["error"], row["seconds_per_simulated"]) if row["status"] == "ok" else (inf, inf)
+
+
+def _limited(spec: WorkSpec, best: float) -> WorkSpec:
+    """With no more time than a simulation may take that is not slower."""
+    limit = max(LEAST_LIMIT, SLOWER * best * spec.horizon)
+    return replace(spec, how=replace(spec.how, time_limit=min(spec.how.time_limit, limit)))
+
+
+def _methods(work: Iterable[WorkSpec]) -> list[_Method]:
+    """Settings by all but time step and tolerance."""
+    by_method: dict[str, list[WorkSpec]] = {}
+    for spec in work:
+        others = {name: value for name, value in spec.options.items() if name != "tolerance"}
+        by_method.setdefault(repr((spec.solver, spec.case.integrator, others)), []).append(spec)
+    found = list[_Method]()
+    for specs in by_method.values():
+        specs.sort(key=lambda spec: (-spec.case.scene.time_step, -(spec.options["tolerance"] or 0.0)))
+        found.append(_Method([list(same) for _, same in groupby(specs, lambda spec: spec.case.scene.time_step)]))
+    return found

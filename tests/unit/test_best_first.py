@@ -1,0 +1,115 @@
+"""The best-first search chooses what a full search chooses, and measures less."""
+
+from __future__ import annotations
+
+from math import inf
+from random import Random
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from harness.config.accuracy import Case, How, WorkSpec
+from harness.config.sweep import SolverSpec
+from harness.experiments.accuracy.best_first import LEAST_LIMIT, OVER_BUDGET, SLOWER, search
+
+STEPS, TOLERANCES, SOLVERS = (0.4, 0.2, 0.1, 0.05, 0.025), (1e-1, 1e-2, 1e-3), ("a", "b", "c", "d", "e")
+
+
+def specs() -> list[WorkSpec]:
+    return [
+        WorkSpec(
+            Case("scene", SimpleNamespace(time_step=dt), 4, "implicit-euler"),  # type: ignore[arg-type]
+            1.0,
+            SolverSpec(solver, {}),
+            {"first_guess": "current", "iterations": 9, "tolerance": tolerance},
+            How(1, rounds=1, time_limit=1e3),
+        )
+        for solver in SOLVERS
+        for tolerance in reversed(TOLERANCES)
+        for dt in reversed(STEPS)
+    ]
+
+
+def table(seed: int) -> dict[Any, dict[str, Any]]:
+    """Errors a dt^p + b tolerance, costs c dt^-q (1 + d log 1/tolerance); some methods diverge at long steps."""
+    random, found = Random(seed), dict[Any, dict[str, Any]]()
+    for solver in SOLVERS:
+        a, b, c, d = (10.0 ** random.uniform(*at) for at in ((-2, 1), (-3, 0), (-1, 2), (-2, 0)))
+        p, q, stable = random.choice((1, 2, 4)), random.uniform(0.5, 1.0), random.choice((1.0, 0.11))
+        for one in (one for one in specs() if one.solver.name == solver):
+            dt, tolerance = one.case.scene.time_step, one.options["tolerance"]
+            error = a * dt**p + b * tolerance
+            cost = c * dt**-q * (1.0 + d * TOLERANCES.index(tolerance))
+            row = {"status": "ok", "error": error, "seconds_per_simulated": cost}
+            found[key(one)] = row if dt <= stable else {"status": "diverged"}
+    return found
+
+
+def key(spec: WorkSpec) -> tuple[Any, ...]:
+    return spec.solver.name, spec.case.scene.time_step, spec.options["tolerance"]
+
+
+class Measured:
+    """Rows of a table, cut off at the time limits of the specifications."""
+
+    def __init__(self, rows: dict[Any, dict[str, Any]]) -> None:
+        self.rows, self.found = rows, dict[Any, dict[str, Any]]()
+
+    def __call__(self, spec: WorkSpec) -> dict[str, Any]:
+        row = self.rows[key(spec)]
+        if row["status"] == "ok" and row["seconds_per_simulated"] > spec.how.time_limit:
+            row = {"status": "time-limit"}
+        self.found[key(spec)] = row
+        return row
+
+    def best(self, error: float) -> Any:
+        return cheapest(self.found, error)
+
+
+def cheapest(rows: dict[Any, dict[str, Any]], error: float) -> Any:
+    within = {at: row["seconds_per_simulated"] for at, row in rows.items() if row.get("error", inf) <= error}
+    return min(within, key=within.__getitem__, default=None)
+
+
+def test_the_choice_is_that_of_a_full_search():
+    measured = none = 0
+    for seed in range(200):
+        rows = table(seed)
+        measure = Measured(rows)
+        omitted = search(specs(), 1e-2, inf, measure, 60.0)
+        assert measure.best(1e-2) == cheapest(rows, 1e-2), seed
+        assert omitted.complete
+        assert omitted.measured == len(measure.found) == omitted.settings - sum(omitted.reasons.values())
+        none += cheapest(rows, 1e-2) is None
+        measured += omitted.measured
+    assert none < 50
+    assert measured < 0.5 * 200 * len(specs())
+
+
+def test_one_known_to_be_cheap_leaves_out_the_methods_that_are_slower_at_once():
+    rows = {key(one): {"status": "ok", "error": 1.0, "seconds_per_simulated": 10.0} for one in specs()}
+    measure = Measured(rows)
+    omitted = search(specs(), 1e-2, 1.0, measure, 60.0)
+    assert set(measure.found) == {(solver, 0.4, 0.1) for solver in SOLVERS}
+    assert all(row["status"] == "time-limit" for row in measure.found.values())
+    assert "take 1.5 times as long" in str(omitted)
+
+
+@pytest.mark.parametrize(("best", "limit"), [(1.0, SLOWER), (1e-3, LEAST_LIMIT), (inf, 1e3)])
+def test_a_simulation_may_take_little_more_than_the_best(best: float, limit: float):
+    given = list[float]()
+
+    def measure(spec: WorkSpec) -> dict[str, Any]:
+        given.append(spec.how.time_limit)
+        return {"status": "unsupported"}
+
+    omitted = search(specs(), 1e-2, best, measure, 60.0)
+    assert given == [limit] * len(SOLVERS)
+    assert omitted.reasons == {"the solver does not support it": len(specs()) - len(SOLVERS)}
+
+
+def test_after_its_budget_nothing_begins():
+    omitted = search(specs(), 1e-2, inf, Measured(table(0)), -1.0)
+    assert (omitted.measured, omitted.complete) == (0, False)
+    assert omitted.reasons == {OVER_BUDGET: len(specs())}
