@@ -12,15 +12,11 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkab
 
 import numpy as np
 
-from solvers.problem import Positions, Solution, StepProblem, StopRule, System
+from solvers.problem import Positions, Solution, StepProblem
 
 Device = Literal["cpu", "cuda"]
 SIMULATED = "Numba's simulator, no device"
 """What rows call Numba's simulator."""
-
-
-_MORE = 100.0
-"""So many times the work that the processor may have in a step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +30,6 @@ class OnDevice:
     unstated: ClassVar[frozenset[str]] = frozenset({"device", "precision"})
 
     device: Device = "cpu"
-
-    def allowed(self, most: float) -> float:
-        """How much work a step may be, which on the processor is `most`: a device goes through it in less time."""
-        return _MORE * most if self.device == "cuda" else most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,60 +66,6 @@ class Marks(NamedTuple):
     down: Event
 
 
-class Rule(NamedTuple):
-    """An integrator of one unknown x a step, in numbers: origin = p + recalls (p - p'), target = origin + leads v +
-    bends (v - v'), with p', v' one step before, and leads and bends [s]. ahead [s]: how far what is lagged is
-    extrapolated; when: the time of x within the step, 1 at its end."""
-
-    recalls: float
-    leads: float
-    bends: float
-    ahead: float
-    when: float
-
-
-@dataclass(frozen=True, eq=False)
-class Course:
-    """What a device needs to go on by itself from step to step of a time integrator.
-
-    rule: of the integrator; first: the method ready for the system of the first step, and the rule of that, where it is
-    another; positions [m], velocity [m/s]: at the start, (n, 3); load: the forces that never change, (n, 3) [N];
-    filters: of the velocity (`solvers.filters`), before each step, in their order; first_guess: its name; pins_at:
-    where the pins want their vertices at a time [s], (q, 3) [m]; pins_move: whether that changes.
-    """
-
-    system: System
-    rule: Rule
-    first: tuple[Remote, Rule] | None
-    positions: Positions
-    velocity: Positions
-    load: Positions
-    filters: tuple[object, ...]
-    first_guess: str
-    pins_at: Callable[[float], Positions]
-    pins_move: bool
-
-
-class Steps(Protocol):
-    """Steps that follow each other on a device."""
-
-    def restart(self) -> None:
-        """Bring the start to the device; waits for it."""
-        ...
-
-    def step(self, iterations: int) -> Marks | None:
-        """The next step by so many iterations, and no look at it; waits for its end."""
-        ...
-
-    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """The next step up to where `stop` ends it, and a copy of that; problem: the same step, as a host states it."""
-        ...
-
-    def positions(self) -> Positions:
-        """A copy of where the last step ended, (n, 3) [m]."""
-        ...
-
-
 @runtime_checkable
 class Remote(Protocol):
     """A prepared solver that computes on a device. Its iterates are copied where somebody asks for them; its times are
@@ -140,15 +78,6 @@ class Remote(Protocol):
 
     def state(self) -> dict[str, float | None]:
         """Columns of the device's clocks, power and temperature now; None for what it does not tell."""
-        ...
-
-    def triad(self) -> tuple[float, Event, Event] | None:
-        """Bytes that a triad a = b + s c read and wrote, between two events that have been waited for; None of a device
-        without a clock, or without room for it."""
-        ...
-
-    def stepping(self, course: Course) -> Steps:
-        """Steps that stay on the device. Raises Unsupported with the reason why a host has to state each."""
         ...
 
     def replay(self, problem: StepProblem, iterations: int) -> tuple[Solution, Marks | None]:

@@ -1,4 +1,4 @@
-"""Filters of the velocity before a step, which a device knows as well; any other function of it may be one on the host.
+"""Filters of the velocity before a step; any other function of it may be one.
 
     decay            v <- kept v                   of dv/dt = -c v, kept = exp(-c dt)
     quadratic drag   v <- m v / (m + c dt |v|)     of m dv/dt = -c |v| v

@@ -71,8 +71,8 @@ COLUMNS = (
         "phase",
         _TEXT,
         "",
-        "prepare, step, local, global, iteration or run (the run as a whole), upload and download (of a round whose "
-        "steps stay on a device), and what else a solver times; of a machine its kernel",
+        "prepare, step, local, global, iteration or run (the run as a whole), and what else a solver times; of a "
+        "machine its kernel",
     ),
     Column("frame", _INT, "", "the step, from 1; null where the phase has none"),
     Column("round", _INT, "", "repetition of the measurement, from 0; prepare: 0 is cold, later ones are warm"),
@@ -241,15 +241,6 @@ COLUMNS = (
     Column("device_memory_gib", _REAL, "GiB", "memory of that device"),
     Column("device_driver", _TEXT, "", "version of its driver"),
     Column("device_versions", _TEXT, "", "versions of the libraries that reach it, as JSON"),
-    Column(
-        "device_bandwidth", _REAL, "B/s", "bytes a second that it reads and writes in a triad a = b + s c, by events"
-    ),
-    Column(
-        "through_host",
-        _TEXT,
-        "",
-        "why a host states each step and copies its end; null: steps stay on the device, or there is none",
-    ),
     Column("sm_clock_mhz", _REAL, "MHz", "clock of its processors after the round; null, as the next five: not told"),
     Column("memory_clock_mhz", _REAL, "MHz", "clock of its memory then"),
     Column("power_w", _REAL, "W", "what it took then"),
@@ -258,7 +249,6 @@ COLUMNS = (
     Column("temperature_c", _REAL, "°C", "its temperature then"),
     Column("kernel_seconds", _REAL, "s", "of the step's kernels on the device, by events on its stream"),
     Column("transfer_seconds", _REAL, "s", "of what the step brings to the device and back, by events"),
-    Column("sweep_bytes", _INT, "", "bytes that an iteration on the device must read and write at least, by count"),
     Column("apart", _REAL, "", "how far the precision of the factor moves converged positions, in the scene's size"),
     Column("bytes", _REAL, "", "bytes that the phase touches, vectors and springs included, by count"),
     Column("flops", _REAL, "", "additions and multiplications of the phase, by count"),

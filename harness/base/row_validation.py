@@ -115,7 +115,7 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("tolerance", "asked", "estimated", "memory_gib"), Range(0, 1e12)),
     "time_step": Range(1e-12, 1e9),
     "mean_rest_length": Range(1e-300, 1e300),
-    **dict.fromkeys(("machine_bandwidth", "machine_flops", "machine_step", "device_bandwidth"), Range(0, 1e30)),
+    **dict.fromkeys(("machine_bandwidth", "machine_flops", "machine_step"), Range(0, 1e30)),
 }
 """By column."""
 

@@ -1,7 +1,6 @@
 """What a CUDA device saves, from a sweep's rows alone: time to a residual on it and on the processor beside it.
 
     time(errors, vertices) = least over solvers of the median wall seconds of a step, of runs whose every step got there
-    share of bandwidth     = bytes that iterations must move / seconds of kernels / the device's own in a triad
 
 Times are compared within one computer. Where no run on a device ended well, in the simulator none, nothing is said of
 what one saves, but why there is none, and the command that fills it in.
@@ -15,7 +14,7 @@ from typing import NamedTuple
 
 import pyarrow as pa
 
-from harness.report.page import count, factor, quantity
+from harness.report.page import count, factor
 from harness.report.sql import answer
 from solvers.device import SIMULATED
 
@@ -25,7 +24,7 @@ ALIKE = 1.05
 
 class Run(NamedTuple):
     """One run. asked: whether for a device; vertices: None where it failed before it knew; seconds: of a step, None
-    without; reached: whether all steps ended by their tolerance; share: of the device's bandwidth."""
+    without; reached: whether all steps ended by their tolerance."""
 
     place: str
     scene: str
@@ -39,9 +38,6 @@ class Run(NamedTuple):
     reason: str | None
     seconds: float | None
     reached: bool | None
-    share: float | None
-    bandwidth: float | None
-    through_host: str | None
 
     @property
     def got_there(self) -> bool:
@@ -55,9 +51,7 @@ select coalesce(any_value(machine), '') || coalesce(any_value(node), ''), any_va
     any_value(device), any_value(vertices),
     coalesce(any_value(status) filter (status <> 'ok'), 'ok'), any_value(reason) filter (status <> 'ok'),
     median(seconds) filter (phase = 'step'),
-    bool_and(coalesce(stopped in ('tolerance', 'floor'), false)) filter (phase = 'step'),
-    median(sweep_bytes * iterations / kernel_seconds / device_bandwidth) filter (phase = 'step' and kernel_seconds > 0),
-    any_value(device_bandwidth), any_value(through_host)
+    bool_and(coalesce(stopped in ('tolerance', 'floor'), false)) filter (phase = 'step')
 from rows_of group by run_id order by any_value("size"), any_value(solver), run_id
 """
 
@@ -143,7 +137,7 @@ def words(found: Sequence[Run], config: str) -> list[str]:
             f"device, `.venv/bin/springbench run {config or 'CONFIG'}` fills this in."
         ]
     said = [_said(panel, compared) for panel, compared in pairs(found).items()]
-    return [*said, *_bandwidths(asked), *_kept_from(asked)]
+    return [*said, *_without_time(asked)]
 
 
 def _why(runs: Sequence[Run]) -> str:
@@ -180,23 +174,8 @@ def _faster(pair: Pair) -> str:
     return f"{pair.there.solver} there {how} {pair.here.solver} on the processor"
 
 
-def _bandwidths(asked: Sequence[Run]) -> Iterator[str]:
-    """Of each solver on a device, what it reaches on its largest mesh."""
-    for solver in sorted({run.solver for run in asked}):
-        known = [run for run in asked if run.solver == solver and run.share is not None and run.vertices]
-        if known:
-            run = max(known, key=lambda run: (run.vertices or 0, run.share or 0.0))
-            own = f"{quantity((run.bandwidth or 0.0) / 1e9)} GB/s"
-            yield (
-                f"{solver} on {run.device} reaches {100 * (run.share or 0.0):.0f} % of its bandwidth of {own} at "
-                f"{count(run.vertices or 0)} vertices, by the bytes that an iteration must move."
-            )
-
-
-def _kept_from(asked: Sequence[Run]) -> Iterator[str]:
-    """Runs on a device without a time, or whose steps did not stay there."""
+def _without_time(asked: Sequence[Run]) -> Iterator[str]:
+    """Runs on a device without a time."""
     failed = [run for run in asked if run.status != "ok"]
     if failed:
         yield f"{len(failed)} of {len(asked)} runs on a device have no time: {_why(failed)}."
-    for why in sorted({run.through_host for run in asked if run.through_host}):
-        yield f"Some states went through the host before each step: {why}."

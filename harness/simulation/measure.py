@@ -22,7 +22,7 @@ from harness.scenes.bind import Scene
 from harness.simulation.algebraic import Stop
 from harness.simulation.clock import Clock, Watch, working
 from harness.simulation.contract import Contract
-from harness.simulation.on_device import Staying, on_device
+from harness.simulation.on_device import on_device
 from harness.simulation.step import Step, prepare, simulate, start
 from solvers.problem import Positions, Prepared, Solver
 
@@ -113,7 +113,7 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
         timings.append(Timing("prepare", None, round, seconds))
     assert prepared is not None
 
-    remote = on_device(scene, prepared, settings.first_guess)
+    remote = on_device(prepared)
     prepared = remote or prepared
     for step in steps(scene, contract.checked(prepared), settings):
         if remote:
@@ -136,42 +136,16 @@ def measure(scene: Scene, solver: Solver, settings: Settings, tick: Callable[[st
 
     final = start(scene).now.positions
     for round in range(settings.rounds):
-        if isinstance(remote, Staying):
-            found, final = _stayed(remote, round, watch, tick)
-        else:
-            clock, found = Clock(watch("step", round)), list[Timing]()
-            for step in steps(scene, remote.again() if remote else prepared, settings, clock):
-                told = remote.told() if remote else {}
-                found.append(Timing("step", step.index, round, clock.seconds, device=told))
-                final = step.positions
-                tick("timed pass")
+        clock, found = Clock(watch("step", round)), list[Timing]()
+        replayed = remote.again() if remote else None
+        for step in steps(scene, replayed or prepared, settings, clock):
+            told = replayed.told() if replayed else {}
+            found.append(Timing("step", step.index, round, clock.seconds, device=told))
+            final = step.positions
+            tick("timed pass")
         state = remote.usual.state() if remote else {}
         timings += [replace(timing, device=timing.device | state) for timing in found]
     return Measured(prepared, timings, watches, final)
-
-
-def _stayed(
-    remote: Staying, round: int, watch: Callable[..., Watch], tick: Callable[[str], None]
-) -> tuple[list[Timing], Positions]:
-    """A round of steps that stay on their device: their times, those of bringing the start there and of copying the
-    end, and that end."""
-    timings, clock = list[Timing](), Clock(watch("step", round))
-    with watch("upload"):
-        began = perf_counter()
-        remote.upload()
-        timings.append(Timing("upload", None, round, perf_counter() - began))
-    frame = 0
-    try:
-        for frame, told in enumerate(remote.timed(clock), start=1):
-            timings.append(Timing("step", frame, round, clock.seconds, device=told))
-            tick("timed pass")
-    except Exception as error:
-        raise StepFailed(frame + 1) from error
-    with watch("download"):
-        began = perf_counter()
-        final = remote.download()
-        timings.append(Timing("download", None, round, perf_counter() - began))
-    return timings, final
 
 
 class _Steps(Clock):

@@ -106,36 +106,30 @@ def dot(a: Positions, b: Positions) -> float:
     return float(np.einsum("ij,ij->", a, b))
 
 
-class Stiffness:
-    """Q of a system's projective energies: what residuals are measured by.
+class Metric:
+    """Q of a system's projective energies, factorised: what residuals are measured by.
 
-    trace: of its unpinned part [N/m]; inner: its free part (f, f); diagonal: of that (f,) [N/m]; facts: counts.
+    trace: of its unpinned part [N/m]; inner: its free part (f, f); diagonal: of that (f,) [N/m]; factor: of the free
+    part; choice: the linear solver in words; facts: counts.
     """
 
     def __init__(self, system: System) -> None:
-        """Raises NotPositiveDefinite where nothing determines some positions."""
+        """Raises NotPositiveDefinite where nothing determines some positions, and Unsupported where no linear solver
+        fits in memory."""
         self.system = system
         self._Q = matrices.assemble(system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)])
         self.inner = csr_array(csr_array(self._Q[system.free])[:, system.free])
         self.diagonal: NDArray[np.float64] = np.asarray(self.inner.diagonal(), np.float64)
         self.trace = float(self._Q.diagonal()[system.unpinned].sum())
         self.facts = {"nnz_system": float(self._Q.nnz)}
-
-    def round_off(self, p: Positions) -> float:
-        """g H^-1 g [J] of a gradient that is round-off of the positions p (n, 3), at most."""
-        return float(np.finfo(np.float64).eps * np.abs(p).max(initial=0.0)) ** 2 * self.trace
-
-
-class Metric(Stiffness):
-    """The same, factorised. factor: of the free part; choice: the linear solver in words."""
-
-    def __init__(self, system: System) -> None:
-        """Raises NotPositiveDefinite, and Unsupported where no linear solver fits in memory."""
-        super().__init__(system)
         free, nothing = system.free, (DenseCholesky(np.eye(0)), "nothing to solve for")
         self.factor, self.choice = factorise(self.inner) if len(free) else nothing
         if self.factor.nonzeros is not None:
             self.facts["nnz_factor"] = float(self.factor.nonzeros)
+
+    def round_off(self, p: Positions) -> float:
+        """g H^-1 g [J] of a gradient that is round-off of the positions p (n, 3), at most."""
+        return float(np.finfo(np.float64).eps * np.abs(p).max(initial=0.0)) ** 2 * self.trace
 
     def solve(self, b: Positions) -> Positions:
         """Q^-1 b, (n, 3), zero at exactly pinned vertices."""

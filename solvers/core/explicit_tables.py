@@ -124,7 +124,6 @@ def _lower(*rows: list[float]) -> Array:
     return out
 
 
-SYMPLECTIC_EULER = Composition(1, np.array([0.0, 1.0]), np.array([1.0]))
 VERLET = Composition(2, np.array([0.0, 1.0, 0.0]), np.array([0.5, 0.5]))
 BLANES_MOAN_4 = Composition.symmetric(
     4, [0.0792036964311957, 0.353172906049774, -0.0420650803577195], [0.209515106613362, -0.143851773179818]

@@ -23,7 +23,7 @@ class Substeps:
 
 @dataclass(frozen=True, eq=False)
 class Substepping:
-    """What of an explicit method is ready for a system, on the processor or on a device."""
+    """What of an explicit method is ready for a system."""
 
     residual_of: ClassVar[ResidualOf] = "none"
     factorisations: ClassVar[int] = 0

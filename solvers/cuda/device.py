@@ -17,13 +17,8 @@ from solvers.device import SIMULATED, broken
 from solvers.memory import in_words
 from solvers.problem import Unsupported
 
-INSTALL = "`.venv/bin/pip install -e '.[{}]'` in the checkout installs what it needs beside NVIDIA's driver"
-"""Of which extras."""
-
-_PACKAGES = (
-    *("numba-cuda", "cuda-bindings", "cuda-core", "cuda-toolkit", "nvidia-ml-py"),
-    *("nvmath-python", "cupy-cuda12x"),
-)
+INSTALL = "`.venv/bin/pip install -e '.[cuda]'` in the checkout installs what it needs beside NVIDIA's driver"
+_PACKAGES = "numba-cuda", "cuda-bindings", "cuda-core", "cuda-toolkit", "nvidia-ml-py"
 _DRIVERS = ("cudadrv", "cuda.bindings", "cuda.core")
 """What errors of a driver come from, as parts of the names of modules."""
 
@@ -38,10 +33,9 @@ def simulated() -> bool:
     return bool(config.ENABLE_CUDASIM)
 
 
-def ready(solver: str, extras: str = "cuda") -> Any:
+def ready(solver: str) -> Any:
     """The module `numba.cuda` with a device. Raises Unsupported with the reason where there is none, and the command
-    that installs the extras that the method needs there."""
-    remedy = INSTALL.format(extras)
+    that installs what a method needs there."""
     if simulated():
         return import_module("numba.cuda")
     if broken():
@@ -49,13 +43,13 @@ def ready(solver: str, extras: str = "cuda") -> Any:
     try:
         version("numba-cuda")
     except PackageNotFoundError as error:
-        raise Unsupported(f"{solver}: `device: cuda` needs numba-cuda, which is not installed; {remedy}") from error
+        raise Unsupported(f"{solver}: `device: cuda` needs numba-cuda, which is not installed; {INSTALL}") from error
     try:
         cuda = import_module("numba.cuda")
         cuda.current_context()
     except Exception as error:  # without a driver, without a device, with one that another holds: each has its own
         why = " ".join(str(error).split()).rstrip(":. ")
-        raise Unsupported(f"{solver}: there is no CUDA device ({why}); {remedy}") from error
+        raise Unsupported(f"{solver}: there is no CUDA device ({why}); {INSTALL}") from error
     return cuda
 
 

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from solvers.contact.touching import without_contact
 from solvers.core.bounds import without_bounded
 from solvers.core.parts import Parts, split
-from solvers.cuda.run import Stream
-from solvers.cuda.traffic import Sizes
+from solvers.cuda.target import Stream
 from solvers.problem import System, Unsupported
 
 WARP = 32
@@ -128,10 +127,6 @@ class Network:
         """What it takes on the device, beside vectors."""
         return 24.0 * len(self.entries.other) + 64.0 * len(self.ends)
 
-    def sizes(self, size: int) -> Sizes:
-        """By which bytes are counted, with numbers of so many bytes."""
-        return Sizes(len(self.order), self.free, len(self.entries.other), len(self.ends), size)
-
     def upload(self, stream: Stream) -> Edges:
         """Copy it to the device."""
         first, other, edge = self.entries
@@ -148,13 +143,6 @@ class Network:
             stream.upload(self.axis),
             stream.upload(np.zeros(len(self.rest))),
         )
-
-    @property
-    def diagonal(self) -> NDArray[np.float64]:
-        """Q's diagonal, of all rows [N/m]."""
-        kept = self.ends[:, 0] != self.ends[:, 1]
-        twice = np.repeat(self.stiffness[kept], 2)
-        return self.hold + np.bincount(self.ends[kept].ravel(), twice, minlength=len(self.order))
 
 
 def require_known(solver: str, system: System) -> None:

@@ -106,14 +106,11 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
     """Those that compute in `real`."""
 
     @cuda.jit
-    def linearise(edges, hold, least, p, linear, blocks):
-        """Write of each entry sqrt(a) n and s to linear (4, entries), and to blocks (6, f) the inverses of the diagonal
-        blocks with s no less than zero, and `least` (f,) more [N/m] on their diagonal."""
+    def linearise(edges, free, p, linear):
+        """Write of each entry of the `free` first rows sqrt(a) n and s to linear (4, entries)."""
         i = cuda.grid(1)
-        while i < hold.shape[0]:
+        while i < free:
             x, y, z = p[i, 0], p[i, 1], p[i, 2]
-            xx = hold[i] + least[i]
-            xy, xz, yz, yy, zz = 0.0, 0.0, 0.0, xx, xx
             e, end = edges.first[i >> 5] + (i & 31), edges.first[(i >> 5) + 1]
             while e < end:
                 j = edges.other[e]
@@ -129,21 +126,7 @@ def kernels(real: type[np.float32] | type[np.float64]) -> Kernels:
                 root = math.sqrt(k - lateral)
                 linear[0, e], linear[1, e], linear[2, e] = real(root * n0), real(root * n1), real(root * n2)
                 linear[3, e] = real(lateral)
-                lateral = lateral if rest == 0.0 else max(lateral, 0.0)
-                a = k - lateral
-                xx += a * n0 * n0 + lateral
-                xy += a * n0 * n1
-                xz += a * n0 * n2
-                yy += a * n1 * n1 + lateral
-                yz += a * n1 * n2
-                zz += a * n2 * n2 + lateral
                 e += 32
-            c0, c1, c2 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-            inverse = 1.0 / (xx * c0 + xy * c1 + xz * c2)
-            blocks[0, i], blocks[1, i], blocks[2, i] = real(c0 * inverse), real(c1 * inverse), real(c2 * inverse)
-            blocks[3, i] = real((xx * zz - xz * xz) * inverse)
-            blocks[4, i] = real((xy * xz - xx * yz) * inverse)
-            blocks[5, i] = real((xx * yy - xy * xy) * inverse)
             i += cuda.gridsize(1)
 
     @cuda.jit

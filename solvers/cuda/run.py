@@ -10,134 +10,94 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from solvers.core.descent import Metric
 from solvers.core.driver import Iterating, Iterative
-from solvers.cuda import device, triad
-from solvers.cuda.target import cuda
-from solvers.device import Course, Event, Marks, Steps
-from solvers.kernels.loop import EACH, ITERATIONS, LAST, Limits, verdict
-from solvers.problem import Positions, Solution, StepProblem, StopRule, Unsupported
+from solvers.core.fixed_objective import Objective
+from solvers.core.objective import StepObjective
+from solvers.cuda import device
+from solvers.cuda.steps import Step, Uploaded
+from solvers.cuda.target import Stream
+from solvers.device import Marks
+from solvers.kernels.loop import EACH, ITERATIONS, LAST, STALLED, Limits, verdict
+from solvers.problem import Positions, Solution, StepProblem, StopRule
 
 EVERY = 8
 """Iterations from one residual to the next."""
 
-_TRIAD = 2**26
-"""Float64 in each array of a triad: many times what caches hold."""
-
-THREADS = 8 if device.simulated() else 128
-"""In a block; the simulator's take a thread of the processor each."""
-
-
-def blocks(threads: int) -> int:
-    """How many blocks so many threads take; one at least."""
-    return max(1, -(-threads // THREADS))
-
-
-class Stream:
-    """A stream with the arrays that are brought to it, and a clock on it. Device arrays live as long as this does."""
-
-    def __init__(self) -> None:
-        self.queue: Any = cuda.stream()
-
-    @property
-    def pointer(self) -> int:
-        """What other libraries know the stream by; the simulator has none."""
-        return 0 if device.simulated() else int(self.queue)
-
-    def upload(self, array: NDArray[Any], dtype: Any = None) -> Any:
-        """A copy of a host's array on the device."""
-        return cuda.to_device(np.ascontiguousarray(array, dtype), stream=self.queue)
-
-    def put(self, array: NDArray[Any], there: Any) -> None:
-        """Copy a host's array to one of the device of the same shape and type."""
-        there.copy_to_device(np.ascontiguousarray(array, there.dtype), stream=self.queue)
-
-    def copy(self, array: Any, there: Any) -> None:
-        """Copy an array of the device to another of the same shape and type."""
-        there.copy_to_device(array, stream=self.queue)
-
-    def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
-        """Memory of the device, with whatever is there."""
-        return cuda.device_array(shape, dtype, stream=self.queue)
-
-    def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
-        """Zeros on the device."""
-        return self.upload(np.zeros(shape, dtype))
-
-    def download(self, there: Any) -> NDArray[Any]:
-        """A copy of a device's array; waits for all that was launched."""
-        out = there.copy_to_host(stream=self.queue)
-        self.wait()
-        return out
-
-    def wait(self) -> None:
-        """Until all that was launched is done."""
-        self.queue.synchronize()
-
-    def mark(self) -> Any:
-        """An event here and now on the stream."""
-        event = cuda.event()
-        event.record(self.queue)
-        return event
-
 
 class DeviceIterating(Iterating):
-    """A solve on a device. A method uploads in its `__init__`, between `super().__init__` and `self.uploaded()`."""
+    """A solve on a device, with memory of its own. order: the vertex of each row (n,); stalled: whether the last
+    iteration moved nothing; gauge: tells the residual [J^(1/2)] at positions, nan of a method that does not minimise.
+    """
 
-    def __init__(self, stream: Stream) -> None:
-        self.stream = stream
+    def __init__(self, stream: Stream, order: NDArray[np.int64]) -> None:
+        self.stream, self.order, self.stalled = stream, order, False
+        self.gauge: Callable[[Positions], float] = lambda p: float("nan")
         self._began = self._up = self._asked = self._down = stream.mark()
         self._copy: Positions | None = None
         self._done = 0
 
     def begun(self) -> None:
         """A solve begins: what it needs is copied from here on."""
-        self._began = self._up = self._asked = self._down = self.stream.mark()
-        self._copy, self._done = None, 0
+        self._began = self.stream.mark()
 
     def uploaded(self) -> None:
         """All that the solve needs is on its way."""
-        self._up = self.stream.mark()
+        self._up = self._asked = self._down = self.stream.mark()
 
     @abstractmethod
-    def sweep(self, count: int) -> None:
-        """Launch so many iterations, and wait for nothing."""
+    def take(self, step: Step) -> None:
+        """Begin to solve a step, which is on the device and stays as it is until the solve has ended."""
 
     @abstractmethod
-    def fetch(self) -> Positions:
-        """A copy of where it is, (n, 3) [m]."""
+    def sweep(self, count: int) -> int:
+        """Launch so many iterations; how many moved something."""
 
-    def gauge(self, p: Positions) -> float:
-        """The residual [J^(1/2)] at positions, which are where it is; nan of a method that does not minimise."""
-        return float("nan")
+    @abstractmethod
+    def settled(self) -> Any:
+        """Where it is, in rows (n, 3) [m], on the device."""
+
+    def speeds(self) -> Any:
+        """The velocity at the step's end, in rows (n, 3) [m/s], on the device; None of a method that keeps none."""
+        return None
+
+    def _by_vertices(self, rows: Any) -> Positions:
+        out = np.empty((len(self.order), 3))
+        out[self.order] = self.stream.download(rows)
+        return out
 
     @property
     def positions(self) -> Positions:  # pyright: ignore[reportIncompatibleVariableOverride] a copy, when asked for
-        """A copy of where it is (n, 3) [m]; the same one until the next iteration."""
+        """A copy of where it is (n, 3) [m], with its velocity; the same one until the next iteration."""
         if self._copy is None:
             with device.guarded():
                 self._asked = self.stream.mark()
-                self._copy = self.fetch()
+                speeds = self.speeds()
+                if speeds is not None:
+                    self.velocity = self._by_vertices(speeds)
+                self._copy = self._by_vertices(self.settled())
                 self._down = self.stream.mark()
         return self._copy
 
     def advance(self) -> bool:
         """See Iterating."""
         self.launch(1)
-        return True
+        return not self.stalled
 
-    def launch(self, count: int) -> None:
-        """So many iterations, and forget the copy."""
+    def launch(self, count: int) -> int:
+        """So many iterations, and forget the copy; how many moved something."""
         with device.guarded():
-            self.sweep(count)
-        self._copy, self._done = None, self._done + count
+            moved = self.sweep(count)
+        self._copy, self._done, self.stalled = None, self._done + moved, moved < count
+        return moved
 
     def residual(self) -> float:
-        """See Iterating."""
+        """See Iterating; on the host, at a copy."""
         return self.gauge(self.positions)
 
     def iterate(self, limits: Limits) -> tuple[int, float, int]:
@@ -146,11 +106,12 @@ class DeviceIterating(Iterating):
         while count < limits.iterations and ended == ITERATIONS:
             some = limits.iterations - count
             some = min(EVERY - self._done % EVERY, some) if limits.wanted == EACH else some
-            self.launch(some)
-            count += some
+            count += self.launch(some)
             if limits.wanted == EACH:
                 found = self.residual()
                 ended = verdict(found, limits)
+            if ended == ITERATIONS and self.stalled:
+                ended = STALLED
         if limits.wanted == LAST or (limits.wanted == EACH and count == 0):
             found = self.residual()
         return count, found, ended
@@ -159,10 +120,6 @@ class DeviceIterating(Iterating):
         """Events up to the last copy of positions, which has been waited for; none of the simulator, whose events tell
         nothing."""
         return None if device.simulated() else Marks(self._began, self._up, self._asked, self._down)
-
-    def marks_until(self, done: Any) -> Marks | None:
-        """The same where nothing was copied, up to an event that has been waited for."""
-        return None if device.simulated() else Marks(self._began, self._up, done, done)
 
 
 class DeviceIterative(Iterative):
@@ -174,18 +131,23 @@ class DeviceIterative(Iterative):
         """See Remote."""
         return device.state()
 
-    def triad(self) -> tuple[float, Event, Event] | None:
-        """See Remote."""
-        with device.guarded():
-            return None if device.simulated() else triad.once(_TRIAD)
-
-    def stepping(self, course: Course) -> Steps:
-        """See Remote."""
-        raise Unsupported("the method takes each step from the host")
+    @abstractmethod
+    def iterating(self) -> DeviceIterating:
+        """Memory for a solve."""
 
     @abstractmethod
+    def stated(self, problem: StepProblem, guess: Positions) -> Step:
+        """A step on the device, from a first guess (n, 3) [m]."""
+
     def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
         """See Iterative."""
+        with device.guarded():
+            run = self.iterating()
+            run.begun()
+            step = self.stated(problem, guess)
+            run.uploaded()
+            run.take(step)
+            return run
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """See Iterative."""
@@ -209,3 +171,32 @@ class DeviceIterative(Iterative):
             p, nan = run.positions, float("nan")
             found = Solution(p, iterations, nan, nan, "iterations", run.velocity, self.residual_of)
             return found, run.marks()
+
+
+class Minimising(DeviceIterative):
+    """A method whose rows are those of a network. uploaded: that; metric, objective: on the host, of residuals;
+    touches: whether it knows contact, and so asks for where a step starts."""
+
+    uploaded: Uploaded
+    metric: Metric
+    objective: Objective
+    touches: ClassVar[bool] = False
+
+    def stated(self, problem: StepProblem, guess: Positions) -> Step:
+        """See DeviceIterative."""
+        return self.uploaded.step(problem, guess, touches=self.touches)
+
+    def begin(self, problem: StepProblem, guess: Positions) -> DeviceIterating:
+        """See Iterative."""
+        run = super().begin(problem, guess)
+        run.gauge = self.gauge(problem)
+        return run
+
+    def gauge(self, problem: StepProblem) -> Callable[[Positions], float]:
+        """See Iterative."""
+        step = StepObjective(self.objective, problem)
+        return lambda p: self.metric.residual(step.gradient(step.placed(p)))
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """See Iterative."""
+        return self.gauge(problem)(p)

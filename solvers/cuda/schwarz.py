@@ -17,10 +17,8 @@ from numpy.typing import NDArray
 
 from solvers.cuda import device, sums
 from solvers.cuda.network import Edges, Entries, Network
-from solvers.cuda.preconditioning import Jacobi
-from solvers.cuda.run import Stream
 from solvers.cuda.schwarz_kernels import fold, kernels, packed, stiffen
-from solvers.cuda.target import cuda
+from solvers.cuda.target import Stream, cuda
 from solvers.linear import schwarz
 
 THREADS = 1 if device.simulated() else 96
@@ -105,11 +103,11 @@ class UploadedLevel(NamedTuple):
         )
 
 
-class Schwarz(Jacobi):
-    """The inverses of one solve, of each level those of its patches, packed; `blocks` are left as they are found."""
+class Schwarz:
+    """The inverses of one solve, of each level those of its patches, packed. r (f, 3): what `apply` is applied to."""
 
     def __init__(self, of: list[Level], uploaded: list[UploadedLevel], stream: Stream, rows: int, real: Real) -> None:
-        super().__init__(stream, rows, real)
+        self._stream, self.r = stream, stream.zeros((rows, 3), real)
         self._levels, self._uploaded, self._of = of, uploaded, kernels(real, schwarz.PATCH)
         self._stiff = [cuda.device_array((6, max(1, one.edges)), np.float64) for one in of]
         half = packed(schwarz.PATCH)
@@ -126,7 +124,7 @@ class Schwarz(Jacobi):
             self._of.invert[self._patches(level)](there, stiff, level.nodes, self._inverses[k])
 
     def apply(self, z: Any, which: int, partials: Any, now: Any) -> None:
-        """See Jacobi."""
+        """Write z (f, 3), and keep the first stage of r'z; nothing where now[0] is not 0."""
         for level, r, coarse in zip(self._levels[1:], self._residuals, self._residuals[1:], strict=False):
             self._of.gather[self._over(level.nodes)](r, coarse, now)
         moved = [z, *self._moved]

@@ -1,8 +1,8 @@
 """Functions of the processor's kernels, compiled for a device: no formula is written twice.
 
 A copy of the function has in its globals, and in what it closes over, such copies of the inner functions that it calls.
-NumPy's functions of one number are those of `math`, which Numba's CUDA target knows; what computes with floats or with
-eights of them (`solvers.vectors.eights`) computes with floats. In the simulator copies are functions of Python.
+NumPy's functions of one number are those of `math`, which Numba's CUDA target knows. In the simulator copies are
+functions of Python.
 """
 
 from __future__ import annotations
@@ -15,38 +15,12 @@ import numpy as np
 
 from solvers.cuda.device import simulated
 from solvers.cuda.target import cuda
-from solvers.vectors import eights
 
 _COPIES: dict[Any, Any] = {}
 
 
 def _on_device(function: Any) -> Any:
     return function if simulated() else cuda.jit(device=True)(function)
-
-
-def _where(flag: Any, x: Any, y: Any) -> Any:
-    return x if flag else y
-
-
-def _ratio(x: Any, y: Any) -> Any:
-    return x / y
-
-
-def _root(x: Any) -> Any:
-    return math.sqrt(x)
-
-
-def _ratio_in_python(x: Any, y: Any) -> Any:
-    with np.errstate(divide="ignore", invalid="ignore"):  # a device divides by zero too
-        return np.float64(x) / y
-
-
-_OTHERS: tuple[tuple[Any, Any], ...] = (
-    (eights.where, _on_device(_where)),
-    (eights.ratio, _on_device(_ratio_in_python if simulated() else _ratio)),
-    (eights.root, _on_device(_root)),
-    *(() if simulated() else ((np, math),)),
-)
 
 
 def shared(function: Any) -> Any:
@@ -69,8 +43,7 @@ def _codes(code: Any) -> list[Any]:
 
 def _replaced(value: Any) -> Any:
     """What stands for a global on a device."""
-    for known, other in _OTHERS:
-        if value is known:
-            return other
+    if value is np and not simulated():
+        return math
     of_processor = hasattr(value, "py_func") and "cuda" not in type(value).__module__
     return shared(value) if of_processor else value

@@ -22,8 +22,7 @@ import numpy as np
 from numba import float64
 from numpy.typing import NDArray
 
-from solvers.cuda.run import Stream
-from solvers.cuda.target import cuda
+from solvers.cuda.target import Stream, cuda
 from solvers.kernels.springs import TINY_SQUARED, Bundles
 from solvers.vectors.springs import LANES
 

@@ -1,4 +1,4 @@
-"""A step on a device: what it gives, from a host's problem or from where the last step ended, and rows of it.
+"""A step on a device: what it gives, from a host's problem, and rows of it.
 
     centre_i = (c m/dt^2 target + w pin) / (c m/dt^2 + w),     force_i = f_i - h_i centre_i        h: of forms
     n = v/|v| and n'(A origin) of dashpots, v = A p at the step's start
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,9 +17,7 @@ from numpy.typing import NDArray
 
 from solvers.cuda import sums
 from solvers.cuda.network import Edges, Given, Network
-from solvers.cuda.residual import Residuals
-from solvers.cuda.run import Stream
-from solvers.cuda.target import cuda
+from solvers.cuda.target import Stream, cuda
 from solvers.energies.edges import TINY
 from solvers.problem import Positions, StepProblem, System
 
@@ -82,11 +79,6 @@ class Uploaded:
         )
         hold = stream.upload(network.hold[: network.free])
         return cls(network, stream, network.upload(stream), places, hold)
-
-    @cached_property
-    def residuals(self) -> Residuals:
-        """What tells residuals, made where one is asked for."""
-        return Residuals(self.stream, self.network, self.edges, self.hold)
 
     def step(self, problem: StepProblem, guess: Positions, *, touches: bool = False) -> Step:
         """A host's problem, from a first guess (n, 3) [m]; touches: whether the method asks for its start."""

@@ -18,8 +18,7 @@ import numpy as np
 from numba import float64
 
 from solvers.cuda import springs
-from solvers.cuda.run import THREADS
-from solvers.cuda.target import cuda
+from solvers.cuda.target import THREADS, cuda
 from solvers.kernels.springs import TINY_SQUARED
 from solvers.vectors.springs import LANES
 

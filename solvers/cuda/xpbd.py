@@ -6,7 +6,7 @@ No two springs of a colour share a vertex, so that nobody writes what another re
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from solvers.core import vertex_terms
 from solvers.cuda import device, sums
-from solvers.cuda.resident import AT_ONCE, Resident, ResidentIterating
-from solvers.cuda.run import Stream
+from solvers.cuda.run import DeviceIterating, DeviceIterative
 from solvers.cuda.steps import Step, pin_numbers, pins_of
-from solvers.cuda.target import cuda
+from solvers.cuda.target import Stream, cuda
 from solvers.cuda.xpbd_kernels import kernels, moved, predict, settle
 from solvers.kernels.xpbd import Constraints
 from solvers.problem import Positions, ResidualOf, StepProblem, System
@@ -31,8 +30,8 @@ def prepare(
     """The method on the device, which is `ready`. constraints: the springs by colour; first (colours + 1,): the first
     of each; small: whether in small steps. Raises Unsupported where the device has no room."""
     m, n, size = len(constraints.stiffness), system.vertices, np.dtype(real).itemsize
-    solves = m * 5.0 * size + n * (5 * 24 + 8 + 5.0 * size)
-    device.require_memory("xpbd", m * (8 + 8 + 24.0 + size) + n * (6 * 24 + 32) + AT_ONCE * solves)
+    solve = m * 5.0 * size + n * (5 * 24 + 8 + 5.0 * size)
+    device.require_memory("xpbd", m * (8 + 8 + 24.0 + size) + n * (6 * 24 + 32) + solve)
     with device.guarded():
         stream = Stream()
         there = Springs.of(stream, constraints, real), Places.of(stream, system)
@@ -74,10 +73,9 @@ class Springs(NamedTuple):
 
 
 class Places(NamedTuple):
-    """On the device, of each vertex (n,). vertex: its own number; pin: the number of its pin, -1 for none; weight: of
+    """On the device, of each vertex (n,). pin: the number of its pin, -1 for none; weight: of
     that, 0 for none; held: c m/dt^2 + weight [N/m]; mass [kg]."""
 
-    vertex: Any
     pin: Any
     weight: Any
     held: Any
@@ -89,12 +87,12 @@ class Places(NamedTuple):
         n, pins = system.vertices, system.pins
         weight = np.zeros(n)
         weight[pins.vertices] = pins.weight
-        arrays = np.arange(n, dtype=np.int32), pin_numbers(system), weight, vertex_terms.held(system), system.mass
+        arrays = pin_numbers(system), weight, vertex_terms.held(system), system.mass
         return cls(*map(stream.upload, arrays))
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedXpbd(Resident):
+class PreparedXpbd(DeviceIterative):
     """first (colours + 1,): of each colour's springs."""
 
     residual_of: ClassVar[ResidualOf] = "none"
@@ -108,23 +106,18 @@ class PreparedXpbd(Resident):
     columns: dict[str, Any]
     choice: str
 
-    @property
-    def facts(self) -> dict[str, float]:
-        """The bytes that a pass over m springs must move, m (8 + 25 s) with numbers of s bytes: of a spring its ends
-        (8), stiffness (s), D and |D| - r (4 s) and tension, read and written (2 s); of each of both ends a row of u,
-        read and written (8 s), and its compliance (s): no two springs of a launch share an end."""
-        size = np.dtype(self.real).itemsize
-        return {"sweep_bytes": float(self.first[-1] * (8 + 25 * size))}
+    facts: dict[str, float] = field(default_factory=dict[str, float])
+    own: ClassVar[bool] = False
 
     def stated(self, problem: StepProblem, guess: Positions) -> Step:
-        """See Resident; the guess is not used."""
+        """See DeviceIterative; the guess is not used."""
         up, start = self.stream.upload, problem.start
         target, force, pins = up(problem.target), up(problem.force), pins_of(problem, self.stream)
         here = (up(start.positions), up(start.velocity)) if self.own else (target, target)
         return Step(target, force, target, pins, target, target, *here, (start.time, start.until))
 
-    def iterating(self) -> ResidentIterating:
-        """See Resident."""
+    def iterating(self) -> DeviceIterating:
+        """See DeviceIterative."""
         return Passes(self)
 
 
@@ -133,33 +126,23 @@ class PreparedSmallSteps(PreparedXpbd):
 
     own: ClassVar[bool] = True
 
-    @property
-    def facts(self) -> dict[str, float]:
-        """The bytes that a substep of m springs and n vertices must move: those of a pass, m (16 + 5 s) + 24 n to write
-        D, |D| - r and tensions by ends, lengths at rest and x, and of a vertex, before that, x, v and the force read, x
-        and where it was written (5 x 24), its compliance, pin and weight (20) and u (3 s), and after it x, u, where it
-        was, and x, v and u written (4 x 24 + 6 s)."""
-        size, n = np.dtype(self.real).itemsize, self.system.vertices
-        linearised, moved = self.first[-1] * (16.0 + 5 * size), n * (10 * 24.0 + 20 + 9 * size)
-        return {"sweep_bytes": super().facts["sweep_bytes"] + linearised + moved}
-
-    def iterating(self) -> ResidentIterating:
-        """See Resident."""
+    def iterating(self) -> DeviceIterating:
+        """See DeviceIterative."""
         return SmallSteps(self)
 
 
-class _Iterating(ResidentIterating):
+class _Iterating(DeviceIterating):
     """x (n, 3): the reference [m]; u (n, 4): the displacement from it; compliance (n,): 1/held [m/N]."""
 
     def __init__(self, made: PreparedXpbd) -> None:
         n, stream = made.system.vertices, made.stream
-        super().__init__(stream, np.arange(n), made.places.vertex)
+        super().__init__(stream, np.arange(n))
         self.made, self.kernels, self.springs = made, kernels(made.real), made.springs.begun(made.real)
         self.x, self.out = (stream.empty((n, 3), np.float64) for _ in range(2))
         self.u, self.compliance = stream.empty((n, 4), made.real), stream.empty(n, made.real)
 
     def settled(self) -> Any:
-        """See ResidentIterating."""
+        """See DeviceIterating."""
         self.run(moved, len(self.x), self.x, self.u, self.out)
         return self.out
 
@@ -182,15 +165,16 @@ class Passes(_Iterating):
     """From where the vertices would go without springs."""
 
     def take(self, step: Step) -> None:
-        """See ResidentIterating."""
+        """See DeviceIterating."""
         n, places = len(self.x), self.made.places
         self.run(self.kernels.anchor, n, places, step.target, step.force, step.pins, self.x, self.u, self.compliance)
         self.linearise()
 
-    def sweep(self, count: int) -> None:
+    def sweep(self, count: int) -> int:
         """See DeviceIterating."""
         for _ in range(count):
             self.project()
+        return count
 
 
 class SmallSteps(_Iterating):
@@ -204,23 +188,23 @@ class SmallSteps(_Iterating):
         self._step: Step
 
     def take(self, step: Step) -> None:
-        """See ResidentIterating."""
+        """See DeviceIterating."""
         self._substeps, self._step = 0, step
 
     def settled(self) -> Any:
-        """See ResidentIterating."""
+        """See DeviceIterating."""
         return super().settled() if self._substeps else self._step.positions
 
     def speeds(self) -> Any:
-        """See ResidentIterating."""
+        """See DeviceIterating."""
         return self._v if self._substeps else self._step.velocity
 
-    def sweep(self, count: int) -> None:
+    def sweep(self, count: int) -> int:
         """See DeviceIterating."""
         step, n, places = self._step, len(self.x), self.made.places
         self._substeps += count
         if not self._substeps:
-            return
+            return count
         h = self.made.system.time_step / self._substeps
         self.stream.copy(step.positions, self.x)
         self.stream.copy(step.velocity, self._v)
@@ -234,3 +218,4 @@ class SmallSteps(_Iterating):
             self.linearise()
             self.project()
             self.run(settle, n, h, self._before, self.x, self.u, self._v)
+        return count

@@ -22,8 +22,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-
 from solvers.integrators.base import Motion
 from solvers.problem import Positions, Solution, Start, Unsupported
 
@@ -48,14 +46,6 @@ class Integrator:
     history: bool
     predict: Callable[[Motion, Motion, float], tuple[Positions, Positions]]
     order: int = 1
-
-    def weights(self, dt: float) -> tuple[float, float, float]:
-        """a, b [s] and c [s] of origin = p + a (p - p'), target = origin + b v + c (v - v'), for dt [s]."""
-        one, none = np.ones(1), np.zeros(1)
-        _, a = self.predict(Motion(none, none), Motion(-one, none), dt)
-        b, _ = self.predict(Motion(none, one), Motion(none, one), dt)
-        c, _ = self.predict(Motion(none, none), Motion(none, -one), dt)
-        return float(a[0]), float(b[0]), float(c[0])
 
     def advance(self, start: Start, solution: Solution) -> Motion:
         """The motion at the step's end; a method that has a velocity of its own brings it in the solution."""

@@ -27,7 +27,7 @@ from solvers.matrices import energy_norm
 from solvers.memory import in_words, of_machine
 from solvers.problem import Unsupported
 
-Linear = Literal["auto", "inverse", "cholespy", "supernodal", "cg", "cudss"]
+Linear = Literal["auto", "inverse", "cholespy", "supernodal", "cg"]
 Precision = Literal["float64", "float32", "float16"]
 
 SMALL = 25
@@ -129,8 +129,6 @@ def choose(
     room = of_machine() if memory is None else memory
     if linear == "cholespy":
         return Choice(linear, "as asked; its factor is not estimated beforehand")
-    if linear == "cudss":
-        raise Unsupported("cudss: solves on a device; give `device: cuda` beside it, which numba and lbfgs know")
     if linear == "inverse" or (linear == "auto" and n <= SMALL):
         why = "as asked" if linear == "inverse" else f"{n} vertices, at most {SMALL}"
         return Choice("inverse", why) if _fits(_inverse(n), room) else _refuse(room, {"inverse": _inverse(n)})

@@ -5,8 +5,7 @@
 Compositions of kicks and drifts are symplectic: without drag their energy stays near where it was for as long as one
 likes. Runge-Kutta methods of Tsitouras and of Dormand and Prince choose their substeps by an estimate of their error.
 Substeps of the others are stable while omega h is below a limit of the method, omega^2 the largest eigenvalue of
-M^-1 A'KA, which is that of the springs at their stiffest. With `device: cuda` the same frames come from
-`solvers.cuda.explicit`.
+M^-1 A'KA, which is that of the springs at their stiffest.
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ from solvers.core.explicit_tables import (
 )
 from solvers.core.forces import ForceParts, Whole, frequency, rows_of_four
 from solvers.core.substeps import Substepping, Substeps
-from solvers.device import Precise
 from solvers.kernels.explicit_steps import Coefficients, Forces, Scratch, Subdivision, compose, integrate
 from solvers.problem import Positions, Prepared, StepProblem, System, Unsupported
 
@@ -47,7 +45,7 @@ _MOST = 1e9
 
 
 @dataclass(frozen=True)
-class Explicit(Precise):
+class Explicit:
     """What they share."""
 
     minimises: ClassVar[bool] = False
@@ -61,21 +59,16 @@ class Explicit(Precise):
 
     def _prepared(self, system: System, substeps: int, error: float) -> Prepared:
         """substeps: times the fewest that are stable; error: of the springs' mean length, 0 for none."""
-        if self.device == "cuda":
-            from solvers.cuda.device import ready  # for those who ask for it
-
-            ready(self.name)
         vertex_terms.require_implicit_euler(system, self.name)
         vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), self.name)
         method, parts = self.method(), ForceParts.of(system, self.name)
         omega = frequency(system)
         rate = omega + float(parts.drag.max(initial=0.0))
         needed = substeps * max(1.0, ceil(system.time_step * rate / (_SAFETY * method.limit)))
-        most = self.allowed(_MOST)
-        if needed * method.evaluations * max(1, len(parts.springs.edges)) > most:
+        if needed * method.evaluations * max(1, len(parts.springs.edges)) > _MOST:
             raise Unsupported(
                 f"{self.name}: is stable with {needed:.3g} substeps a step of {method.evaluations} evaluations, which "
-                f"for {len(parts.springs.edges)} springs are beyond the {most:.0e} allowed; take a shorter time step"
+                f"for {len(parts.springs.edges)} springs are beyond the {_MOST:.0e} allowed; take a shorter time step"
             )
         soft = int((~system.pins.exact).sum())
         exact = f"; {soft} pins by penalty taken as exact" if soft else ""
@@ -88,10 +81,6 @@ class Explicit(Precise):
         tolerance = error * (float(lengths.mean()) if len(lengths) else 1.0)
         choice = f"{told}, for vibrations of at most {omega:.3g} rad/s{exact}"
         taken = Substeps(int(needed), tolerance, rate, choice)
-        if self.device == "cuda":
-            from solvers.cuda.explicit import prepare
-
-            return prepare(self.name, system, method, parts, taken, self.real)
         return PreparedExplicit(method, taken, system, parts)
 
 

@@ -10,8 +10,7 @@ and below Q, s y is not less than y Q^-1 y, and H stays positive definite. Takes
 projective leave Q as it is.
 
 `preconditioner: a-jacobi` takes S, what some sweeps of Jacobi's method make of Q^-1 (`solvers.methods.a_jacobi`), in
-its place: a product with a sparse matrix, as suits a graphics processor. With `device: cuda` the iterates come from
-`solvers.cuda.lbfgs`.
+its place: a product with a sparse matrix, as suits a graphics processor.
 """
 
 from __future__ import annotations
@@ -19,18 +18,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-import numpy as np
-
 from solvers.about import About, Reference
 from solvers.contact.touching import without_contact
 from solvers.core.acceleration import Interpreted, Scheme
 from solvers.core.bounds import without_bounded
-from solvers.core.descent import Metric, Stiffness
+from solvers.core.descent import Metric
 from solvers.core.driver import Iterating, Iterative
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
 from solvers.core.prefactored import PreparedLocalGlobal, prepared
-from solvers.device import OnDevice
 from solvers.kernels.accelerate_coefficients import LBFGS
 from solvers.methods.a_jacobi import Aggregated, require_sweeps
 from solvers.methods.quasi_newton import PreparedAccelerated, Windowed, prepare
@@ -38,12 +34,11 @@ from solvers.problem import Positions, Prepared, ProjectiveEnergy, StepProblem, 
 
 
 @dataclass(frozen=True)
-class Lbfgs(Windowed, OnDevice):
-    """pairs: kept of the latest iterations; linear, precision: the solver of Q x = b and of its stored entries, on a
-    device those of S and of the pairs; preconditioner: what is in the place of Q^-1, a device knows a-jacobi; sweeps:
-    of Jacobi's method in that, 1 to 8."""
+class Lbfgs(Windowed):
+    """pairs: kept of the latest iterations; linear, precision: the solver of Q x = b and of its stored entries;
+    preconditioner: what is in the place of Q^-1; sweeps: of Jacobi's method in that, 1 to 8."""
 
-    unstated: ClassVar[frozenset[str]] = frozenset({"device", "preconditioner", "sweeps"})
+    unstated: ClassVar[frozenset[str]] = frozenset({"preconditioner", "sweeps"})
 
     about: ClassVar[About] = About(
         "quasi-Newton",
@@ -68,45 +63,22 @@ class Lbfgs(Windowed, OnDevice):
             return
         if self.linear != "auto":
             raise ValueError(f"linear: {self.linear} is for `preconditioner: factor`; a-jacobi solves no system")
-        if self.precision != "float64" and self.device == "cpu":
-            raise ValueError(f"precision: {self.precision} is of a factor's entries, or for `device: cuda`")
+        if self.precision != "float64":
+            raise ValueError(f"precision: {self.precision} is of a factor's entries")
 
     def prepare(self, system: System) -> Prepared:
         """Raises NotPositiveDefinite, Unsupported where Q fits nowhere, and with a-jacobi for contact."""
-        if self.device == "cuda":
-            from solvers.cuda.device import ready  # for those who ask for it
-
-            by_factor = self.preconditioner == "factor"
-            ready("lbfgs", "cuda,cudss" if by_factor else "cuda")
-            if self.precision == "float16" or (by_factor and (self.linear, self.precision) != ("cudss", "float64")):
-                raise Unsupported(
-                    "lbfgs, device: cuda: knows preconditioner: a-jacobi in float64 or float32, and factor by linear: "
-                    f"cudss in float64, not {self.preconditioner} by {self.linear} in {self.precision}; take these, or "
-                    "device: cpu"
-                )
         if self.preconditioner == "a-jacobi" and without_bounded(without_contact(system)) is not system:
             raise Unsupported(
                 "lbfgs, preconditioner: a-jacobi: its matrix, which is made once, has no rows for what begins to "
                 "touch; take preconditioner: factor"
             )
-        if self.device == "cuda":
-            return self._there(system)
         if self.preconditioner == "factor":
             return self.by_factor(system)
         words, scheme, metric = f"{self.sweeps} sweeps of Jacobi", self._scheme, Metric(system)
         energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
         base = prepared(system, energies, lambda Q: (Aggregated(Q, self.sweeps), words))
         return _Prepared(base, metric, scheme, Objective(system))
-
-    def _there(self, system: System) -> Prepared:
-        """On a device."""
-        from solvers.cuda.lbfgs import prepare
-
-        scheme, stiffness = self._scheme, Stiffness(system)
-        if self.preconditioner == "factor":
-            return prepare(system, stiffness, None, scheme, np.float64, "")
-        S, real = Aggregated(stiffness.inner, self.sweeps), np.float32 if self.precision == "float32" else np.float64
-        return prepare(system, stiffness, S.matrix, scheme, real, f"{self.sweeps} sweeps of Jacobi; ")
 
     def by_factor(self, system: System) -> PreparedAccelerated:
         """With Q's factor. Raises as `prepare` does."""

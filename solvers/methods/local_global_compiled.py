@@ -2,8 +2,7 @@
 
 Factors of float64 solve for positions, Q p = A'K d + y. Less precise ones solve for corrections,
 p <- p - Q^-1 grad g(p), with the gradient in float64: the iterations end where those of float64 do, to all of its
-digits, and only the way there differs. With `device: cuda` and `linear: cudss` these come from
-`solvers.cuda.local_global`.
+digits, and only the way there differs.
 """
 
 from __future__ import annotations
@@ -18,22 +17,19 @@ from solvers.contact.touching import without_contact
 from solvers.core.bounds import without_bounded
 from solvers.core.compiled import FAR, PreparedCompiled, compiled
 from solvers.core.prefactored import Project, prepared, projective
-from solvers.device import OnDevice
 from solvers.energies.springs import Springs
 from solvers.kernels import springs as kernels
 from solvers.linear.choice import Linear, Precision, factorise
 from solvers.memory import aligned
-from solvers.problem import Positions, Prepared, System, Unsupported
+from solvers.problem import Positions, Prepared, System
 
 
 @dataclass(frozen=True)
-class CompiledLocalGlobal(OnDevice):
+class CompiledLocalGlobal:
     """Compiled steps over a linear solver that is chosen by size, or given.
 
-    linear: the solver of Q p = b, on a device cudss; precision: of its stored entries.
+    linear: the solver of Q p = b; precision: of its stored entries.
     """
-
-    unstated: ClassVar[frozenset[str]] = frozenset({"device"})
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
@@ -44,18 +40,6 @@ class CompiledLocalGlobal(OnDevice):
 
     def prepare(self, system: System) -> Prepared:
         """Raises Unsupported for energies that are neither projective nor contact, NotPositiveDefinite."""
-        if self.device == "cuda":
-            from solvers.cuda.device import ready  # for those who ask for it
-
-            ready("numba", "cuda,cudss")
-            if (self.linear, self.precision) != ("cudss", "float64"):
-                raise Unsupported(
-                    "numba, device: cuda: solves by linear: cudss in float64 alone, not by "
-                    f"{self.linear} in {self.precision}; take that, or device: cpu"
-                )
-            from solvers.cuda.local_global import prepare
-
-            return prepare(system)
         if without_contact(system) is not system:
             from solvers.contact.local_global import local_global  # for those who need it
 

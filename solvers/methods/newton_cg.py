@@ -45,7 +45,7 @@ _MOST = 1000
 class NewtonCG(Precise):
     """Newton's method without a factor of the Hessian: it needs the memory of local-global.
 
-    preconditioner: of conjugate gradients; `solvers.core.preconditioning` tells them. A device knows the last two.
+    preconditioner: of conjugate gradients; `solvers.core.preconditioning` tells them. A device knows schwarz.
     """
 
     unstated: ClassVar[frozenset[str]] = Precise.unstated | {"preconditioner"}

@@ -27,18 +27,17 @@ from solvers.core.driver import Iterating, Iterative, largest
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
 from solvers.core.preconditioning import At, Preconditioning, preconditioning
-from solvers.device import Precise
 from solvers.problem import Positions, Prepared, StepProblem, System, Unsupported
 
 
 @dataclass(frozen=True)
-class NonlinearCG(Precise):
+class NonlinearCG:
     """Preconditioned nonlinear conjugate gradients: takes all energies, with the memory of local-global.
 
-    preconditioner: `solvers.core.preconditioning` tells them. A device knows the last two.
+    preconditioner: `solvers.core.preconditioning` tells them.
     """
 
-    unstated: ClassVar[frozenset[str]] = Precise.unstated | {"preconditioner"}
+    unstated: ClassVar[frozenset[str]] = frozenset({"preconditioner"})
 
     minimises: ClassVar[bool] = True
     descends: ClassVar[bool] = True
@@ -57,13 +56,6 @@ class NonlinearCG(Precise):
     def prepare(self, system: System) -> Prepared:
         """Raises NotPositiveDefinite where nothing determines some positions, Unsupported for contact of single
         vertices, where Q fits nowhere, and for blocks of energies without elements."""
-        if self.device == "cuda":
-            from solvers.cuda.device import ready  # for those who ask for it
-
-            ready("pncg")
-            from solvers.cuda.pncg import prepare
-
-            return prepare(system, self.preconditioner, self.real)
         if without_contact(system) is not system:
             raise Unsupported(
                 "pncg: no quadratic model holds along a direction where single vertices begin to press and grip "

@@ -9,7 +9,7 @@ are those of K^(1/2) A M^-1 A'K^(1/2), are at most the largest sum of a row (Ger
     omega^2 <= max over springs (i, j) of s_i + s_j,    s_i = sum of the stiffnesses at i / m_i, 0 if i is pinned
 
 The bound is that of a spring, and to 3 % of chains and nets; with shear and bending it is up to 1.12 times the largest
-omega of a sheet, and 1.28 times that of a solid. With `device: cuda` the same frames come from `solvers.cuda.explicit`.
+omega of a sheet, and 1.28 times that of a solid.
 """
 
 from __future__ import annotations
@@ -23,10 +23,8 @@ import numpy as np
 from solvers.about import About, Reference
 from solvers.core import vertex_terms
 from solvers.core.driver import Iterating, Iterative
-from solvers.core.explicit_tables import SYMPLECTIC_EULER
-from solvers.core.forces import ForceParts, Whole, rows_of_four
+from solvers.core.forces import Whole, rows_of_four
 from solvers.core.prefactored import only_springs
-from solvers.device import Precise
 from solvers.energies.springs import Springs
 from solvers.kernels.explicit import advance
 from solvers.kernels.springs import Bundles
@@ -40,7 +38,7 @@ _MOST = 1e10
 
 
 @dataclass(frozen=True)
-class SymplecticEuler(Precise):
+class SymplecticEuler:
     """Symplectic Euler: one iterate, the whole step, whatever the stop rule and the first guess. Pins by
     penalty are taken to be exact, for their weight would ask for the shortest substeps; pins move evenly, and forces
     stay."""
@@ -62,30 +60,19 @@ class SymplecticEuler(Precise):
     def prepare(self, system: System) -> Prepared:
         """Raises Unsupported for energies other than springs, integrators other than implicit Euler, vertices without
         mass that are not pinned, and steps that would take too many substeps."""
-        if self.device == "cuda":
-            from solvers.cuda.device import ready  # for those who ask for it
-
-            ready("symplectic-euler")
         springs, n = only_springs(system, "symplectic-euler"), system.vertices
         vertex_terms.require_implicit_euler(system, "symplectic-euler")
         vertex_terms.require_mass(system, np.where(system.unpinned, system.mass, np.inf), "symplectic-euler")
         omega = frequency_bound(system, springs)
         needed = max(1.0, ceil(system.time_step * omega / (2.0 * _SAFETY)))
-        most = self.allowed(_MOST)
-        if needed * max(1, len(springs.edges)) > most:
+        if needed * max(1, len(springs.edges)) > _MOST:
             raise Unsupported(
                 f"symplectic-euler: is stable with {needed:.3g} substeps a step, which for {len(springs.edges)} "
-                f"springs are more than the {most:.0e} evaluations that are allowed; take a shorter time step"
+                f"springs are more than the {_MOST:.0e} evaluations that are allowed; take a shorter time step"
             )
         soft = int((~system.pins.exact).sum())
         taken = f"; {soft} pins by penalty taken as exact" if soft else ""
         choice = f"{needed:.0f} substeps for vibrations of at most {omega:.3g} rad/s{taken}"
-        if self.device == "cuda":
-            from solvers.core.substeps import Substeps
-            from solvers.cuda.explicit import prepare
-
-            parts, taken_steps = ForceParts.of(system, "symplectic-euler"), Substeps(int(needed), 0.0, omega, choice)
-            return prepare("symplectic-euler", system, SYMPLECTIC_EULER, parts, taken_steps, self.real)
         part = np.where(system.unpinned, 0, -1)
         bundles, _ = Bundles.of(springs, np.arange(n), part, 1, n, n + 1)
         return PreparedSymplecticEuler(system, bundles, int(needed), choice)

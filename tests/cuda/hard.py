@@ -17,38 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.scenes.bind import Scene
-from harness.simulation.on_device import Staying, on_device
 from harness.simulation.step import prepare, problem, simulate, start
 from solvers.core.fixed_objective import Objective
 from solvers.core.objective import StepObjective
-from solvers.core.substeps import Substepping
-from solvers.cuda.resident import Resident
 from solvers.integrators import Motion
-from solvers.methods.explicit import RungeKutta4, VelocityVerlet
-from solvers.methods.lbfgs import Lbfgs
 from solvers.methods.newton_cg import NewtonCG
-from solvers.methods.pncg import NonlinearCG
-from solvers.methods.symplectic_euler import SymplecticEuler
 from solvers.methods.vbd import VertexBlockDescent
 from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
 from solvers.problem import Positions, StopRule, Unsupported
 
 METHODS: dict[str, Callable[..., Any]] = {
     "vbd": VertexBlockDescent,
-    "newton-cg": lambda **on: NewtonCG(preconditioner="block-jacobi", **on),
-    "pncg": lambda **on: NonlinearCG(preconditioner="block-jacobi", **on),
-    "lbfgs": lambda **on: Lbfgs(preconditioner="a-jacobi", **on),
+    "newton-cg": lambda **on: NewtonCG(preconditioner="schwarz", **on),
     "xpbd": Xpbd,
     "xpbd-small-steps": XpbdSmallSteps,
-    "symplectic-euler": SymplecticEuler,
-    "velocity-verlet": VelocityVerlet,
-    "runge-kutta-4": RungeKutta4,
 }
 
 FRAMES, STOP = 2, StopRule(4)
-SUBSTEPS = 1200
-"""More of them are too many for the simulator, which takes some milliseconds for a launch; the next case has 4,000."""
-
 Precision = Literal["float64", "float32"]
 ROUND_OFF: dict[Precision, tuple[float, float]] = {"float64": (4e-16, 1e-10), "float32": (1e-7, 1e-5)}
 """By precision: what round-off changes at the start, in parts of the springs' mean length and, in float64, of the
@@ -64,15 +49,11 @@ stiffnesses lie far apart, conjugate gradients in float32 end elsewhere, and as 
 Frames = NDArray[np.float64]
 
 
-class TooLong(Exception):
-    """For the simulator."""
-
-
 class Outcome(NamedTuple):
-    """word: right, refused, too long, or wrong; why, of all but the first; over: of what it is away from the processor,
+    """word: right, refused or wrong; why, of all but the first; over: of what it is away from the processor,
     over what it may be."""
 
-    word: Literal["right", "refused", "too long", "wrong"]
+    word: Literal["right", "refused", "wrong"]
     why: str = ""
     over: float = 0.0
 
@@ -82,8 +63,6 @@ def outcome(made: Scene, method: str, precision: Precision) -> Outcome:
     solver = METHODS[method]
     try:
         found = ran(made, solver(device="cuda", precision=precision))
-    except TooLong as error:
-        return Outcome("too long", str(error))
     except Unsupported as error:
         return Outcome(*_refused(str(error), made, solver))
     wanted, begun = ran(made, solver()), start(made).now.positions
@@ -108,15 +87,12 @@ def outcome(made: Scene, method: str, precision: Precision) -> Outcome:
 
 def ran(made: Scene, solver: Any, changes: Frames | tuple[float, float] = (0.0, 0.0)) -> Frames:
     """Where the first steps end, (frames, n, 3) [m]. changes (2, n, 3) [m]: of the start's positions, and of what its
-    velocities move in a step; a device takes none."""
+    velocities move in a step."""
     prepared = prepare(made, solver)
-    if isinstance(prepared, Resident) and isinstance(prepared, Substepping) and prepared.substeps.count > SUBSTEPS:
-        raise TooLong(prepared.substeps.choice)
-    there, state = on_device(made, prepared, "current"), start(made)
+    state = start(made)
     p, v = state.now
     state = replace(state, now=Motion(p + changes[0], v + changes[1] / made.system.time_step))
-    stepped = there if isinstance(there, Staying) else prepared
-    run = simulate(made, stepped, STOP, first_guess="current", frames=FRAMES, state=state)
+    run = simulate(made, prepared, STOP, first_guess="current", frames=FRAMES, state=state)
     return np.array([step.positions for step in run])
 
 

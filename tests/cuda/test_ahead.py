@@ -22,25 +22,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.simulation.measure import Settings, steps
-from solvers.cuda import cudss, device, local_global, triad, vbd
-from solvers.cuda.target import cuda
+from solvers.cuda import device, vbd
 from solvers.linear import schwarz
-from solvers.methods.explicit import BlanesMoan4, Tsitouras5, VelocityVerlet
-from solvers.methods.lbfgs import Lbfgs
 from solvers.methods.newton_cg import NewtonCG
-from solvers.methods.pncg import NonlinearCG
 from solvers.methods.vbd import VertexBlockDescent
 from solvers.methods.xpbd import Xpbd, XpbdSmallSteps
 from solvers.problem import StopRule
 from tests.cuda import ahead
 from tests.cuda.near import PRECISIONS
-from tests.cuda.test_pairs import PROBLEMS as PAIRED
-from tests.cuda.test_pairs import every_other_search_fails
-from tests.cuda.test_steps import DRAGS, FILTERS, staying
-from tests.cuda.test_steps import cloth as moving
 from tests.cuda.test_touching import touching
-from tests.effects import DASHPOTS
+from tests.effects import BEND, DASHPOTS, DRAG, stepped
+from tests.effects import cloth as cloth_with
 from tests.scenes import cloth, first_problem, random_problem
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,13 +40,8 @@ ROOT = Path(__file__).resolve().parents[2]
 METHODS: tuple[Callable[..., Any], ...] = (
     VertexBlockDescent,
     lambda **on: NewtonCG(preconditioner="schwarz", **on),
-    lambda **on: NonlinearCG(preconditioner="block-jacobi", **on),
-    lambda **on: Lbfgs(preconditioner="a-jacobi", **on),
     Xpbd,
     XpbdSmallSteps,
-    VelocityVerlet,
-    BlanesMoan4,
-    lambda **on: Tsitouras5(error=1e-4, **on),
 )
 
 SHARED, REGISTERS = 48 * 1024, 65_536
@@ -65,7 +52,7 @@ MOST_THREADS = 256
 """Of a block, that kernels are launched with."""
 
 WITHOUT_DOUBLES = (
-    *("vbd_kernels.sweep", "vbd_kernels.extrapolate", "xpbd_kernels.project", "lbfgs_kernels.multiply"),
+    *("vbd_kernels.sweep", "vbd_kernels.extrapolate", "xpbd_kernels.project"),
     *("schwarz_kernels.gather", "schwarz_kernels.multiply"),
 )
 """Kernels that in float32 compute nothing in float64: a literal in it would make all that it meets float64."""
@@ -107,20 +94,11 @@ def launch_all() -> None:
         for method in METHODS:
             for problem in problems:
                 method(device="cuda", precision=precision).prepare(problem.system).solve(problem, StopRule(8, 1e-3))
-        for touched in (touching("sphere"), *(make() for make in PAIRED.values())):
-            method = VertexBlockDescent(device="cuda", precision=precision)
-            method.prepare(touched.system).solve(touched, StopRule(2))
-    by_itself, minimises = XpbdSmallSteps(device="cuda"), NonlinearCG(preconditioner="block-jacobi", device="cuda")
-    for solver, effects in (by_itself, FILTERS), (minimises, (*DRAGS, DASHPOTS)):
-        made = moving(*effects)
-        on_it = staying(made, solver)
-        for step in steps(made, on_it, Settings(StopRule(1), "current", 1, 1)):
-            on_it.keep(step)
-    triad.run(*(cuda.device_array(1, np.float64) for _ in range(3)))
-    rows, columns = (cuda.device_array(shape, np.float64) for shape in ((1, 3), (3, 1)))  # of cuDSS, which is not there
-    cudss.to_columns[1, 1](rows, columns)
-    cudss.from_columns[1, 1](columns, rows)
-    local_global.moved[1, 1](rows, rows)
+        touched = touching("sphere")
+        VertexBlockDescent(device="cuda", precision=precision).prepare(touched.system).solve(touched, StopRule(2))
+        damped = stepped(cloth_with(BEND, DASHPOTS, DRAG))
+        newton = NewtonCG(preconditioner="schwarz", device="cuda", precision=precision)
+        newton.prepare(damped.system).solve(damped, StopRule(2))
 
 
 @pytest.mark.long
@@ -130,7 +108,6 @@ def test_every_kernel_compiles_as_it_is_launched(tmp_path: Path, monkeypatch: py
     with monkeypatch.context() as patch:
         patch.setattr(schwarz, "PATCH", 3)  # small scenes have levels, and the reference changes soon
         patch.setattr(vbd, "REBASE", 3)
-        every_other_search_fails(patch)
         launches = recorded(patch)
         launch_all()
         assert set(launches) == set(ahead.kernels())

@@ -14,9 +14,8 @@ from harness.cli import app
 from harness.config.load import load_any
 from harness.experiments.plan import Files
 from solvers import device as where
-from solvers.cuda import device, run
-from solvers.cuda.resident import Stepping
-from solvers.cuda.residual import Residuals
+from solvers.cuda import device, run, target
+from solvers.problem import StepProblem
 from tests.scenes import CLOTH_FILE
 
 SWEEP = """
@@ -41,28 +40,26 @@ def test_rows_tell_of_the_device_and_timed_steps_ask_for_no_residual(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked, timed = list[float](), list[tuple[int, int]]()
-    of, step = Residuals.of, Stepping.step
+    residual, replay = run.DeviceIterating.residual, run.DeviceIterative.replay
 
-    def counted(self: Any, g: Any) -> float:
-        asked.append(of(self, g))
+    def counted(self: Any) -> float:
+        asked.append(residual(self))
         return asked[-1]
 
-    def seen(self: Any, iterations: int) -> Any:
+    def seen(self: Any, problem: StepProblem, iterations: int) -> Any:
         before = len(asked)
-        found = step(self, iterations)
+        found = replay(self, problem, iterations)
         timed.append((iterations, len(asked) - before))
         return found
 
-    monkeypatch.setattr(Residuals, "of", counted)
-    monkeypatch.setattr(Stepping, "step", seen)
+    monkeypatch.setattr(run.DeviceIterating, "residual", counted)
+    monkeypatch.setattr(run.DeviceIterative, "replay", seen)
     told, (here, there) = ran(tmp_path)
     assert told.exit_code == 0, told.output
     assert {row["device"] for row in here} == {device.told()["device"]}
     assert {row["device"] for row in there} == {None}
-    assert {row["through_host"] for row in (*here, *there)} == {None}
-    assert all(row["sweep_bytes"] > 0 for row in here)
     phases = Counter(row["phase"] for row in here)
-    assert phases == {"prepare": 2, "step": 2, "upload": 1, "download": 1}
+    assert phases == {"prepare": 2, "step": 2}
     steps = [row for row in here if row["phase"] == "step"]
     assert all((row["power_w"] is None) == device.simulated() for row in steps)
     assert {row["stopped"] for row in steps} == {"tolerance"}
@@ -100,7 +97,7 @@ def test_a_device_that_fails_is_a_row_and_the_sweep_goes_on(
     def fails(self: Any, array: Any) -> Any:
         raise error
 
-    monkeypatch.setattr(run.Stream, "download", fails)
+    monkeypatch.setattr(target.Stream, "download", fails)
     told, (here, there) = ran(tmp_path)
     assert told.exit_code == 1
     assert [row["status"] for row in here] == ["failed"]

@@ -15,11 +15,12 @@ from harness.base import rows
 from harness.cli import app
 from harness.config.load import load_any
 from harness.experiments.plan import Files
-from harness.simulation.on_device import bandwidth, seconds
+from harness.simulation.on_device import seconds
 from solvers.cuda import device
 from solvers.device import Marks
-from solvers.methods.lbfgs import Lbfgs
-from solvers.methods.local_global_compiled import CompiledLocalGlobal
+from solvers.methods.newton_cg import NewtonCG
+from solvers.methods.vbd import VertexBlockDescent
+from solvers.methods.xpbd import Xpbd
 from solvers.problem import Solver, Unsupported
 from tests.scenes import CLOTH_FILE, cloth
 
@@ -56,22 +57,16 @@ def test_without_a_device_a_run_is_refused_and_the_others_are_done(sweep: Path) 
 
 
 @pytest.mark.parametrize(
-    ("solver", "extras"),
-    [
-        (CompiledLocalGlobal(linear="cudss", device="cuda"), "cuda,cudss"),
-        (Lbfgs(linear="cudss", device="cuda"), "cuda,cudss"),
-        (Lbfgs(preconditioner="a-jacobi", device="cuda"), "cuda"),
-    ],
-    ids=["numba, cudss", "lbfgs, cudss", "lbfgs, a-jacobi"],
+    "solver",
+    [VertexBlockDescent(device="cuda"), NewtonCG(preconditioner="schwarz", device="cuda"), Xpbd(device="cuda")],
+    ids=["vbd", "newton-cg", "xpbd"],
 )
-def test_the_command_installs_all_that_a_method_needs(
-    solver: Solver, extras: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_installs_all_that_a_method_needs(solver: Solver, monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(package: str) -> str:
         raise PackageNotFoundError(package)
 
     monkeypatch.setattr(device, "version", missing)
-    with pytest.raises(Unsupported, match=re.escape(f"`.venv/bin/pip install -e '.[{extras}]'`")):
+    with pytest.raises(Unsupported, match=re.escape("`.venv/bin/pip install -e '.[cuda]'`")):
         solver.prepare(cloth(3).system)
 
 
@@ -86,6 +81,7 @@ def test_runs_on_the_processor_are_named_as_before_there_were_devices(sweep: Pat
         ("{name: vbd, device: gpu}", "'cpu' or 'cuda'"),
         ("{name: vbd, precision: float32}", "precision: float32 is for `device: cuda`"),
         ("{name: vbd, device: cuda, precision: float16}", "'float32' or 'float64'"),
+        ("{name: lbfgs, device: cuda}", "device"),
     ],
 )
 def test_what_no_device_knows_is_refused(entry: str, said: str, sweep: Path) -> None:
@@ -109,14 +105,6 @@ def test_events_tell_kernels_and_transfers_apart() -> None:
     told = seconds(Marks(At(1.0), At(3.0), At(10.0), At(10.5)))
     assert told == pytest.approx({"kernel_seconds": 7e-3, "transfer_seconds": 2.5e-3})
     assert seconds(None) == {}, "of a device without a clock nothing is told"
-
-
-def test_a_devices_bandwidth_is_that_of_its_best_triad() -> None:
-    took = iter([9.0, 4.0, 2.0, 4.0, 4.0, 4.0])
-    remote: Any = SimpleNamespace(triad=lambda: (6e9, At(0.0), At(next(took))))
-    assert bandwidth(remote) == pytest.approx(3e12)
-    silent: Any = SimpleNamespace(triad=lambda: None)
-    assert bandwidth(silent) is None
 
 
 class Refused(Exception):

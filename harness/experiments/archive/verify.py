@@ -52,7 +52,7 @@ UNREPEATED = frozenset(
         *("seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted", "adds_up", "estimate_seconds"),
         *("kernel_seconds", "transfer_seconds", "load", "started", "machine", "node", "cpu", "cores", "memory_gib"),
         *("machine_bandwidth", "machine_flops", "machine_step", "system", "versions", "commit", "code", "device"),
-        *("device_memory_gib", "device_driver", "device_versions", "device_bandwidth", "sm_clock_mhz"),
+        *("device_memory_gib", "device_driver", "device_versions", "sm_clock_mhz"),
         *("memory_clock_mhz", "power_w", "power_limit_w", "performance_state", "temperature_c", "sweep", "recorded"),
         *("time_limit", "memory_limit", "timing", "at_once", "pinned"),
     )

@@ -1,20 +1,19 @@
-"""Conjugate gradients on a device, linear and nonlinear: the processor's iterates, in both precisions."""
+"""Newton's method by conjugate gradients on a device: the processor's iterates, in both precisions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
 
+from solvers.core.preconditioning import Preconditioning
 from solvers.cuda import sums
 from solvers.cuda.device import simulated
 from solvers.cuda.target import cuda
 from solvers.linear import schwarz
 from solvers.methods.newton_cg import NewtonCG
-from solvers.methods.pncg import NonlinearCG
 from solvers.problem import StepProblem, StopRule, Unsupported
 from tests.cuda.near import same_iterates
 from tests.effects import BEND, DASHPOTS, DRAG, LIMITS, stepped
@@ -22,8 +21,7 @@ from tests.effects import SCENES as EFFECTS
 from tests.effects import cloth as cloth_with
 from tests.scenes import SCENES, cloth, first_problem, random_problem
 
-METHODS: dict[str, Callable[..., Any]] = {"newton-cg": NewtonCG, "pncg": NonlinearCG}
-methods = pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
+schwarz_cg = partial(NewtonCG, preconditioner="schwarz")
 
 PROBLEMS: dict[str, Callable[[], StepProblem]] = {
     "chain": lambda: first_problem(SCENES["chain"](1e10)),
@@ -33,50 +31,47 @@ PROBLEMS: dict[str, Callable[[], StepProblem]] = {
 }
 
 
-@methods
 @pytest.mark.parametrize("make", PROBLEMS.values(), ids=list(PROBLEMS))
-def test_iterates_are_those_of_the_processor(make: Callable[[], StepProblem], method: Callable[..., Any]) -> None:
-    same_iterates(partial(method, preconditioner="block-jacobi"), make(), 3)
+def test_iterates_are_those_of_the_processor(make: Callable[[], StepProblem]) -> None:
+    same_iterates(schwarz_cg, make(), 3)
 
 
-@methods
 @pytest.mark.parametrize(
     ("name", "make"), [(n, m) for n, m in PROBLEMS.items() if n != "chain"], ids=list(PROBLEMS)[1:]
 )
-def test_iterates_with_schwarz_are_those_of_the_processor(
-    name: str, make: Callable[[], StepProblem], method: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+def test_iterates_on_several_levels_are_those_of_the_processor(
+    name: str, make: Callable[[], StepProblem], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In patches of three, so that small scenes have three levels, and a last patch that is not full."""
     monkeypatch.setattr(schwarz, "PATCH", 3)
-    same_iterates(partial(method, preconditioner="schwarz"), make(), 2)
+    same_iterates(schwarz_cg, make(), 2)
 
 
-@methods
-def test_it_ends_where_the_processor_does(method: Callable[..., Any]) -> None:
+def test_it_ends_where_the_processor_does() -> None:
     """Kernels in float32, and a minimum in float64."""
     problem, rule = first_problem(cloth(3, "exact")), StopRule(200, 1e-8)
-    there = method(preconditioner="block-jacobi", device="cuda").prepare(problem.system).solve(problem, rule)
-    here = method(preconditioner="block-jacobi").prepare(problem.system).solve(problem, rule)
+    there = schwarz_cg(device="cuda").prepare(problem.system).solve(problem, rule)
+    here = schwarz_cg().prepare(problem.system).solve(problem, rule)
     assert there.stopped == "tolerance"
     np.testing.assert_allclose(there.positions, here.positions, rtol=0, atol=1e-7)
 
 
-@methods
 @pytest.mark.parametrize(
     ("make", "preconditioner", "named"),
     [
-        (lambda: stepped(cloth_with(LIMITS)), "block-jacobi", "StrainLimits"),
-        (lambda: stepped(EFFECTS["contact"]()), "block-jacobi", "ContactEnergy|Contact"),
-        (lambda: stepped(EFFECTS["gas"]()), "block-jacobi", "Gas"),
-        (lambda: first_problem(cloth(3, "exact")), "factor", "block-jacobi and schwarz, not factor"),
+        (lambda: stepped(cloth_with(LIMITS)), "schwarz", "StrainLimits"),
+        (lambda: stepped(EFFECTS["contact"]()), "schwarz", "ContactEnergy|Contact"),
+        (lambda: stepped(EFFECTS["gas"]()), "schwarz", "Gas"),
+        (lambda: first_problem(cloth(3, "exact")), "factor", "knows preconditioner: schwarz, not factor"),
+        (lambda: first_problem(cloth(3, "exact")), "block-jacobi", "knows preconditioner: schwarz, not block-jacobi"),
     ],
-    ids=["strain limits", "contact", "gas", "factor"],
+    ids=["strain limits", "contact", "gas", "factor", "block-jacobi"],
 )
 def test_what_it_does_not_know_it_refuses_by_name(
-    make: Callable[[], StepProblem], preconditioner: str, named: str, method: Callable[..., Any]
+    make: Callable[[], StepProblem], preconditioner: Preconditioning, named: str
 ) -> None:
     with pytest.raises(Unsupported, match=f"device: cuda: .*({named})"):
-        method(preconditioner=preconditioner, device="cuda").prepare(make().system)
+        NewtonCG(preconditioner=preconditioner, device="cuda").prepare(make().system)
 
 
 def test_sums_of_blocks_are_added_by_a_tree(monkeypatch: pytest.MonkeyPatch) -> None:
