@@ -1,1 +1,1 @@
-"""What every part of the harness stands on: errors, YAML with lines, models, rows, the machine."""
+"""Foundations of the harness: errors, YAML with line numbers, models, rows and machine facts."""

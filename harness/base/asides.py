@@ -1,9 +1,9 @@
 # pyright: reportUnknownMemberType=false
-# Numba tells no types.
-"""What a piece of work does beside its steps, said on the way that its steps are told: compiling, and waiting.
+# Numba has no type stubs.
+"""Progress events for activities that are not steps: compilation and waiting.
 
-The time of it is no measure of the work, so whoever foretells an end leaves it out; and whoever limits a piece leaves
-out what it waited.
+They use the callback that reports the steps. Estimates of the remaining time exclude both activities, and time limits
+exclude the waiting time.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 
 COMPILING, WAITING, LOOK = "compiling (once)", "waiting for the machine", ""
-"""LOOK is no aside: it says that time goes by and nothing else has happened."""
+"""POLL is no activity. It reports that time has passed and that nothing else has happened."""
 
 _BEGIN, _END = "\0begin ", "\0end "
 
@@ -21,7 +21,12 @@ Tick = Callable[[str], None]
 
 @contextmanager
 def aside(tick: Tick, what: str) -> Generator[None]:
-    """Say that something else than a step goes on, as long as it does."""
+    """Report an activity that is not a step while the block runs.
+
+    Args:
+        tick: progress callback.
+        activity: description, such as COMPILING or WAITING.
+    """
     tick(_BEGIN + what)
     try:
         yield
@@ -30,23 +35,23 @@ def aside(tick: Tick, what: str) -> Generator[None]:
 
 
 def begun(said: str) -> str | None:
-    """What begins, if that was said."""
+    """Return the activity that a message starts, or None for any other message."""
     return said.removeprefix(_BEGIN) if said.startswith(_BEGIN) else None
 
 
 def ended(said: str) -> str | None:
-    """What ends, if that was said."""
+    """Return the activity that a message ends, or None for any other message."""
     return said.removeprefix(_END) if said.startswith(_END) else None
 
 
 def is_step(said: str) -> bool:
-    """Whether it tells of a step, by the name of its phase."""
+    """Return whether a message reports a step, by the name of its phase."""
     return said != LOOK and not said.startswith("\0")
 
 
 @contextmanager
 def compiling_told(tick: Tick) -> Generator[None]:
-    """Say of kernels when they are compiled within this; those that are found on disk are not."""
+    """Report the compilation of kernels inside the block; kernels loaded from the cache are not reported."""
     from numba.core import event  # where nothing is compiled, nobody waits for it
 
     class Watch(event.Listener):

@@ -1,4 +1,4 @@
-"""Where in the code something went wrong: of an error, and of what a process that died has written down."""
+"""Locate errors in source code, from exceptions and from the dumps of crashed processes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from solvers import sources
 
 
 def said(error: BaseException) -> str:
-    """The type of an error and its message in one line, cut to a length that fits; other people's may fail to tell."""
+    """Return the type and the message of an error in one line of at most 300 characters.
+
+    An exception of user code may fail to produce its message; a placeholder then takes its place.
+    """
     try:
         words = " ".join(str(error).split())[:300]
     except Exception:
@@ -20,8 +23,17 @@ def said(error: BaseException) -> str:
 
 
 def where(error: BaseException, own: Collection[str]) -> str:
-    """`file:line` of an error: the last line in the files `own`, else in those of other people, else of all; with the
-    line that raised it behind that, where it is another."""
+    """Return `file:line` of an error.
+
+    The line is the last one in user_files, else the last one in any user code, else the last one. The line that raised
+    the
+    error is appended if it is another one.
+
+    Args:
+        error: exception with a traceback.
+        user_files: paths of the user's source files.
+    Returns: the location, such as `mine.py:12, raised in core.py:40`.
+    """
     frames = [(frame.filename, frame.lineno or 0) for frame in traceback.extract_tb(error.__traceback__)]
     theirs = [frame for frame in frames if not sources.known(frame[0])]
     blamed = [frame for frame in frames if frame[0] in own] or theirs or frames
@@ -30,8 +42,11 @@ def where(error: BaseException, own: Collection[str]) -> str:
 
 
 def place(dump: str) -> str:
-    """`file:line in function` of what `faulthandler` wrote down, the innermost first: the first one in other people's
-    files, else the first; "" where there is none."""
+    """Return `file:line in function` from a dump of `faulthandler`.
+
+    The dump lists the innermost frame first. The first frame in user code is preferred, else the first frame is used.
+    Returns: the location, or "" if the dump has no frames.
+    """
     frames = re.findall(r'File "(.+?)", line (\d+) in (\S+)', dump)
     if not frames:
         return ""

@@ -1,7 +1,8 @@
-"""Foreign input is read in a process of its own, which may hang, swell or crash, and this one goes on.
+"""Run a function in a sandboxed subprocess that may hang, exhaust memory or crash.
 
-One child serves all calls of a process, one after the other, and is started anew when it was lost. Before each call it
-limits its own processor time and memory, both counted from there. Function, arguments and answer travel as pickles.
+It reads untrusted input. One subprocess serves all calls of a process, one after the other, and is restarted after a
+failure. Before each call it limits its own processor time and memory, both counted from that moment. Function,
+arguments and result are transferred as pickles.
 """
 
 from __future__ import annotations
@@ -23,27 +24,34 @@ from typing import Any, BinaryIO
 from harness.base.errors import InputError
 
 _PATIENCE = 10.0
-"""Wall seconds that a call may take for each second of processor time: others may hold the cores."""
+"""Wall seconds allowed per second of processor time, because other processes may occupy the cores."""
 
 _LENGTH = struct.Struct("<Q")
 
 
 @dataclass(frozen=True, slots=True)
 class Allowance:
-    """What a call may take: seconds of processor time, and bytes of memory beyond what the child has already."""
+    """Limits of one call: processor time [s], and memory [bytes] beyond that in use at its start."""
 
     seconds: float
     bytes: int
 
 
 class NoAnswer(Exception):
-    """The child gave no answer; the message says why, as the end of a sentence."""
+    """The subprocess returned no result; the message gives the reason as the end of a sentence."""
 
 
 def call(function: Callable[..., Any], *arguments: Any, limits: Allowance) -> Any:
-    """What a function of a module says to these arguments, within limits; all of it must pickle.
+    """Call a module-level function in the sandbox, within limits.
 
-    Raises InputError where the function does, and NoAnswer where it raises anything else, takes too much, or crashes.
+    Args:
+        function: function of a module; it is pickled by reference.
+        arguments: positional arguments, which must pickle.
+        limits: processor time and memory of this call.
+    Returns: the function's return value, which must pickle.
+    Raises:
+        InputError: if the function raises it.
+        SandboxError: if the function raises anything else, exceeds a limit, or crashes.
     """
     child = _Child.running()
     try:
@@ -66,7 +74,7 @@ def _why(code: int, limits: Allowance) -> str:
 
 
 class _Child:
-    """A running process that serves calls."""
+    """A running subprocess that serves calls."""
 
     _one: _Child | None = None
 
@@ -85,7 +93,7 @@ class _Child:
 
     @classmethod
     def running(cls) -> _Child:
-        """The child of this process; a fork of it gets one of its own."""
+        """Return the subprocess of this process; a fork starts its own."""
         one = cls._one
         if one is None or one._owner != os.getpid() or one._process.poll() is not None:
             one = cls._one = cls()
@@ -94,7 +102,7 @@ class _Child:
 
     @classmethod
     def of_this_process(cls) -> int:
-        """Its process, 0 where none was started here."""
+        """Return the id of the subprocess, or 0 if none was started here."""
         return cls._one._process.pid if cls._one and cls._one._owner == os.getpid() else 0
 
     def send(self, message: Any) -> None:
@@ -102,7 +110,12 @@ class _Child:
         _write(self._process.stdin, message)
 
     def receive(self, seconds: float) -> Any:
-        """The next message; raises EOFError where the child ends before it, as it has to after so many seconds."""
+        """Receive the next message.
+
+        The subprocess is killed after the given number of seconds.
+        Raises:
+            EOFError: if the subprocess ends before the message.
+        """
         assert self._process.stdout
         timer = Timer(seconds, self._process.kill)
         timer.start()
@@ -112,7 +125,7 @@ class _Child:
             timer.cancel()
 
     def end(self) -> int:
-        """End it, if it has not ended by itself; its exit code, negative for a signal."""
+        """Stop the subprocess if it is still running, and return its exit code, negative for a signal."""
         if self._owner != os.getpid():
             return 0
         for pipe in (self._process.stdin, self._process.stdout):
@@ -142,7 +155,10 @@ def _read(pipe: BinaryIO | Any) -> Any:
 
 
 def serve() -> None:
-    """Serve calls until there are no more: what the child does. What readers print goes nowhere."""
+    """Serve calls until the pipe is closed; this is the main loop of the subprocess.
+
+    Output that the called functions print is discarded.
+    """
     without_core_dumps()
     calls, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_RDWR)
@@ -178,8 +194,12 @@ def _answer(function: Callable[..., Any], arguments: tuple[Any, ...], limits: Al
 
 @contextmanager
 def memory_limited(bytes: int) -> Generator[None]:
-    """Let this process take at most so many bytes more for a while: what needs more raises MemoryError, or the error of
-    a library."""
+    """Limit the additional memory of this process inside the block.
+
+    A larger allocation raises MemoryError, or the error of a library.
+    Args:
+        memory_bytes: allowed bytes beyond those in use now.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     wanted = data() + bytes
     limit(resource.RLIMIT_DATA, wanted if soft == resource.RLIM_INFINITY else min(wanted, soft))
@@ -190,24 +210,29 @@ def memory_limited(bytes: int) -> Generator[None]:
 
 
 def reader() -> int:
-    """The process that reads for this one; 0 where there is none."""
+    """Return the process id of the sandbox of this process, or 0 if there is none."""
     return _Child.of_this_process()
 
 
 def without_core_dumps() -> None:
-    """Let this process and its children leave no dump of their memory when they crash."""
+    """Disable core dumps of this process and its children."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def limit(what: int, value: float) -> None:
-    """Set a soft limit; the hard one stays, so that the next call may have another."""
+    """Set a soft resource limit and leave the hard limit, so that the next call can use another value.
+
+    Args:
+        resource_id: constant `resource.RLIMIT_*`.
+        value: limit in the unit of the resource, or RLIM_INFINITY.
+    """
     hard = resource.getrlimit(what)[1]
     soft = int(value) if value != resource.RLIM_INFINITY else hard
     resource.setrlimit(what, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
 
 
 def data() -> int:
-    """Bytes of memory that this process has of its own, as the limit counts them; 0 where the system does not say."""
+    """Return the data size of this process as RLIMIT_DATA counts it [bytes], or 0 if unavailable."""
     with suppress(OSError), open("/proc/self/status") as file:
         return next((1024 * int(line.split()[1]) for line in file if line.startswith("VmData:")), 0)
     return 0

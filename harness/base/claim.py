@@ -1,7 +1,7 @@
-"""A folder of results belongs to one config: two of one name would write over each other's pictures.
+"""Ownership of results folders: each belongs to one config, so that two of one name cannot overwrite each other.
 
-The folder holds the way to its config. A config that was moved takes its folder along; one that still is where it was
-keeps it.
+The folder stores the relative path of its config. A config that was moved together with its results remains the owner,
+and so does one that is still at its old path.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ NAME = ".config"
 
 
 _LONGEST = 4096
-"""Bytes of a way to a config; no path is longer."""
+"""Maximum length of a config path [bytes]; no path is longer."""
 
 
 def config_of(folder: Path) -> Path | None:
-    """The config whose results a folder holds, all links resolved, where it can be found."""
+    """Return the resolved path of the config that owns a folder, or None if it cannot be found."""
     note = folder / NAME
     with suppress(OSError, ValueError):  # what a folder from elsewhere says may be no path at all
         if note.is_file():
@@ -33,7 +33,15 @@ def config_of(folder: Path) -> Path | None:
 
 
 def claimed(folder: Path, config: Path) -> Path:
-    """The folder of a config's results, made if it is not there. Raises InputError where it is another config's."""
+    """Create the results folder of a config if needed, and record its owner.
+
+    Args:
+        folder: results folder.
+        config: file of the config, which must exist.
+    Returns: the folder.
+    Raises:
+        InputError: if the folder belongs to another config.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     owner = config_of(folder)
     if owner and not owner.samefile(config):

@@ -1,4 +1,4 @@
-"""The columns of a run's rows: `COLUMNS` is their schema and its documentation at once.
+"""Columns of the rows of a run: `RUN_COLUMNS` is both their schema and their documentation.
 
 `results/README.md` shows the same table.
 """
@@ -12,7 +12,7 @@ import pyarrow as pa
 
 
 class Column(NamedTuple):
-    """One column: its name, Arrow type, unit ("" for none) and meaning."""
+    """One column: name, Arrow type, unit ("" if dimensionless) and description."""
 
     name: str
     type: pa.DataType
@@ -291,7 +291,7 @@ COLUMNS = (
 
 
 def schema_of(columns: Iterable[Column]) -> pa.Schema:
-    """The Arrow schema of columns, in their order."""
+    """Build the Arrow schema of columns, in their order."""
     return pa.schema([pa.field(c.name, c.type) for c in columns])
 
 
@@ -301,14 +301,14 @@ _BY_NAME = {column.name: column for column in COLUMNS}
 
 
 def as_in_runs(*names: str) -> tuple[Column, ...]:
-    """Columns of other rows that mean what they mean in those of runs."""
+    """Return columns of other tables that have the same definition as in the rows of runs."""
     return tuple(_BY_NAME[name] for name in names)
 
 
 OF_SOLVER = as_in_runs("family", "reference", "minimises", "own_steps")
-"""What a solver states of itself."""
+"""Metadata of a solver."""
 
 PROVENANCE = as_in_runs(
     *("machine", "node", "cpu", "cores", "memory_gib", "system", "versions", "commit", "code", "started"),
 )
-"""Where, when and by which code something was measured."""
+"""Machine, time and code version of a measurement."""

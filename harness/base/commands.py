@@ -1,4 +1,4 @@
-"""A command line that answers what goes wrong with a message and an exit code instead of a traceback."""
+"""Shared command-line options, and a command group that reports errors without a traceback."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Peers = Annotated[bool, typer.Option("--peers", help="With --error: time other l
 
 
 class Commands(TyperGroup):
-    """Answers our own errors and those of the system."""
+    """A command group that reports the project's errors and system errors as a message and an exit code."""
 
     def invoke(self, ctx: Any) -> Any:
         show_log()

@@ -1,6 +1,6 @@
-"""Where the command line writes: tables to standard output; messages, and what the log tells, to standard error.
+"""Console output: tables on standard output, messages and log records on standard error.
 
-Rich is loaded when something is written: no command has to wait for it before.
+Rich is imported on first output, so that no command waits for it earlier.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from rich.table import Column, Table
 
 _LONGEST = 4_000
-"""Characters of a line: names in foreign files may have millions."""
+"""Maximum number of characters of a line; names in untrusted files may have millions."""
 WIDTH = 100
-"""Columns that tables of our own take at most, wherever they are printed."""
+"""Maximum width of the project's own tables, in columns."""
 _PIPE = 240
-"""Columns of a pipe or a file, which has no width of its own, and where no cell should be cut."""
+"""Width of a pipe or a file, in columns. Neither has a width of its own, and no cell should be truncated there."""
 
 
 @cache
 def out() -> Console:
-    """Standard output."""
+    """Return the console of standard output."""
     from rich.console import Console
 
     made = Console()
@@ -35,15 +35,24 @@ def out() -> Console:
 
 @cache
 def err() -> Console:
-    """Standard error."""
+    """Return the console of standard error."""
     from rich.console import Console
 
     return Console(stderr=True)
 
 
 def narrow(table: Table, beside: int = 1, width: int = WIDTH) -> Group:
-    """A table in parts of `width` characters at most: as many of its columns as fit, beside the first of them, without
-    those that say nothing. What is wider alone is folded."""
+    """Split a table into parts of at most `width` characters.
+
+    Each part repeats the first key_columns columns and adds as many others as fit. Columns without values are omitted.
+    A
+    column that is too wide by itself is folded.
+    Args:
+        table: table to split.
+        key_columns: number of leading columns that each part repeats.
+        width: maximum width, in characters.
+    Returns: the parts, followed by the caption.
+    """
     from rich.console import Console, Group
     from rich.constrain import Constrain
     from rich.measure import Measurement
@@ -67,7 +76,7 @@ def narrow(table: Table, beside: int = 1, width: int = WIDTH) -> Group:
 
 
 def _with(table: Table, columns: Sequence[Column]) -> Table:
-    """These columns of a table, without its title and caption."""
+    """Return a table with the given columns only, without title and caption."""
     from rich.table import Table
 
     part = Table(box=table.box, padding=table.padding, pad_edge=table.pad_edge, title_justify="left")
@@ -82,8 +91,10 @@ def _with(table: Table, columns: Sequence[Column]) -> Table:
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Lines of cells in columns, the first of them headings: plain, for tables of many thousand lines, of which Rich
-    lays out a thousand a second."""
+    """Format lines of cells as a plain table whose first line has the headings.
+
+    It is for tables of many thousand lines, of which Rich lays out a thousand per second.
+    """
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for number, line in enumerate(lines):
         yield "  ".join(map(str.ljust, line, widths)).rstrip()
@@ -92,7 +103,7 @@ def aligned(lines: Sequence[Sequence[str]]) -> Iterator[str]:
 
 
 def say(line: str) -> None:
-    """Print a line to standard error, as it stands; no more of it than fits a screen."""
+    """Print one line to standard error without markup, truncated to 4000 characters."""
     from rich.markup import escape
 
     err().print(
@@ -104,7 +115,7 @@ def say(line: str) -> None:
 
 
 def show_log() -> None:
-    """Show what the project's modules log, such as effects that were left out, each message once."""
+    """Print the log messages of the project, such as omitted effects, each message once."""
     log = logging.getLogger("springbench")
     if not log.handlers:
         handler = _Saying()
@@ -114,21 +125,21 @@ def show_log() -> None:
 
 
 def write_plainly() -> None:
-    """In a copy of this process: write to its own standard error, whatever is drawn on this one's."""
+    """In a forked process, write to its own standard error with the parent's console width."""
     width = err().width
     err.cache_clear()
     err().width = width
 
 
 class _Saying(logging.Handler):
-    """Says each message."""
+    """Prints each log message."""
 
     def emit(self, record: logging.LogRecord) -> None:
         say(record.getMessage())
 
 
 class _Once(logging.Filter):
-    """Lets a message pass once: a command builds a scene several times."""
+    """Drops repeated log messages, because a command builds a scene several times."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,7 +1,7 @@
-"""Several pieces of work at once, each in a worker of its own, from one thread.
+"""Worker pool: run several tasks concurrently, each in its own worker process, from one thread.
 
-A worker does pieces of one group one after the other where it can, because they share what is found once: a reference
-motion, a mesh.
+Where possible a worker runs tasks of one group one after the other, because they share cached data such as a reference
+trajectory or a mesh.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 from harness.base.workers import Going, Limits, Lost, Piece, Tick, Workers
 
 _LOOK = 0.1
-"""Seconds between two looks at workers that are at work."""
+"""Seconds between two polls of busy workers."""
 
 
 class Task(NamedTuple):
-    """A piece of work, what it may take, to whom it ticks, its group, and the code of others that it runs."""
+    """One task: function, progress callback, limits, group, and the user code that it runs."""
 
     piece: Piece
     tick: Tick
@@ -30,7 +30,7 @@ class Task(NamedTuple):
 
 
 Start = Callable[[int], Task | None]
-"""What to do of the task of a number: None where it is done already, or by somebody else."""
+"""Create the task of a given index; None if it is finished already or runs elsewhere."""
 
 
 @dataclass
@@ -41,7 +41,7 @@ class _Member:
     going: Going | None = None
 
     def end(self) -> None:
-        """Stop what it does."""
+        """Stop the running task and the worker."""
         if self.going:
             self.going.close()
         self.workers.end()
@@ -54,11 +54,19 @@ def done_by(
     start: Start,
     meanwhile: Callable[[], object] | None = None,
 ) -> Iterator[tuple[int, Any]]:
-    """Do tasks by so many workers; yields (number, value or Lost) of each that is done, in that order.
+    """Run tasks in a pool of workers and yield each result as it is completed.
 
-    ready: called in each worker before anything else; groups: of the tasks, by number; start: see there, called when a
-    task's turn comes; meanwhile: done here once the workers have begun, and nothing is looked at as long as it takes.
-    Raises what a piece raises. Whoever stops asking ends the workers.
+    Args:
+        num_workers: maximum number of concurrent workers.
+        initialiser: called first in each worker.
+        groups: group of each task, by index.
+        create_task: called with the index of a task when a worker is available for it.
+        background_call: called once in this process after the workers have started. No worker is polled until it
+            returns.
+    Yields: (index, value or TaskFailure) in order of completion.
+    Raises: the SpringbenchError that a task raises.
+
+    Closing the generator stops the workers.
     """
     left = dict(enumerate(groups))
     with ExitStack() as cleanup:
@@ -95,7 +103,7 @@ def done_by(
 
 
 def _next(left: dict[int, Hashable], member: _Member, others: list[Hashable]) -> int:
-    """The next task of the worker's own group, else of one that nobody is at, else any."""
+    """Select the next task: of the worker's own group, else of a group that no other worker runs, else any."""
     grouped = {number: group for number, group in left.items() if group is not None}
     own = (number for number, group in grouped.items() if group == member.group)
     new = (number for number, group in grouped.items() if group not in others)

@@ -1,4 +1,4 @@
-"""Configs as plain data that remembers its lines, and data to models with every mistake at once."""
+"""Config documents: plain data with line numbers, validated by models with all mistakes collected."""
 
 from __future__ import annotations
 
@@ -30,9 +30,13 @@ def _nothing(said: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class OwnCode:
-    """What becomes of code of others that a config names. opens: whether it is imported here, else it is told by its
-    files alone; tell: told what is about to be imported; stated: by solver, what its class states, where that is known;
-    kept: whether parameters of shipped solvers may be those of an earlier time."""
+    """Policy for user code that a config names.
+
+    imports_code: whether the code is imported here; otherwise only its files identify it.
+    on_import: called with a description before each import.
+    solver_metadata: metadata of each solver class by solver name, as far as it was read before.
+    uses_cache: whether cached parameters of shipped solvers may be used.
+    """
 
     opens: bool = True
     tell: Callable[[str], None] = _nothing
@@ -41,9 +45,9 @@ class OwnCode:
 
 
 IMPORTED = OwnCode()
-"""Code of others is imported."""
+"""Import user code."""
 UNOPENED = OwnCode(opens=False)
-"""Code of others stays what it is, files."""
+"""Do not import user code; treat it as files."""
 
 
 @dataclass(slots=True)
@@ -60,14 +64,19 @@ class Document:
     own: OwnCode = IMPORTED
 
     def report(self, problem: str, at: Key = ()) -> None:
-        """Note a mistake at a key; a key that is not in the file gets the line of the mapping around it."""
+        """Add a mistake at a key; a key that is not in the file gets the line of its parent mapping."""
         line = next((self.lines[at[:k]] for k in range(len(at), -1, -1) if at[:k] in self.lines), None)
         self.mistakes.append(Mistake(problem, self.path, line, key_text(at)))
 
     def check(self, model: type[M], data: Any, at: Key = ()) -> M | None:
-        """`data`, which stands at `at`, as a `model`; None after its mistakes were noted.
+        """Validate data with a model and add its mistakes to the document.
 
-        It is validated as strict JSON: a list may stand for a tuple, but no boolean or text for a number.
+        The data is validated as strict JSON. A list may represent a tuple, but no boolean or text a number.
+        Args:
+            model: pydantic model.
+            data: plain data.
+            at: location of the data in the document.
+        Returns: the model instance, or None if there are mistakes.
         """
         try:
             return model.model_validate_json(json.dumps(data), strict=True, context={"folder": self.path.parent})
@@ -85,7 +94,7 @@ class Document:
             return None
 
     def with_paths(self, model: type[BaseModel], data: dict[str, Any], at: Key) -> dict[str, Any]:
-        """The data with its file names made relative to the config's folder; a missing file is a mistake."""
+        """Resolve file names relative to the config's folder; a missing file is a mistake."""
         names = [k for k, f in model.model_fields.items() if f.annotation is Path and isinstance(data.get(k), str)]
         for key in names:
             data = data | {key: str(self.path.parent / data[key])}
@@ -94,7 +103,15 @@ class Document:
         return data
 
     def choose(self, data: Any, table: Mapping[str, Any], tag: str, at: Key) -> tuple[str, dict[str, Any]] | None:
-        """Split the mapping `data` into the name under its key `tag`, one of `table`, and its other keys."""
+        """Split a mapping into the name under its tag and its other keys.
+
+        Args:
+            data: value that should be a mapping.
+            table: known names.
+            tag: key that selects the name, such as `kind`.
+            at: location of the data in the document.
+        Returns: (name, other keys), or None after a mistake was added.
+        """
         if not is_mapping(data) or not isinstance(data.get(tag), str):
             place = (*at, tag) if is_mapping(data) and tag in data else at
             self.report(f"should be a mapping with a `{tag}`, {did_you_mean('', table)}", place)
@@ -105,36 +122,36 @@ class Document:
         return data[tag], {key: value for key, value in data.items() if key != tag}
 
     def error(self) -> InputError:
-        """All mistakes (the first MAX_MISTAKES of them), sorted by line."""
+        """Return an error with all mistakes (at most MAX_MISTAKES), sorted by line."""
         found = sorted(self.mistakes, key=lambda mistake: (str(mistake.file), mistake.line or 0))
         more = [Mistake("... and more; mend these first", self.path)] if len(found) > MAX_MISTAKES else []
         return InputError(found[:MAX_MISTAKES] + more)
 
 
 def key_text(at: Key) -> str:
-    """A key as users write it: `effects[2].weight`."""
+    """Format a key as users write it: `effects[2].weight`."""
     text = "".join(f"[{k}]" if isinstance(k, int) else f".{k if k.isprintable() else ascii(k)}" for k in at)
     return text.removeprefix(".")[:200]
 
 
 def is_mapping(data: object) -> TypeGuard[dict[str, Any]]:
-    """Whether data of a config is a mapping; its keys are text."""
+    """Return whether config data is a mapping; its keys are text."""
     return isinstance(data, dict)
 
 
 def is_list(data: object) -> TypeGuard[list[Any]]:
-    """Whether data of a config is a list."""
+    """Return whether config data is a list."""
     return isinstance(data, list)
 
 
 def quote(value: object) -> str:
-    """A value as JSON, cut to a length that fits a message."""
+    """Format a value as JSON, truncated to 60 characters for a message."""
     text = json.dumps(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _place(detail: ErrorDetails, data: Any) -> Key:
-    """The key in `data` that an error is about; names of union members in its location are passed over."""
+    """Return the key that a validation error refers to, without the names of union members in its location."""
     key: Key = ()
     for step in detail["loc"]:
         if _holds(data, step):
@@ -147,7 +164,7 @@ def _holds(data: Any, step: str | int) -> bool:
 
 
 def _problem(detail: ErrorDetails, model: type[BaseModel], key: Key) -> str:
-    """What came and what was wanted."""
+    """Describe the given value and the expected one."""
     kind, said = detail["type"], detail["msg"]
     if kind == "missing":
         return "is missing" if isinstance(detail["loc"][-1], str) else "has too few items"
@@ -168,7 +185,7 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], key: Key) -> str:
 
 
 def _models_at(model: type[BaseModel], location: Key) -> list[type[BaseModel]]:
-    """The model of the mapping at an error's location, which names the member of a union by its kind; or all."""
+    """Return the models at an error's location, where a union member is selected by its kind; else all members."""
     members = [model]
     for step in location:
         if isinstance(step, int):

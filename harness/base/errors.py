@@ -1,4 +1,4 @@
-"""What goes wrong because of its input, and what goes wrong in a run."""
+"""Exceptions of the project: mistakes in the input, and failures of a run."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from pathlib import Path
 
 
 class SpringbenchError(Exception):
-    """Base of the errors that the command line answers with a message instead of a traceback."""
+    """Base of the errors that the command line reports as a message instead of a traceback."""
 
     exit_code = 1
 
 
 class RunFailed(SpringbenchError):
-    """A run ended without an answer."""
+    """A run ended without a result."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mistake:
-    """One mistake in an input: what came, where, what was wanted, what to do."""
+    """One mistake in an input: its problem with a remedy, file, line and key."""
 
     problem: str
     file: Path | None = None
@@ -33,7 +33,7 @@ class Mistake:
 
 
 class InputError(SpringbenchError):
-    """The user's mistakes, all at once."""
+    """All mistakes in the user's input."""
 
     exit_code = 2
 
@@ -45,7 +45,13 @@ class InputError(SpringbenchError):
 
 
 def did_you_mean(came: object, allowed: Iterable[str]) -> str:
-    """`one of a, b, c` and the nearest name for a typo, as the end of a message."""
+    """Format the allowed names, and the closest one as a suggestion for a typo.
+
+    Args:
+        came: name that the user gave.
+        allowed: valid names.
+    Returns: `one of a, b, c; did you mean 'b'?`, as the end of a message.
+    """
     names = sorted(allowed)
     near = difflib.get_close_matches(str(came), names, n=1)
     return f"one of {', '.join(names)}" + (f"; did you mean {near[0]!r}?" if near else "")

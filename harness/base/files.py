@@ -1,4 +1,4 @@
-"""Files that are whole or not there, and in words why one cannot be written."""
+"""Atomic file writes, lock files, safe file names, and messages for file errors."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from harness.base.errors import InputError, Mistake, SpringbenchError
 
 
 class CannotWrite(SpringbenchError):
-    """The disk is full, or will not be written for another such reason: no fault of a run, which may be done again."""
+    """A file cannot be written, for example because the disk is full; the run itself is valid and may be repeated."""
 
 
 _STEM = 100
-"""So much of a file's name stands in its partial name, which may not be too long for the disk."""
+"""Maximum length of the stem in a temporary name, which the file system limits."""
 
 
 def partial_name(path: Path) -> Path:
-    """What a file is called while this process writes it."""
+    """Return the temporary name of a file while this process writes it."""
     return path.with_name(f".{path.stem[:_STEM]}.{os.getpid()}.partial{path.suffix}")
 
 
 def half_written(path: Path) -> Iterator[Path]:
-    """What any process left half written of a file."""
+    """Find incomplete temporary files of a path, left by any process."""
     return path.parent.glob(f".{escape(path.stem[:_STEM])}.*.partial{path.suffix}")
 
 
@@ -50,8 +50,16 @@ def replacing(path: Path) -> Generator[Path]:
 
 
 def open_lock(path: Path, access: int = os.O_RDWR, *, otherwise: str = "") -> int:
-    """A file to lock, opened, and made where it is missing; access: for reading or writing. No link is followed, and
-    nothing is waited for. Raises InputError that says what is in the way; otherwise: what else to do than remove it.
+    """Open a lock file and create it if it is missing.
+
+    Symbolic links are not followed, and the call does not block.
+    Args:
+        path: lock file.
+        access: flag of `os.open`, for reading or writing.
+        hint: alternative to removing the file, appended to the error message.
+    Returns: file descriptor.
+    Raises:
+        InputError: if something else is at this path.
     """
     flags = access | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
@@ -78,24 +86,24 @@ _IN_THE_WAY = {errno.EACCES, errno.EPERM, errno.EISDIR, errno.ELOOP, errno.ENXIO
 
 
 def _kind(mode: int) -> str:
-    """What a file is that is no plain one, in words."""
+    """Describe the type of a file that is not a regular file."""
     kinds = {stat.S_IFIFO: "a pipe", stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFSOCK: "a socket"}
     return kinds.get(stat.S_IFMT(mode), "a device")
 
 
 def is_file_name(text: str) -> bool:
-    """Whether a text is the name of a file or of a folder, and no path."""
+    """Return whether a text is a valid name of a file or folder, and not a path."""
     size = len(text.encode(errors="surrogateescape"))
     return 0 < size <= 240 and "/" not in text and "\0" not in text and text not in (".", "..")
 
 
 def safe_name(text: str) -> str:
-    """The text as the name of a file in a folder, whatever it says: letters, digits and any of `._-` are left."""
+    """Convert a text to a safe file name of letters, digits, `.`, `_` and `-`."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._")[:200] or "_"
 
 
 def users_cache(name: str) -> Path:
-    """Where a kind of file is kept for the user, between commands; the folder may not be there."""
+    """Return the user's cache folder for one kind of file; it may not exist."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "springbench" / name
 
 
@@ -103,33 +111,39 @@ MISTAKES = {
     *(errno.EACCES, errno.EEXIST, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENODEV, errno.ENOENT),
     *(errno.ENOTDIR, errno.ENXIO, errno.EOPNOTSUPP, errno.EPERM, errno.EROFS),
 }
-"""What the system says to a path that is the user's mistake."""
+"""Error numbers that indicate a mistake of the user in a path."""
 
 
 def told(error: OSError) -> str:
-    """The file that an error is about, and why, as a message."""
+    """Describe a system error as a message with its file and cause."""
     names = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
     return f"{names or 'a file'}: {reason(error)}"
 
 
 def cannot_write(path: Path, error: Exception) -> CannotWrite:
-    """What to raise where a file cannot be written because of an error."""
+    """Build the error for a file that cannot be written."""
     return CannotWrite(f"{path}: cannot be written: {reason(error)}")
 
 
 def reason(error: Exception) -> str:
-    """What the system says of an error, else what the error does: `No space left on device`."""
+    """Describe the cause of an error in the system's words, such as `No space left on device`, else in its own
+    words."""
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else " ".join(str(error).split()) or type(error).__name__
 
 
 HEAD = 1024
-"""Bytes by which `misnamed` tells what a file is."""
+"""Number of leading bytes that `describe_misnamed_file` examines."""
 
 
 def misnamed(head: bytes, size: int) -> str:
-    """Say what a file is that has the name of a data file and holds none, by its first HEAD bytes and its size; "" for
-    any other file."""
+    """Describe a file that has the name of a data file but other content.
+
+    Args:
+        head: first HEAD_BYTES bytes of the file.
+        size: size of the file [bytes].
+    Returns: the end of a sentence for an empty file, a Git LFS pointer or a web page; "" for any other file.
+    """
     start = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if not start and size <= len(head):
         return "is empty"

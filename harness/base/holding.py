@@ -1,4 +1,4 @@
-"""Who works in a folder of results: one process alone, or several together that claim units one by one."""
+"""Locks on a results folder: exclusive for one process, or shared by processes that claim units one by one."""
 
 from __future__ import annotations
 
@@ -16,15 +16,19 @@ from harness.base.files import open_lock
 DONE, TAKEN = "was done by another command", "is left to another command"
 
 _PATIENCE = 5.0
-"""Seconds that whoever comes first or last may take to clean up."""
+"""Seconds that the first or the last process may take to clean up."""
 
 _LOOK = 0.2
-"""Seconds between two looks at what others do."""
+"""Seconds between two polls of other processes' results."""
 
 
 @contextmanager
 def alone(folder: Path) -> Generator[None]:
-    """Hold a folder of results for one process; whatever is left half written is removed. Raises InputError."""
+    """Lock a results folder exclusively, and remove incomplete files before and after.
+
+    Raises:
+        InputError: if another process has locked the folder.
+    """
     with _opened(folder) as lock:
         if not _locked(lock, fcntl.LOCK_EX):
             raise InputError(f"{folder}: another springbench is running this sweep; wait for it or stop it")
@@ -37,8 +41,12 @@ def alone(folder: Path) -> Generator[None]:
 
 @contextmanager
 def together(folder: Path) -> Generator[None]:
-    """Hold a folder beside other processes that do; the first and the last remove what is left half written. Raises
-    InputError where one has it for itself."""
+    """Lock a results folder together with other processes.
+
+    The first and the last process remove incomplete files.
+    Raises:
+        InputError: if one process has locked the folder exclusively.
+    """
     with _opened(folder) as lock:
         until = monotonic() + _PATIENCE
         while not (first := _locked(lock, fcntl.LOCK_EX)) and not _locked(lock, fcntl.LOCK_SH):
@@ -57,7 +65,7 @@ def together(folder: Path) -> Generator[None]:
 
 @contextmanager
 def _opened(folder: Path) -> Generator[int]:
-    """The file by which a folder is held."""
+    """Open the lock file of a folder."""
     lock = open_lock(folder / ".lock")
     _LOCKS.add(lock)
     try:
@@ -68,7 +76,7 @@ def _opened(folder: Path) -> Generator[int]:
 
 
 def _locked(lock: int, how: int) -> bool:
-    """Whether it could be locked at once."""
+    """Try to lock a file without waiting, and return whether it succeeded."""
     try:
         fcntl.flock(lock, how | fcntl.LOCK_NB)
     except OSError:
@@ -85,7 +93,7 @@ _LOCKS: set[int] = set()
 
 
 def _let_go() -> None:
-    """A copy of this process holds no folder, and so holds up nobody who comes after this one."""
+    """Close inherited locks in a forked process, which would otherwise block later processes."""
     while _LOCKS:
         os.close(_LOCKS.pop())
 
@@ -94,15 +102,17 @@ os.register_at_fork(after_in_child=_let_go)
 
 
 class Claims:
-    """Which units of a folder this process does, where several share the folder: the first to come has a unit.
+    """Claims of this process on units of a shared folder; the first process to claim a unit computes it.
 
-    A claim is a lock on one byte of `.claims` (POSIX record locks, which hold on network file systems too), and goes
-    with its process, however that ends. Units are files of rows; one whose file is another than at first was done by
-    somebody else since.
+    A claim is a lock on one byte of `.claims` (POSIX record locks, which work on network file systems too). It is
+    released
+    when its process ends, however that happens. Units are files of rows. A unit whose file has changed since the start
+    was
+    finished by another process.
     """
 
     def __init__(self, folder: Path, units: Sequence[Path]) -> None:
-        """units: their files of rows."""
+        """Record the initial state of the units, given as paths of their row files."""
         self._lock = open_lock(folder / ".claims")
         self._units = {path: _state(path) for path in units}
 
@@ -121,18 +131,23 @@ class Claims:
         return _state(unit) != self._units[unit]
 
     def wait(self, units: Sequence[Path], look: Callable[[], object] = int) -> None:
-        """Until one of them was done by somebody else, or may be claimed. look: called now and then."""
+        """Wait until another process has finished one of the units, or until one can be claimed.
+
+        Args:
+            units: row files of the units.
+            poll: called between two checks.
+        """
         while units and all(self.take(unit) == TAKEN for unit in units):
             look()
             sleep(_LOOK)
 
     def close(self) -> None:
-        """Give all claims back."""
+        """Release all claims."""
         os.close(self._lock)
 
 
 def _state(path: Path) -> tuple[int, int] | None:
-    """What tells a file from one that takes its place."""
+    """Return the inode and modification time [ns] of a file, or None if it is missing."""
     try:
         there = path.stat()
     except OSError:

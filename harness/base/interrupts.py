@@ -1,8 +1,8 @@
-"""Ctrl-C: a command ends with one message and exit code 130, from its first import to its last picture.
+"""Interrupt handling: after Ctrl-C a command ends with one message and exit code 130, at any time.
 
-* While a module is being imported the interrupt is deferred, because extension modules turn a KeyboardInterrupt into an
-  ImportError and print it.
-* Where a callback or a destructor swallows the KeyboardInterrupt, it is raised again.
+* During an import the interrupt is deferred, because extension modules turn a KeyboardInterrupt into an ImportError and
+  print it.
+* If a callback or a destructor swallows the KeyboardInterrupt, it is raised again.
 * Once the command is ending, further interrupts are ignored.
 """
 
@@ -19,14 +19,14 @@ from types import FrameType
 from typing import NoReturn
 
 EXIT_CODE = 130
-"""Of a command that Ctrl-C stopped, as shells have it."""
+"""Exit code of a command that Ctrl-C stopped, by shell convention."""
 
 MESSAGE = "springbench: stopped; what is complete is kept, and the same command goes on from there"
 
 _RETRY = 0.02
 """Seconds until a deferred interrupt is tried again."""
 _MAX_DEFERRALS = 250
-"""An import that takes longer, 5 s, is interrupted."""
+"""Maximum number of retries; an import of more than 5 s is interrupted."""
 
 _IMPORTING = ("importlib._bootstrap", "_frozen_importlib")
 
@@ -35,8 +35,10 @@ _interrupted = False
 
 
 def install_handler() -> None:
-    """Handle Ctrl-C in this process. A shell that starts a command in the background makes it ignore Ctrl-C, which is
-    left so."""
+    """Install the handler of Ctrl-C in this process.
+
+    A shell makes a background command ignore Ctrl-C; that setting is left unchanged.
+    """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
         sys.unraisablehook = _raise_again
@@ -52,7 +54,7 @@ def ignore() -> None:
 
 @contextmanager
 def blocked() -> Generator[None]:
-    """Defer Ctrl-C inside the block; processes that are started there never receive it.
+    """Defer Ctrl-C inside the block; processes started there never receive it.
 
     A process that multiprocessing spawns needs its resource tracker, whose start unblocks Ctrl-C: start that before.
     """
@@ -67,14 +69,14 @@ def blocked() -> Generator[None]:
 
 
 def is_interrupted() -> bool:
-    """Whether Ctrl-C has come."""
+    """Return whether Ctrl-C was received."""
     return _interrupted
 
 
 def exit_process() -> NoReturn:
-    """Say that the command was stopped, and exit.
+    """Print that the command was stopped, and exit.
 
-    The interpreter's own way out ends by a signal where Ctrl-C came during `exec`.
+    The interpreter's regular exit ends by a signal if Ctrl-C came during `exec`.
     """
     ignore()
     _kill_workers()
@@ -89,7 +91,7 @@ def exit_process() -> NoReturn:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, as soon as no module is being imported."""
+    """Raise KeyboardInterrupt as soon as no module is being imported."""
     global _deferrals, _interrupted
     while frame and sys.platform != "win32" and _deferrals < _MAX_DEFERRALS:
         if frame.f_globals.get("__name__") in _IMPORTING:
@@ -104,14 +106,14 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _kill_workers() -> None:
-    """Kill the worker processes, which are not to finish their work first."""
+    """Kill the worker processes instead of waiting for their work."""
     if multiprocessing := sys.modules.get("multiprocessing"):
         for child in multiprocessing.active_children():
             child.kill()
 
 
 def _raise_again(unraisable: sys.UnraisableHookArgs) -> None:
-    """Interrupt again where a KeyboardInterrupt could not be passed on."""
+    """Interrupt again if a KeyboardInterrupt could not be propagated."""
     if unraisable.exc_type is KeyboardInterrupt and sys.platform != "win32":
         signal.setitimer(signal.ITIMER_REAL, _RETRY)
     else:

@@ -1,4 +1,4 @@
-"""What a measurement ran on: the machine, the versions, the state of the code; and how many threads it may use."""
+"""Provenance of a measurement (machine, library versions, code version), and the number of threads."""
 
 from __future__ import annotations
 
@@ -21,17 +21,19 @@ from harness.base.errors import InputError, Mistake
 _ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("harness", "solvers")
 _LOOK, _NEARLY = 0.3, 0.25
-"""For how many seconds to look at what the cores do, and how busy one may be and still count as idle."""
+"""Duration of the sample of core usage [s], and the load of a core that still counts as idle."""
 
 _LIBRARIES = ("numpy", "scipy", "numba", "llvmlite", "cholespy", "pyarrow", "rerun-sdk", "pyvista", "vtk")
 
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """The machine, as far as it decides about speed; it does not say whose it is.
+    """Properties of the machine that affect speed; they do not identify its owner.
 
-    cpu: the processor's name; cores: how many this process may use; memory_gib: memory [GiB], to one decimal;
-    system: operating system, release and architecture.
+    cpu: name of the processor.
+    cores: number of cores that this process may use.
+    memory_gib: memory [GiB], to one decimal.
+    operating_system: operating system, release and architecture.
     """
 
     cpu: str
@@ -41,13 +43,13 @@ class Machine:
 
     @property
     def id(self) -> str:
-        """12 hexadecimal digits, the same for the same processor, cores and memory (rounded to 1 GiB)."""
+        """12 hexadecimal digits that depend on processor, cores and memory (rounded to 1 GiB)."""
         text = f"{self.cpu}|{self.cores}|{round(self.memory_gib)}"
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def describe() -> Machine:
-    """The machine that this process runs on, with the cores that it may use now."""
+    """Describe the machine of this process, with the cores that it may use now."""
     system = f"{platform.system()} {platform.release()} {platform.machine()}"
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return Machine(_cpu(), _cores(), round(memory / 2**30, 1), system)
@@ -61,7 +63,7 @@ def node() -> str:
 
 @cache
 def _cpu() -> str:
-    # lscpu also names ARM processors, of which the kernel tells numbers only.
+    # lscpu also names ARM processors, for which the kernel reports only numbers.
     try:
         told = subprocess.run(["lscpu"], env={**os.environ, "LC_ALL": "C"}, capture_output=True, text=True)
     except OSError:
@@ -83,7 +85,7 @@ def _cores() -> int:
 
 @cache
 def versions(*more: str) -> dict[str, str]:
-    """The versions of Python, of the libraries that compute, store and draw, and of these; absent ones are left out."""
+    """Collect the versions of Python, the standard set of libraries and more packages; absent ones are omitted."""
     found = {"python": platform.python_version()}
     for name in (*_LIBRARIES, *more):
         try:
@@ -95,11 +97,12 @@ def versions(*more: str) -> dict[str, str]:
 
 @cache
 def commit(root: Path = _ROOT) -> str:
-    """The commit of the checkout at `root`, with `-dirty` where tracked files differ; "unknown" outside one.
+    """Read the commit of a checkout, with `-dirty` if tracked files differ.
 
-    The default is the project's own checkout, wherever the process was started. Never fails.
+    The default is the project's own checkout, independent of the working directory. This function never fails.
+    Returns: the commit, or "unknown" outside a checkout.
     """
-    # Naming the repository keeps git from answering for one that merely encloses the project.
+    # An explicit repository keeps git from using one that merely contains the project.
     git = ["git", "--no-optional-locks", f"--git-dir={root / '.git'}", f"--work-tree={root}"]
     try:
         told = subprocess.run(
@@ -115,7 +118,7 @@ def commit(root: Path = _ROOT) -> str:
 
 @cache
 def code_hash(root: Path = _ROOT) -> str:
-    """12 hexadecimal digits of SHA-256 over the paths and contents of the project's Python sources."""
+    """Hash the paths and contents of the project's Python sources to 12 hexadecimal digits of SHA-256."""
     digest = hashlib.sha256()
     sources = (path for package in _PACKAGES for path in (root / package).rglob("*.py"))
     for name, path in sorted((path.relative_to(root).as_posix(), path) for path in sources):
@@ -126,20 +129,20 @@ def code_hash(root: Path = _ROOT) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Threads:
-    """How many threads BLAS and Numba may use, and why, in words, where that was not said but chosen."""
+    """Number of threads of BLAS and Numba, and the reason if it was chosen automatically."""
 
     number: int
     why: str = ""
 
 
 def threads(asked: int | Literal["auto"]) -> Threads:
-    """The threads that were asked for; for "auto" as many as there are idle cores, the same all the process long."""
+    """Return the requested number of threads; for "auto" the number of idle cores, constant within a process."""
     return _idle() if asked == "auto" else Threads(asked)
 
 
 @cache
 def _idle() -> Threads:
-    """A thread for each core that others leave idle while this process looks on; once, so that runs are alike."""
+    """Count the cores that other processes leave idle; computed once, so that all runs use the same number."""
     import psutil  # as long to load as the rest of this module
 
     usable = _usable()
@@ -152,7 +155,7 @@ def _idle() -> Threads:
 
 
 def require_threads(number: int) -> None:
-    """Raise InputError where this process may not use so many threads."""
+    """Raise InputError if this process may not use the given number of threads."""
     usable = _usable()
     if not 1 <= number <= usable:
         wanted = f"should be from 1 to {usable}, the cores that this process may use, not {number}"
@@ -161,12 +164,14 @@ def require_threads(number: int) -> None:
 
 @contextmanager
 def pinned_threads(threads: int) -> Generator[None]:
-    """Let BLAS and Numba's parallel kernels use `threads` threads each, and restore their numbers afterwards.
+    """Limit BLAS and Numba's parallel kernels to `threads` threads each inside the block.
 
-    Raises InputError where this process may not use as many.
+    The previous limits are restored afterwards.
+    Raises:
+        InputError: if this process may not use that many threads.
     """
-    # Loaded here: BLAS can only be limited once it is loaded, NumPy and SciPy bring one each, and a process
-    # that computes nothing should not wait for them.
+    # Imported here: BLAS can only be limited once it is loaded. NumPy and SciPy bring one BLAS each, and a process that
+    # computes nothing should not wait for them.
     import numba
 
     import_module("scipy.linalg")
@@ -182,8 +187,12 @@ def pinned_threads(threads: int) -> Generator[None]:
 
 @lru_cache(maxsize=1)
 def _pools(modules: int) -> Any:
-    """The libraries with threads that are loaded; they come with modules, so it is enough to look when there are more:
-    the system's list of what is loaded takes longer to read than a short run's rows to write."""
+    """Return the loaded libraries that have thread pools.
+
+    They are loaded with modules, so a new search is needed only if the number of modules has changed. Reading the
+    system's
+    list of loaded libraries takes longer than writing the rows of a short run.
+    """
     from threadpoolctl import ThreadpoolController  # pyright: ignore[reportMissingTypeStubs]
 
     return ThreadpoolController()
