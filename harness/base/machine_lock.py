@@ -1,13 +1,16 @@
-"""Who computes on this machine at a time: one that is timed, alone, or any number of those that are not.
+"""Timing lock of the machine: one exclusive timed run, or any number of untimed computations.
 
-    alone    waits until nobody computes, and keeps all others waiting
-    beside   waits while somebody is timed alone, or waits for it
-    own_cores   as `beside`, on cores that nobody else has
+    lock_timing_exclusive   waits until nothing else computes, and blocks all others
+    lock_timing_shared      waits while a run is timed exclusively, or waits for that
+    reserve_cores           as lock_timing_shared, on cores reserved for this process
 
-Whoever wants to be timed goes first, so that those who were timed look at what they found side by side and not each
-before the next is timed. Who gets ready for it (`Turn`) counts among them, or two would take turns for ever, each
-getting ready while the other looks. The locks are files, which the system lets go of where a process dies; they are
-the same for all commands and workers of a machine: in the folder `SPRINGBENCH_LOCKS`, else in that for temporary files.
+Runs that wait to be timed have priority. Processes that were timed therefore analyse their results concurrently, and
+not
+each before the next one is timed. A process that prepares a timed run (`TimingSession`) counts as waiting; otherwise
+two
+processes would alternate indefinitely, each preparing while the other one analyses. The locks are files, which the
+system releases when a process dies. All commands and workers of a machine share them, in the folder `SPRINGBENCH_LOCKS`
+or else in the folder for temporary files.
 """
 
 from __future__ import annotations
@@ -25,19 +28,19 @@ from harness.base.errors import InputError, Mistake
 from harness.base.files import open_lock
 
 _PAUSE = 0.02
-"""Seconds between two looks for a free core."""
+"""Seconds between two searches for a free core."""
 
 
 @contextmanager
 def alone(tick: Tick) -> Generator[None]:
-    """Be the only one on the machine. tick: is told while this waits."""
+    """Compute alone on the machine; tick reports the waiting time."""
     with _held("wanted", fcntl.LOCK_SH, tick), _held("used", fcntl.LOCK_EX, tick):
         yield
 
 
 @contextmanager
 def beside(tick: Tick) -> Generator[None]:
-    """Compute while nobody is timed. tick: is told while this waits."""
+    """Compute while no run is timed exclusively; tick reports the waiting time."""
     with _held("wanted", fcntl.LOCK_EX, tick):  # nobody who would be timed waits
         used = _locked("used", fcntl.LOCK_SH, tick)
     try:
@@ -47,9 +50,11 @@ def beside(tick: Tick) -> Generator[None]:
 
 
 class Turn:
-    """The turn of one that is timed alone: it gets ready, is timed (`alone`), and looks at what was found.
+    """Session of one timed run: preparation, timing (`lock_timing_exclusive`), and analysis of its result.
 
-    exclusive: else it is timed beside others (`own_cores`), and waits for nobody's turn.
+    exclusive: whether the run is timed alone. Otherwise it is timed on reserved cores (`reserve_cores`) without waiting
+    for
+    other sessions.
     """
 
     def __init__(self, tick: Tick, *, exclusive: bool) -> None:
@@ -66,11 +71,11 @@ class Turn:
         self._looking.close()
 
     def ready(self) -> AbstractContextManager[None]:
-        """Compute before it is timed."""
+        """Lock the machine for preparation before the timing."""
         return _held("used", fcntl.LOCK_SH, self._tick) if self._exclusive else beside(self._tick)
 
     def look(self) -> None:
-        """Compute beside others from now on: it was timed, or will not be."""
+        """Release the timing priority after the timing, or if there is none, and lock for shared computation."""
         self._coming.close()
         self._looking.close()
         self._looking.enter_context(beside(self._tick))
@@ -78,8 +83,15 @@ class Turn:
 
 @contextmanager
 def own_cores(number: int, tick: Tick) -> Generator[list[int]]:
-    """Compute beside others, kept to so many cores that are nobody else's, by number. Raises ValueError where this
-    process may not use as many."""
+    """Compute with the threads of this process pinned to cores that no other process has reserved.
+
+    Args:
+        number: number of cores.
+        tick: progress callback, which reports the waiting time.
+    Yields: the numbers of the cores.
+    Raises:
+        ValueError: if this process may not use that many cores.
+    """
     mine = sorted(os.sched_getaffinity(0))
     if number > len(mine):
         raise ValueError(f"{number} cores of {len(mine)}")
@@ -102,7 +114,7 @@ def own_cores(number: int, tick: Tick) -> Generator[list[int]]:
 
 
 def _free(cores: list[int], most: int) -> dict[int, int]:
-    """Locks of cores that nobody has, at most so many."""
+    """Lock free cores, up to a limit, and return their lock files by core."""
     found: dict[int, int] = {}
     for core in cores:
         if len(found) == most:
@@ -117,7 +129,7 @@ def _free(cores: list[int], most: int) -> dict[int, int]:
 
 
 def _keep_to(cores: set[int]) -> None:
-    """Let all threads of this process run on these cores alone."""
+    """Pin all threads of this process to the given cores."""
     for thread in os.listdir("/proc/self/task"):
         with suppress(OSError):  # it has ended
             os.sched_setaffinity(int(thread), cores)
@@ -153,7 +165,7 @@ def _let_go(*locks: int) -> None:
 
 
 def _opened(name: str) -> int:
-    """A lock's file, which all users of the machine may lock. Raises InputError."""
+    """Open a lock file that all users of the machine may lock; raise InputError if that fails."""
     path = Path(os.environ.get("SPRINGBENCH_LOCKS") or tempfile.gettempdir()) / f"springbench-{name}.lock"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

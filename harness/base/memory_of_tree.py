@@ -1,4 +1,4 @@
-"""The memory of a process and of all that it started, as Linux tells it."""
+"""Memory of a process and all its descendants, from Linux's /proc."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from contextlib import suppress
 
 
 class TreeMemory:
-    """Whether the processes below one take more than a number of GiB together, beyond what they have now."""
+    """Monitor of the memory of all descendants of a process, beyond what they use at the start.
+
+    root: process id.
+    gib: limit of their sum [GiB].
+    """
 
     def __init__(self, root: int, gib: float) -> None:
         self._root, self._most = root, gib * 2**30
@@ -16,7 +20,7 @@ class TreeMemory:
 
     @property
     def exceeded(self) -> bool:
-        """Asked of processes that were started since: those that were there limit themselves."""
+        """Whether the limit is exceeded, counting processes started since; earlier ones have limits of their own."""
         new = set(found := list(_below(self._root))) - self._before.keys()
         if not new:
             return False
@@ -35,7 +39,7 @@ def _below(process: int) -> Iterator[int]:
 
 
 def _bytes(process: int, file: str, names: tuple[str, ...]) -> int:
-    """The sum of lines `name: ... kB`; 0 for a process that has ended."""
+    """Sum the lines `name: ... kB` of a /proc file [bytes]; 0 for a process that has ended."""
     with suppress(OSError), open(f"/proc/{process}/{file}") as lines:
         return sum(1024 * int(line.split()[1]) for line in lines if line.startswith(names))
     return 0

@@ -1,7 +1,7 @@
-"""The base of every model that a config is checked against: frozen, and unknown keys are refused.
+"""Base of all config models: frozen, and unknown keys are errors.
 
-The string below a field says what it means. Sources are parsed for these when somebody asks, as the schema does:
-to check a config nobody does.
+The string below a field is its description. Sources are parsed for these only on request, for example for the JSON
+Schema; validation of a config does not need them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Vector = tuple[float, float, float]
 
 
 class Model(BaseModel):
-    """A frozen pydantic model; unknown keys are errors, infinities and NaN are refused."""
+    """A frozen pydantic model that rejects unknown keys, infinities and NaN."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False, allow_inf_nan=False)
 
@@ -39,7 +39,7 @@ class Model(BaseModel):
 
 
 def meanings(model: type[Model]) -> dict[str, str]:
-    """What the fields of a model mean, its bases' among them."""
+    """Read the descriptions of the fields of a model, including inherited ones."""
     found: dict[str, str] = {}
     for base in reversed(model.__mro__):
         file = getattr(sys.modules.get(base.__module__), "__file__", None)
@@ -50,7 +50,7 @@ def meanings(model: type[Model]) -> dict[str, str]:
 
 @cache
 def _stated(file: str) -> dict[str, dict[str, str]]:
-    """What stands below the fields of each class of a source."""
+    """Parse the strings below the fields of each class of a source file."""
     with open(file, encoding="utf-8") as source:
         classes = [node for node in ast.parse(source.read()).body if isinstance(node, ast.ClassDef)]
     return {
@@ -69,7 +69,7 @@ T = TypeVar("T")
 
 
 class _OneOrMany:
-    """Lets a single value stand for a list of one."""
+    """Validator that accepts a single value for a tuple of one."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
         def many(value: Any) -> tuple[Any, ...]:

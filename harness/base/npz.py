@@ -1,6 +1,6 @@
-"""Arrays of numbers in .npz files that anybody may have written: read in a child process, within limits.
+"""Reader of numeric arrays in untrusted .npz files, in a sandboxed subprocess within limits.
 
-The whole array is read, so that its check sum is compared; pickles, other types, NaN and infinities are refused.
+The whole array is read, so that its checksum is verified. Pickles, other types, NaN and infinities are rejected.
 """
 
 from __future__ import annotations
@@ -18,13 +18,23 @@ from harness.base.errors import InputError, Mistake
 from harness.base.files import HEAD, misnamed, reason
 
 MAX_BYTES = 100_000_000
-"""Of an array in float64, and of a file: a scene writes such numbers out as text, which takes 17 times as much."""
+"""Maximum size of an array in float64, and of a file [bytes]. A scene writes such numbers as text, which takes 17 times
+as much.
+"""
 _SECONDS, _BYTES_PER_SECOND = 5.0, 2e7
 _MEMORY = 2**28 + 3 * MAX_BYTES
 
 
 def read_numbers(path: Path, name: str) -> NDArray[np.float64]:
-    """The array of a name in an .npz file. Raises InputError with the file."""
+    """Read one array of an .npz file as float64.
+
+    Args:
+        path: the .npz file.
+        name: name of the array.
+    Returns: C-contiguous array of finite numbers.
+    Raises:
+        InputError: if the file or the array is invalid; it names the file.
+    """
     try:
         if not path.is_file():
             raise InputError(Mistake("is no file; give the path of an .npz file", path))
@@ -45,7 +55,7 @@ def read_numbers(path: Path, name: str) -> NDArray[np.float64]:
 
 
 def _extracted(path: Path, name: str) -> NDArray[np.float64]:
-    """What the child does. Raises InputError, and what the standard library raises for a broken file."""
+    """Extract an array in the sandbox; raise InputError, or errors of the standard library for a broken file."""
     try:
         with zipfile.ZipFile(path) as packed:
             names = [info.filename.removesuffix(".npy") for info in packed.infolist()]
@@ -65,7 +75,7 @@ def _extracted(path: Path, name: str) -> NDArray[np.float64]:
 
 
 def _array(content: bytes, what: Mistake) -> NDArray[np.float64]:
-    """The numbers of a .npy file. Raises InputError."""
+    """Parse the content of an .npy file; raise InputError if it is invalid."""
 
     def refuse(problem: str) -> InputError:
         return InputError(Mistake(f"{what.problem} {problem}", what.file))

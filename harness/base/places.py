@@ -1,11 +1,12 @@
 # pyright: reportMissingTypeStubs=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 # fsspec has no types.
-"""Results on another file system, by URL (fsspec): `s3://bucket/results`, `sftp://host/results`, `memory://...`
+"""Remote storage of results, by URL (fsspec): `s3://bucket/results`, `sftp://host/results`, `memory://...`
 
-Commands work on a folder in the user's cache, one for each URL. What is new there is fetched before, and what is new
-here is sent when the command ends, however it does; what a kill keeps from being sent, the next command sends. An index
-remembers both sides as they were when they last agreed: where one of them changed since, the other follows; where both
-did, this one's is sent.
+Commands work on a local folder in the user's cache, one per URL. Remote changes are downloaded before a command, and
+local changes are uploaded when it ends, even after an error. If a kill prevents the upload, the next command repeats
+it.
+An index stores both states at the last synchronisation. If one side has changed since, the other side is updated; if
+both have, the local version is uploaded.
 """
 
 from __future__ import annotations
@@ -26,23 +27,29 @@ from harness.base.errors import InputError, Mistake, RunFailed
 from harness.base.files import replacing, users_cache
 
 _BATCH = 500
-"""So many files travel at once."""
+"""Number of files per transfer."""
 INDEX = ".place.json"
-"""The index, in the folder."""
+"""Name of the index file in the local folder."""
 
 ROWS = ("rows", "accuracy", "ablation")
-"""What holds rows: folders of these names, and packed files."""
+"""Names of folders with rows, and stems of packed files."""
 
 
 def parse(value: str | Path) -> Path | str:
-    """A path, which a default is already, or a URL as it stands."""
+    """Parse a path or URL of results; a URL remains text."""
     if "\0" in str(value):
         raise typer.BadParameter("holds NUL, which no path and no URL can")
     return value if isinstance(value, Path) or "://" in value else Path(value)
 
 
 def everything(context: typer.Context, value: Path | str) -> Path:
-    """The folder of a command that reads and writes results."""
+    """Download all results before a command, and upload its changes when it ends.
+
+    Args:
+        context: context of the command.
+        value: local path or URL.
+    Returns: the local folder.
+    """
     if isinstance(value, Path):
         return value
     place = Place.of(value)
@@ -52,7 +59,7 @@ def everything(context: typer.Context, value: Path | str) -> Path:
 
 
 def rows_alone(value: Path | str) -> Path:
-    """The folder of a command that reads rows and writes nothing."""
+    """Download the rows of results for a command that writes nothing, and return the local folder."""
     if isinstance(value, Path):
         return value
     place = Place.of(value)
@@ -72,7 +79,7 @@ class Place:
 
     @classmethod
     def of(cls, url: str) -> Place:
-        """The place of a URL. Raises InputError where its kind is not known, or takes a package that is missing."""
+        """Create the storage of a URL; raise InputError if its scheme is unknown or its package is missing."""
         from fsspec.core import url_to_fs
 
         try:
@@ -88,7 +95,13 @@ class Place:
         return place
 
     def fetch(self, *, rows_alone: bool = False) -> None:
-        """Fetch what is new there, and take away what went there and was not touched here. Raises InputError."""
+        """Download changed files, and remove local files that were deleted remotely and are unchanged here.
+
+        Args:
+            only_rows: whether to download only files of rows.
+        Raises:
+            InputError: if the storage cannot be read.
+        """
         try:
             self.system.invalidate_cache()
             there = self._there()
@@ -105,7 +118,7 @@ class Place:
         self._remember()
 
     def _get(self, names: Sequence[str], there: Mapping[str, str]) -> None:
-        """Fetch some files, many at once; what a kill leaves is fetched again."""
+        """Download some files in one transfer; an interrupted transfer is repeated later."""
         with TemporaryDirectory(dir=self.folder, prefix=".partial") as scratch:
             fetched = [Path(scratch) / str(number) for number in range(len(names))]
             self.system.get([f"{self.root}/{name}" for name in names], [str(path) for path in fetched])
@@ -116,7 +129,11 @@ class Place:
         self._remember()
 
     def send(self) -> None:
-        """Send what is new here, then take away there what went here. Raises RunFailed: it is kept, and sent later."""
+        """Upload changed files, then delete remote files that were deleted here.
+
+        Raises:
+            RunFailed: if the storage cannot be written; the local files remain, and are uploaded later.
+        """
         names = {path.relative_to(self.folder).as_posix() for path in self.folder.rglob("*") if _is_result(path)}
         new = [name for name in sorted(names) if self.index.get(name, ["", ""])[1] != self._here(name)]
         gone = [name for name in self.index if not (self.folder / name).exists()]
@@ -144,14 +161,14 @@ class Place:
         self._remember()
 
     def _there(self) -> dict[str, str]:
-        """The files there, and what changes when they do."""
+        """List the remote files with a token that changes when they do."""
         found: Mapping[str, Mapping[str, Any]] = self.system.find(self.root, detail=True)
         start = len(self.root.strip("/")) + 1
         files = {name.strip("/")[start:]: about for name, about in found.items()}
         return {name: _token(about) for name, about in files.items() if _is_safe(name)}
 
     def _here(self, name: str) -> str:
-        """What changes when a file here does; empty where there is none."""
+        """Return a token that changes when a local file does, or "" if it is missing."""
         try:
             about = (self.folder / name).stat()
         except FileNotFoundError:
@@ -169,7 +186,7 @@ def _token(about: Mapping[str, Any]) -> str:
 
 
 def _is_safe(name: str) -> bool:
-    """Whether a name leads into the folder, and to no file of ours."""
+    """Return whether a name stays inside the folder and is not the index."""
     parts = PurePosixPath(name).parts
     return bool(parts) and ".." not in parts and not name.startswith("/") and name != INDEX
 

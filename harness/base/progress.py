@@ -1,6 +1,6 @@
-"""How far a sweep is: bars with the time left on a terminal, plain lines elsewhere.
+"""Progress of a sweep: bars with the remaining time on a terminal, plain lines elsewhere.
 
-Nothing here runs beside the measurements: bars are redrawn between steps, while the clock stands still.
+Nothing here runs concurrently with measurements: bars are redrawn between steps, while the clock is stopped.
 """
 
 from __future__ import annotations
@@ -21,19 +21,22 @@ _REDRAW = 0.2
 """Seconds between two redraws."""
 
 _SILENT = 10.0
-"""Seconds after which a line is printed, though nothing has ended."""
+"""Seconds without output after which a line is printed, even if no run has ended."""
 
 _KNOWN = 0.2
-"""The share of runs or of their work from which on the time left is stated; half where no run of a kind has ended."""
+"""Fraction of the runs, or of their cost, from which the remaining time is estimated. It is one half while some kind of
+run has no finished run.
+"""
 
 _OWN_PACE = 0.05
-"""The share of a run from which on its own pace tells when it ends."""
+"""Fraction of a run from which its own pace determines its estimate."""
 
 
 class Effort(NamedTuple):
-    """What a run takes, before it is known in seconds.
+    """Relative cost of a run, before its seconds are known.
 
-    kind: runs of one kind, such as those by one solver, take time in proportion to their amount, in any measure.
+    kind: runs of one kind, such as those of one solver, take time in proportion to their amount.
+    amount: cost in any unit.
     """
 
     kind: str = ""
@@ -41,66 +44,79 @@ class Effort(NamedTuple):
 
 
 ANY_EFFORT = Effort()
-"""Of runs of which nothing is known."""
+"""Cost of runs without further information."""
 
 
 class Remarks:
-    """Says how far something is that is no run, as often as lines come while no run ends."""
+    """Prints progress messages of work that is not a run, at most one per _MAX_SILENT_SECONDS."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say, self._said = say, monotonic()
 
     def __call__(self, words: str) -> None:
-        """How far it is, in words."""
+        """Print the message if the last one is old enough."""
         if monotonic() - self._said > _SILENT:
             self._say(words)
             self._said = monotonic()
 
 
 class Run(Protocol):
-    """Is told what happens in a run."""
+    """Receiver of the events of one run."""
 
     def tick(self, phase: str) -> None:
-        """A step of a phase is done, or what `harness.base.asides` says."""
+        """Report a finished step by the name of its phase, or an event of `harness.execution.progress_events`."""
         ...
 
     def finished(self, outcome: str) -> None:
-        """The run has ended, with an outcome in words."""
+        """Report the end of the run, with a description of its outcome."""
         ...
 
 
 class Display(Protocol):
-    """Is told what happens in a sweep."""
+    """Receiver of the events of a sweep."""
 
     def begin(self, efforts: Sequence[Effort], at_once: int = 1) -> None:
-        """The sweep begins: these runs are to be done, so many of them at once."""
+        """Start the sweep.
+
+        Args:
+            costs: costs of the pending runs.
+            num_concurrent: number of runs that are executed concurrently.
+        """
         ...
 
     def run(self, title: str, ticks: int, effort: Effort) -> Run:
-        """A run begins: it will take so many ticks."""
+        """Start a run.
+
+        Args:
+            title: description of the run.
+            ticks: expected number of steps.
+            cost: relative cost.
+        Returns: receiver of the run's events.
+        """
         ...
 
     def elsewhere(self, title: str, effort: Effort, outcome: str) -> None:
-        """A run that is none of this command's any more, and why in words."""
+        """Report a run that another command has taken over, and the reason as its outcome."""
         ...
 
     def end(self) -> None:
-        """The sweep has ended, or was stopped."""
+        """End the sweep, or its interruption."""
         ...
 
 
 def display(console: Console) -> Display:
-    """Bars on a terminal, lines elsewhere."""
+    """Create bars for a terminal, or lines for any other output."""
     return Bars(console) if console.is_terminal else Lines(console)
 
 
 class Pace:
-    """How long the runs take that have not ended, by those that have.
+    """Estimate of the remaining time from the runs that have ended.
 
-    seconds = a + b amount,   a = least seconds of a run,   b = (seconds - a) / amount of the kind's latest run,
+        seconds = a + b amount,   a = least seconds of a run,   b = (seconds - a) / amount of the kind's latest run,
 
-    where a is what comes with any run. A kind of which no run has ended has the median b of the others. Compiling and
-    waiting are left out of the seconds. Where several runs go on at once, the sum is divided by how many did so far.
+    where a is the overhead of any run. A kind without a finished run has the median b of the others. Compilation and
+    waiting
+    are excluded from the seconds. For concurrent runs the sum is divided by the concurrency observed so far.
     """
 
     def __init__(self, efforts: Sequence[Effort] = (), at_once: int = 1) -> None:
@@ -114,12 +130,12 @@ class Pace:
         self._latest: dict[str, tuple[float, float]] = {}
 
     def leave_out(self, effort: Effort) -> None:
-        """Leave out a run that is done elsewhere."""
+        """Remove a run that another command has taken over."""
         self._left[effort.kind].remove(effort.amount)
         self._runs, self.amount = self._runs - 1, self.amount - effort.amount
 
     def add_ended(self, effort: Effort, seconds: float) -> None:
-        """Take note of a run that has ended, and of the seconds that it took itself."""
+        """Record a finished run, with the seconds that it took itself."""
         if effort.amount in self._left.get(effort.kind, ()):
             self._left[effort.kind].remove(effort.amount)
         self._ended, self.done = self._ended + 1, self.done + effort.amount
@@ -130,9 +146,8 @@ class Pace:
         """Estimate the seconds until all runs have ended.
 
         Args:
-            going: runs that have begun; from a twentieth of its steps on, a run's own pace counts.
-
-        Returns: None while too few runs have ended for an estimate.
+            running: started runs; from a twentieth of its steps on, a run's own pace is used.
+        Returns: seconds, or None while too few runs have ended for an estimate.
         """
         known = max(self._ended / max(1, self._runs), self.done / (self.amount or 1.0))
         kinds = {kind for kind, amounts in self._left.items() if amounts}
@@ -155,7 +170,11 @@ class Pace:
 
 @dataclass
 class _Running:
-    """A run that goes on. changed: called after whatever happens to it."""
+    """State of a started run.
+
+    on_change: called after each event.
+    on_end: called with the outcome.
+    """
 
     title: str
     ticks: int
@@ -172,22 +191,21 @@ class _Running:
 
     @property
     def done(self) -> float:
-        """The share of its steps that is done."""
+        """Fraction of the steps that are finished."""
         return min(1.0, self.steps / max(1, self.ticks))
 
     @property
     def seconds(self) -> float:
-        """Seconds since it began, without those that it compiled or waited."""
+        """Seconds since the start, without compilation and waiting."""
         aside = monotonic() - self._since if self.aside else 0.0
         return monotonic() - self.began - self._beside - aside
 
     @property
     def doing(self) -> str:
-        """In words."""
+        """Current activity, else current phase."""
         return self.aside or self.phase
 
     def tick(self, phase: str) -> None:
-        """See Run."""
         if is_step(phase):
             self.phase, self.steps = phase, self.steps + 1
         elif what := begun(phase):
@@ -197,27 +215,26 @@ class _Running:
         self.changed(self)
 
     def finished(self, outcome: str) -> None:
-        """See Run."""
         self.pace.add_ended(self.effort, self.seconds)
         self.ended(self, outcome)
 
 
 def left_in_words(seconds: float | None) -> str:
-    """Empty where it is not known."""
+    """Format the remaining time; empty if it is unknown."""
     if seconds is None:
         return ""
     return f"about {seconds:.0f} s left" if seconds < 600 else f"about {seconds / 60:.0f} min left"
 
 
 def _at_hand(going: Sequence[_Running]) -> str:
-    """The first of the runs that go on and do not wait, and how many there are beside it: one short line."""
+    """Describe the first running run that does not wait, and the number of other runs, in one short line."""
     run = min(going, key=lambda one: bool(one.aside))
     others = f"; {len(going) - 1} more at hand" if len(going) > 1 else ""
     return f"{run.title}: {run.doing}, {100 * run.done:.0f} %{others}"
 
 
 class Bars:
-    """A bar for the sweep and one for each run that goes on."""
+    """One progress bar for the sweep and one for each started run."""
 
     def __init__(self, console: Console) -> None:
         self._bars = Progress(
@@ -233,13 +250,11 @@ class Bars:
         self._sweep = self._bars.add_task("", phase="")
 
     def begin(self, efforts: Sequence[Effort], at_once: int = 1) -> None:
-        """See Display."""
         self._pace = Pace(efforts, at_once)
         self._bars.start()
         self._bars.update(self._sweep, description="sweep", total=self._pace.amount, phase=f"{len(efforts)} runs")
 
     def run(self, title: str, ticks: int, effort: Effort) -> Run:
-        """See Display."""
         running = _Running(title, ticks, effort, self._pace, self._changed, self._ended)
         self._tasks[id(running)] = self._bars.add_task(title, total=ticks, phase="prepare")
         self._going.append(running)
@@ -265,20 +280,17 @@ class Bars:
         self._show()
 
     def elsewhere(self, title: str, effort: Effort, outcome: str) -> None:
-        """See Display."""
         self._pace.leave_out(effort)
         self._bars.update(self._sweep, total=self._pace.amount)
         self._bars.console.print(f"{title}: {outcome}", highlight=False)
         self._show()
 
     def end(self) -> None:
-        """See Display."""
         self._bars.stop()
 
 
 class Lines:
-    """A line for each run that has ended, with the time left for the sweep, and one of those that go on where there is
-    no other for a while."""
+    """One line for each finished run with the remaining time, and a status line after a period without output."""
 
     def __init__(self, console: Console) -> None:
         self._console, self._pace, self._printed = console, Pace(), monotonic()
@@ -286,11 +298,9 @@ class Lines:
         self._runs = self._number = 0
 
     def begin(self, efforts: Sequence[Effort], at_once: int = 1) -> None:
-        """See Display."""
         self._runs, self._number, self._pace, self._printed = len(efforts), 0, Pace(efforts, at_once), monotonic()
 
     def run(self, title: str, ticks: int, effort: Effort) -> Run:
-        """See Display."""
         running = _Running(title, ticks, effort, self._pace, self._changed, self._ended)
         self._going.append(running)
         return running
@@ -305,7 +315,6 @@ class Lines:
         self._print(f"{run.title}: {outcome}")
 
     def elsewhere(self, title: str, effort: Effort, outcome: str) -> None:
-        """See Display."""
         self._pace.leave_out(effort)
         self._number += 1
         self._print(f"{title}: {outcome}")
@@ -318,4 +327,3 @@ class Lines:
         self._printed = monotonic()
 
     def end(self) -> None:
-        """See Display."""
