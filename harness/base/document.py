@@ -17,7 +17,7 @@ from harness.base.errors import InputError, Mistake, did_you_mean
 MAX_MISTAKES = 100
 
 Key = tuple[str | int, ...]
-"""Where a value stands: the keys of mappings and the indices of lists on the way to it."""
+"""Location of a value: the mapping keys and list indices that lead to it."""
 
 _CAME = "; should be "
 
@@ -52,9 +52,9 @@ UNOPENED = OwnCode(opens=False)
 
 @dataclass(slots=True)
 class Document:
-    """A config as plain data, the line of each key, and the mistakes found in it so far.
+    """A config as plain data, with the line of each key and the mistakes found so far.
 
-    own: what becomes of code that the config names.
+    user_code: policy for code that the config names.
     """
 
     path: Path

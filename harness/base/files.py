@@ -34,9 +34,10 @@ def half_written(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replacing(path: Path) -> Generator[Path]:
-    """A partial name beside a file, for what takes the file's place where nothing goes wrong, and goes where it does.
+    """Yield a temporary path that replaces the file on success and is removed on failure.
 
-    Raises CannotWrite from an OSError.
+    Raises:
+        WriteError: for an OSError inside the block.
     """
     partial = partial_name(path)
     try:

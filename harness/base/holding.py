@@ -117,7 +117,7 @@ class Claims:
         self._units = {path: _state(path) for path in units}
 
     def take(self, unit: Path) -> str:
-        """Claim a unit; empty where it is this process's now, DONE or TAKEN where it is not."""
+        """Claim a unit; return "" on success, else DONE_ELSEWHERE or CLAIMED_ELSEWHERE."""
         if self._changed(unit):
             return DONE
         place = int.from_bytes(sha256(unit.name.encode()).digest()[:7])

@@ -57,7 +57,7 @@ def describe() -> Machine:
 
 @cache
 def node() -> str:
-    """12 hexadecimal digits that tell this computer from others of its kind, without its name."""
+    """Compute 12 hexadecimal digits that identify this computer among others of its kind, without its name."""
     return hashlib.sha256(f"springbench {platform.node()}".encode()).hexdigest()[:12]
 
 

@@ -69,7 +69,14 @@ def rows_alone(value: Path | str) -> Path:
 
 @dataclass(slots=True)
 class Place:
-    """A URL and its folder here. index: of each file what it was there and here when the two last agreed."""
+    """A URL and its local folder.
+
+    url: as the user gave it.
+    folder: local folder in the user's cache.
+    filesystem: file system of fsspec.
+    root: path of the results on that file system.
+    index: remote and local state of each file at the last synchronisation.
+    """
 
     url: str
     folder: Path

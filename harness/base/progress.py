@@ -327,3 +327,4 @@ class Lines:
         self._printed = monotonic()
 
     def end(self) -> None:
+        """End the output; lines need no cleanup."""

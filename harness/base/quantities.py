@@ -1,4 +1,4 @@
-"""The quantities that tables, pictures, figures and pages state of a run: each has one definition and one name.
+"""Quantities that tables, pictures, figures and pages report of a run, each with one definition and one name.
 
     ms a step         median wall time of the timed steps, over all frames and rounds [ms]
     least             the smallest of the same times [ms]
@@ -7,10 +7,10 @@
     residual          that of the last frame [J^(1/2)]
     largest residual  maximum over all frames, where each has one
     largest strain    maximum of |length / rest length - 1| over all springs and all frames after the start
-    99 % below        maximum over these frames of what 99 % of the springs stay below
+    99 % below        maximum over these frames of the 99 % quantile over the springs
 
-`SQL` computes them from the rows of one run. A recording holds the strain of each frame, and the run's ms a step as
-a property that `ms_per_step` has computed.
+`SQL_EXPRESSIONS` computes them from the rows of one run. A recording stores the strain of each frame, and the run's ms
+a step as a property computed by `compute_ms_per_step`.
 """
 
 from __future__ import annotations
@@ -35,16 +35,22 @@ SQL = {
 
 
 def ms_per_step(seconds: Sequence[float]) -> float:
-    """The ms a step of these steps' wall times [s], of all frames and rounds."""
+    """Compute the median ms a step from the wall times [s] of all frames and rounds."""
     return 1e3 * float(np.median(seconds))
 
 
 def times_as_long(run: float, other: float) -> float:
-    """How many times as long a run takes as another one, from their ms a step."""
+    """Compute how many times as long a run takes as another one, from their ms a step."""
     return run / other
 
 
 def largest_strain(frames: NDArray[np.int64], strains: NDArray[np.float64]) -> float:
-    """The largest strain of a run, from that of each frame (k,); frame 0 is the start. NaN without a later frame."""
+    """Compute the largest strain of a run from the strain of each frame.
+
+    Args:
+        frames: frame numbers (k,); frame 0 is the start and is excluded.
+        strains: largest strain of each frame (k,).
+    Returns: maximum, or NaN without a frame after the start.
+    """
     after = strains[frames > 0]
     return float(after.max()) if len(after) else float("nan")

@@ -1,9 +1,9 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# pyarrow's stubs say little of columns.
-"""Checks of the values in rows, which may be somebody else's: names become files, text becomes links and JSON.
+# pyarrow's stubs have incomplete types of columns.
+"""Validation of row values from untrusted files: names become files, text becomes links and JSON.
 
-A rule belongs to a column's name, whatever the kind of rows; a column without a rule may hold anything of its type.
-Null is valid everywhere: readers name the columns that they need.
+A rule belongs to a column name, for all kinds of rows. A column without a rule may hold any value of its type. Null is
+always valid; readers state the columns that they require.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ import pyarrow.compute as pc
 from harness.base.files import is_file_name
 
 LONGEST = 100_000
-"""Characters of a text."""
+"""Maximum length of a text, in characters."""
 
 _SAID = 60
-"""Characters of a value that a message repeats."""
+"""Maximum number of characters of a value that a message quotes."""
 
 
 class TextRule(NamedTuple):
-    """fits: whether a text is valid; wanted: what is, in words."""
+    """Rule of a text column: a predicate, and a description of valid values."""
 
     fits: Callable[[str], bool]
     wanted: str
 
 
 class Range(NamedTuple):
-    """The finite numbers from low to high."""
+    """Range of finite numbers from low to high, inclusive."""
 
     low: float
     high: float
 
     @property
     def wanted(self) -> str:
-        """The range in words."""
+        """Description of the range."""
         return f"a number from {self.low:g} to {self.high:g}"
 
 
@@ -59,7 +59,7 @@ def _is_word(text: str) -> bool:
 
 
 def is_path_below(text: str) -> bool:
-    """Whether a text is a path that leads from a folder to a file below it."""
+    """Return whether a text is a relative path to a file inside a folder."""
     return not text or (not text.startswith("/") and all(map(is_file_name, PurePosixPath(text).parts)))
 
 
@@ -68,7 +68,7 @@ def _refuse(constant: str) -> None:
 
 
 def _object(text: str) -> dict[str, Any] | None:
-    """The JSON object that a text is; None for what is none."""
+    """Parse a JSON object; return None for any other text."""
     try:
         found = json.loads(text, parse_constant=_refuse)
     except (ValueError, RecursionError):
@@ -97,7 +97,7 @@ TEXTS: dict[str, TextRule] = {
     "reference": TextRule(_is_reference, "a JSON object with authors, year, title and doi"),
     "recording": TextRule(is_path_below, "a path in the folder of the results"),
 }
-"""By column."""
+"""Rules of text columns, by column name."""
 
 
 def _is_short(text: str) -> bool:
@@ -117,11 +117,11 @@ RANGES: dict[str, Range] = {
     "mean_rest_length": Range(1e-300, 1e300),
     **dict.fromkeys(("machine_bandwidth", "machine_flops", "machine_step"), Range(0, 1e30)),
 }
-"""By column."""
+"""Ranges of numeric columns, by column name."""
 
 
 class Invalid(NamedTuple):
-    """A value that does not fit its column: the number of its row, the column, the value and what was wanted."""
+    """An invalid value: the index of its row, its column, the value and a description of valid ones."""
 
     row: int
     column: str
@@ -134,7 +134,7 @@ class Invalid(NamedTuple):
 
 
 def invalid(table: pa.Table) -> Iterator[Invalid]:
-    """All values that do not fit their columns, column by column."""
+    """Find all invalid values of a table, column by column."""
     for field in table.schema:
         column = table[field.name]
         if pa.types.is_string(field.type) or pa.types.is_large_string(field.type):

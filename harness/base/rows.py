@@ -1,8 +1,8 @@
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
-# pyarrow's stubs say little of columns, and of files that Parquet is read from.
-"""The rows that a run leaves: one flat Parquet file a run, under `results/<sweep>/rows/`, written and read.
+# pyarrow's stubs have incomplete types of columns, and of files that Parquet is read from.
+"""Reader and writer of rows: one flat Parquet file per run, under `results/<sweep>/rows/`.
 
-`harness.base.shelf` says where the rows of a unit lie once many were packed.
+`harness.results.row_store` defines where rows are stored after packing.
 """
 
 from __future__ import annotations
@@ -30,22 +30,30 @@ Row = Mapping[str, Any]
 
 
 MOST = 2_000_000
-"""No file may hold more rows: a few bytes can claim any number of them."""
+"""Maximum number of rows of a file, because a few bytes can claim any number of them."""
 _BYTES = 2**29
-"""No file may hold more bytes once it is unpacked."""
+"""Maximum decompressed size of a file, in bytes."""
 _MEMORY, _EXPANDS = 7 * 2**28, 100
-"""Bytes of memory that reading units may take, and for each byte of their files."""
+"""Memory limit of reading units: a base in bytes, and a factor for the size of their files."""
 _FEW = 8
-"""So many units are read one by one, before DuckDB is loaded."""
+"""Maximum number of units that are read one by one, without loading DuckDB."""
 
 
 def write(path: Path, rows: Iterable[Row], schema: pa.Schema = SCHEMA) -> None:
-    """Write one file's rows as `store` does. Raises CannotWrite."""
+    """Write the rows of one file durably; raise WriteError if that fails."""
     store(path, encoded(rows, schema))
 
 
 def encoded(rows: Iterable[Row], schema: pa.Schema = SCHEMA) -> bytes:
-    """A file's rows as Parquet."""
+    """Encode the rows of one file as Parquet.
+
+    Args:
+        rows: mappings of column names to values.
+        schema: Arrow schema.
+    Returns: content of the file.
+    Raises:
+        ValueError: if a row has a column that the schema lacks.
+    """
     rows, file = list(rows), io.BytesIO()
     unknown = set[str]().union(*rows) - set(schema.names)
     if unknown:
@@ -55,8 +63,12 @@ def encoded(rows: Iterable[Row], schema: pa.Schema = SCHEMA) -> bytes:
 
 
 def store(path: Path, content: bytes) -> None:
-    """Write a file under a partial name, wait for the disk, and rename: a kill leaves the whole file or none, and so
-    does an error. Raises CannotWrite."""
+    """Write a file atomically: write a temporary file, flush it to disk, and rename it.
+
+    After a kill or an error the file is complete or absent.
+    Raises:
+        WriteError: if the file cannot be written.
+    """
     with replacing(path) as partial, partial.open("wb") as file:
         file.write(content)
         file.flush()
@@ -72,12 +84,19 @@ def read(
     named: bool = False,
     left_out: Callable[[Mistake], None] | None = None,
 ) -> pa.Table:
-    """All rows of units, in the order of their paths; those of an older schema get nulls.
+    """Read all rows of units, in the order of their paths.
 
-    needed: columns without which a row is none of ours; promote: whether columns of one name may differ in type
-    ("permissive"); named: with a column of the units' names, shelf.FILE; left_out: called with each unit that has a
-    value which does not fit its column (`row_validation`) and is left out therefore. Raises InputError that names all
-    files that are damaged, foreign or without rows, and without `left_out` those with such values.
+    Rows of an older schema get nulls in new columns.
+    Args:
+        paths: row files of the units.
+        schema: columns that the result has at least.
+        required_columns: columns without which a row is invalid.
+        promote: "permissive" allows columns of one name to differ in type.
+        with_unit_names: whether to append the column `row_store.FILE_COLUMN` with the names of the units.
+        on_invalid: called for each unit with an invalid value (`row_validation`), which is then omitted.
+    Returns: the rows.
+    Raises:
+        InputError: for all damaged, foreign or empty files; without on_invalid also for invalid values.
     """
     paths = list(paths)
     if len(paths) > _FEW:
@@ -111,7 +130,10 @@ def read_each(
     promote: union.Promote = "default",
     named: bool = False,
 ) -> pa.Table:
-    """As `read`, by pyarrow, file by file: the reader against which what is written is compared."""
+    """Read rows by pyarrow, file by file; this is the reference for the verification of written rows.
+
+    The parameters are those of `read_rows`.
+    """
     return _valid(paths, *_each(paths, schema, needed, promote), None, named=named)
 
 
@@ -123,7 +145,7 @@ def _valid(
     *,
     named: bool,
 ) -> pa.Table:
-    """The rows whose units have valid values alone, as `read` has it. number: of each row's unit."""
+    """Remove the rows of units with invalid values; number (n,) is the index of each row's unit."""
     bad: dict[int, Mistake] = {}
     what = "it is left out" if left_out else "take it out of the results"
     for one in invalid(table):
@@ -147,7 +169,7 @@ def _valid(
 def _each(
     paths: Sequence[Path], schema: pa.Schema, needed: Sequence[str], promote: union.Promote
 ) -> tuple[pa.Table, NDArray[np.int64]]:
-    """All rows of units, and the number of each row's unit, by pyarrow. Raises InputError."""
+    """Read all rows by pyarrow, with the index of each row's unit; raise InputError."""
     with memory_for(paths):
         return _joined(paths, schema, needed, promote)
 
@@ -172,7 +194,7 @@ def _joined(
 
 
 def _packed(paths: Sequence[Path]) -> dict[Path, pa.Table]:
-    """The rows of those units that are packed, each packed file read once. Raises InputError for a damaged one."""
+    """Read the rows of packed units, each packed file once; raise InputError for a damaged one."""
     names: dict[Path, list[str]] = {}
     for path in paths:
         if not os.path.lexists(path) and path.stem in shelf.packed_units(path.parent):
@@ -200,9 +222,16 @@ def _packed(paths: Sequence[Path]) -> dict[Path, pa.Table]:
 def heads(
     paths: Iterable[Path], columns: Sequence[str], schema: pa.Schema = SCHEMA, *, needed: Sequence[str] = ()
 ) -> dict[Path, dict[str, Any] | str]:
-    """These columns of the first row of each unit that is there, or in words what is wrong with the unit's rows.
+    """Read columns of the first row of each existing unit.
 
-    columns, needed: of the schema. Raises InputError for a packed file that is damaged.
+    Args:
+        paths: row files of the units.
+        columns: columns to return, which the schema has.
+        schema: columns that the result has at least.
+        required_columns: columns of the schema without which a row is invalid.
+    Returns: by path, the values of the first row, or a description of what is wrong with the unit.
+    Raises:
+        InputError: for a damaged packed file.
     """
     paths = [path for path in paths if shelf.there(path)]
     found: dict[int, dict[str, Any]] = {}
@@ -222,7 +251,7 @@ def heads(
 
 
 def first(path: Path, schema: pa.Schema = SCHEMA, *, needed: Sequence[str] = ()) -> dict[str, Any] | str:
-    """The first row of a unit, or in words what is wrong with its rows."""
+    """Read the first row of a unit, or describe what is wrong with its rows."""
     with memory_for([path]):
         return _first(path, schema, needed, _packed([path]))
 
@@ -263,7 +292,7 @@ def _file(path: Path) -> pa.Table:
 
 
 def _within_limits(content: BinaryIO) -> pa.Table:
-    """A file's rows. Raises OSError where it has more of them, or more bytes, than a file may have."""
+    """Read the rows of a file; raise OSError if it exceeds the maximum number of rows or bytes."""
     with pq.ParquetFile(content) as file:
         told, fields = file.metadata, list[Any](file.schema_arrow)
     names = [field.name for field in fields]
@@ -284,14 +313,14 @@ def _within_limits(content: BinaryIO) -> pa.Table:
 
 
 def _bytes_as_text(column: Any) -> int:
-    """The bytes that a dictionary of texts takes with each text written out."""
+    """Compute the bytes of a dictionary-encoded text column after decoding."""
     if not pa.types.is_dictionary(column.type):
         return 0
     return sum(pc.sum(pc.binary_length(chunk.dictionary).take(chunk.indices)).as_py() or 0 for chunk in column.chunks)
 
 
 def same(one: pa.Table, other: pa.Table) -> bool:
-    """Whether rows are equal to the bit: what is not a number equals itself here."""
+    """Return whether two tables are bitwise equal; a NaN equals itself."""
     return one.schema.equals(other.schema) and all(
         _same(a.combine_chunks(), b.combine_chunks())
         for a, b in zip(one.itercolumns(), other.itercolumns(), strict=True)

@@ -1,10 +1,11 @@
 # pyright: reportUnknownMemberType=false
-# pyarrow's stubs say little of columns, and of files that Parquet is read from.
-"""Where rows are kept: a unit's in a file of its own, `rows/<unit>.parquet`, or those of many in one file beside the
-folder, `rows.parquet`, whose column `file` names the unit (`springbench compact`).
+# pyarrow's stubs have incomplete types of columns, and of files that Parquet is read from.
+"""Row store: each unit has its own file, `rows/<unit>.parquet`, or many units share one packed file.
 
-A path under `rows/` names a unit wherever its rows lie. Its own file goes before what was packed of it: so nothing is
-seen twice, or missing, at any moment of packing, and a run that is done again takes the place of its packed rows.
+The packed file `rows.parquet` is next to the folder, and its column `file` names the unit (`springbench compact`). A
+path
+under `rows/` identifies a unit wherever its rows are stored. Its own file has priority over packed rows. Therefore no
+unit appears twice or is missing at any moment of packing, and a repeated run replaces its packed rows.
 """
 
 from __future__ import annotations
@@ -23,25 +24,32 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 FILE = "file"
-"""The column of a packed file that names the unit."""
+"""Column of a packed file that names the unit."""
 
 _END = 2**15
-"""Bytes at the end of a file in which its schema is looked for."""
+"""Number of bytes at the end of a file in which its schema is searched."""
 
 
 def packed_file(folder: Path) -> Path:
-    """The file that holds packed units of a folder of rows, if there is one."""
+    """Return the path of the packed file of a folder of rows; it may not exist."""
     return folder.with_name(f"{folder.name}.parquet")
 
 
 def folders(above: Path, name: str, depth: str = "**/") -> list[Path]:
-    """The folders of rows of this name somewhere in a folder, those included of which all is packed."""
+    """Find the folders of rows of a given name, including those whose units are all packed.
+
+    Args:
+        above: folder to search.
+        name: name of the row folders, such as `rows`.
+        depth: glob prefix of the search.
+    Returns: sorted paths.
+    """
     packed = (path.with_suffix("") for path in above.glob(f"{depth}{name}.parquet"))
     return sorted({*above.glob(f"{depth}{name}/"), *packed})
 
 
 def own_files(folder: Path) -> set[str]:
-    """The units of a folder that have files of their own, or something else in the place of one."""
+    """List the units of a folder that have a file of their own, or something else at its path."""
     try:
         with os.scandir(folder) as entries:
             return {e.name[:-8] for e in entries if e.name.endswith(".parquet") and not e.name.startswith(".")}
@@ -50,7 +58,7 @@ def own_files(folder: Path) -> set[str]:
 
 
 def packed_units(folder: Path) -> frozenset[str]:
-    """The units in the packed file of a folder. Raises InputError where that is damaged."""
+    """List the units in the packed file of a folder; raise InputError if it is damaged."""
     path = packed_file(folder)
     try:
         there = path.stat()
@@ -80,12 +88,12 @@ def _packed(path: Path, *state: int) -> frozenset[str]:
 
 
 def units(folder: Path) -> list[Path]:
-    """All units of a folder of rows, as paths in it, by their names. Raises InputError."""
+    """List all units of a folder of rows as paths, sorted by name; raise InputError."""
     return [folder / f"{name}.parquet" for name in sorted(own_files(folder) | packed_units(folder))]
 
 
 def there(unit: Path) -> bool:
-    """Whether there are rows of a unit, or something in their place. Raises InputError."""
+    """Return whether a unit has rows, or something else at its path; raise InputError."""
     return os.path.lexists(unit) or unit.stem in packed_units(unit.parent)
 
 
@@ -100,9 +108,13 @@ class Part:
 
 
 def parts(asked: Iterable[Path]) -> tuple[list[Part], list[int]]:
-    """Units in as few parts as they have schemas, and the numbers of those that are no files of rows on the face of it.
+    """Group units by schema.
 
-    Raises InputError for a packed file that is damaged.
+    Args:
+        paths: row files of the units.
+    Returns: the groups, and the indices of units that are evidently not files of rows.
+    Raises:
+        InputError: for a damaged packed file.
     """
     alike: dict[bytes, list[tuple[str, int]]] = {}
     packed: dict[Path, dict[str, int]] = {}
@@ -123,7 +135,7 @@ def parts(asked: Iterable[Path]) -> tuple[list[Part], list[int]]:
 
 
 def schema(part: Part) -> pa.Schema:
-    """The schema of a part's rows."""
+    """Read the schema of the rows of a group."""
     import pyarrow.parquet as pq
 
     with open(part.files[0], "rb") as file:
@@ -132,8 +144,10 @@ def schema(part: Part) -> pa.Schema:
 
 
 def _kind(path: str) -> bytes | None:
-    """What files of one schema have in common, at the price of reading their ends: the schema as pyarrow leaves it
-    there; of other writers' the name. None for what is no Parquet file."""
+    """Read a key that files of one schema share, from the end of the file only.
+
+    It is the schema as pyarrow stores it there, or the path for files of other writers. None for other files.
+    """
     try:
         if not os.path.isfile(path):  # a pipe would be waited for
             return None

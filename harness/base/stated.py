@@ -1,4 +1,4 @@
-"""What a solver states of itself, as columns of rows: so reports need not import it, which may be someone else's."""
+"""Metadata of solvers as columns of rows, so that reports need not import solvers, which may be user code."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from solvers.registry import EVERY, about, load, minimises
 
 
 def packages(solver: str) -> tuple[str, ...]:
-    """The distributions of others that a solver by name is an interface to."""
+    """List the third-party distributions that a solver is an interface to."""
     if solver not in EVERY:
         return ()
     package = about(load(EVERY[solver]), solver).package
@@ -18,7 +18,7 @@ def packages(solver: str) -> tuple[str, ...]:
 
 
 def stated(solver: str) -> dict[str, Any]:
-    """The columns `family`, `reference`, `minimises` and `own_steps` of a solver by name; none of what is no solver."""
+    """Read the columns `family`, `reference`, `minimises` and `own_steps` of a solver; empty for an unknown name."""
     if solver not in EVERY:
         return {}
     method = load(EVERY[solver])

@@ -1,14 +1,14 @@
-"""The statistics of times, one for each meaning, so that tables can be laid side by side.
+"""Bootstrap statistics of times, one for each meaning, so that tables are comparable.
 
-    what something takes         the median over the rounds (of a run: over its steps too)
-    what a frame adds to a run   the mean over the frames of the median over the rounds: such means add up
-    how many times as much       the median of the ratios, round by round, of what took turns
-    the same on another day      exp(median over the frames of log(new / old)), of the least over the rounds
+    time of a thing              the median over the rounds (of a run: over its steps too)
+    time that a frame adds       the mean over the frames of the median over the rounds: such means are additive
+    ratio of paired times        the median of the ratios, round by round, of interleaved measurements
+    ratio on different days      exp(median over the frames of log(new / old)), of the least over the rounds
 
-A busy machine delays some rounds and speeds up none. The median bears that of nearly half of them; a mean does not, and
-a minimum has no interval. Rounds of two days do not pair, and their load differs: there the least is what load moves
-least, and the frames are what is resampled. Intervals are those of a percentile bootstrap (Efron 1979,
-`scipy.stats.bootstrap`), which resamples the rounds; it is seeded, so the same times give the same interval.
+A busy machine delays some rounds and accelerates none. The median is robust against delays of nearly half of them; a
+mean is not, and a minimum has no interval. Rounds of two days are not paired, and their load differs. There the least
+time is used, which load affects least, and the frames are resampled. Intervals are those of a percentile bootstrap
+(Efron 1979, `scipy.stats.bootstrap`), which resamples the rounds. It is seeded, so equal times give equal intervals.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 RESAMPLES = 4000
-"""Of the bootstrap: with so many, the ends of an interval repeat to a few per cent of its width."""
+"""Number of bootstrap resamples; with this number the ends of an interval repeat to a few per cent of its width."""
 
 
 class Interval(NamedTuple):
-    """A figure and the ends of its 95 % interval."""
+    """An estimate and the ends of its 95 % interval."""
 
     middle: float
     low: float
@@ -32,15 +32,19 @@ class Interval(NamedTuple):
 
 
 def ratio(theirs: ArrayLike, ours: ArrayLike) -> Interval:
-    """How many times as much `theirs` are as `ours`, both (rounds,): the median of the ratios of the same round."""
+    """Estimate the ratio theirs / ours of paired times, both (rounds,), by the median over the rounds."""
     return _resampled((np.asarray(theirs, float) / np.asarray(ours, float),), np.median)
 
 
 def added(more: ArrayLike) -> Interval:
-    """What a frame adds, of (rounds, frames): the mean over frames of the median over rounds.
+    """Estimate the time that a frame adds: the mean over frames of the median over rounds.
 
-    Each frame's rounds are resampled by themselves: nothing ties those of two frames together but the machine's drift,
-    which is to count as noise.
+    The rounds of each frame are resampled separately. Only the drift of the machine couples the rounds of two frames,
+    and
+    it should count as noise.
+    Args:
+        more: added times (rounds, frames).
+    Returns: estimate and interval, in the unit of the times.
     """
     frames = tuple(np.asarray(more, float).T)
 
@@ -51,7 +55,12 @@ def added(more: ArrayLike) -> Interval:
 
 
 def least(steps: Iterable[tuple[int, float]]) -> dict[int, float]:
-    """Of each frame's step the least over its rounds [s], of pairs of a frame and its seconds in a round."""
+    """Compute the least time of each frame's step over its rounds [s].
+
+    Args:
+        steps: pairs of a frame and its seconds in one round.
+    Returns: least seconds by frame.
+    """
     seconds: dict[int, float] = {}
     for frame, taken in steps:
         seconds[frame] = min(taken, seconds.get(frame, taken))
@@ -59,14 +68,17 @@ def least(steps: Iterable[tuple[int, float]]) -> dict[int, float]:
 
 
 def changed(new: Mapping[int, float], old: Mapping[int, float]) -> Interval:
-    """How many times as much `new` is as `old`, both by frame: over those that both have, of which there is one."""
+    """Estimate the ratio new / old of times by frame, over the common frames, of which there is at least one."""
     frames = sorted(set(new) & set(old))
     logs = np.log([new[frame] / old[frame] for frame in frames])
     return Interval(*(float(np.exp(end)) for end in _resampled((logs,), np.median)))
 
 
 def _resampled(samples: Sequence[NDArray[np.float64]], statistic: Callable[..., Any]) -> Interval:
-    """The statistic of some samples, each resampled by itself; of a single round the interval is that round."""
+    """Compute a statistic with its bootstrap interval; each sample is resampled separately.
+
+    For a single round the interval is the value itself.
+    """
     from scipy.stats import bootstrap  # half a second to load: few commands need it
 
     middle = float(statistic(*samples, axis=-1))

@@ -1,8 +1,9 @@
-"""A process between a command and its worker, which runs nobody's code.
+"""Supervisor process between a command and its worker; it runs no user code.
 
-It reads what the worker writes as soon as it is written, so that writing costs a worker next to nothing, however seldom
-the command looks. And it is the one whom Linux gives the processes whose parents ended, so it ends all that a worker
-has started when the worker ends, when the command asks for it (SIGTERM), and when the command is gone.
+It reads the worker's output as soon as it is written. Writing therefore costs a worker almost nothing, however rarely
+the command polls. Linux also makes it the parent of orphaned descendants (subreaper). It kills all processes of a
+worker
+when the worker ends, when the command requests it (SIGTERM), and when the command has ended.
 """
 
 from __future__ import annotations
@@ -20,17 +21,27 @@ from harness.base.child import without_core_dumps
 from harness.base.worker import DUMP, adopt_orphans, has_children, serve, tie
 
 BUFFER = 2**25
-"""Bytes of output that wait for the command at most; what is more is left out."""
+"""Maximum number of output bytes that wait for the command; further output is dropped."""
 _GRACE = 2.0
-"""Seconds that the end of a worker's processes may take, and that its last output may wait for the command."""
+"""Maximum seconds for killing a worker's processes, and for its last output to reach the command."""
 _REAP = 1.0
-"""Seconds between two looks for ended processes whose parents ended before them."""
+"""Seconds between two searches for ended orphaned processes."""
 
 
 def supervise(
     calls: Connection, ticks: Connection, said: Connection, dump: Connection, ready: Callable[[], object], parent: int
 ) -> None:
-    """In a child of the command: start a worker (`harness.base.worker.serve`), and end as it ends."""
+    """Start a worker (`harness.execution.worker_process.serve_tasks`), and end as it ends.
+
+    It is the main function of the supervisor, a child of the command.
+    Args:
+        calls: pipe of tasks and results.
+        ticks: pipe of progress events.
+        output_pipe: pipe for the worker's output.
+        dump: pipe for the worker's stack dumps.
+        initialiser: called first in the worker.
+        parent: process id of the command.
+    """
     tie(parent, signal.SIGTERM)
     os.setsid()
     adopt_orphans()
@@ -55,7 +66,12 @@ def supervise(
 
 
 class _Supervisor:
-    """worker: its process; output: the pipe that it writes to; command: the pipe to pass that on to."""
+    """Relays the output of a worker, and ends its processes.
+
+    worker: process id.
+    output: pipe that the worker writes to.
+    command: pipe to the command.
+    """
 
     def __init__(self, worker: int, output: int, command: int) -> None:
         self._worker, self._output, self._command = worker, output, command
@@ -63,7 +79,7 @@ class _Supervisor:
         self._left_out = 0
 
     def run(self, signals: set[signal.Signals]) -> NoReturn:
-        """Pass on the worker's output until it ends; then end as it did."""
+        """Relay the worker's output until it ends, then end with the same exit code or signal."""
         signal.signal(signal.SIGTERM, self._stop)
         signal.signal(DUMP, lambda number, frame: os.kill(self._worker, DUMP))
         ended = os.pidfd_open(self._worker)
@@ -86,7 +102,7 @@ class _Supervisor:
         os._exit(0)
 
     def _passed_on(self, ended: int | None, seconds: float) -> bool:
-        """Move what is written now; wait for it for some seconds at most. Whether `ended` is."""
+        """Relay pending output, wait for it at most the given seconds, and return whether the worker has ended."""
         poll = select.poll()
         poll.register(self._output, select.POLLIN)
         if ended is not None:
@@ -101,7 +117,7 @@ class _Supervisor:
         return ended in ready
 
     def _read(self) -> bool:
-        """Take what is in the worker's pipe; whether there was anything."""
+        """Read the worker's pipe, and return whether it had any content."""
         try:
             found = os.read(self._output, 2**20)
         except OSError:
@@ -131,7 +147,7 @@ class _Supervisor:
             self._write()
 
     def _reap(self, sparing: int = 0) -> None:
-        """Let go of ended processes that are children of this one."""
+        """Reap ended child processes."""
         with suppress(OSError):
             while found := os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT):
                 if found.si_pid == sparing:
@@ -139,7 +155,7 @@ class _Supervisor:
                 os.waitpid(found.si_pid, os.WNOHANG)
 
     def _end_all(self) -> None:
-        """Kill all processes below this one, those included that they start meanwhile."""
+        """Kill all descendants, including those started meanwhile."""
         if not has_children():
             return
         import psutil  # for those who left something

@@ -1,9 +1,11 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# pyarrow's stubs say little of columns, and of files that Parquet is read from.
-"""The rows of many units at once, by DuckDB on their Parquet files; those of one schema are read together.
+# pyarrow's stubs have incomplete types of columns, and of files that Parquet is read from.
+"""Queries over the rows of many units, by DuckDB on their Parquet files, grouped by schema.
 
-`union_by_name` would do as much for files of any schema, and takes 140 kB of memory a file. What does not fit together
-raises `Unfit`: whoever reads then looks unit by unit, and can say which. So does a path that is a pattern to DuckDB.
+DuckDB's `union_by_name` would do the same for files of any schema, but takes 140 kB of memory per file. Units that
+cannot
+be read together raise `SchemaMismatch`. The caller then reads unit by unit and can name the invalid one. A path that
+DuckDB would interpret as a pattern raises it too.
 """
 
 from __future__ import annotations
@@ -30,11 +32,14 @@ if TYPE_CHECKING:
 Promote = Literal["default", "permissive"]
 
 MEMORY = 2**29
-"""Bytes that DuckDB may take beside what it hands out."""
+"""Memory limit of DuckDB, beyond its results, in bytes."""
 
 
 class Unfit(Exception):
-    """The units cannot be read together; damaged: the numbers of those that are no files of rows."""
+    """The units cannot be read together.
+
+    damaged_units: indices of units that are not files of rows.
+    """
 
     def __init__(self, why: str, damaged: Sequence[int] = ()) -> None:
         super().__init__(why)
@@ -48,25 +53,29 @@ class Union:
     parts: list[Part]
     schema: pa.Schema
     sources: list[str]
-    """What each part is read from, as a table expression."""
+    """Table expression of each group."""
     columns: list[str]
-    """The columns of the schema, as they stand in each part."""
+    """Select list of each group, in the order of the schema."""
 
     none: str
-    """The columns where there are no parts."""
+    """Select list without any group."""
 
     files: list[str]
-    """The files of all parts, by the paths that DuckDB reads."""
+    """Paths of all groups' files, as DuckDB reads them."""
 
     def select(self) -> str:
-        """A query for all rows, in the columns of the schema."""
+        """Build a query for all rows, in the columns of the schema."""
         parts = [f"SELECT {columns} FROM {source}" for columns, source in zip(self.columns, self.sources, strict=True)]
         return " UNION ALL ".join(parts or [f"SELECT {self.none} WHERE false"])
 
 
 @contextmanager
 def connected(memory: int = MEMORY) -> Generator[DuckDBPyConnection]:
-    """A DuckDB that reads Parquet files and nothing else, on one thread: others may be timed."""
+    """Open a DuckDB connection that reads only Parquet files, on one thread because other runs may be timed.
+
+    Raises:
+        SchemaMismatch: for an error of DuckDB, Arrow or the system inside the block.
+    """
     import duckdb
 
     settings: Any = {"memory_limit": f"{memory}B", "threads": 1, "temp_directory": ""}
@@ -81,10 +90,18 @@ def connected(memory: int = MEMORY) -> Generator[DuckDBPyConnection]:
 def union(
     connection: DuckDBPyConnection, name: str, asked: Sequence[Path], schema: pa.Schema, promote: Promote
 ) -> Union:
-    """Units as DuckDB reads them, in variables of these names; the schema's columns come first.
+    """Build the union of units for DuckDB; the schema's columns come first.
 
-    Values come from inside the files alone: a folder called `size=64` sets no column. Raises Unfit, and InputError for
-    a packed file that is damaged.
+    Values come only from inside the files: a folder called `size=64` sets no column.
+    Args:
+        connection: open connection, in which variables of the given name are set.
+        name: prefix of the variables.
+        paths: row files of the units.
+        schema: columns that the union has at least.
+        promote: mode of Arrow's schema unification.
+    Raises:
+        SchemaMismatch: if the units cannot be read together.
+        InputError: for a damaged packed file.
     """
     found, damaged = parts(asked)
     if damaged:
@@ -117,11 +134,12 @@ def union(
 
 
 _PATTERN = re.compile(r"[*?\[\\\ud800-\udfff]")
-"""Characters by which DuckDB takes a path for a pattern of several files, and those that UTF-8 does not have."""
+"""Characters that DuckDB interprets as a pattern of several files, and those that UTF-8 lacks."""
 
 
 def _literal(files: Sequence[str]) -> list[str]:
-    """Paths that DuckDB takes as they are: absolute, or `~` and `file:` at the start had a meaning. Raises Unfit."""
+    """Return absolute paths, because DuckDB interprets `~` and `file:` at the start; raise SchemaMismatch for a
+    pattern."""
     found = [os.path.abspath(file) for file in files]
     if bad := next((file for file in found if _PATTERN.search(file)), None):
         raise Unfit(f"{bad!a} would be read as a pattern")
@@ -136,10 +154,17 @@ def table(
     most: int,
     promote: Promote = "default",
 ) -> tuple[pa.Table, NDArray[np.int64]]:
-    """All rows of units, in their order, and the number of each row's unit. needed: columns that no row lacks; most:
-    rows of one unit.
+    """Read all rows of units, in their order.
 
-    Raises Unfit where a unit is damaged, has no rows or more than that, or lacks what is needed.
+    Args:
+        paths: row files of the units.
+        schema: columns that the table has at least.
+        required_columns: columns that no row may lack.
+        max_rows: maximum number of rows of one unit.
+        promote: mode of Arrow's schema unification.
+    Returns: the rows, and the index of each row's unit (n,).
+    Raises:
+        SchemaMismatch: if a unit is damaged, empty or too long, or lacks a required column.
     """
     with connected() as connection:
         whole = union(connection, "files", asked, schema, promote)
@@ -177,9 +202,17 @@ def _check_claims(files: Sequence[str], most: int) -> None:
 def heads(
     asked: Sequence[Path], columns: Sequence[str], schema: pa.Schema, needed: Sequence[str] = ()
 ) -> dict[int, dict[str, Any]]:
-    """Columns of the first row of each unit, by its number; none of those that have no rows, or lack what is needed.
+    """Query columns of the first row of each unit.
 
-    Raises Unfit.
+    Units without rows, or without a required column, are omitted.
+    Args:
+        paths: row files of the units.
+        columns: columns to return.
+        schema: columns that the union has at least.
+        required_columns: columns that no row may lack.
+    Returns: values by the index of the unit.
+    Raises:
+        SchemaMismatch: if the units cannot be read together.
     """
     with connected() as connection:
         whole = union(connection, "files", asked, schema, "default")
@@ -197,11 +230,11 @@ def heads(
 
 _AT, _ROW = "unit_asked_for", "row_of_the_unit"
 _RESERVED = (_AT, _ROW, "file_index", "file_row_number", "filename")
-"""Names that no column may have: ours, and those by which DuckDB states where a row comes from."""
+"""Reserved column names: the module's own, and those by which DuckDB reports the source of a row."""
 
 
 def _numbers(part: Part, at: Any) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """The number of each row's unit."""
+    """Compute the index of each row's unit."""
     if part.packed is None:
         return np.asarray(part.numbers, np.int64)[at.to_numpy()]
     coded = at.combine_chunks().dictionary_encode()
@@ -209,7 +242,7 @@ def _numbers(part: Part, at: Any) -> np.ndarray[Any, np.dtype[np.int64]]:
 
 
 def _types(connection: DuckDBPyConnection, schema: pa.Schema) -> dict[str, str]:
-    """DuckDB's names of the columns' types."""
+    """Read DuckDB's names of the column types."""
     connection.register("empty", schema.empty_table())
     types = connection.execute("SELECT column_name, column_type FROM (DESCRIBE empty)").fetchall()
     connection.unregister("empty")
@@ -217,7 +250,7 @@ def _types(connection: DuckDBPyConnection, schema: pa.Schema) -> dict[str, str]:
 
 
 def _column(field: pa.Field[Any], own: pa.Schema, type: str) -> str:
-    """A column of the whole schema as it is read from a part."""
+    """Format the select expression of a column for a group that may lack it or have another type."""
     name = _quoted(field.name)
     at = own.get_field_index(field.name)
     if at >= 0 and own.field(at).type == field.type:

@@ -1,6 +1,6 @@
-"""What a worker process does: one piece of work after the other, each within limits, until its parent is gone.
+"""Worker process: runs tasks one after the other, each within limits, until its parent ends.
 
-What it prints to standard error, and where it was when it crashed, goes to the parent by pipes.
+Its output, and its stack at a crash, are sent to the parent by pipes.
 """
 
 from __future__ import annotations
@@ -28,23 +28,30 @@ from solvers.device import broken
 
 Tick = Callable[[str], None]
 Piece = Callable[[Tick], Any]
-"""A piece of work, which is given whom to tell the name of its phase after each step; it pickles, and so does what it
-returns."""
+"""Function of a task. Its argument is the progress callback, which receives the name of the phase after each step. The
+function and its result must pickle.
+"""
 
 DUMP = signal.SIGUSR1
-"""Makes a worker say where it is."""
+"""Signal that makes a worker dump its stack."""
 
 _THOROUGH = 10.0
-"""After so many seconds what earlier pieces left is looked through too: a cache may have let go of it since."""
+"""Seconds between two full garbage collections, which include objects of earlier tasks; a cache may have released
+them."""
 
 _PARENT_DIES, _SUBREAPER = 1, 36
 """`PR_SET_PDEATHSIG`: Linux sends a process a signal when its parent dies. `PR_SET_CHILD_SUBREAPER`: Linux makes it the
-parent of all processes below it whose parents end."""
+parent of orphaned descendants.
+"""
 
 
 class Limits(NamedTuple):
-    """What a piece may take: wall seconds, and GiB of memory beyond what a worker has anyway, in all its processes;
-    None is any amount. log: the file for what it writes where that is too long to be shown."""
+    """Limits of a task; None is unlimited.
+
+    wall_seconds: wall time [s].
+    memory_gib: memory of all its processes [GiB], beyond what a worker uses anyway.
+    log_path: file for output that is too long to be shown.
+    """
 
     seconds: float | None = None
     gib: float | None = None
@@ -52,8 +59,12 @@ class Limits(NamedTuple):
 
 
 class PieceOutcome(NamedTuple):
-    """What a piece returned, or its error, or in words how it left; clean: whether it left nothing behind, a
-    broken device among it."""
+    """Result of a task.
+
+    value: return value.
+    error: its error, or a description of another failure.
+    is_clean: whether no thread, process or broken device is left behind.
+    """
 
     value: Any
     error: SpringbenchError | str = ""
@@ -63,8 +74,16 @@ class PieceOutcome(NamedTuple):
 def serve(
     calls: Connection, ticks: Connection, output: int, dump: Connection, ready: Callable[[], object], parent: int
 ) -> None:
-    """Do what comes through `calls` until that ends. output: where what it writes goes; ready: called first; parent:
-    whose child this is."""
+    """Run the tasks that arrive through `calls` until the pipe is closed.
+
+    Args:
+        calls: pipe of tasks and results.
+        ticks: pipe of progress events.
+        output: file descriptor that receives the worker's output.
+        dump: pipe for stack dumps.
+        initialiser: called first.
+        parent: process id of the parent.
+    """
     tie(parent)
     adopt_orphans()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's affair, which ends this
@@ -106,7 +125,7 @@ def serve(
 
 
 def tie(parent: int, how: signal.Signals = signal.SIGKILL) -> None:
-    """In a child: end by a signal when its parent does, and be the first to go where memory runs out."""
+    """In a child process: end by a signal when the parent ends, and be the first to be killed when memory runs out."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PARENT_DIES, how)
         if os.getppid() != parent:
@@ -116,7 +135,7 @@ def tie(parent: int, how: signal.Signals = signal.SIGKILL) -> None:
 
 
 def adopt_orphans() -> None:
-    """Be the parent of all processes below this one whose parents end."""
+    """Make this process the parent of its orphaned descendants."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_SUBREAPER, 1)
 
@@ -138,7 +157,7 @@ def _answer(piece: Piece, limits: Limits, tick: Tick) -> PieceOutcome:
 
 
 def _processes() -> set[int]:
-    """The children of this process, less the one that reads files for it."""
+    """List the children of this process without the sandbox that reads files."""
     if not has_children():
         return set()
     import psutil  # which takes longer to load than most pieces have
@@ -147,7 +166,7 @@ def _processes() -> set[int]:
 
 
 def has_children() -> bool:
-    """Whether this process has children; of the calls that tell, the one that costs next to nothing."""
+    """Return whether this process has children, by the cheapest system call that reports it."""
     try:
         os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     except ChildProcessError:
@@ -156,5 +175,5 @@ def has_children() -> bool:
 
 
 def _as(before: tuple[int, set[int]]) -> bool:
-    """Whether a piece left no threads and no processes behind."""
+    """Return whether a task left no threads and no processes behind."""
     return threading.active_count() <= before[0] and _processes() <= before[1]

@@ -1,12 +1,12 @@
-"""Strangers' code may crash, hang, swell or leave; it is run in a worker process, which may die, and this one goes on.
+"""Isolated worker: runs user code in a process that may crash, hang or exhaust memory without affecting this one.
 
-Between the two is a process that reads what the worker writes and ends what it started (`harness.base.supervisor`).
-One worker does all pieces of work, one after the other, so it stays warm: modules are imported, kernels compiled. It
-is replaced where it was lost, or where a piece left threads behind. It is a fork of this process, which costs nothing
-of that again, as long as nothing was begun here that does not survive a fork, as OpenMP's threads; then it is started
-anew.
+Between both is a supervisor (`harness.execution.worker_supervisor`), which reads the worker's output and ends its
+processes. One worker runs all tasks one after the other, so modules stay imported and kernels compiled. It is replaced
+after a failure, or if a task left threads behind. It is a fork of this process, which repeats none of that cost, as
+long
+as nothing was started here that does not survive a fork, such as OpenMP's threads. Otherwise it is spawned.
 
-Files are read in a process of their own likewise (`harness.base.child`), which has nothing of this one's.
+Files are read in a sandbox likewise (`harness.execution.sandbox`), which shares nothing with this process.
 """
 
 from __future__ import annotations
@@ -33,28 +33,29 @@ from harness.base.supervisor import BUFFER, supervise
 from harness.base.worker import DUMP, Limits, Piece, PieceOutcome, Tick
 
 Going = Generator[Connection, None, Any]
-"""A piece that is being done: yields whom to wait for, and returns its value."""
+"""A running task: a generator that yields the connection to wait for, and returns the task's value."""
 
 NO_FORK: set[str] = set()
-"""What was begun in this process, besides Numba's threads, and does not survive a fork."""
+"""Components started in this process, besides Numba's threads, that do not survive a fork."""
 
 _LOOK = 0.1
-"""Seconds between two looks at a worker that is at work."""
+"""Seconds between two polls of a busy worker."""
 _LATEST = 1.0
-"""Seconds that the last output of a piece may take to come, where the piece has closed or stopped what passes it on."""
+"""Maximum seconds to wait for a task's last output if the task has closed or stopped the stream."""
 _GRACE = 5.0
-"""Seconds that a worker has to say where it is, or to end, before it is killed."""
+"""Seconds that a worker has for dumping its stack, or for ending, before it is killed."""
 _KEPT = 2**14
-"""So many of the last bytes that a worker said are kept."""
+"""Number of the last output bytes that are stored."""
 _SHOWN = 2**13
-"""Bytes of what a piece writes that are shown; if there are more, all of them go to a file, `BUFFER` at most."""
+"""Maximum number of output bytes of a task that are shown; longer output goes to a file, up to `BUFFER_BYTES`."""
 
 
 class Lost(Exception):
-    """A piece gave no answer.
+    """A task returned no result.
 
-    status: `time-limit` where it took too long, `killed` where others ended its worker, `failed` where it did so
-    itself, or raised what no program should catch; reason: all that is known of it.
+    status: `time-limit` after too long a time, `killed` if its worker was ended from outside, `failed` if it ended its
+    process or raised an error that no program should catch.
+    reason: all that is known about the failure.
     """
 
     def __init__(self, status: str, reason: str) -> None:
@@ -63,8 +64,11 @@ class Lost(Exception):
 
 
 class Workers:
-    """Does pieces in a worker. ready: called in each before anything else; fork: whether that may be a fork of this
-    process, as it may while no other thread runs here."""
+    """Runs tasks in an isolated worker process.
+
+    initialiser: called first in each worker.
+    fork: whether the worker may be a fork of this process, which is safe while no other thread runs here.
+    """
 
     def __init__(self, ready: Callable[[], object] = int, *, fork: bool = True) -> None:
         self._ready, self._fork = ready, fork
@@ -72,15 +76,25 @@ class Workers:
         self._own: frozenset[Hashable] = frozenset()
 
     def begin(self) -> None:
-        """Start a worker where there is none; it gets ready while this process does something else."""
+        """Start a worker if there is none; it initialises itself concurrently."""
         if self._worker is None or not self._worker.alive:
             self.end()
             with interrupts.blocked():  # a worker that has started is known to this, and never receives Ctrl-C
                 self._worker = _Worker(self._ready, fork=self._fork)
 
     def do(self, piece: Piece, tick: Tick, limits: Limits, meanwhile: Callable[[], object] = int) -> Any:
-        """What the piece returns. meanwhile: done here once the worker has it. Raises the SpringbenchError that the
-        piece raises, and Lost where it gives no answer."""
+        """Run a task and wait for its result.
+
+        Args:
+            function: function of the task.
+            tick: progress callback.
+            limits: wall time and memory.
+            background_call: called once in this process after the task was submitted.
+        Returns: the task's value.
+        Raises:
+            SpringbenchError: if the task raises it.
+            TaskFailure: if the task returns no result.
+        """
         going = self.doing(piece, tick, limits)
         while True:
             try:
@@ -92,8 +106,17 @@ class Workers:
             wait([come], _LOOK)
 
     def doing(self, piece: Piece, tick: Tick, limits: Limits, own: frozenset[Hashable] = frozenset()) -> Going:
-        """Do a piece while others are done; see `do`. tick is told LOOK too, whenever this is asked to go on; own: the
-        code of others that the piece runs, for which no piece that runs none of it shares its worker."""
+        """Start a task that runs concurrently with others.
+
+        Args:
+            function: function of the task.
+            tick: progress callback, which also receives POLL each time the generator is resumed.
+            limits: wall time and memory.
+            user_code: user code that the task runs. A worker that has run user code is replaced before a task without
+                that code.
+        Returns: generator that yields the connection to wait for, and returns the task's value.
+        Raises: as `run_task`.
+        """
         if not self._own <= own:
             self.end()
         self.begin()
@@ -115,14 +138,14 @@ class Workers:
         return answer.value
 
     def end(self) -> None:
-        """Let go of everything."""
+        """Stop the worker and release its resources."""
         if self._worker:
             self._worker.end()
             self._worker, self._own = None, frozenset[Hashable]()
 
 
 class _Worker:
-    """One worker process and its supervisor, seen from the command."""
+    """One worker process and its supervisor, as seen from the command."""
 
     def __init__(self, ready: Callable[[], object], *, fork: bool) -> None:
         fork = fork and sys.platform == "linux" and not NO_FORK and not _threads_run()
@@ -140,11 +163,11 @@ class _Worker:
 
     @property
     def alive(self) -> bool:
-        """Whether it can be asked: nothing is to be read from one that waits, not even the end of its pipe."""
+        """Whether a task can be submitted: an idle worker's pipe has nothing to read, not even its end."""
         return self._process.is_alive() and not self._calls.poll()
 
     def ask(self, piece: Piece, tick: Tick, limits: Limits) -> Generator[Connection, None, PieceOutcome]:
-        """The answer to a piece, in the end. Raises Lost."""
+        """Submit a task and return its result at the end; raise TaskFailure."""
         heard, began = _Heard(self._ticks, self._said, tick, limits.log), monotonic()
         memory = TreeMemory(self._process.pid or 0, limits.gib) if limits.gib else None
         try:
@@ -168,7 +191,7 @@ class _Worker:
             heard.close()
 
     def _late(self, seconds: float, heard: _Heard) -> Lost:
-        """Ask a worker that takes too long where it is, and kill it."""
+        """Request the stack of a worker that exceeds its time limit, and kill it."""
         with suppress(OSError):
             os.kill(self._process.pid or 0, DUMP)
         dump, more = b"", b""
@@ -178,7 +201,7 @@ class _Worker:
         return Lost("time-limit", f"did not end within {seconds:g} s; it was {_at(dump)}{heard}")
 
     def _ended(self, heard: _Heard) -> Lost:
-        """What became of a worker that gave no answer."""
+        """Describe why a worker ended without a result."""
         self._wait(_GRACE, heard.listen)
         self.kill(heard.listen)
         code, at = self._process.exitcode or 0, _at(_come(self._dump))
@@ -192,7 +215,8 @@ class _Worker:
         return Lost("failed", f"crashed by {name} {at}{heard}")
 
     def kill(self, listen: Callable[[], object] = int) -> None:
-        """End it and all that it started, at once. listen: takes what it said, which the supervisor still passes on."""
+        """Kill the worker and all its processes at once; `listen` receives the output that the supervisor still
+        relays."""
         if self._process.is_alive():
             self._process.terminate()
             with suppress(OSError):
@@ -204,13 +228,13 @@ class _Worker:
         listen()
 
     def _wait(self, seconds: float, listen: Callable[[], object]) -> None:
-        """Wait for its end, some seconds at most."""
+        """Wait for the worker's exit, at most the given seconds."""
         until = monotonic() + seconds
         while (left := until - monotonic()) > 0 and not wait([self._process.sentinel], min(left, 0.01)):
             listen()
 
     def end(self) -> None:
-        """Let it end, and end it where it does not."""
+        """Request the worker's exit, and kill it if it does not end."""
         with suppress(OSError):
             self._calls.send(None)
         self._wait(_GRACE, partial(_come, self._said))
@@ -221,7 +245,7 @@ class _Worker:
 
 
 class _Heard:
-    """What is heard of a piece while it is done: the phases of its steps, and what it writes."""
+    """Progress events and output of a task while it runs."""
 
     def __init__(self, ticks: Connection, said: Connection, tick: Tick, log: Path | None) -> None:
         self._ticks, self._said, self._tick, self._log = ticks, said, tick, log
@@ -233,11 +257,11 @@ class _Heard:
 
     @property
     def waited(self) -> float:
-        """For how many seconds it has waited for others, by what it told."""
+        """Seconds that the task has waited for other processes, according to its events."""
         return self._waited + (0.0 if self._waits_since is None else monotonic() - self._waits_since)
 
     def listen(self) -> None:
-        """Pass on what came meanwhile."""
+        """Forward the events and the output received since the last call."""
         with suppress(EOFError, OSError):
             while self._ticks.poll():
                 phase = self._ticks.recv_bytes().decode(errors="replace")
@@ -252,7 +276,7 @@ class _Heard:
         self._take(_come(self._said))
 
     def listen_to_end(self, seconds: float) -> None:
-        """Pass on what a piece that has ended said, for which to come these seconds should do."""
+        """Forward the last output of a finished task, waiting at most the given seconds."""
         until = monotonic() + seconds
         self.listen()
         while not self._ended and (left := until - monotonic()) > 0:
@@ -260,7 +284,8 @@ class _Heard:
             self.listen()
 
     def _take(self, said: bytes) -> None:
-        """Show and keep what was written; bytes that may be the beginning of `end` stay until the next ones come."""
+        """Show and store output; bytes that may be the start of the end marker are held back until the next ones
+        arrive."""
         self._held += said
         at = self._held.find(self.end)
         self._ended = self._ended or at >= 0

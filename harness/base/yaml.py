@@ -1,9 +1,10 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# ruamel.yaml says nothing of its nodes and marks.
-"""YAML files to plain data that remembers its lines.
+# ruamel.yaml has no types of its nodes and marks.
+"""YAML loader that returns plain data with line numbers.
 
-Only the plain values of YAML 1.2 are read (mappings, lists, text, numbers, booleans, null): a tag or a directive is
-refused, and so is a file that exceeds the limits below once its aliases are expanded.
+It reads only the plain values of YAML 1.2 (mappings, lists, text, numbers, booleans, null). It rejects tags,
+directives,
+and files that exceed the limits below after the expansion of aliases.
 """
 
 from __future__ import annotations
