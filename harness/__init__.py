@@ -1,8 +1,10 @@
-"""The harness: scenes, sweeps, measurements, recordings and pictures; `dir(harness)` is what scripts and notebooks use.
+"""The harness: scenes, sweeps, measurements, recordings and pictures. `dir(harness)` lists its interface.
 
-A setting of OpenMP must be made before it loads, hence here: its idle threads must sleep instead of spin, or Numba's
-and BLAS's threads slow each other down by several times where both live in one process. All else is imported when it is
-first asked for.
+OpenMP reads its settings when it is loaded, so this module sets them. Idle OpenMP threads must sleep instead of
+spinning;
+otherwise the threads of Numba and BLAS slow each other down several times in one process. Everything else is imported
+on
+first use.
 """
 
 from __future__ import annotations

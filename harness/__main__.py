@@ -1,4 +1,4 @@
-"""The console script: prepares the process, then imports and runs the command line."""
+"""Console script: prepares the process, then imports and runs the command line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def main() -> None:
 
         run_command()
     except BaseException as end:
-        # Cleaning up may raise anything after Ctrl-C, and Typer turns a KeyboardInterrupt into an exit code.
+        # After Ctrl-C, clean-up code may raise anything, and Typer turns a KeyboardInterrupt into an exit code.
         if interrupts.is_interrupted() or isinstance(end, KeyboardInterrupt):
             interrupts.exit_process()
         raise
@@ -27,7 +27,7 @@ def main() -> None:
 
 
 def _prepare_environment() -> None:
-    """Replace settings of the environment that no command can use; exit with code 2 where one has no meaning."""
+    """Override environment settings that no command can use; exit with code 2 for an invalid one."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # what a terminal cannot write is written as an escape sequence
             stream.reconfigure(errors="backslashreplace")

@@ -1,4 +1,4 @@
-"""What scripts and notebooks use, as `harness.run` and so on: scenes, steps, sweeps, rows, pictures, recordings.
+"""Python interface for scripts and notebooks: scenes, steps, sweeps, rows, pictures and recordings.
 
 scene = harness.make_scene(mesh={"kind": "grid"}, mass=1.0, time_step=1/30, frames=60, default_size=16,
                            effects=[{"kind": "springs", "stretch": 300.0}, {"kind": "gravity"}])
@@ -55,7 +55,7 @@ __all__ = [
 
 
 def load_scene(path: str | Path) -> SceneSpec:
-    """The scene in a YAML file, or in an assignment's JSON file. Raises InputError."""
+    """Load a scene from a YAML file, or from an assignment's JSON file; raise InputError."""
     return load.opened_scene(Path(path))
 
 
@@ -67,10 +67,17 @@ def make_scene(
     name: str = "scene",
     **fields: Unpack[SceneKeys],
 ) -> SceneSpec:
-    """A scene written in Python, with the keys that its file would have.
+    """Build a scene in Python, with the keys that its file would have.
 
-    mesh, effects: mappings as in a file, or objects, such as an effect of your own; folder: where files that it names
-    are; name: for messages. Raises InputError.
+    Args:
+        mesh: mapping as in a file, or a mesh object.
+        effects: mappings as in a file, or effect objects.
+        folder: folder of the files that the scene names.
+        name: name of the scene in messages.
+        fields: other keys of a scene file.
+    Returns: the validated scene.
+    Raises:
+        InputError: for any mistake in the scene.
     """
     listed = [dict(effect) if isinstance(effect, Mapping) else {"kind": "gravity"} for effect in effects]
     given = dict(mesh) if isinstance(mesh, Mapping) else {"kind": "grid"}
@@ -86,10 +93,13 @@ def make_scene(
 
 
 class Simulation:
-    """A scene in motion, one step each time it is asked.
+    """A simulation of a scene that advances step by step.
 
-    mesh: at rest; time [s]; positions (n, 3) [m]; velocity (n, 3) [m/s]; last: the last step, with its problem and its
-    solution, None at the start.
+    mesh: mesh at rest.
+    time: simulated time [s].
+    positions: (n, 3) [m].
+    velocity: (n, 3) [m/s].
+    last_step: last step, with its problem and its solution; None at the start.
     """
 
     def __init__(
@@ -104,8 +114,19 @@ class Simulation:
         first_guess: FirstGuess | None = None,
         parameters: Mapping[str, Any] | None = None,
     ) -> None:
-        """solver: a name as in a sweep, its parameters beside it, or an object; size: of the mesh, the scene's own if
-        left out; tolerance: relative, None does all iterations. Raises InputError, and what `prepare` raises."""
+        """Build the scene and prepare the solver.
+
+        Args:
+            scene: scene to simulate.
+            solver: a solver's name as in a sweep, or a solver object.
+            size: mesh size; the scene's default if omitted.
+            integrator: name of the time integrator.
+            max_iterations: iteration limit of a step.
+            rtol: relative tolerance of a step; None performs all iterations.
+            initial_guess: initial guess of a step; the scene's default if omitted.
+            parameters: parameters of a solver that is given by name.
+        Raises: InputError, and the errors of the solver's preparation.
+        """
         size = size if size is not None else scene.default_size
         self._scene = build(scene, size or 0, integrator)
         if isinstance(solver, str):
@@ -118,21 +139,21 @@ class Simulation:
 
     @property
     def time(self) -> float:
-        """The simulated time [s]."""
+        """Simulated time [s]."""
         return self._scene.time(self._state.index)
 
     @property
     def positions(self) -> Positions:
-        """Where the vertices are, (n, 3) [m]; a copy."""
+        """Copy of the vertex positions, (n, 3) [m]."""
         return self._state.now.positions.copy()
 
     @property
     def velocity(self) -> Positions:
-        """Of the vertices, (n, 3) [m/s]; a copy."""
+        """Copy of the vertex velocities, (n, 3) [m/s]."""
         return self._state.now.velocity.copy()
 
     def step(self) -> Positions:
-        """Do one step, and tell where the vertices are after it, (n, 3) [m]."""
+        """Advance by one step and return the new positions, (n, 3) [m]."""
         frames = self._state.index + 1
         (self.last,) = simulate(
             self._scene, self._prepared, self._stop, first_guess=self._guess, frames=frames, state=self._state
@@ -141,7 +162,7 @@ class Simulation:
         return self.positions
 
     def steps(self, count: int) -> NDArray[np.float64]:
-        """Do some steps: the positions after each, (count, n, 3) [m]."""
+        """Advance by a number of steps and return the positions after each, (count, n, 3) [m]."""
         return np.array([self.step() for _ in range(count)])
 
 
@@ -161,10 +182,17 @@ def run(
     results: str | Path = "results",
     again: bool = False,
 ) -> Any:
-    """Do what is missing of a sweep, as `springbench run`, and return its rows as `rows` does.
+    """Run what is missing of a sweep, as `springbench run`, and return its rows.
 
-    config: the file of a sweep or a scene; or a sweep as a mapping, with its name, and the folder that holds the scenes
-    and the code that it names. Raises InputError.
+    Args:
+        config: file of a sweep or a scene, or a sweep as a mapping.
+        name: name of a sweep that is a mapping.
+        folder: folder of the scenes and the code that a mapping names.
+        results: folder that contains a results folder for each sweep.
+        rerun: whether to repeat runs that have results.
+    Returns: the rows, in the type that `load_rows` returns.
+    Raises:
+        InputError: for any mistake in the config.
     """
     from harness.base.claim import claimed
     from harness.base.console import err
@@ -187,8 +215,10 @@ def run(
 
 
 def _plain(value: Any, at: Key = ()) -> Any:
-    """Data of a config as its file would have it: lists for tuples and arrays, texts for paths. Raises InputError for
-    what no file can hold."""
+    """Convert config data to what its file would contain; raise InputError for other objects.
+
+    Tuples and arrays become lists, paths become text.
+    """
     if isinstance(value, Mapping):
         given = cast(Mapping[Any, Any], value)
         return {str(key): _plain(one, (*at, str(key))) for key, one in given.items()}
@@ -208,8 +238,10 @@ def _plain(value: Any, at: Key = ()) -> Any:
 
 
 def rows(folder: str | Path) -> Any:
-    """The rows of a sweep's results, such as "results/quickstart": a DataFrame of polars where it is installed, else of
-    pandas, else a table of pyarrow. Raises InputError."""
+    """Load the rows of a sweep's results folder, such as "results/quickstart"; raise InputError.
+
+    Returns: a polars DataFrame if polars is installed, else a pandas DataFrame, else a pyarrow table.
+    """
     from harness.base.rows import read
     from harness.base.shelf import units
 
@@ -223,8 +255,11 @@ def _frame(table: Any) -> Any:
 
 
 def open_recording(path: str | Path) -> Replay:
-    """What a recording shows: times (k,) [s], positions (k, n, 3) [m] relative to `origin`
-    (3,), springs, scalars; `absolute_positions(k)` adds the origin, in double precision. Raises InputError."""
+    """Open a recording; raise InputError if it cannot be read.
+
+    Returns: times (k,) [s], positions (k, n, 3) [m] relative to `origin` (3,), springs and scalars. Its method
+    `absolute_positions(k)` adds the origin in double precision.
+    """
     from harness.record.reader import read_replay
 
     return read_replay(Path(path))
@@ -232,7 +267,7 @@ def open_recording(path: str | Path) -> Replay:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture that a notebook shows; png: its content."""
+    """A PNG image that a notebook displays; content: bytes of the file."""
 
     png: bytes
 
@@ -240,15 +275,19 @@ class Picture:
         return self.png
 
     def save(self, path: str | Path) -> Path:
-        """Write it to a file (.png)."""
+        """Write the image to a file (.png) and return its path."""
         Path(path).write_bytes(self.png)
         return Path(path)
 
 
 def draw(what: str | Path | Replay | Mapping[str, str | Path | Replay]) -> Picture:
-    """The picture of a run, from its recording; or, of several recordings by name, one that compares them.
+    """Draw the picture of a run from its recording, or a comparison of several recordings.
 
-    Raises InputError, and RunFailed where the system cannot draw.
+    Args:
+        source: a recording or its path, or a mapping of names to these.
+    Raises:
+        InputError: if a recording cannot be read.
+        RunFailed: if the system cannot draw.
     """
     from harness.report.comparison import draw_comparison
     from harness.report.run_picture import draw_run

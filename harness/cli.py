@@ -1,7 +1,7 @@
-"""The command line: `springbench run`, `speed`, `accuracy`, `recommend`, `list`, `query`, `schema`, `inspect` and more.
+"""Command line: `springbench run`, `speed`, `accuracy`, `recommend`, `list`, `query`, `schema`, `inspect` and more.
 
-Exit codes: 0 all is well, 1 a run failed or a gate found a regression, 2 the user's mistake, 3 a gate cannot tell,
-130 stopped by Ctrl-C.
+Exit codes: 0 success, 1 a failed run or a performance regression, 2 a mistake of the user, 3 an inconclusive regression
+test, 130 stopped by Ctrl-C.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def run(
     ] = None,
     here: InThisProcess = False,
 ) -> None:
-    """Do what is missing of a sweep, or of the one scene in a file."""
+    """Run what is missing of a sweep, or of the one scene in a file."""
     from harness.base.claim import claimed
     from harness.base.progress import display
     from harness.config.load import load_any
@@ -121,7 +121,7 @@ def run(
 
 
 def _load_what_tells() -> None:
-    """What `_told` needs, which takes as long to load as a picture to draw."""
+    """Import the modules of `_report_sweep`, which takes as long as drawing a picture."""
     from harness.base.machine_lock import beside
 
     with beside(lambda said: None):
@@ -130,7 +130,7 @@ def _load_what_tells() -> None:
 
 
 def _told(sweep: Sweep, table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
-    """What the rows of a sweep say, and the reports on them; returns a line for each run that failed."""
+    """Print the summary of a sweep, draw its reports, and return a line for each failed run."""
     from harness.experiments.plan import of_other_code
     from harness.experiments.sweep import failures
     from harness.report.learned import closing
@@ -157,7 +157,7 @@ def accuracy(
     changed: Changed = False,
     here: InThisProcess = False,
 ) -> None:
-    """Measure what accuracy costs in time: convergence on frozen steps, and errors of whole simulations."""
+    """Measure work and precision: convergence on single steps, and errors of whole simulations."""
     from harness.base.claim import claimed
     from harness.base.progress import display
     from harness.config.accuracy_load import load_accuracy
@@ -184,8 +184,10 @@ def report(
         bool, typer.Option("--viewer/--without-viewer", help="Put Rerun's viewer into the page, 19 MB.")
     ] = True,
 ) -> None:
-    """Write the page of all results, `index.html`, the map of solvers x cases of those that were judged, and what a
-    device saves where runs asked for one."""
+    """Write the page of all results, `index.html`, and maps of solvers x cases.
+
+    The maps show the verified runs. Runs on a device also get a picture of the time that the device saves.
+    """
     from harness.experiments.older import older_of
     from harness.report.devices_plot import draw_devices
     from harness.report.robustness import summary
@@ -229,7 +231,7 @@ def query(
     csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
     seconds: Annotated[float, typer.Option(help="Processor time that the answer may take.")] = 15.0,
 ) -> None:
-    """Answer an SQL query over the rows of all sweeps."""
+    """Run an SQL query over the rows of all sweeps."""
     from harness.report.machines import COMPARE
     from harness.report.query import PRINTED, SHOWN, answer
 
@@ -259,7 +261,7 @@ def inspect(
     export: Annotated[Path | None, typer.Option(help="Write one frame's mesh to this file (.vtp, ...).")] = None,
     csv: Annotated[Path | None, typer.Option(help="Write the scalars to this file.")] = None,
 ) -> None:
-    """Print what is in recordings, without a viewer; two are compared."""
+    """Print the content of recordings without a viewer, or compare two of them."""
     from harness.report.inspect import inspect as inspect_recordings
 
     inspect_recordings(recordings, frame=frame, export=export, csv=csv, console=out())
@@ -281,7 +283,7 @@ def _check_positions(path: Path | None) -> None:
 def main() -> None:
     """Run the command that the arguments name."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for some in every installed package
-    # Typer makes a parser of every command that it knows, a tenth of what it takes to list.
+    # Typer builds the parsers of all registered commands, which takes a tenth of the time of `list`.
     one = copy(app)
     asked = [c for c in app.registered_commands if c.callback and (c.name or c.callback.__name__) in sys.argv[1:2]]
     one.registered_commands = asked or app.registered_commands

@@ -1,1 +1,1 @@
-"""What a config says: sweeps and accuracy configs, expanded and checked, and their schema."""
+"""Configs: sweeps and accuracy configs, their validation, expansion and JSON Schema."""

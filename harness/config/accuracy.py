@@ -1,4 +1,4 @@
-"""What an accuracy config asks, once it was checked: curves on frozen steps, and work of whole trajectories."""
+"""Models of a validated accuracy config: convergence curves on step snapshots, and work of whole trajectories."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from harness.scenes.spec import FirstGuess, Frames, IntegratorName, SceneSpec, S
 from solvers.plugins import identity
 
 Moment = Literal["early", "middle", "violent"] | Frames
-"""A moment of the scene that is found from its own run, or the number of a frame."""
+"""A snapshot of the scene that is found from its own run, or the number of a frame."""
 
 
 def moment_name(moment: str | int) -> str:
-    """A moment in rows: early, middle, violent or frame-k."""
+    """Format a snapshot for rows: early, middle, violent or frame-k."""
     return f"frame-{moment}" if isinstance(moment, int) else moment
 
 
@@ -30,7 +30,7 @@ TimeLimit = Annotated[float, Field(gt=0, le=1e5)]
 
 
 class Study(lists("integrator", "time_step"), single(rounds=3)):
-    """What every study says: of its lists, all combinations are measured."""
+    """Fields of every study; all combinations of its lists are measured."""
 
     scene: Many[str] = ()
     """Names of scenes, the stems of their files; all of them if left out."""
@@ -39,18 +39,18 @@ class Study(lists("integrator", "time_step"), single(rounds=3)):
     solver: Many[str] = ()
     """Names of solvers that the config lists; all of them if left out."""
     threads: Threads = 1
-    """Threads of Numba and of BLAS: a number, for what is measured at another number is another measurement."""
+    """Number of threads of Numba and of BLAS; never automatic, because another number is another measurement."""
     time_limit: TimeLimit = 5.0
     """Seconds that a solver may take for one curve, or one simulation."""
 
 
 class CurveStudy(Study, lists(first_guess=("current", "inertial")), single(iterations=2000)):
-    """Convergence of the solvers that minimise, on frozen steps; a curve ends where it has converged."""
+    """Convergence of minimising solvers on step snapshots; a curve ends at convergence."""
 
     moment: Many[Moment] = ("early", "middle", "violent")
-    """Which steps are frozen: moments found from the scene's run, or numbers of frames."""
+    """Steps to take snapshots of: moments found from the scene's run, or numbers of frames."""
     recordings: bool = False
-    """Whether the solve from the first of the guesses is recorded, to scrub through its iterates beside the mesh."""
+    """Whether the solve from the first initial guess is recorded, to view its iterates on the mesh."""
 
 
 class WorkStudy(Study, lists(*OF_STEPS)):
@@ -61,23 +61,23 @@ class WorkStudy(Study, lists(*OF_STEPS)):
 
 
 class AccuracyFields(Model):
-    """An accuracy config: scenes, solvers, and what to measure of them."""
+    """An accuracy config: scenes, solvers and studies."""
 
     description: str = Field(default="", max_length=1000)
-    """One sentence about what the config asks."""
+    """One sentence about the question that the config answers."""
     scenes: tuple[str, ...] = Field(min_length=1)
     """Scene files (*.yaml, or *.json of the assignment), relative to the config."""
     solvers: tuple[str | dict[str, Any], ...] = Field(min_length=1)
     """Solvers: a name, or a mapping of `name` and the solver's parameters."""
     curves: tuple[CurveStudy, ...] = ()
-    """Studies of convergence; where two ask for the same solve, the first says how."""
+    """Studies of convergence; if two include the same solve, the settings of the first apply."""
     work: tuple[WorkStudy, ...] = ()
-    """Studies of work; where two ask for the same simulation, the first says how."""
+    """Studies of work; if two include the same simulation, the settings of the first apply."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A scene at a size, with an integrator and a time step (which is that of `scene`)."""
+    """A scene at a mesh size, with an integrator and a time step (that of `scene`)."""
 
     scene_name: str
     scene: SceneSpec
@@ -85,7 +85,7 @@ class Case:
     integrator: IntegratorName
 
     def identity(self) -> list[Any]:
-        """All that determines the motion, as plain data."""
+        """Build plain data that determines the motion."""
         return [self.scene.digest, self.size, identity(self.integrator)]
 
     @property
@@ -96,7 +96,7 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class How:
-    """How a unit is measured; see `Study`."""
+    """Measurement settings of a unit, as in `AccuracyStudyConfig`."""
 
     threads: int
     rounds: int
@@ -105,7 +105,7 @@ class How:
 
 @dataclass(frozen=True, slots=True)
 class CurveSpec:
-    """The curves of one solver on one frozen step; `moment` as in the config."""
+    """Specification of the curves of one solver on one step snapshot, named as in the config."""
 
     case: Case
     moment: str | int
@@ -116,28 +116,28 @@ class CurveSpec:
     how: How
 
     def point(self) -> list[Any]:
-        """What is measured, however it is; plain data."""
+        """Describe what is measured as plain data, without the measurement settings."""
         return ["curve", *self.case.identity(), self.moment, identity(self.solver.name), dict(self.solver.parameters)]
 
     def unit_id(self, machine: str) -> str:
-        """12 hex digits of all that determines result and timing."""
+        """Compute 12 hex digits from all that determines result and timing."""
         how = [asdict(self.how), self.first_guesses, self.iterations, self.recordings]
         return _hash([machine, self.point(), how])
 
     def label(self) -> str:
-        """The name of its file; measured otherwise, it takes the place of what was there."""
+        """Build the stem of its file, which is the same for other measurement settings."""
         solver = safe_name(self.solver.name)
         return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{solver}-{_hash(self.point())}"
 
     def problem_label(self) -> str:
-        """The name of the file of the step itself."""
+        """Build the stem of the file of the step itself."""
         problem = [*self.case.identity(), self.moment]
         return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{_hash(problem)}"
 
 
 @dataclass(frozen=True, slots=True)
 class WorkSpec:
-    """One simulation up to the horizon [s]; options: those of `OF_STEPS`, in their order."""
+    """Specification of one simulation up to t_end [s]; options: the values of `STEP_OPTIONS`, in their order."""
 
     case: Case
     horizon: float
@@ -146,17 +146,17 @@ class WorkSpec:
     how: How
 
     def point(self) -> list[Any]:
-        """What is measured, however it is; plain data."""
+        """Describe what is measured as plain data, without the measurement settings."""
         stop = [*self.options.values(), self.how.threads]
         solver = [identity(self.solver.name), dict(self.solver.parameters)]
         return ["work", *self.case.identity(), self.horizon, *solver, *stop]
 
     def unit_id(self, machine: str) -> str:
-        """12 hex digits of all that determines result and timing."""
+        """Compute 12 hex digits from all that determines result and timing."""
         return _hash([machine, self.point(), asdict(self.how)])
 
     def label(self) -> str:
-        """The name of its file; measured otherwise, it takes the place of what was there."""
+        """Build the stem of its file, which is the same for other measurement settings."""
         return f"{self.case.scene_name}-{self.case.size}-work-{safe_name(self.solver.name)}-{_hash(self.point())}"
 
 

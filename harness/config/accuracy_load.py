@@ -1,4 +1,4 @@
-"""Accuracy configs from their files, and the units of work that they ask for; all mistakes are reported at once."""
+"""Loader of accuracy configs: validation and expansion into units of work, with all mistakes reported at once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MAX_UNITS = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """A checked config: its name, and its units of work without duplicates."""
+    """A validated accuracy config: its name and its distinct units of work."""
 
     name: str
     curves: tuple[CurveSpec, ...]
@@ -36,8 +36,10 @@ class Accuracy:
 
 
 def load_accuracy(path: Path) -> Accuracy:
-    """The accuracy config in a YAML file; code that it names was tried before (`harness.config.own`). Raises
-    InputError."""
+    """Load an accuracy config from a YAML file; raise InputError.
+
+    User code that it names is tried first in a worker process (`harness.config.user_code`).
+    """
     return tried(partial(_load, path), _own, _stated, lambda accuracy: MOST)
 
 
@@ -69,7 +71,16 @@ def _load(path: Path, own: OwnCode) -> Accuracy:
 def expand(
     document: Document, fields: AccuracyFields, scenes: Mapping[str, SceneSpec], solvers: Sequence[SolverSpec]
 ) -> Accuracy:
-    """The units that a config asks for; where two studies ask for the same, the first says how. Raises InputError."""
+    """Expand a config into its units of work; the settings of the first study apply to duplicates.
+
+    Args:
+        document: config, which collects mistakes.
+        fields: validated fields of the config.
+        scenes: scenes by name.
+        solvers: solvers of the config.
+    Raises:
+        InputError: for all mistakes.
+    """
     expansion = _Expansion(document, scenes, solvers)
     curves = [unit for i, study in enumerate(fields.curves) for unit in expansion.curves(study, ("curves", i))]
     work = [unit for i, study in enumerate(fields.work) for unit in expansion.work(study, ("work", i))]
@@ -91,7 +102,7 @@ U = TypeVar("U", CurveSpec, WorkSpec)
 
 
 def _distinct(units: Sequence[U]) -> tuple[U, ...]:
-    """The first of the units that measure the same."""
+    """Return the first of the units that measure the same."""
     first: dict[str, U] = {}
     for unit in units:
         first.setdefault(unit.label(), unit)
@@ -99,13 +110,13 @@ def _distinct(units: Sequence[U]) -> tuple[U, ...]:
 
 
 class _Expansion:
-    """Expands studies; mistakes are noted in the document."""
+    """Expands studies, and adds mistakes to the document."""
 
     def __init__(self, document: Document, scenes: Mapping[str, SceneSpec], solvers: Sequence[SolverSpec]) -> None:
         self.document, self.scenes, self.solvers = document, scenes, solvers
 
     def curves(self, study: CurveStudy, at: Key) -> Iterator[CurveSpec]:
-        """One for each problem and solver; solvers that do not minimise have none."""
+        """Expand a study into one curve for each problem and minimising solver."""
         how = How(study.threads, study.rounds, study.time_limit)
         if "coarse" in study.first_guess:
             problem = "a curve's clock begins at its first guess, and this one is a solve itself; compare it in a sweep"
@@ -142,7 +153,7 @@ class _Expansion:
         return found
 
     def _sizes(self, name: str, study: Study, at: Key) -> Sequence[int]:
-        """The sizes of a scene: the study's, else the scene's default; 0 for a mesh from a file."""
+        """Return the study's mesh sizes, else the scene's default; 0 for a mesh from a file."""
         scene = self.scenes[name]
         if not isinstance(scene.mesh, Generator):
             return (0,)
@@ -159,7 +170,7 @@ class _Expansion:
         return [solver for solver in self.solvers if solver.name in names]
 
     def _named(self, key: str, asked: Sequence[str], known: Sequence[str], at: Key) -> list[str]:
-        """The names that a study asks for, all of them if it asks for none."""
+        """Return the names that a study selects, or all if it selects none."""
         for name in asked:
             if name not in known:
                 self.document.report(f"came {quote(name)}; expected {did_you_mean(name, known)}", (*at, key))

@@ -1,6 +1,6 @@
-"""The options of a run on the command line, made of the model that states them.
+"""Command-line options of a run, generated from their model.
 
-The model is imported when a command that takes them is asked, and not to list the commands.
+The model is imported when a command with these options is parsed, and not to list the commands.
 """
 
 from __future__ import annotations
@@ -14,8 +14,12 @@ from typer.main import get_command
 
 
 def taking(*names: str) -> type[TyperCommand]:
-    """A command that takes these options of a run too, all without names. It finds what was given in `obj` of its
-    context; a value means there what it means in a file."""
+    """Build a command class that also accepts options of a run.
+
+    The values are parsed as in a file and passed in `obj` of the command's context.
+    Args:
+        names: options to add; all of them if empty.
+    """
 
     class Taking(TyperCommand):
         _added: tuple[str, ...] = ()
@@ -38,7 +42,7 @@ def taking(*names: str) -> type[TyperCommand]:
 
 
 def _options(names: tuple[str, ...]) -> list[Any]:
-    """As Typer makes them of a function that has them as parameters."""
+    """Build the options that Typer creates for a function with such parameters."""
     from harness.config.options import OPTIONS, meaning
 
     def function() -> None: ...

@@ -1,4 +1,4 @@
-"""From a sweep's lists to its runs: the grid of all combinations, less `exclude`, and `include`."""
+"""Expansion of a sweep into its runs: the grid of all combinations without `exclude`, plus `include`."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ MAX_RUNS = 10_000
 
 
 class Expansion:
-    """Expands one sweep; mistakes are noted in its document.
+    """Expands one sweep, and adds mistakes to its document.
 
-    name: of the sweep; scenes: by name; solvers: in the order of the sweep.
+    name: name of the sweep.
+    scenes: scenes by name.
+    solvers: solvers, in the order of the sweep.
     """
 
     def __init__(
@@ -35,7 +37,7 @@ class Expansion:
         self.scenes, self.solvers = scenes, solvers
 
     def runs(self) -> tuple[RunSpec, ...]:
-        """The runs without duplicates, the grid's first; empty after mistakes were noted."""
+        """Expand the runs without duplicates, those of the grid first; empty if there are mistakes."""
         self._check_names()
         options = self.fields.options.model_dump(include=set(OPTIONS))
         self._check_chosen()
@@ -79,7 +81,7 @@ class Expansion:
             )
 
     def _sizes(self, scene_name: str) -> Sequence[int]:
-        """The sizes of a scene: the sweep's, else the scene's default; 0 for a mesh from a file."""
+        """Return the sweep's mesh sizes, else the scene's default; 0 for a mesh from a file."""
         scene = self.scenes[scene_name]
         if not isinstance(scene.mesh, Generator):
             return (0,)
@@ -107,7 +109,7 @@ class Expansion:
             yield scene_name, sizes, solvers, chosen
 
     def _kept(self, grid: Sequence[RunSpec]) -> list[RunSpec]:
-        """The grid points that no entry of `exclude` matches."""
+        """Return the grid points that no entry of `exclude` matches."""
         kept = list(grid)
         for i, entry in enumerate(self.fields.exclude):
             if not any(_matches(entry, run) for run in grid):
@@ -126,7 +128,7 @@ class Expansion:
                             self.document.report(problem, (part, i, key))
 
     def _check_chosen(self) -> None:
-        """What an asked error chooses is not stated beside it; and neither can be had of a judged run."""
+        """Check that an error target is not combined with options that it selects, or with verification."""
         options = self.fields.options
         if None not in options.accuracy:
             for name in OF_ERROR:
@@ -149,7 +151,15 @@ class Expansion:
 
 
 def check_size(document: Document, scene_name: str, scene: SceneSpec, size: int, at: Key) -> None:
-    """Note a mistake where a generated mesh has no such size."""
+    """Add a mistake if a generated mesh does not support a size.
+
+    Args:
+        document: config, which collects mistakes.
+        scene_name: name of the scene in messages.
+        scene: scene with the mesh.
+        size: requested mesh size.
+        at: location of the size in the document.
+    """
     mesh = scene.mesh
     if not isinstance(mesh, Generator):
         return

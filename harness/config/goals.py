@@ -1,4 +1,4 @@
-"""What `springbench goals` reads: errors, what else each is to be had by, and the part of its cost that is wanted."""
+"""Performance targets of `springbench goals`: error bounds, a baseline for each, and the target ratio of cost."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from harness.scenes.spec import IntegratorName, SceneSpec, Size
 
 
 class Goal(Model):
-    """An error of scenes at their horizon, and the cheapest of something else to hold it against."""
+    """A performance target: an error of scenes at t_end, and the baseline whose cheapest variant is compared."""
 
     scene: Many[str]
     """Names of scenes, the stems of their files."""
@@ -28,21 +28,21 @@ class Goal(Model):
     horizon: Annotated[float, Field(gt=0, le=1e4)]
     """Simulated time [s]."""
     error: Many[Annotated[float, Field(gt=0, lt=1)]]
-    """Relative to the displacement at the horizon; of several, each is a goal."""
+    """Error relative to the displacement at the end; each of several values is a target of its own."""
     peer: str | None = None
-    """Another library's integrator, by name (`springbench run SCENE --error E --peers` has them all)."""
+    """Baseline: a third-party integrator, by name (`springbench run SCENE --error E --peers` lists them)."""
     integrator: Many[IntegratorName] | None = None
-    """Or steps of one length by these integrators ..."""
+    """Baseline instead of `peer`: fixed step sizes by these integrators ..."""
     solver: Many[str] = ()
     """... these solvers ..."""
     tolerance: Many[Tolerance] = (1e-1, 1e-2, 1e-4)
-    """... and these tolerances: the steps are shortened until the error is the one asked."""
+    """... and these tolerances; the step size is reduced until the error is the requested one."""
     iterations: Iterations = 500
     """Iteration limit of such a step."""
     graded: bool = False
-    """Whether errors are those by the reference; then the one that was asked for has to be kept to, too."""
+    """Whether errors are measured against the reference solution; then the requested error must be met, too."""
     wanted: PositiveFloat
-    """The part of its processor time that is wanted."""
+    """Target ratio of processor time to that of the baseline."""
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
@@ -52,18 +52,18 @@ class Goal(Model):
 
 
 class GoalsFields(Model):
-    """Goals, and the scenes that they name."""
+    """A config of performance targets and their scenes."""
 
     description: str = Field(default="", max_length=1000)
-    """One sentence about what the config asks."""
+    """One sentence about the question that the config answers."""
     scenes: tuple[str, ...] = Field(min_length=1)
     """Scene files (*.yaml, or *.json of the assignment), relative to the config."""
     goals: tuple[Goal, ...] = Field(min_length=1)
-    """One after the other."""
+    """The targets, in the order of their execution."""
 
 
 class OneGoal(NamedTuple):
-    """A goal with the name of one scene, one size, None for the default, and one error."""
+    """A target for one scene, one mesh size (None for the default) and one error."""
 
     goal: Goal
     scene: str
@@ -73,7 +73,7 @@ class OneGoal(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Goals:
-    """A checked config: its name, its scenes, and its goals one by one."""
+    """A validated config: its name, its scenes, and its individual targets."""
 
     name: str
     scenes: dict[str, SceneSpec]
@@ -81,7 +81,15 @@ class Goals:
 
 
 def load_goals(path: Path, peers: Sequence[str], solvers: Sequence[str]) -> Goals:
-    """The config in a YAML file; peers, solvers: the names that there are. Raises InputError."""
+    """Load performance targets from a YAML file.
+
+    Args:
+        path: the file.
+        libraries: names of available third-party integrators.
+        solvers: names of available solvers.
+    Raises:
+        InputError: for all mistakes.
+    """
     document = read_yaml(path)
     if "goals" not in document.data:
         raise InputError(Mistake("has no `goals`; `springbench run` does scenes and sweeps", path))

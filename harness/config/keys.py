@@ -1,6 +1,6 @@
-"""The names and keys that configs written in Python have, as types: a type checker finds those that do not exist.
+"""Types of the names and keys of configs written in Python, for type checkers.
 
-They say no more than the models do; a test compares both.
+They contain the same information as the models; a test compares both.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ IntegratorName = Literal[
 ]  # fmt: skip
 ReportName = Literal["certificates", "medians", "timing"]
 OwnName = NewType("OwnName", str)
-"""The name of code of one's own: `OwnName("./mine.py:Mine")`."""
+"""Name of user code: `UserCodeName("./mine.py:Mine")`."""
 
 T = TypeVar("T")
 Some = T | Sequence[T]
@@ -31,7 +31,7 @@ Number = float | str
 
 
 class SceneKeys(TypedDict, total=False):
-    """The keys of a scene besides its mesh and effects; see `harness.scenes.spec.SceneFields`."""
+    """Keys of a scene besides its mesh and effects, as in `harness.scenes.spec.SceneFields`."""
 
     description: str
     mass: float | None
@@ -46,7 +46,7 @@ class SceneKeys(TypedDict, total=False):
 
 
 class OptionKeys(TypedDict, total=False):
-    """The options of a sweep; see `harness.config.sweep.Options`."""
+    """Options of a sweep, as in `harness.config.sweep_config.SweepOptions`."""
 
     iterations: Some[int]
     tolerance: Some[float | Literal["auto"] | None]
@@ -68,7 +68,7 @@ class OptionKeys(TypedDict, total=False):
 
 
 class SweepKeys(TypedDict, total=False):
-    """The keys of a sweep; see `harness.config.sweep.SweepFields`. A solver with parameters is a mapping."""
+    """Keys of a sweep, as in `harness.config.sweep_config.SweepConfig`; a solver with parameters is a mapping."""
 
     description: str
     scenes: Required[Sequence[str]]

@@ -1,4 +1,4 @@
-"""Scenes and sweeps from their files; all mistakes of a sweep and its scenes are reported at once."""
+"""Loader of scenes and sweeps from their files; all mistakes of a sweep and its scenes are reported at once."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from solvers.plugins import Plugin, found, load
 
 ASSIGNMENT_FRAMES = 30
 ASSIGNMENT_SOLVER = "numba"
-"""What an assignment's scene is simulated by where nothing is stated, with the iterations of `Chosen`."""
+"""Default number of frames and solver of an assignment's scene; iteration limits are those of `RunOptions`."""
 
 
 class AssignmentMesh(Model):
@@ -42,13 +42,13 @@ class AssignmentMesh(Model):
     path: Path
 
     def build(self, size: int = 0) -> Mesh:
-        """The file's mesh, whatever the size; raises InputError."""
+        """Read the mesh of the file, which has only one size; raise InputError."""
         return read_assignment(self.path).mesh
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """A checked sweep: its name, its options, the runs and the reports that it asks for."""
+    """A validated sweep: its name, options, runs and reports."""
 
     name: str
     options: Options
@@ -56,19 +56,25 @@ class Sweep:
     reports: tuple[str, ...] = ()
 
     def runs(self) -> list[RunSpec]:
-        """The runs, without duplicates: scene by scene, size by size, solver by solver."""
+        """List the distinct runs: scene by scene, size by size, solver by solver."""
         return list(self.expanded)
 
 
 def load_any(
     path: Path, *, solvers: Sequence[str] = (), sizes: Sequence[int] = (), opens: bool = True, **options: Any
 ) -> Sweep:
-    """The sweep in a file, or a sweep of the one scene in it.
+    """Load a sweep from a file, or build a sweep of the one scene in it.
 
-    For a scene, `solvers`, `sizes` and `options` (those of `harness.config.sweep.Options`, None as null in a sweep) say
-    what to run; a sweep says so itself. Where nothing is stated of how steps end, they end as `DEFAULT_STOP` states,
-    those of an assignment's scene as in a sweep. opens: whether code that it names is tried before, in a process of its
-    own; else its parameters are not checked. Raises InputError.
+    The keyword arguments apply to scenes only; a sweep defines its own. A YAML scene without a stop rule gets
+    `DEFAULT_STOP_RULE`, and an assignment's scene gets the defaults of a sweep.
+    Args:
+        path: file of a sweep or a scene.
+        solvers: names of solvers; the default solver if empty.
+        sizes: mesh sizes; the scene's default if empty.
+        imports_code: whether user code is tried first in a worker process. Otherwise its parameters are not checked.
+        options: options of `harness.config.sweep_config.SweepOptions`; None corresponds to null in a sweep.
+    Raises:
+        InputError: for all mistakes.
     """
     load = partial(_any, path, solvers, sizes, options)
     return _tried_sweep(load) if opens else load(OwnCode(opens=False, kept=True))
@@ -99,7 +105,7 @@ def _any(path: Path, solvers: Sequence[str], sizes: Sequence[int], options: dict
 
 
 def load_sweep(path: Path) -> Sweep:
-    """The sweep in a YAML file, its scenes checked and its grid expanded. Raises InputError."""
+    """Load a sweep from a YAML file, validate its scenes and expand its grid; raise InputError."""
     return sweep_of(read_yaml(path))
 
 
@@ -116,27 +122,29 @@ def _stated(sweep: Sweep) -> dict[str, Any]:
 
 
 def stated_by(solvers: Iterable[str]) -> dict[str, Any]:
-    """What those solvers among these state that are somebody's own; their code is imported."""
+    """Read the metadata of the user solvers among the given names, by importing their code."""
     return {str(name): stated(name) | {"packages": packages(name)} for name in found(solvers)}
 
 
 def load_scene(path: Path) -> SceneSpec:
-    """The scene in a YAML file, or in an assignment's JSON file; code that it names was tried before, as it is for
-    `load_any`. Raises InputError."""
+    """Load a scene from a YAML file, or from an assignment's JSON file; raise InputError.
+
+    User code that it names is tried first in a worker process, as in `load_config`.
+    """
     return tried(
         partial(_scene, path), lambda scene: [plugin for plugin, _ in scene.own.values()], _bound, lambda scene: MOST
     )
 
 
 def _bound(scene: SceneSpec) -> dict[str, Any]:
-    """Bind a scene at its own size; no solver states anything of it."""
+    """Check a scene by building it at its default size; return no metadata of solvers."""
     if mistakes := misfits(scene, [scene.default_size or 0]):
         raise InputError(mistakes)
     return {}
 
 
 def opened_scene(path: Path) -> SceneSpec:
-    """The same with code that it names imported in this process. Raises InputError."""
+    """Load a scene and import the code that it names in this process; raise InputError."""
     return _scene(path, IMPORTED)
 
 
@@ -145,7 +153,10 @@ def _scene(path: Path, own: OwnCode) -> SceneSpec:
 
 
 def scene_from_assignment(path: Path) -> SceneSpec:
-    """The scene that equals an assignment file: same springs, force, pins, time step. Raises InputError."""
+    """Convert an assignment file to an equivalent scene; raise InputError.
+
+    It has the same springs, force, pins and time step.
+    """
     document = Document(path, {})
     check_name(document)
     if document.mistakes:
@@ -169,7 +180,7 @@ def scene_from_assignment(path: Path) -> SceneSpec:
 
 
 def scene_of(document: Document) -> SceneSpec:
-    """The scene in a document. Raises InputError."""
+    """Build the scene of a document; raise InputError for all mistakes."""
     data = document.data
     if "scenes" in data and "mesh" not in data:
         raise InputError(Mistake("is a sweep; a scene is wanted here", document.path))
@@ -194,7 +205,7 @@ def scene_of(document: Document) -> SceneSpec:
 
 
 def _digest(source: Any) -> str:
-    """SHA-256 of a mesh from a file; a generated mesh has none."""
+    """Compute the SHA-256 of a mesh from a file, or "" for a generated mesh."""
     if isinstance(source, Generator):
         return ""
     mesh: Mesh = source.build(0)
@@ -210,9 +221,14 @@ _PARTS = {"mesh": (mesh_names.EVERY, OwnMesh), "effect": (effect_names.EVERY, Ow
 
 
 def _part(document: Document, what: str, data: Any, at: Key, own: dict[str, tuple[Plugin, dict[str, Any]]]) -> Any:
-    """A mesh or an effect, checked by the class that its `kind` names; only that class is imported.
+    """Build a mesh or an effect by the class of its `kind`; only that class is imported.
 
-    own: told of what is somebody's own code.
+    Args:
+        document: config, which collects mistakes.
+        part_kind: "mesh" or "effect".
+        data: mapping of the part.
+        at: location of the part in the document.
+        plugins: dictionary that receives user code, by location.
     """
     table, unopened = _PARTS[what]
     named = chosen(document, table, data, "kind", at)
@@ -229,8 +245,10 @@ def _part(document: Document, what: str, data: Any, at: Key, own: dict[str, tupl
 
 
 def sweep_of(document: Document) -> Sweep:
-    """The sweep in a document, its scenes read from the files that it names; code that it names was tried before.
-    Raises InputError."""
+    """Build the sweep of a document, with the scenes that it names; raise InputError.
+
+    User code that it names is tried first in a worker process.
+    """
     return _tried_sweep(partial(_sweep_by, document))
 
 
@@ -243,7 +261,7 @@ def _sweep_of(document: Document) -> Sweep:
 
 
 def scenes_of(document: Document) -> dict[str, SceneSpec]:
-    """The scenes by name, read from the files that the config lists under `scenes`; mistakes are noted."""
+    """Read the scenes listed under `scenes`, by name; mistakes are added to the document."""
     scenes: dict[str, SceneSpec] = {}
     listed: Any = document.data.get("scenes")
     for i, entry in enumerate(listed if is_list(listed) else []):
@@ -283,7 +301,7 @@ def _expanded(document: Document, scenes: dict[str, SceneSpec]) -> Sweep:
 
 
 def require_stated(runs: Iterable[RunSpec]) -> None:
-    """Raise InputError for a run whose steps are chosen, where they are compared as they are stated."""
+    """Raise InputError for a run with an error target, whose step size is not fixed."""
     if any(run.accuracy is not None for run in runs):
         raise InputError(
             Mistake("chooses the steps of each run, which `springbench run` does; leave it out", key="accuracy")
@@ -291,7 +309,14 @@ def require_stated(runs: Iterable[RunSpec]) -> None:
 
 
 def misfits_of(document: Document, name: str, scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:
-    """See `misfits`; of scenes with code of others only where that is imported."""
+    """Find mistakes of a scene as `find_scene_mistakes`, but import user code only if the policy allows it.
+
+    Args:
+        document: config with the policy for user code.
+        name: name of the scene in messages.
+        scene: scene to check.
+        sizes: mesh sizes of its runs.
+    """
     if not scene.own:
         return misfits(scene, sizes)
     document.own.tell(f"{BINDING}{name}")
@@ -299,7 +324,7 @@ def misfits_of(document: Document, name: str, scene: SceneSpec, sizes: Sequence[
 
 
 def misfits(scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:
-    """What keeps the parts of a scene from fitting together, found at the smallest of the sizes."""
+    """Find mistakes between the parts of a scene by building it at the smallest of the sizes."""
     try:
         if sizes:
             build(scene, min(sizes))
@@ -313,7 +338,7 @@ def _is_assignment(path: Path) -> bool:
 
 
 def check_name(document: Document) -> None:
-    """Note a mistake where the file's name cannot name its results."""
+    """Add a mistake if the file's name is not a valid name of results."""
     if not NAME.fullmatch(document.path.stem):
         wanted = "rename it to letters, digits, `.`, `_` and `-`, at most 64, the first a letter or a digit"
         document.report(f"the file's name becomes the name of results; {wanted}")

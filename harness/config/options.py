@@ -1,7 +1,8 @@
-"""The options of a run, stated once.
+"""Options of a run, defined once.
 
-From `Chosen` follow what a sweep and an accuracy study list, the options of the command line, what entries of a sweep
-match, how runs are told apart where space is short, columns of their rows, and their hash.
+`RunOptions` determines the lists of a sweep and of an accuracy study, the options of the command line, and the keys
+that
+entries of a sweep match. It also determines the short descriptions of runs, columns of their rows, and their hash.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ Rounds = Annotated[int, Field(ge=1, le=1000)]
 
 
 class Option(NamedTuple):
-    """What is known of an option besides its type and meaning.
+    """Attributes of an option besides its type and description.
 
-    short: how its value is named where space is short; column: of rows, "" for none; null: what it means to leave it
-    out, for what the scene says else.
+    short_format: format of its value in short descriptions.
+    column: column of rows, "" for none.
+    null_meaning: meaning of null, for options that a scene defines otherwise.
     """
 
     short: str
@@ -38,16 +40,17 @@ _OF_SCENE = "null takes the scene's"
 
 
 class Chosen(Model):
-    """How a run is done: one value of each option that can be varied."""
+    """Options of a run that can be varied, one value of each."""
 
     iterations: Annotated[Iterations, Option("{} it.", "max_iterations")] = 50
     """Iteration limit of a step."""
     tolerance: Annotated[Tolerance | Literal["auto"], Option("tol. {}", "tolerance")] = None
-    """Relative tolerance that ends a step's iterations; null does all of them; auto: what is left of the
-    residual adds at most a tenth to the step's own local error, as an embedded method or differences of the velocity
-    estimate it."""
+    """Relative tolerance of a step's iterations; null performs all of them. auto: the remaining residual adds at most a
+    tenth
+    to the step's own local error, estimated by an embedded method or by differences of the velocity.
+    """
     integrator: Annotated[IntegratorName, Option("{}", "integrator")] = "implicit-euler"
-    """How time is integrated."""
+    """Time integrator."""
     time_step: Annotated[TimeStep, Option("dt {:.3g}", "time_step", _OF_SCENE)]
     """Time step [s]."""
     first_guess: Annotated[

@@ -1,4 +1,4 @@
-"""Somebody's own code in a config: named, told by its file, and tried in a process of its own before anything runs."""
+"""User code in a config: it is identified by its file, and tried in a worker process before anything runs."""
 
 from __future__ import annotations
 
@@ -17,23 +17,33 @@ if TYPE_CHECKING:  # for configs that name code of others
 
 
 class Most(NamedTuple):
-    """Wall seconds, and GiB of memory."""
+    """Limits of loading user code: wall time [s] and memory [GiB]."""
 
     seconds: float
     gib: float
 
 
 MOST = Most(60.0, 2.0)
-"""What importing and binding code of others may take before a command starts; a config may say less time, or another
-memory."""
+"""Limits for importing and binding user code before a command starts. A config may set a shorter time, or another
+amount of
+memory.
+"""
 
 T = TypeVar("T")
 Load = Callable[[OwnCode], T]
 
 
 def chosen(document: Document, table: Table, data: Any, tag: str, at: Key) -> tuple[str, dict[str, Any]] | None:
-    """Split the mapping `data` into the name under its key `tag`, a Plugin where it is somebody's own code, and its
-    other keys; None after a mistake was noted."""
+    """Split a mapping into the name under its tag and its other keys; user code becomes a Plugin.
+
+    Args:
+        document: config, which collects mistakes.
+        table: known names.
+        data: value that should be a mapping.
+        tag: key that selects the name, such as `kind`.
+        at: location of the data in the document.
+    Returns: (name, other keys), or None after a mistake was added.
+    """
     if is_mapping(data) and isinstance(data.get(tag), str):
         try:
             name = table.named(data[tag], document.path.parent)
@@ -61,11 +71,19 @@ def tried(
     stated: Callable[[T], dict[str, Any]],
     limits: Callable[[T], Most],
 ) -> T:
-    """What a config loads to, where code of others stays unopened. Where it has some, that was opened before in a
-    process of its own, which found no mistakes, and told what solvers state.
+    """Load a config without importing its user code, after a trial in a worker process.
 
-    load: pickles; own: the code of others; stated: by solver, asked where its class is imported.
-    Raises InputError, also where that process is lost.
+    The trial imports and binds the user code, finds mistakes, and reads the metadata of solvers. It is omitted for a
+    config
+    without user code.
+    Args:
+        load: loads the config with a given policy; it must pickle.
+        find_plugins: lists the user code of a loaded config.
+        read_metadata: reads metadata by solver, where the classes are imported.
+        limits: limits of the trial for a loaded config.
+    Returns: the loaded config.
+    Raises:
+        InputError: for a mistake, or if the worker process fails.
     """
     found = load(UNOPENED)
     names = list(dict.fromkeys(own(found)))
@@ -99,9 +117,9 @@ def _elsewhere(piece: Callable[[Tick], Any], limits: Most, names: list[Plugin]) 
 
 
 def within(seconds: float | None, gib: float | None) -> Most:
-    """MOST, with a config's limits."""
+    """Build the load limits from a config's time [s] and memory [GiB], bounded by the default time."""
     return Most(min(MOST.seconds, seconds or MOST.seconds), gib or MOST.gib)
 
 
 BINDING = "\0binding "
-"""What a process says, with the name of a scene behind it, before it binds one."""
+"""Prefix of the progress event, followed by the name of a scene, before a scene is bound."""

@@ -1,4 +1,7 @@
-"""The JSON Schema (draft 2020-12) of scenes, sweeps, accuracy configs and goals, for editors; made of their models."""
+"""JSON Schema (draft 2020-12) of scenes, sweeps, accuracy configs and performance targets, generated from their models.
+
+Editors use it for completion and validation.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ from solvers.registry import OPTIONAL, SOLVERS, load
 
 
 def schema() -> dict[str, Any]:
-    """The schema of a config: a scene, a sweep, an accuracy config or goals; it names every mesh, effect and solver."""
+    """Build the schema of all kinds of configs; it lists every mesh, effect and solver."""
     mesh = _one_of({kind: load(target) for kind, target in MESHES.items()}, "kind")
     effect = _one_of({kind: load(target) for kind, target in EFFECTS.items()}, "kind")
     shipped = {**SOLVERS, **OPTIONAL}
@@ -50,7 +53,7 @@ def schema() -> dict[str, Any]:
 
 
 def _one_of(models: dict[str, type[Model]], tag: str) -> Any:
-    """The union of models, told apart by the key `tag`, which is required and holds the model's name."""
+    """Build a union of models, discriminated by a required key that has the name of the model."""
     make: Any = create_model  # the name of a field is known at run time alone
     tagged: list[Any] = [
         make(name, __base__=model, __doc__=model.__doc__, **{tag: (Literal[name], ...)})

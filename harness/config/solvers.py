@@ -1,8 +1,8 @@
-"""The solvers of a config, with all of their parameters; they are the fields of a solver's dataclass.
+"""Solvers of a config with all of their parameters, which are the fields of a solver's dataclass.
 
-A solver brings Numba and its kernels along, most of what `springbench list` would take. So what a shipped one said of
-its parameters is kept in the user's cache, by the digest of all sources of solvers: a change of any asks anew, and
-checkouts of other sources keep theirs beside it.
+Importing a solver also imports Numba and its kernels, which would be most of the time of `springbench list`. The
+parameters of shipped solvers are therefore cached for the user, by the digest of all sources of solvers. Any change of
+the sources invalidates the entry, and checkouts with other sources have entries of their own.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from solvers.plugins import Plugin, load
 from solvers.registry import EVERY
 
 _KEPT_FOR = 30 * 86400.0
-"""Seconds."""
+"""Lifetime of a cached entry, in seconds."""
 
 
 def solvers_of(document: Document) -> list[SolverSpec]:
-    """The solvers that the config lists under `solvers`, with all of their parameters; mistakes are noted."""
+    """Read the solvers listed under `solvers`, with all of their parameters; mistakes are added to the document."""
     listed: Any = document.data.get("solvers")
     found = [
         _solver(document, entry, ("solvers", i))
@@ -74,7 +74,7 @@ def _solver(document: Document, entry: str | dict[str, Any], at: Key) -> SolverS
 
 
 def _try(document: Document, name: Plugin, asked: dict[str, Any], at: Key) -> None:
-    """Make a solver of somebody's own, and note what mistakes there are."""
+    """Try to create a user's solver, and add its mistakes to the document."""
     solver = opened(document, name, "solver", at)
     if solver is None:
         return
@@ -89,8 +89,13 @@ def _try(document: Document, name: Plugin, asked: dict[str, Any], at: Key) -> No
 
 
 def parameters_model(name: str, solver: type) -> type[Model]:
-    """The model of a solver's parameters, made of the fields of its frozen dataclass; of those of somebody's own fields
-    may be of any type, which no file can give, such as arrays."""
+    """Build the model of a solver's parameters from the fields of its frozen dataclass.
+
+    For user code the fields may have any type, including types that no file can contain, such as arrays.
+    Args:
+        name: name of the solver.
+        solver: dataclass of the solver.
+    """
     hints = get_type_hints(solver, include_extras=True)
     given: dict[str, Any] = {f.name: (hints[f.name], _default(f)) for f in fields(solver) if f.init}
     base = _OfAnyType if isinstance(name, Plugin) else Model
@@ -108,14 +113,14 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def _stated(solver: type, parameters: Model) -> dict[str, Any]:
-    """What rows and hashes tell of parameters: all but what the solver leaves unstated where it is as usual."""
+    """Select the parameters for rows and hashes: all except those that the solver omits at their default."""
     unstated: frozenset[str] = getattr(solver, "unstated", frozenset())
     usual = {name for name in unstated if getattr(parameters, name, None) == getattr(solver, name, None)}
     return parameters.model_dump(mode="json", exclude=usual)
 
 
 def _kept_file(name: str) -> Path:
-    """Where the parameters of a shipped solver that a config names alone are kept."""
+    """Return the cache path of a shipped solver that a config names without parameters."""
     return users_cache("parameters") / f"{name}-{_of_sources()[:16]}.json"
 
 
@@ -133,7 +138,7 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def _keep(path: Path, parameters: dict[str, Any]) -> None:
-    """Keep parameters where there is a place; what was kept long ago goes, and is asked anew if somebody wants it."""
+    """Write parameters to the cache if possible, and remove expired entries."""
     with suppress(OSError, CannotWrite):
         path.parent.mkdir(parents=True, exist_ok=True)
         for older in path.parent.glob("*.json"):

@@ -1,4 +1,4 @@
-"""What a sweep asks, once it was checked: its options, and the runs that they make."""
+"""Models of a validated sweep: its options and its runs."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ REPORTS: dict[str, str] = {
     "medians": "harness.report.medians:medians",
     "timing": "harness.report.timing_plot:timing",
 }
-"""The shipped reports by name; each is a function `report(rows, folder)` that answers the files it wrote."""
+"""The shipped reports by name; each is a function `report(rows, folder)` that returns the files it wrote."""
 
 EVERY_REPORT = Table("springbench.reports", REPORTS)
-"""All that a sweep can name."""
+"""All reports that a sweep can name."""
 
 if TYPE_CHECKING:
     ReportName = str
@@ -35,30 +35,34 @@ else:
 
 
 class Varied(lists(*OPTIONS)):
-    """Options that a sweep can vary: one value, or a list of values to run each of."""
+    """Options that a sweep can vary: one value, or a list of values."""
 
 
 class Kept(Model):
-    """Options that are the same for all runs of a sweep."""
+    """Options that all runs of a sweep share."""
 
     convergence_frames: tuple[Annotated[int, Field(ge=1)], ...] | None = None
     """Frames whose convergence is measured; null is the first, the middle and the last."""
     strain_range: float | None = Field(default=None, gt=0, le=10)
-    """Strain at the ends of a recording's colour scale (0.1 is 10 %); null takes it from where the run ends."""
+    """Strain at the ends of a recording's colour scale (0.1 is 10 %); null uses the strain at the end of the run."""
     record: bool = True
     """Whether a Rerun recording is written for each run."""
     pictures: bool = True
     """Whether pictures are drawn from the recordings."""
     judge: bool = False
-    """Whether an oracle judges each step's answer in the rows: for `springbench report`, on small meshes."""
+    """Whether the reference evaluator verifies each step's result in the rows, for `springbench report`; for small
+    meshes."""
     timing: Literal["exclusive", "shared", "rough"] = "exclusive"
-    """exclusive: while a run is timed, nothing else of springbench's computes on the machine; shared: several are timed
-    at once, each on cores of its own, and their rows say so; rough: no pass is there to be timed, the steps are done
-    once and looked at, and their times are of that: for what is not about times, without recordings."""
+    """exclusive: while a run is timed, no other springbench process computes on the machine; shared: several runs are
+    timed
+    concurrently, each on reserved cores, and their rows state that; rough: there is no timed pass, the steps are
+    computed
+    once with instrumentation, and the times include it. rough is for questions other than times, without recordings.
+    """
     time_limit: float | None = Field(default=3600.0, gt=0, le=1e7)
-    """Wall time [s] that a run may take, all of it; null is any. One that takes longer is ended, and is a row."""
+    """Wall time [s] of a whole run; null is unlimited. A run that exceeds it is stopped, and its row records that."""
     memory_limit: float | None = Field(default=None, gt=0, le=1e6)
-    """Memory [GiB] that a run may take beyond what a process has anyway; null is any."""
+    """Memory [GiB] of a run, beyond what its process uses anyway; null is unlimited."""
 
 
 class Options(Kept, Varied):
@@ -66,25 +70,25 @@ class Options(Kept, Varied):
 
 
 def _without_defaults(schema: dict[str, Any]) -> None:
-    """What an entry leaves out is not the default of a sweep."""
+    """Remove the defaults of a sweep, which do not apply to omitted keys of an entry."""
     for described in schema["properties"].values():
         described.pop("default", None)
 
 
 class Include(Varied):
-    """Runs beside the grid: what is left out means every scene, every solver, and an option's first value."""
+    """Runs in addition to the grid; an omitted key selects every scene, every solver, or an option's first value."""
 
     model_config = ConfigDict(json_schema_extra=_without_defaults)
 
     scene: Many[str] = ()
     """Names of scenes, the stems of their files."""
     size: Many[Size] = ()
-    """Mesh sizes; they need not be among the sweep's."""
+    """Mesh sizes, which need not be among the sweep's."""
     solver: Many[str] = ()
     """Names of solvers that the sweep lists."""
 
     def stated(self, key: str) -> tuple[Any, ...]:
-        """The values that the entry lists under a key; none where it leaves it out."""
+        """Return the values of a key, or none if the entry omits it."""
         return getattr(self, key) if key in self.model_fields_set else ()
 
 
@@ -98,30 +102,34 @@ class Exclude(Include):
 
 
 class SweepFields(Model):
-    """A sweep: scenes, sizes, solvers and options, of which every combination is a run."""
+    """A sweep: scenes, sizes, solvers and options; every combination is a run."""
 
     description: str = Field(default="", max_length=1000)
-    """One sentence about what the sweep asks."""
+    """One sentence about the question that the sweep answers."""
     scenes: tuple[str, ...] = Field(min_length=1)
     """Scene files (*.yaml, or *.json of the assignment), relative to the sweep file."""
     sizes: tuple[Size, ...] = ()
-    """Mesh sizes; may be left out where every scene has a default size or takes its mesh from a file."""
+    """Mesh sizes; may be left out if every scene has a default size or a mesh from a file."""
     solvers: tuple[str | dict[str, Any], ...] = Field(min_length=1)
     """Solvers: a name, or a mapping of `name` and the solver's parameters."""
     options: Options = Options()
-    """Options; lists make a grid."""
+    """Options; lists form a grid."""
     exclude: tuple[Exclude, ...] = ()
     """Grid points to leave out."""
     include: tuple[Include, ...] = ()
-    """Runs beside the grid."""
+    """Runs in addition to the grid."""
     reports: tuple[ReportName, ...] = ()
-    """What is told of the rows when all runs are done, beside the pictures."""
+    """Reports on the rows of all runs, in addition to the pictures."""
 
 
 @dataclass(frozen=True, slots=True)
 class SolverSpec:
-    """A solver's name and all of its parameters, defaults included. stated: what the class of somebody's own states,
-    as `harness.base.stated` has it, its `packages` among it; nothing for shipped ones."""
+    """A solver's name and all of its parameters, including defaults.
+
+    metadata: metadata of a user's class, as in `harness.results.solver_metadata`, with its `packages`; empty for
+    shipped
+    solvers.
+    """
 
     name: str
     parameters: Mapping[str, Any]
@@ -129,28 +137,27 @@ class SolverSpec:
 
     @property
     def columns(self) -> dict[str, Any]:
-        """The columns of what it states of itself; the class of somebody's own is not imported for them."""
+        """Metadata columns of the solver; the class of user code is not imported for them."""
         if not isinstance(self.name, Plugin):
             return stated(self.name)
         return {name: value for name, value in self.stated.items() if name != "packages"}
 
     @property
     def minimises(self) -> bool:
-        """See `solvers.registry.minimises`."""
+        """Whether the solver's iterates tend to a minimum, as in `solvers.registry.minimises`."""
         own = isinstance(self.name, Plugin)
         return bool(self.stated.get("minimises", True)) if own else minimises(load(EVERY[self.name]))
 
     @property
     def packages(self) -> tuple[str, ...]:
-        """The distributions of others that it is an interface to."""
+        """Third-party distributions that the solver is an interface to."""
         return tuple(self.stated.get("packages", ())) if isinstance(self.name, Plugin) else packages(self.name)
 
 
 class RunSpec(Kept, Chosen):
-    """One run, made with `model_construct` of what was checked before.
+    """One run, built with `model_construct` from validated values.
 
-    size: 0 where the mesh comes from a file; frames, time_step (which is the scene's own here) and first_guess are
-    resolved.
+    size: 0 if the mesh comes from a file. frames, time_step (that of the scene here) and initial_guess are resolved.
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -162,22 +169,24 @@ class RunSpec(Kept, Chosen):
     solver: SkipValidation[SolverSpec]
 
     def but(self, **other: Any) -> RunSpec:
-        """The same run with other values."""
+        """Return a copy of the run with other values of some options."""
         return self.model_copy(update=other)
 
     @property
     def title(self) -> str:
-        """The run in words."""
+        """Description of the run."""
         return f"{self.scene_name}{f' {self.size}' if self.size else ''} {self.solver.name}"
 
     @property
     def passes(self) -> int:
-        """How often the steps are done: to warm up, to be timed, and to be looked at."""
+        """Number of passes over the steps: warm-up, timed rounds, and instrumentation."""
         return 1 if self.timing == "rough" else self.rounds + 2
 
     def identity(self) -> str:
-        """All that determines the run's result and timing on one machine, as canonical JSON; pictures come later, from
-        the recording, and limits only say when to give up."""
+        """Build canonical JSON of all that determines the run's result and timing on one machine.
+
+        Pictures are drawn later from the recording, and limits only determine when a run is stopped; both are excluded.
+        """
         left_out = ("sweep", "scene_name", "pictures", "time_limit", "memory_limit")
         settings = {name: value for name, value in self if name not in left_out}
         settings |= {"scene": self.scene.digest, "solver": [identity(self.solver.name), dict(self.solver.parameters)]}
@@ -189,13 +198,13 @@ class RunSpec(Kept, Chosen):
         return json.dumps(settings, sort_keys=True, separators=(",", ":"))
 
     def run_id(self, machine: str) -> str:
-        """The run's name on a machine, 12 hex digits of SHA-256; names of sweep and scene are no part."""
+        """Compute the run's id on a machine, 12 hex digits of SHA-256, independent of the names of sweep and scene."""
         return hashlib.sha256(f"{machine} {self.identity()}".encode()).hexdigest()[:12]
 
     def label(self, machine: str) -> str:
-        """The run's name in the names of its files."""
+        """Build the stem of the run's file names."""
         return f"{self.scene_name}-{self.size}-{safe_name(self.solver.name)}-{self.run_id(machine)}"
 
     def own(self) -> list[Plugin]:
-        """Somebody's own code in the run: the solver, the integrator, the mesh, effects."""
+        """Find the user code of the run: solver, integrator, mesh and effects."""
         return found([self.solver.name, self.integrator, *(plugin for plugin, _ in self.scene.own.values())])
