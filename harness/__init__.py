@@ -1,10 +1,8 @@
 """The harness: scenes, sweeps, measurements, recordings and pictures. `dir(harness)` lists its interface.
 
 OpenMP reads its settings when it is loaded, so this module sets them. Idle OpenMP threads must sleep instead of
-spinning;
-otherwise the threads of Numba and BLAS slow each other down several times in one process. Everything else is imported
-on
-first use.
+spinning; otherwise the threads of Numba and BLAS slow each other down several times in one process. Everything else is
+imported on first use.
 """
 
 from __future__ import annotations

@@ -26,8 +26,7 @@ def where(error: BaseException, own: Collection[str]) -> str:
     """Return `file:line` of an error.
 
     The line is the last one in user_files, else the last one in any user code, else the last one. The line that raised
-    the
-    error is appended if it is another one.
+    the error is appended if it is another one.
 
     Args:
         error: exception with a traceback.

@@ -105,10 +105,8 @@ class Claims:
     """Claims of this process on units of a shared folder; the first process to claim a unit computes it.
 
     A claim is a lock on one byte of `.claims` (POSIX record locks, which work on network file systems too). It is
-    released
-    when its process ends, however that happens. Units are files of rows. A unit whose file has changed since the start
-    was
-    finished by another process.
+    released when its process ends, however that happens. Units are files of rows. A unit whose file has changed since
+    the start was finished by another process.
     """
 
     def __init__(self, folder: Path, units: Sequence[Path]) -> None:

@@ -190,8 +190,7 @@ def _pools(modules: int) -> Any:
     """Return the loaded libraries that have thread pools.
 
     They are loaded with modules, so a new search is needed only if the number of modules has changed. Reading the
-    system's
-    list of loaded libraries takes longer than writing the rows of a short run.
+    system's list of loaded libraries takes longer than writing the rows of a short run.
     """
     from threadpoolctl import ThreadpoolController  # pyright: ignore[reportMissingTypeStubs]
 

@@ -5,12 +5,10 @@
     reserve_cores           as lock_timing_shared, on cores reserved for this process
 
 Runs that wait to be timed have priority. Processes that were timed therefore analyse their results concurrently, and
-not
-each before the next one is timed. A process that prepares a timed run (`TimingSession`) counts as waiting; otherwise
-two
-processes would alternate indefinitely, each preparing while the other one analyses. The locks are files, which the
-system releases when a process dies. All commands and workers of a machine share them, in the folder `SPRINGBENCH_LOCKS`
-or else in the folder for temporary files.
+not each before the next one is timed. A process that prepares a timed run (`TimingSession`) counts as waiting;
+otherwise two processes would alternate indefinitely, each preparing while the other one analyses. The locks are files,
+which the system releases when a process dies. All commands and workers of a machine share them, in the folder
+`SPRINGBENCH_LOCKS` or else in the folder for temporary files.
 """
 
 from __future__ import annotations
@@ -53,8 +51,7 @@ class Turn:
     """Session of one timed run: preparation, timing (`lock_timing_exclusive`), and analysis of its result.
 
     exclusive: whether the run is timed alone. Otherwise it is timed on reserved cores (`reserve_cores`) without waiting
-    for
-    other sessions.
+    for other sessions.
     """
 
     def __init__(self, tick: Tick, *, exclusive: bool) -> None:

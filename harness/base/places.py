@@ -4,9 +4,8 @@
 
 Commands work on a local folder in the user's cache, one per URL. Remote changes are downloaded before a command, and
 local changes are uploaded when it ends, even after an error. If a kill prevents the upload, the next command repeats
-it.
-An index stores both states at the last synchronisation. If one side has changed since, the other side is updated; if
-both have, the local version is uploaded.
+it. An index stores both states at the last synchronisation. If one side has changed since, the other side is updated;
+if both have, the local version is uploaded.
 """
 
 from __future__ import annotations

@@ -115,8 +115,7 @@ class Pace:
         seconds = a + b amount,   a = least seconds of a run,   b = (seconds - a) / amount of the kind's latest run,
 
     where a is the overhead of any run. A kind without a finished run has the median b of the others. Compilation and
-    waiting
-    are excluded from the seconds. For concurrent runs the sum is divided by the concurrency observed so far.
+    waiting are excluded from the seconds. For concurrent runs the sum is divided by the concurrency observed so far.
     """
 
     def __init__(self, efforts: Sequence[Effort] = (), at_once: int = 1) -> None:
@@ -206,6 +205,7 @@ class _Running:
         return self.aside or self.phase
 
     def tick(self, phase: str) -> None:
+        """Record an event and report the change."""
         if is_step(phase):
             self.phase, self.steps = phase, self.steps + 1
         elif what := begun(phase):
@@ -215,6 +215,7 @@ class _Running:
         self.changed(self)
 
     def finished(self, outcome: str) -> None:
+        """Record the end and report the outcome."""
         self.pace.add_ended(self.effort, self.seconds)
         self.ended(self, outcome)
 
@@ -250,11 +251,13 @@ class Bars:
         self._sweep = self._bars.add_task("", phase="")
 
     def begin(self, efforts: Sequence[Effort], at_once: int = 1) -> None:
+        """Start the bars."""
         self._pace = Pace(efforts, at_once)
         self._bars.start()
         self._bars.update(self._sweep, description="sweep", total=self._pace.amount, phase=f"{len(efforts)} runs")
 
     def run(self, title: str, ticks: int, effort: Effort) -> Run:
+        """Add a bar for a run."""
         running = _Running(title, ticks, effort, self._pace, self._changed, self._ended)
         self._tasks[id(running)] = self._bars.add_task(title, total=ticks, phase="prepare")
         self._going.append(running)
@@ -280,12 +283,14 @@ class Bars:
         self._show()
 
     def elsewhere(self, title: str, effort: Effort, outcome: str) -> None:
+        """Report a run that another command has taken over."""
         self._pace.leave_out(effort)
         self._bars.update(self._sweep, total=self._pace.amount)
         self._bars.console.print(f"{title}: {outcome}", highlight=False)
         self._show()
 
     def end(self) -> None:
+        """Stop the bars."""
         self._bars.stop()
 
 
@@ -298,9 +303,11 @@ class Lines:
         self._runs = self._number = 0
 
     def begin(self, efforts: Sequence[Effort], at_once: int = 1) -> None:
+        """Start counting the runs."""
         self._runs, self._number, self._pace, self._printed = len(efforts), 0, Pace(efforts, at_once), monotonic()
 
     def run(self, title: str, ticks: int, effort: Effort) -> Run:
+        """Add a run."""
         running = _Running(title, ticks, effort, self._pace, self._changed, self._ended)
         self._going.append(running)
         return running
@@ -315,6 +322,7 @@ class Lines:
         self._print(f"{run.title}: {outcome}")
 
     def elsewhere(self, title: str, effort: Effort, outcome: str) -> None:
+        """Print a line for a run that another command has taken over."""
         self._pace.leave_out(effort)
         self._number += 1
         self._print(f"{title}: {outcome}")

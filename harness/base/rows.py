@@ -109,8 +109,14 @@ def read(
 
 @contextmanager
 def memory_for(units: Sequence[Path]) -> Generator[None]:
-    """Limit the memory that reading units may take, for a while: a file of some kB can claim any number of GB. Raises
-    InputError where they take more."""
+    """Limit the memory for reading units inside the block.
+
+    A file of some kB can claim any number of GB.
+    Args:
+        units: row files of the units; their sizes determine the limit.
+    Raises:
+        InputError: if reading exceeds the limit.
+    """
     files = {*units, *(shelf.packed_file(folder) for folder in {unit.parent for unit in units})}
     most = _MEMORY + _EXPANDS * sum(file.stat().st_size for file in files if file.is_file())
     try:

@@ -3,9 +3,8 @@
 """Row store: each unit has its own file, `rows/<unit>.parquet`, or many units share one packed file.
 
 The packed file `rows.parquet` is next to the folder, and its column `file` names the unit (`springbench compact`). A
-path
-under `rows/` identifies a unit wherever its rows are stored. Its own file has priority over packed rows. Therefore no
-unit appears twice or is missing at any moment of packing, and a repeated run replaces its packed rows.
+path under `rows/` identifies a unit wherever its rows are stored. Its own file has priority over packed rows. Therefore
+no unit appears twice or is missing at any moment of packing, and a repeated run replaces its packed rows.
 """
 
 from __future__ import annotations
@@ -99,8 +98,12 @@ def there(unit: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Files that have one schema, and for each the number of its unit among those that were asked for; of a packed
-    file the numbers of its units by their names."""
+    """A group of files with one schema.
+
+    files: paths of the files.
+    unit_numbers: for each file, the index of its unit in the request.
+    packed_numbers: for a packed file, the indices of its units by name.
+    """
 
     files: tuple[str, ...]
     numbers: tuple[int, ...] = ()

@@ -2,8 +2,7 @@
 
 It reads the worker's output as soon as it is written. Writing therefore costs a worker almost nothing, however rarely
 the command polls. Linux also makes it the parent of orphaned descendants (subreaper). It kills all processes of a
-worker
-when the worker ends, when the command requests it (SIGTERM), and when the command has ended.
+worker when the worker ends, when the command requests it (SIGTERM), and when the command has ended.
 """
 
 from __future__ import annotations

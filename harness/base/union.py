@@ -3,9 +3,8 @@
 """Queries over the rows of many units, by DuckDB on their Parquet files, grouped by schema.
 
 DuckDB's `union_by_name` would do the same for files of any schema, but takes 140 kB of memory per file. Units that
-cannot
-be read together raise `SchemaMismatch`. The caller then reads unit by unit and can name the invalid one. A path that
-DuckDB would interpret as a pattern raises it too.
+cannot be read together raise `SchemaMismatch`. The caller then reads unit by unit and can name the invalid one. A path
+that DuckDB would interpret as a pattern raises it too.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class Unfit(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Union:
-    """Parts of units, the schema of all of their rows, and the SQL of each part's rows."""
+    """Groups of units, the schema of all their rows, and the SQL of each group's rows."""
 
     parts: list[Part]
     schema: pa.Schema

@@ -3,8 +3,7 @@
 Between both is a supervisor (`harness.execution.worker_supervisor`), which reads the worker's output and ends its
 processes. One worker runs all tasks one after the other, so modules stay imported and kernels compiled. It is replaced
 after a failure, or if a task left threads behind. It is a fork of this process, which repeats none of that cost, as
-long
-as nothing was started here that does not survive a fork, such as OpenMP's threads. Otherwise it is spawned.
+long as nothing was started here that does not survive a fork, such as OpenMP's threads. Otherwise it is spawned.
 
 Files are read in a sandbox likewise (`harness.execution.sandbox`), which shares nothing with this process.
 """
@@ -301,7 +300,7 @@ class _Heard:
         self._kept = (self._kept + said)[-_KEPT:]
 
     def close(self) -> None:
-        """Show the rest; write what was too long to be shown to the log, and say so."""
+        """Show the rest of the output. Write output that was too long to the log, and report that."""
         self._pass_on(bytes(self._held))
         self._held.clear()
         if self._count <= _SHOWN:
@@ -322,7 +321,7 @@ class _Heard:
 
 
 def _come(pipe: Connection) -> bytes:
-    """The bytes that are in a pipe now, as many as may be waiting for it."""
+    """Read the bytes that are in a pipe now, at most BUFFER_BYTES."""
     found = b""
     with suppress(OSError):
         while len(found) < BUFFER and pipe.poll() and (more := os.read(pipe.fileno(), 2**16)):
@@ -331,13 +330,13 @@ def _come(pipe: Connection) -> bytes:
 
 
 def _at(dump: bytes) -> str:
-    """Where a worker was, as it has written down: `at file:line in function, `."""
+    """Format the location of a worker from its dump: `at file:line in function, `."""
     found = place(dump.decode(errors="replace"))
     return found and f"at {found}, "
 
 
 def _threads_run() -> bool:
-    """Whether Numba's threads were started in this process."""
+    """Return whether Numba's threads were started in this process."""
     numba: Any = sys.modules.get("numba")
     if numba is None:
         return False

@@ -3,8 +3,7 @@
 """YAML loader that returns plain data with line numbers.
 
 It reads only the plain values of YAML 1.2 (mappings, lists, text, numbers, booleans, null). It rejects tags,
-directives,
-and files that exceed the limits below after the expansion of aliases.
+directives, and files that exceed the limits below after the expansion of aliases.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ MAX_BYTES, MAX_NODES, MAX_DEPTH = 2**18, 100_000, 32
 
 
 def read_bytes(path: Path) -> bytes:
-    """The content of a config; InputError when it is missing, no plain file, unreadable or too large."""
+    """Read the content of a config; raise InputError if it is missing, irregular, unreadable or too large."""
     try:
         if path.exists() and not path.is_file():
             raise InputError(Mistake("is not a file; give a scene or a sweep (*.yaml, *.json)", path))
@@ -43,7 +42,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_yaml(path: Path) -> Document:
-    """Read a YAML file that holds one mapping; InputError with the line for everything else."""
+    """Read a YAML file that holds one mapping; raise InputError with the line for anything else."""
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -79,7 +78,13 @@ def read_yaml(path: Path) -> Document:
 
 
 def _in_plain_words(problem: str, lines: list[str], column: int) -> str:
-    """What is wrong and how to mend it, of what a parser says about a column of a line; else its own words."""
+    """Explain a parse error and its remedy, or return the parser's own words.
+
+    Args:
+        problem: message of the parser.
+        lines: the line of the error, or none.
+        column: position in the line.
+    """
     line = lines[0] if lines else ""
     if "cannot start any token" in problem and line[column:]:
         return f"a value cannot begin with {line[column]!r}; put the value in quotes"
@@ -117,13 +122,13 @@ def _integer(text: str) -> int:
 
 
 def _number(text: str) -> float | int:
-    """A float; 1e5, a whole number without a point, may also stand where an integer is wanted."""
+    """Parse a float; 1e5, a whole number without a decimal point, may also be used as an integer."""
     value = float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
     return int(value) if "." not in text and abs(value) < 2**53 and value.is_integer() else value
 
 
 def scalar(text: str) -> Any:
-    """What a text means as a plain value of a file: a number, null, a boolean; else it is text."""
+    """Parse a text as a plain YAML value (number, null or boolean), else return the text."""
     tag = YAML(typ="safe", pure=True).resolver.resolve(ScalarNode, text, (True, False))
     try:
         return _SCALARS[str(tag).removeprefix(_CORE)](text)
@@ -132,7 +137,7 @@ def scalar(text: str) -> Any:
 
 
 class _Converter:
-    """Turns composed nodes into plain data; the nodes are counted each time an alias repeats them."""
+    """Converts composed nodes to plain data; nodes are counted each time an alias repeats them."""
 
     def __init__(self, document: Document) -> None:
         self.document = document

@@ -90,7 +90,7 @@ class Case:
 
     @property
     def title(self) -> str:
-        """The case in words."""
+        """Description of the case."""
         return f"{self.scene_name} {self.size}" if self.size else self.scene_name
 
 

@@ -1,8 +1,7 @@
 """Options of a run, defined once.
 
 `RunOptions` determines the lists of a sweep and of an accuracy study, the options of the command line, and the keys
-that
-entries of a sweep match. It also determines the short descriptions of runs, columns of their rows, and their hash.
+that entries of a sweep match. It also determines the short descriptions of runs, columns of their rows, and their hash.
 """
 
 from __future__ import annotations
@@ -46,8 +45,7 @@ class Chosen(Model):
     """Iteration limit of a step."""
     tolerance: Annotated[Tolerance | Literal["auto"], Option("tol. {}", "tolerance")] = None
     """Relative tolerance of a step's iterations; null performs all of them. auto: the remaining residual adds at most a
-    tenth
-    to the step's own local error, estimated by an embedded method or by differences of the velocity.
+    tenth to the step's own local error, estimated by an embedded method or by differences of the velocity.
     """
     integrator: Annotated[IntegratorName, Option("{}", "integrator")] = "implicit-euler"
     """Time integrator."""
@@ -62,26 +60,29 @@ class Chosen(Model):
             "forces at their unknowns, else `current`",
         ),
     ]
-    """Where a step's iteration starts; coarse: where the same scene on a mesh of half the size goes, which is solved
-    first, within the step's time."""
+    """Initial guess of a step's iteration. coarse: the solution of the same step on a mesh of half the size, which is
+    solved first, within the step's time.
+    """
     threads: Annotated[Threads | Literal["auto"], Option("{} thr.", "threads")] = 1
-    """Threads of Numba and of BLAS; auto: as many as there are cores that nobody else uses."""
+    """Threads of Numba and of BLAS; auto: the number of idle cores."""
     frames: Annotated[Frames, Option("{} frames", "", _OF_SCENE)]
     """Number of steps."""
     rounds: Annotated[Rounds, Option("{} rounds")] = 2
-    """How often the timed part is repeated."""
+    """Number of repetitions of the timed part."""
     accuracy: Annotated[Error, Option("error {}", "asked")] = None
-    """Relative error of the positions at the end to keep to, which chooses integrator, steps and tolerance for the
-    solver; null leaves them as they are stated."""
+    """Target for the relative error of the final positions. It selects integrator, steps and tolerance for the solver;
+    null uses the given values.
+    """
 
 
 DEFAULT_SOLVER: Final = "hybrid"
 DEFAULT_STOP: dict[str, Any] = {"iterations": 500, "tolerance": 1e-4}
-"""How one scene is simulated, without a sweep and in Python, where nothing is stated: by the recommended solver, to a
-tolerance. A sweep's own defaults, those of `Chosen`, are those of the assignment."""
+"""Default stop rule of a single scene, without a sweep and in Python: the recommended solver is run to a tolerance. The
+defaults of a sweep, those of `RunOptions`, are the assignment's.
+"""
 
 OF_ERROR: tuple[str, ...] = ("integrator", "iterations", "tolerance", "first_guess")
-"""Those that an asked error chooses."""
+"""Options that an error target selects."""
 
 
 OPTIONS: dict[str, Option] = {
@@ -93,25 +94,27 @@ OPTIONS: dict[str, Option] = {
 """The options by name."""
 
 OF_SCENE = tuple(name for name, option in OPTIONS.items() if option.null)
-"""Those that the scene says where nobody else does."""
+"""Options whose default the scene defines."""
 
 
 OF_STEPS: tuple[str, ...] = ("first_guess", "iterations", "tolerance")
-"""Those that say how a step is solved, whatever it is."""
+"""Options that define how a step is solved, for any kind of step."""
 
 _HINTS, _SAYS = get_type_hints(Chosen, include_extras=True), meanings(Chosen)
 
 
 def meaning(name: str) -> str:
-    """What an option is, in a sentence."""
+    """Describe an option in one sentence."""
     said, null = _SAYS[name].removesuffix("."), OPTIONS[name].null
     return f"{said}; {null}." if null else f"{said}."
 
 
 def lists(*names: str, **usual: tuple[Any, ...]) -> Any:
-    """A model that has a list of values of each of these options, or a single value.
+    """Build a model with a value or a list of values for each option.
 
-    usual: more options, with other values than their own where they are left out.
+    Args:
+        names: options with their usual defaults.
+        usual: more options, with the defaults given here.
     """
     fields: dict[str, Any] = {}
     for name in dict.fromkeys((*names, *usual)):
@@ -124,7 +127,7 @@ def lists(*names: str, **usual: tuple[Any, ...]) -> Any:
 
 
 def single(**usual: Any) -> Any:
-    """A model that has one value of each of these options, and this one where it is left out."""
+    """Build a model with one value of each option, with the defaults given here."""
     fields: dict[str, Any] = {
         name: (_HINTS[name], Field(default=value, description=_SAYS[name])) for name, value in usual.items()
     }

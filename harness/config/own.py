@@ -25,8 +25,7 @@ class Most(NamedTuple):
 
 MOST = Most(60.0, 2.0)
 """Limits for importing and binding user code before a command starts. A config may set a shorter time, or another
-amount of
-memory.
+amount of memory.
 """
 
 T = TypeVar("T")
@@ -56,7 +55,7 @@ def chosen(document: Document, table: Table, data: Any, tag: str, at: Key) -> tu
 
 
 def given(document: Document, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters of own code as they stand in the file, and beside the names of files their digests."""
+    """Return parameters of user code as in the file, with digests next to file names."""
     return {key: _with_digest(document, value) for key, value in data.items()}
 
 
@@ -74,8 +73,7 @@ def tried(
     """Load a config without importing its user code, after a trial in a worker process.
 
     The trial imports and binds the user code, finds mistakes, and reads the metadata of solvers. It is omitted for a
-    config
-    without user code.
+    config without user code.
     Args:
         load: loads the config with a given policy; it must pickle.
         find_plugins: lists the user code of a loaded config.

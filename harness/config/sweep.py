@@ -54,10 +54,9 @@ class Kept(Model):
     meshes."""
     timing: Literal["exclusive", "shared", "rough"] = "exclusive"
     """exclusive: while a run is timed, no other springbench process computes on the machine; shared: several runs are
-    timed
-    concurrently, each on reserved cores, and their rows state that; rough: there is no timed pass, the steps are
-    computed
-    once with instrumentation, and the times include it. rough is for questions other than times, without recordings.
+    timed concurrently, each on reserved cores, and their rows state that; rough: there is no timed pass, the steps are
+    computed once with instrumentation, and the times include it. rough is for questions other than times, without
+    recordings.
     """
     time_limit: float | None = Field(default=3600.0, gt=0, le=1e7)
     """Wall time [s] of a whole run; null is unlimited. A run that exceeds it is stopped, and its row records that."""
@@ -127,8 +126,7 @@ class SolverSpec:
     """A solver's name and all of its parameters, including defaults.
 
     metadata: metadata of a user's class, as in `harness.results.solver_metadata`, with its `packages`; empty for
-    shipped
-    solvers.
+    shipped solvers.
     """
 
     name: str
