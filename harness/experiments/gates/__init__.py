@@ -1,1 +1,1 @@
-"""Gates: is this slower than that, and by how much? Two programs take turns until an interval answers."""
+"""Performance regression tests: interleaved paired benchmarks with a sequential test on the ratio of times."""

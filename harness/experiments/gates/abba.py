@@ -1,12 +1,13 @@
-"""Two programs take turns, A B B A or B A A B by a coin, until the sequential test knows or the budget ends.
+"""Interleaved paired benchmark (ABBA) of two programs, until the sequential test decides or the budget ends.
 
-A test sees what differs between two running programs, and two of the same code differ a little, by where their memory
-happens to lie (Mytkowicz et al. 2009). So the work of both is made anew between turns, elsewhere in memory, in an
-eighth of the time (after Curtsinger and Berger 2013): what places do is noise then, of which there are many draws.
-What a process keeps all its life, such as where its compiled code lies, is noise likewise: both programs are started
-anew every PAIR seconds. A slowdown is believed only when a second race, by programs started anew, finds it too. Chance
-is ruled out by the first race alone, so that the second needs fewer turns. What the rule proves of one pair's ratio
-holds of several only as far as theirs are alike: of those the study tells how often gates are wrong.
+The order of each block, A B B A or B A A B, is random. A test detects any difference between two running programs. Two
+programs of the same code differ slightly by the memory layout of their data (Mytkowicz et al. 2009). Between blocks the
+work of both is therefore rebuilt at other addresses, in an eighth of the time (after Curtsinger and Berger 2013). The
+effect of the layout becomes noise with many samples. Properties that a process has all its life, such as the addresses
+of its compiled code, become noise likewise: both programs are restarted every RESTART_SECONDS. A slowdown is reported
+only if a second benchmark, with restarted programs, confirms it. The first benchmark alone excludes chance, so the
+second needs fewer blocks. The guarantee of the test is for the ratio of one pair of processes. For several pairs it
+holds only as far as their ratios agree; the study measures the error rate for these.
 """
 
 from __future__ import annotations
@@ -25,32 +26,39 @@ from harness.experiments.gates.sequential import RatioInterval, Rule, Verdict, i
 ORDERS = ("ABBA", "BAAB")
 
 BUDGET = 240.0
-"""Seconds that a gate may take until it says that it cannot tell."""
+"""Time budget [s] of a test, after which the result is inconclusive."""
 
 SHARE = 0.125
-"""Of the time, what making work anew may take. Places make turns differ by 1 to 2 %, other programs by 3 to 7 %: some
-twenty places are as good as hundreds, and turns are what is needed."""
+"""Fraction of the time for rebuilding the work. The layout changes the times of blocks by 1 to 2 %, and other programs
+change them by 3 to 7 %. Some twenty layouts are therefore as good as hundreds; the number of blocks matters more.
+"""
 
 PAIR = 30.0
-"""Seconds of racing after which both programs are started anew: what differs between two processes of the same code all
-their lives, up to 1 %, is then drawn again. Most races end earlier, and a start takes two or three seconds."""
+"""Benchmark time [s] after which both programs are restarted. Two processes of the same code can differ by up to 1 %
+all their lives, and a restart samples that difference again. Most benchmarks end earlier, and a start takes two or
+three seconds.
+"""
 
 CONFIRMS = 0.05
-"""The error of the race that confirms a first one: both must be wrong for an alarm to be."""
+"""Error probability of the benchmark that confirms a first one; a false alarm requires an error of both."""
 
 CALL = 0.01
-"""Seconds of work that a call should hold: a clock's overhead is nothing then. Longer calls are not steadier: with
-seven other programs on two cores turns of 10 and of 40 ms spread alike, and five times as many of them fit."""
+"""Minimum work of a call [s], for which the overhead of a clock is negligible. Longer calls have no less variance: with
+seven other programs on two cores, blocks of 10 and of 40 ms have the same spread, and five times as many of them fit.
+"""
 
 Clock = Literal["cpu", "wall"]
 Timed = Callable[[], float]
-"""Does the work once; how long it took [s], by whatever clock."""
+"""Function that performs the work once and returns its time [s] by some clock."""
 
 
 @dataclass(frozen=True, slots=True)
 class Racers:
-    """Two programs, warm. renew: makes the work of both anew, elsewhere in memory, and warms it; None where that cannot
-    be done."""
+    """Two programs after warm-up.
+
+    a, b: perform the work once and return its time [s].
+    rebuild_work: rebuilds the work of both at other addresses and warms it up; None if that is impossible.
+    """
 
     a: Timed
     b: Timed
@@ -58,18 +66,18 @@ class Racers:
 
 
 Start = Callable[[], AbstractContextManager[Racers]]
-"""Starts both programs, which end with the block."""
+"""Context manager that starts both programs and stops them at its end."""
 
 
 @dataclass(slots=True)
 class Renewing:
-    """Renews racers' work after turns, in its share of the time, however long it takes."""
+    """Rebuilds the programs' work between blocks, limited to its share of the time."""
 
     renew: Callable[[], None] | None
     _earned: float = 0.0
 
     def after(self, seconds: float) -> None:
-        """After a turn of so many seconds."""
+        """Rebuild the work after a block of the given duration [s], if the share of the time permits."""
         self._earned += SHARE / (1.0 - SHARE) * seconds
         if self.renew and self._earned >= 0.0:
             began = perf_counter()
@@ -79,25 +87,33 @@ class Renewing:
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One turn: its order, and the seconds of its four calls in that order."""
+    """One block: its order, and the times [s] of its four calls in that order."""
 
     order: str
     seconds: tuple[float, ...]
 
     def of(self, who: str) -> list[float]:
-        """The two times of A, or of B [s]."""
+        """Return the two times [s] of program "A" or "B"."""
         return [seconds for name, seconds in zip(self.order, self.seconds, strict=True) if name == who]
 
     @property
     def log_ratio(self) -> float:
-        """Of A's time to B's."""
+        """Log of the ratio of A's time to B's."""
         return turn(self.of("A"), self.of("B"))
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What came of a gate. elapsed: seconds that its turns took; load: the machine's load average at its end; starts:
-    how many pairs of programs were started, one every PAIR seconds and others to confirm what the first race found."""
+    """Result of a performance test.
+
+    verdict: decision of the sequential test.
+    sequential_test: the test, with its limit and error probability.
+    interval: estimated ratio of times, with its confidence interval.
+    blocks: all timed blocks.
+    elapsed_seconds: duration of the blocks [s].
+    load_average: load average of the machine at the end.
+    num_process_pairs: number of pairs of started programs, one every RESTART_SECONDS and those of the confirmation.
+    """
 
     answer: Verdict
     rule: Rule
@@ -132,10 +148,14 @@ class Result:
 def race(
     racers: Racers, rule: Rule, *, budget: float = BUDGET, coin: Random | None = None, before: Sequence[Turn] = ()
 ) -> Result:
-    """Time both, warm, until the rule answers or `budget` seconds have gone.
+    """Time both programs, after warm-up, until the test decides or the budget ends.
 
-    coin: what decides the orders; the system's own where none is given, which nothing on the machine can follow;
-    before: turns that others of the same programs took already, and that count.
+    Args:
+        programs: the two programs.
+        sequential_test: test on the ratio A / B.
+        time_budget: seconds.
+        rng: chooses the orders; by default the system's random source, which no other program can follow.
+        earlier_blocks: blocks of earlier processes of the same programs, which count too.
     """
     game = playing(racers.b, rule, budget=budget, coin=coin, renew=racers.renew, before=before)
     next(game)
@@ -155,7 +175,17 @@ def playing(
     renew: Callable[[], None] | None = None,
     before: Sequence[Turn] = (),
 ) -> Generator[None, float, Result]:
-    """The same for a caller that times A itself: each time this yields it wants the seconds of one call of A."""
+    """Run a paired benchmark as a generator, for a caller that times A itself.
+
+    Each `yield` expects the seconds of one call of A; the generator returns the result.
+    Args:
+        b: times one call of B.
+        sequential_test: test on the ratio A / B.
+        time_budget: seconds.
+        rng: chooses the orders.
+        rebuild_work: rebuilds the work of both programs.
+        earlier_blocks: blocks of earlier processes of the same programs, which count too.
+    """
     began, turns, renewing = perf_counter(), list(before), Renewing(renew)
     for order in orders(coin):
         at, seconds = perf_counter(), list[float]()
@@ -170,23 +200,33 @@ def playing(
 
 
 def orders(coin: Random | None = None) -> Iterator[str]:
-    """The orders of turns, without end."""
+    """Draw the orders of blocks, without end."""
     coin = coin or SystemRandom()
     while True:
         yield coin.choice(ORDERS)
 
 
 def result(rule: Rule, turns: list[Turn], elapsed: float) -> Result:
-    """What came of the turns so far, one at least, after so many seconds."""
+    """Build the result of at least one block.
+
+    Args:
+        sequential_test: test on the ratio A / B.
+        blocks: all blocks so far.
+        elapsed: their duration [s].
+    """
     x = [t.log_ratio for t in turns]
     return Result(rule.judge(x), rule, interval(x, rule.alpha), tuple(turns), elapsed, os.getloadavg()[0])
 
 
 def confirmed(start: Start, rule: Rule, *, budget: float = BUDGET) -> Result:
-    """A race between programs that `start` starts, anew every PAIR seconds; one that fails is repeated with others.
+    """Benchmark programs that are restarted every RESTART_SECONDS, and confirm a failure with other processes.
 
-    The second has a larger error of its own (CONFIRMS); where it finds otherwise nothing is decided. The budget is that
-    of both races together, without what it takes to start programs.
+    The confirmation has an error probability of its own, CONFIRMATION_ALPHA. If it disagrees, the result is
+    inconclusive.
+    Args:
+        start_programs: starts both programs.
+        sequential_test: test on the ratio A / B.
+        time_budget: seconds of both benchmarks together, without the starts of programs.
     """
     first = _raced(start, rule, budget)
     if first.answer is not Verdict.FAILS:
@@ -194,14 +234,14 @@ def confirmed(start: Start, rule: Rule, *, budget: float = BUDGET) -> Result:
     second = _raced(start, replace(rule, alpha=max(rule.alpha, CONFIRMS)), max(budget - first.elapsed, 0.0))
     answer = Verdict.FAILS if second.answer is Verdict.FAILS else Verdict.UNDECIDED
     both, elapsed = (*first.turns, *second.turns), first.elapsed + second.elapsed
-    # Each race's interval has its own error; the wider ends hold what both say.
+    # Each benchmark's interval has its own error; the wider bounds contain both.
     low, high = (f(getattr(r.interval, end) for r in (first, second)) for f, end in ((min, "low"), (max, "high")))
     found = RatioInterval(interval([t.log_ratio for t in both], rule.alpha).ratio, low, high)
     return Result(answer, rule, found, both, elapsed, second.load, first.starts + second.starts)
 
 
 def _raced(start: Start, rule: Rule, budget: float) -> Result:
-    """One race, of pairs that are started one after the other, whose turns count together."""
+    """Run one benchmark over successive pairs of processes, whose blocks are pooled."""
     elapsed, turns = 0.0, tuple[Turn, ...]()
     for starts in count(1):
         with start() as racers:

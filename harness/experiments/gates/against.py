@@ -1,7 +1,7 @@
-"""`springbench gate --against REVISION`: is this checkout slower than a revision, in one run on one machine?
+"""Comparison of this checkout with a git revision: `springbench gate --against REVISION`, in one run on one machine.
 
-Correctness first: both must give the same answer, or nothing is timed. What they count, iterations and entries and
-bytes, is compared exactly. Then two processes take turns.
+Both must give the same answer before anything is timed. Deterministic counts (iterations, entries, bytes) are compared
+exactly. Then two processes are benchmarked by interleaved blocks.
 """
 
 from __future__ import annotations
@@ -22,13 +22,17 @@ from harness.experiments.gates.pair import HeldWork, RevisionProcess, Side, chan
 from harness.experiments.gates.sequential import ALPHA, Rule, Verdict
 
 LIMIT = 1.03
-"""The ratio of times from which on something counts as slower."""
+"""Default of the ratio of times from which a program counts as slower."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What both revisions are asked to hold: `do` and its arguments for `worker.py`; title: in messages; config: the
-    file of the run, each revision's own, None for a gate of the tree's."""
+    """Work that both revisions prepare.
+
+    title: description in messages.
+    command: request of `revision_worker.py`, with its arguments.
+    config: file of the run, in each revision's version; None for a performance test of the checkout.
+    """
 
     title: str
     do: str
@@ -38,8 +42,13 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """budget: seconds a gate; limit: ratio of times; alpha: error of all gates of a command together;
-    clock: cpu or wall, None for what suits the work."""
+    """Options of a comparison.
+
+    budget: seconds per test.
+    max_ratio: ratio of times from which the checkout counts as slower.
+    alpha: error probability of all tests of a command together.
+    clock: cpu or wall; None selects it by the work.
+    """
 
     budget: float
     limit: float = LIMIT
@@ -48,7 +57,15 @@ class Options:
 
 
 def requests_of_config(sides: Sequence[Side], config: Path, asked: dict[str, Any]) -> list[Request]:
-    """A request for each run of a scene or sweep, which both revisions must read alike. Raises InputError."""
+    """Build a request for each run of a scene or sweep, for which both revisions must list the same runs.
+
+    Args:
+        revisions: the two revisions.
+        config: file of the scene or sweep.
+        options: options of the runs.
+    Raises:
+        InputError: if a revision fails, or if the lists differ.
+    """
     config = config.resolve()
     with workers(*sides) as alive:
         listed = [worker.ask("runs", config=str(worker.side.own(config)), asked=asked)["runs"] for worker in alive]
@@ -60,7 +77,14 @@ def requests_of_config(sides: Sequence[Side], config: Path, asked: dict[str, Any
 
 
 def requests_of_gates(sides: Sequence[Side], name: str) -> list[Request]:
-    """A request for each of the checkout's own gates whose name holds `name`. Raises InputError."""
+    """Build a request for each performance test of the checkout whose name contains `name`.
+
+    Args:
+        revisions: the two revisions.
+        name: part of the names.
+    Raises:
+        InputError: if no test matches, or if one revision lacks it.
+    """
     with workers(*sides) as alive:
         listed = [worker.ask("gates")["gates"] for worker in alive]
     found = [[gate for gate in gates if name in gate] for gates in listed]
@@ -75,7 +99,16 @@ def requests_of_gates(sides: Sequence[Side], name: str) -> list[Request]:
 def run_gates(
     sides: tuple[Side, Side], requests: Sequence[Request], options: Options, say: Callable[[str], None]
 ) -> list[tuple[Request, Result]]:
-    """Race this checkout, the first side, against the revision; each result is told as it comes. Raises InputError."""
+    """Benchmark this checkout against the revision, and print each result at once.
+
+    Args:
+        revisions: this checkout, then the revision.
+        requests: work to compare.
+        options: limits of the comparison.
+        print_message: receives one line per result.
+    Raises:
+        InputError: if the work fails, or if the answers differ.
+    """
     rule = Rule(options.limit, options.alpha / len(requests))
     found: list[tuple[Request, Result]] = []
     told = cache(say)  # what differs is found at each start, and told once
@@ -87,7 +120,7 @@ def run_gates(
 
 
 def exit_code(answers: Sequence[Verdict]) -> int:
-    """1 where one fails, else 3 where one is undecided, else 0."""
+    """Return 1 if a verdict is a failure, else 3 if one is inconclusive, else 0."""
     return next((a.value for a in (Verdict.FAILS, Verdict.UNDECIDED) if a in answers), 0)
 
 
@@ -95,7 +128,17 @@ def exit_code(answers: Sequence[Verdict]) -> int:
 def started(
     sides: tuple[Side, Side], request: Request, options: Options, say: Callable[[str], None]
 ) -> Generator[Racers]:
-    """Both revisions in processes of their own, warm, with the same answer."""
+    """Start both revisions in their own processes, warm them up, and check that their answers agree.
+
+    Args:
+        revisions: this checkout, then the revision.
+        request: work to prepare.
+        options: limits of the comparison.
+        print_message: receives differences of deterministic counts.
+    Yields: the two programs.
+    Raises:
+        InputError: if the work fails, or if the answers differ.
+    """
     with workers(*sides) as alive:
         held = _held(alive, request, 1)
         clock = options.clock or held[0].clock
@@ -115,7 +158,7 @@ def started(
 
 
 def _held(alive: Sequence[RevisionProcess], request: Request, frames: int) -> list[HeldWork]:
-    """The request's work in both, of so many steps where it is a run's."""
+    """Prepare the request's work in both processes; for a run it has num_frames steps."""
     held: list[HeldWork] = []
     for worker in alive:
         more: dict[str, Any] = {}
@@ -126,7 +169,10 @@ def _held(alive: Sequence[RevisionProcess], request: Request, frames: int) -> li
 
 
 def _renew(alive: Sequence[RevisionProcess]) -> None:
-    """Both make their work anew and do it once, in an order that a coin decides: the last to work is the warmest."""
+    """Rebuild the work of both processes and run it once.
+
+    The order is random because the last process to run has the warmest caches.
+    """
     chance = sample(alive, len(alive))
     for worker in chance:
         worker.renew()
@@ -140,6 +186,6 @@ def _instructions(worker: RevisionProcess) -> dict[str, int]:
 
 
 def _first(listed: Sequence[Sequence[str]]) -> str:
-    """The first run that one has and the other has not."""
+    """Find the first run that only one of the revisions lists."""
     pairs = zip(*listed, strict=False)
     return next((f"{a} | {b}" for a, b in pairs if a != b), f"{len(listed[0])} and {len(listed[1])} of them")

@@ -1,4 +1,4 @@
-"""Correctness first: whether two answers are the same, before anybody asks which came sooner."""
+"""Correctness check before timing: whether two answers agree."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 AGREEMENT = 1e-9
-"""How far two answers may lie apart, in their own size: round-off of some hundred iterations in another order."""
+"""Default tolerance of the difference of two answers, relative to their size. It covers round-off of some hundred
+iterations in another order.
+"""
 
 
 def difference(new: ArrayLike, old: ArrayLike, tolerance: float = AGREEMENT) -> str:
-    """How two answers, arrays of points (n, d) or of any other shape, differ, in words; empty where they agree.
+    """Describe the difference of two answers in words; empty if they agree.
 
-    tolerance: as a part of the old answer's size, the largest extent along an axis; 0 wants the same numbers.
+    Args:
+        new: points (n, d), or an array of any other shape.
+        old: baseline of the same shape.
+        rtol: tolerance relative to the size of `old`, its largest extent along an axis; 0 requires equal numbers.
     """
     now, was = np.asarray(new, float), np.asarray(old, float)
     if now.shape != was.shape:

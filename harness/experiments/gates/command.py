@@ -1,4 +1,5 @@
-"""`springbench gate`: against another revision, from a table, or between two stored results."""
+"""The command `springbench gate`: performance regressions against a revision, from a table, or between stored
+results."""
 
 from __future__ import annotations
 
@@ -29,7 +30,7 @@ def gate(
     iterations: Annotated[int | None, typer.Option(help="For a scene: iteration limit of a step.")] = None,
     tolerance: Annotated[float | None, typer.Option(help="For a scene: relative tolerance of a step.")] = None,
 ) -> None:
-    """Find what became slower. Exit code 1: something did; 3: cannot tell; 0: all gates hold."""
+    """Find performance regressions. Exit code 1: a regression; 3: inconclusive; 0: all tests pass."""
     files = what or []
     chosen = {"--solver": solver, "--size": size, "--iterations": iterations, "--tolerance": tolerance}
     if against is not None:

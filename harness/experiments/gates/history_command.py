@@ -1,4 +1,4 @@
-"""The command `springbench history`."""
+"""The command `springbench history`: performance changes over the stored results of commits."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from harness.base.console import narrow, out, say
 from harness.base.errors import InputError, Mistake
 
 PLACES = (Path("results/bench"), Path(".benchmarks"))
-"""Where our own gates leave their results, and those of others do."""
+"""Default folders of stored results: those of this project, and those of pytest-benchmark."""
 
 
 def history(
@@ -23,7 +23,7 @@ def history(
         "results/history.png"
     ),
 ) -> None:
-    """Find where gates became slower or faster, in their stored results by commit. Exit code 3: there are too few."""
+    """Find performance changes in stored results by commit. Exit code 3: too few results."""
     from harness.report.history import FEWEST, history_table, stored_files
     from harness.report.history import history as tell
     from harness.report.history_plot import draw_history

@@ -1,8 +1,8 @@
-"""Instructions that a program retires, as the processor counts them: no other program moves them.
+"""Hardware counter of retired instructions, which other programs do not affect.
 
-The counter is perf's (`perf_event_open`, Linux); it counts this thread's own instructions, not the kernel's. Many
-virtual machines hide it, and a kernel whose `perf_event_paranoid` is above 2 refuses it: `reason` then says so. Only
-the standard library is needed, so that a worker may load this file wherever it runs.
+The counter is that of perf (`perf_event_open`, Linux). It counts the instructions of this thread in user mode. Many
+virtual machines hide it, and a kernel with `perf_event_paranoid` above 2 denies it; `explain_unavailable` describes the
+cause. The module needs only the standard library, so that a worker can load it in any environment.
 """
 
 from __future__ import annotations
@@ -14,20 +14,26 @@ import struct
 from collections.abc import Callable
 
 _CALL = {"x86_64": 298, "aarch64": 241}
-"""The number of the system call."""
+"""Number of the system call, by architecture."""
 _SIZE = 128
-"""Bytes of `perf_event_attr`; what lies beyond the fields given here is zero."""
+"""Size of `perf_event_attr` [bytes]; fields not given here are zero."""
 _FLAGS = 1 << 5 | 1 << 6
 """exclude_kernel, exclude_hv."""
 
 INSTRUCTIONS = (0, 1)
 """PERF_TYPE_HARDWARE, PERF_COUNT_HW_INSTRUCTIONS."""
 PAGE_FAULTS = (1, 2)
-"""PERF_TYPE_SOFTWARE, PERF_COUNT_SW_PAGE_FAULTS: there even where a virtual machine hides the processor's counters."""
+"""PERF_TYPE_SOFTWARE, PERF_COUNT_SW_PAGE_FAULTS: available even if a virtual machine hides the hardware counters."""
 
 
 def count(work: Callable[[], object], event: tuple[int, int] = INSTRUCTIONS) -> int | None:
-    """How often an event happens in this thread while the work is done; None where that cannot be read."""
+    """Count the occurrences of an event in this thread during some work.
+
+    Args:
+        work: function to call.
+        event: type and config of perf.
+    Returns: the count, or None if the counter is unavailable.
+    """
     handle, _ = _opened(event)
     if handle is None:
         return None
@@ -40,7 +46,7 @@ def count(work: Callable[[], object], event: tuple[int, int] = INSTRUCTIONS) -> 
 
 
 def reason(event: tuple[int, int] = INSTRUCTIONS) -> str:
-    """Why an event cannot be counted here, in words; empty where it can."""
+    """Explain why an event cannot be counted here; empty if it can."""
     handle, said = _opened(event)
     if handle is not None:
         os.close(handle)
@@ -48,7 +54,7 @@ def reason(event: tuple[int, int] = INSTRUCTIONS) -> str:
 
 
 def _opened(event: tuple[int, int]) -> tuple[int | None, str]:
-    """A counter that runs, or why there is none."""
+    """Open a running counter; return its file descriptor, or None and the reason."""
     number = _CALL.get(platform.machine())
     if platform.system() != "Linux" or number is None:
         return None, f"instructions cannot be counted on {platform.system()} {platform.machine()}"

@@ -1,4 +1,4 @@
-"""Gates from a table, without Python: `springbench gate gates.yaml`.
+"""Table of performance tests in a YAML file: `springbench gate gates.yaml`.
 
 gates:
   - {scene: cloth.yaml, size: 32, solver: numba, against: sparse, limit: 0.6, agree: 1e-6}
@@ -30,54 +30,60 @@ from solvers.problem import NotPositiveDefinite, Unsupported
 
 
 class Gate(Model):
-    """A gate: a solver that must take at most `limit` times as long as another on a scene's steps."""
+    """A performance test: a solver may take at most a given multiple of a baseline's time on a scene's steps."""
 
     scene: str
     """The scene's file (*.yaml, or *.json of the assignment), relative to the table."""
     solver: str | dict[str, Any]
-    """The solver that must not be slow: a name, or a mapping of `name` and the solver's parameters."""
+    """The tested solver: a name, or a mapping of `name` and the solver's parameters."""
     against: str | dict[str, Any]
-    """What it is compared with, likewise."""
+    """The baseline, in the same form."""
     limit: float = Field(gt=0, le=1e6)
-    """The largest ratio of times, the solver's over the other's."""
+    """The largest ratio of times, the solver's over the baseline's."""
     agree: float = Field(default=AGREEMENT, ge=0, le=1)
-    """How far their positions may lie apart, in the scene's size; nothing is timed where they lie further."""
+    """Tolerance of the difference of their positions, relative to the scene's size; nothing is timed if it is
+    exceeded."""
     size: Size | None = None
     """Mesh size; the scene's default if left out."""
     iterations: Iterations = 50
     """Iteration limit of a step."""
     tolerance: Tolerance = None
-    """Relative tolerance that ends a step's iterations; null does all of them."""
+    """Relative tolerance of a step's iterations; null performs all of them."""
     integrator: IntegratorName = "implicit-euler"
-    """How time is integrated."""
+    """Time integrator."""
     frames: Frames | None = None
-    """Number of steps at most; null takes the scene's."""
+    """Maximum number of steps; null uses the scene's."""
     clock: Clock = "cpu"
-    """cpu, which other programs hardly move, or wall, what one waits."""
+    """cpu: CPU time, which other programs hardly affect; wall: elapsed time."""
     budget: float | None = Field(default=None, gt=0, le=86400)
-    """Seconds until the gate says that it cannot tell; null takes the command's."""
+    """Seconds until the test is inconclusive; null uses the command's."""
 
     @property
     def title(self) -> str:
-        """The gate in words."""
+        """Description of the test."""
         size = f" {self.size}" if self.size else ""
         return f"{Path(self.scene).stem}{size}, {_name(self.solver)} against {_name(self.against)}"
 
 
 class ListedGates(Model):
-    """A table of gates."""
+    """A table of performance tests."""
 
     description: str = Field(default="", max_length=1000)
-    """One sentence about what the gates guard."""
+    """One sentence about what the tests protect."""
     gates: tuple[Gate, ...] = Field(min_length=1)
-    """The gates."""
+    """The tests."""
 
 
 def run_table(path: Path, budget: float, say: Callable[[str], None], alpha: float = ALPHA) -> list[tuple[Gate, Result]]:
-    """Run all gates of a table; each result is told as it comes.
+    """Run all tests of a table, and print each result at once.
 
-    budget: seconds of a gate that does not say itself; alpha: the error of all gates together.
-    Raises InputError, also for answers that differ.
+    Args:
+        path: the table.
+        budget: seconds of a test without a budget of its own.
+        print_message: receives one line per result.
+        alpha: error probability of all tests together.
+    Raises:
+        InputError: for a mistake in the table, or if the answers differ.
     """
     document = read_yaml(path)
     table = document.check(ListedGates, document.data)
@@ -99,7 +105,7 @@ def run_table(path: Path, budget: float, say: Callable[[str], None], alpha: floa
 
 @contextmanager
 def _started(document: Document, i: int, gate: Gate) -> Generator[Racers]:
-    """Both solvers prepared anew, warm, with the same answer."""
+    """Prepare both solvers again, warm them up, and check that their answers agree."""
     options = {key: getattr(gate, key) for key in ("iterations", "tolerance", "integrator", "frames")}
     with pinned_threads(1):
         try:
@@ -111,7 +117,7 @@ def _started(document: Document, i: int, gate: Gate) -> Generator[Racers]:
             document.report(f"cannot be run: {error}", ("gates", i))
             raise document.error() from error
         except InputError as error:
-            # What a scene or a solver lacks is told with the line of the gate that asked for it.
+            # Mistakes of a scene or a solver are reported at the line of the test that uses it.
             line = document.lines.get(("gates", i))
             raise InputError([_placed(mistake, document.path, line, i) for mistake in error.mistakes]) from error
         if said:
@@ -128,7 +134,7 @@ def _placed(mistake: Mistake, path: Path, line: int | None, i: int) -> Mistake:
 
 
 def _name(given: str | dict[str, Any]) -> str:
-    """A solver in words."""
+    """Describe a solver by its name and parameters."""
     if isinstance(given, str):
         return given
     return " ".join([str(given.get("name", "?")), *(f"{k}={v}" for k, v in given.items() if k != "name")])

@@ -1,4 +1,4 @@
-"""Real gates of a checkout against itself, one after the other, so that what a replay says can be believed or not."""
+"""Live study: real performance tests of a checkout against itself, to validate the replay study."""
 
 from __future__ import annotations
 
@@ -44,7 +44,18 @@ def hold(
     planted: float,
     say: Callable[[str], None],
 ) -> None:
-    """Hold so many gates of each request; each answer is stored at once, and what is stored already is kept."""
+    """Run performance tests of each request, and store each result at once; earlier results in the file remain.
+
+    Args:
+        path: Parquet file of the results.
+        checkout: folder of the checkout.
+        requests: work to test.
+        background_load: "nothing", "busy" or "bursty".
+        options: limits of each test.
+        num_repeats: number of tests of each request.
+        injected_slowdown: extra work of the candidate, as a fraction of its iterations.
+        print_message: receives one line per result.
+    """
     found = rows.read([path], SCHEMA).to_pylist() if path.exists() else []
     sides = Side("the one", checkout, extra=planted), Side("the other", checkout)
     rule = Rule(options.limit, options.alpha)
@@ -62,7 +73,7 @@ def hold(
 
 
 def summary(path: Path) -> list[tuple[str, ...]]:
-    """Of each kind of gate that is stored: what it was, and how often it gave which answer."""
+    """Summarise the stored results by kind of test: its conditions, and the number of each verdict."""
     by: dict[tuple[str, str, float, float], list[dict[str, Any]]] = {}
     for row in rows.read([path], SCHEMA).to_pylist():
         by.setdefault((row["gate"], row["condition"], row["planted"], row["limit"]), []).append(row)

@@ -1,4 +1,4 @@
-"""Two live worker processes, one for each revision, and the questions that both are asked."""
+"""Processes that run one revision each, and the requests that both receive."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Side:
     extra: float = 0.0
 
     def own(self, file: Path) -> Path:
-        """A file of the checkout as the revision has it, and others as they are: those that it lacks too."""
+        """Return the revision's version of a file of the checkout; other and missing files are returned unchanged."""
         if self.checkout and file.is_relative_to(self.checkout):
             there = self.tree / file.relative_to(self.checkout)
             return there if there.exists() else file
@@ -44,7 +44,13 @@ class Side:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldWork:
-    """What a worker holds: its answer, its exact facts, the clock that suits it, and its frames where it has some."""
+    """Work that a process has prepared.
+
+    answer: result of the work.
+    stats: deterministic counts.
+    clock: clock that suits the work.
+    num_frames: number of steps, 0 if the work has none.
+    """
 
     answer: NDArray[np.float64]
     facts: dict[str, int]
@@ -53,11 +59,11 @@ class HeldWork:
 
 
 class RevisionProcess:
-    """A process that holds one revision's work. Errors are InputErrors, in the revision's own words."""
+    """A process that runs one revision's work; errors become InputErrors with the revision's own message."""
 
     def __init__(self, side: Side, scratch: Path) -> None:
         self.side, self._answer = side, scratch / f"{side.name.replace('/', '_')}.npy"
-        # The script's own folder would come first on the path, and its neighbours hide modules of other names.
+        # The script's folder would come first on the path, and files next to it would shadow modules of other names.
         environment = {**os.environ, "PYTHONPATH": _path(side), "PYTHONSAFEPATH": "1"}
         command = [str(side.python), str(WORKER)]
         pipe = subprocess.PIPE
@@ -69,7 +75,14 @@ class RevisionProcess:
         self._listener.start()
 
     def ask(self, do: str, **asked: Any) -> dict[str, Any]:
-        """The answer to a request; raises InputError with what the worker says is wrong."""
+        """Send a request and return its answer.
+
+        Args:
+            command: name of the request.
+            arguments: its arguments, which JSON can represent.
+        Raises:
+            InputError: with the worker's message, or if its process has ended.
+        """
         process = self._process
         assert process.stdin is not None
         assert process.stdout is not None
@@ -88,24 +101,30 @@ class RevisionProcess:
         return answer
 
     def hold(self, do: str, **asked: Any) -> HeldWork:
-        """Ask for work to be held; see `worker.py`."""
+        """Request the preparation of work; `revision_worker.py` lists the commands."""
         told = self.ask(do, positions=str(self._answer), **asked)
         return HeldWork(np.load(self._answer), told["facts"], told["clock"], told.get("frames", 0))
 
     def instructions(self) -> int | None:
-        """The instructions that one call of the work retires, None where the machine does not tell."""
+        """Count the instructions of one call of the work; None if the machine hides them."""
         return self.ask("instructions")["instructions"]
 
     def seconds(self, calls: int, clock: str) -> float:
-        """The seconds that so many calls of the work take, together."""
+        """Time calls of the work together.
+
+        Args:
+            num_calls: number of calls.
+            clock: cpu or wall.
+        Returns: seconds.
+        """
         return self.ask("time", calls=calls, clock=clock)["seconds"]
 
     def renew(self) -> None:
-        """Make the work that it holds anew, elsewhere in memory."""
+        """Rebuild the prepared work at other addresses."""
         self.ask("renew")
 
     def close(self) -> None:
-        """End the process."""
+        """Stop the process."""
         process = self._process
         for pipe in (process.stdin, process.stdout):
             if pipe:
@@ -118,7 +137,7 @@ class RevisionProcess:
             process.wait()
 
     def _listen(self) -> None:
-        """Keep the last lines of standard error; a full pipe would stop the process."""
+        """Read standard error and store its last lines; a full pipe would block the process."""
         assert self._process.stderr is not None
         for line in self._process.stderr:
             if line.strip():
@@ -126,7 +145,7 @@ class RevisionProcess:
 
 
 def _path(side: Side) -> str:
-    """The tree, then what was on the path already, where it lies in the checkout the tree's own."""
+    """Build the path: the worktree first, then existing entries, mapped from the checkout to the worktree."""
     given = [Path(entry).resolve() for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry]
     mapped = [
         side.tree / entry.relative_to(side.checkout) if side.checkout and entry.is_relative_to(side.checkout) else entry
@@ -137,7 +156,7 @@ def _path(side: Side) -> str:
 
 @contextmanager
 def workers(*sides: Side) -> Generator[list[RevisionProcess]]:
-    """A live worker for each side; all end with the block."""
+    """Start a worker process for each revision; all stop at the end of the block."""
     alive: list[RevisionProcess] = []
     with TemporaryDirectory(prefix="springbench-") as scratch:
         try:
@@ -152,11 +171,17 @@ def workers(*sides: Side) -> Generator[list[RevisionProcess]]:
 
 
 SAME = 0.001
-"""The part by which instructions may differ: the interpreter's own housekeeping."""
+"""Relative tolerance of instruction counts, for internal work of the interpreter."""
 
 
 def changes(new: dict[str, int], old: dict[str, int]) -> list[str]:
-    """What differs of exact facts, in words: iterations, entries, bytes, flops, instructions."""
+    """Describe the differences of deterministic counts: iterations, entries, bytes, flops, instructions.
+
+    Args:
+        new: counts of this checkout.
+        old: counts of the revision.
+    Returns: one text per difference.
+    """
     allowed = {name: SAME * old[name] if name == "instructions" else 0 for name in old}
     both = [name for name in old if name in new and abs(new[name] - old[name]) > allowed[name]]
     return [f"{name} {old[name]:,} -> {new[name]:,} ({new[name] / old[name] - 1:+.1%})" for name in both if old[name]]

@@ -1,4 +1,4 @@
-"""Gates of one's own, in one's own tests: a plugin for pytest that comes with the package, on top of pytest-benchmark.
+"""Plugin for pytest with performance tests, based on pytest-benchmark.
 
     def test_mine_is_no_slower(race):
         race(mine, theirs, limit=1.03)                                  # two functions of no arguments
@@ -6,9 +6,9 @@
     def test_my_solver_is_no_slower(race):
         race.solvers("cloth.yaml", Mine(), "numba", limit=1.0, agree=1e-6)      # on a scene
 
-Both must give the same answer, in every test run; with pytest-benchmark enabled they then take turns. What was found
-stands in pytest-benchmark's JSON. A gate that cannot tell is neither passed nor failed: it is counted as `undecided`,
-and a session of which nothing failed then ends with the exit code 13 (with 3 pytest itself ends where it breaks).
+Both must give the same answer, in every test run. With pytest-benchmark enabled they are then timed in interleaved
+blocks, and pytest-benchmark's JSON has the result. An inconclusive test is neither passed nor failed: it is counted as
+`undecided`. A session without failures then ends with the exit code 13, because 3 is pytest's code of internal errors.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 UNDECIDED = pytest.StashKey[bool]()
 EXIT_UNDECIDED = 13
 MOST = 10**9
-"""Rounds that pytest-benchmark is asked for; the race ends before."""
+"""Number of rounds requested from pytest-benchmark; the benchmark ends earlier."""
 
 
 class _Decided(BaseException):
-    """Ends pytest-benchmark's rounds; no Exception, which would mark the benchmark as failed."""
+    """Ends the rounds of pytest-benchmark; an Exception would mark the benchmark as failed."""
 
 
 class Race:
-    """The fixture: compare two programs, or two solvers on a scene. One race a test."""
+    """Fixture that compares two programs, or two solvers on a scene; one comparison per test."""
 
     def __init__(self, benchmark: BenchmarkFixture, item: pytest.Item) -> None:
         self._benchmark, self._item = benchmark, item
@@ -56,11 +56,18 @@ class Race:
         error: float | None = None,
         **told: Any,
     ) -> Result | None:
-        """Fail where the candidate takes more than `limit` times as long as the yardstick.
+        """Fail the test if the candidate takes more than max_ratio times as long as the baseline.
 
-        agree: how far their answers may lie apart, in their own size; None where they have none. clock: the process's
-        CPU time, or what one waits. budget: seconds, else --race-budget. error: the probability of a wrong answer, .1 %
-        if left out. told: goes to the benchmark's JSON as it is. Returns what was found, None where nothing is timed.
+        Args:
+            candidate: function without arguments.
+            baseline: function without arguments.
+            max_ratio: limit of the ratio of times.
+            clock: "cpu" for the CPU time of the process, "wall" for elapsed time.
+            agreement_rtol: tolerance of the difference of the answers, relative to their size; None if there are none.
+            budget: seconds; --race-budget by default.
+            alpha: probability of a wrong verdict; 0.1 % by default.
+            extra_info: stored in the benchmark's JSON.
+        Returns: the result, or None if nothing is timed.
         """
         from harness.experiments.gates.abba import playing
         from harness.experiments.gates.agreement import difference
@@ -114,10 +121,19 @@ class Race:
         size: int | None = None,
         **options: Any,
     ) -> Result | None:
-        """The same of two solvers on a scene: each a name, a mapping of name and parameters, or a solver itself.
+        """Compare two solvers on a scene.
 
-        scene: its file, relative to the test's; agree: how far the positions may lie apart, in the scene's size;
-        options: those of a run: iterations, tolerance, frames, integrator, time_step, first_guess.
+        Args:
+            scene: file of the scene, relative to the test's file.
+            solver: the candidate: a name, a mapping of name and parameters, or a solver object.
+            baseline: solver to compare with, in the same form.
+            max_ratio: limit of the ratio of times.
+            agreement_rtol: tolerance of the difference of the positions, relative to the scene's size.
+            clock: "cpu" or "wall".
+            budget: seconds; --race-budget by default.
+            size: mesh size; the scene's default if omitted.
+            options: options of a run: iterations, tolerance, frames, integrator, time_step, first_guess.
+        Returns: the result, or None if nothing is timed.
         """
         from harness.base.machine import pinned_threads
         from harness.experiments.gates.scenes import pair
@@ -128,7 +144,7 @@ class Race:
 
 
 def _told(result: Result, calls: int, clock: str) -> dict[str, Any]:
-    """What a race leaves in the benchmark's `extra_info`."""
+    """Build the entries of the benchmark's `extra_info`."""
     found = result.interval
     return {
         "ratio": {"median": found.ratio, "low": max(found.low, 1e-300), "high": min(found.high, 1e300)},  # no inf
@@ -144,18 +160,18 @@ def _told(result: Result, calls: int, clock: str) -> dict[str, Any]:
 
 @pytest.fixture
 def race(benchmark: BenchmarkFixture, request: pytest.FixtureRequest) -> Race:
-    """Compare two programs, or two solvers on a scene: the same answer first, then who is faster."""
+    """Compare the times of two programs, or of two solvers on a scene, after a check of their answers."""
     return Race(benchmark, request.node)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """The options of races."""
+    """Add the plugin's command-line options."""
     group = parser.getgroup("springbench")
     group.addoption("--race-budget", type=float, default=60.0, help="Seconds that a race may take; 60.")
 
 
 class _Count:
-    """Counts what could not be told; with xdist in the process that reports."""
+    """Counts inconclusive tests; with xdist in the process that reports."""
 
     def __init__(self) -> None:
         self.undecided = 0
@@ -170,13 +186,13 @@ class _Count:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Count from the start."""
+    """Register the counter of inconclusive tests."""
     config.pluginmanager.register(_Count(), "springbench-undecided")
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Mark what could not be told."""
+    """Mark the report of an inconclusive test."""
     report = yield
     if report.when == "call" and report.skipped and item.stash.get(UNDECIDED, False):
         report.undecided = True  # type: ignore[attr-defined]
@@ -184,14 +200,14 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 
 def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, tuple[str, dict[str, bool]]] | None:
-    """`?` for what could not be told."""
+    """Report an inconclusive test as `?`."""
     if getattr(report, "undecided", False):
         return "undecided", "?", ("UNDECIDED", {"yellow": True})
     return None
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """What could not be told, and why."""
+    """Print the inconclusive tests with their reasons."""
     for report in terminalreporter.stats.get("undecided", []):
         said = report.longrepr[2].removeprefix("Skipped: ")
         terminalreporter.write_line(f"UNDECIDED {report.nodeid}: {said}")

@@ -1,7 +1,6 @@
-"""A git revision as something that can be run: a worktree of its own, and an environment where its libraries differ.
+"""Git worktrees of revisions, with an own environment if the required libraries differ.
 
-Worktrees stay in the user's cache, so that what a revision compiles is compiled once; of the least recently used ones
-all but a few go.
+Worktrees stay in the user's cache, so that a revision is compiled once. Only the most recently used ones remain.
 """
 
 from __future__ import annotations
@@ -22,16 +21,16 @@ from harness.base.files import open_lock, users_cache
 from harness.experiments.gates.pair import Side
 
 KEPT = 6
-"""Worktrees that stay in the cache."""
+"""Maximum number of worktrees in the cache."""
 
 
 def cache() -> Path:
-    """Where worktrees are kept."""
+    """Return the cache folder of worktrees."""
     return users_cache("revisions")
 
 
 def root(folder: Path) -> Path:
-    """The git checkout that holds a folder; raises InputError."""
+    """Return the git checkout that contains a folder; raise InputError if there is none."""
     told = _git(folder, "rev-parse", "--show-toplevel")
     if told.returncode:
         raise InputError(f"--against: {folder} is in no git checkout ({_last(told.stderr)}); go to one")
@@ -39,7 +38,7 @@ def root(folder: Path) -> Path:
 
 
 def resolve(checkout: Path, revision: str) -> str:
-    """The commit that a revision names; raises InputError."""
+    """Return the commit that a revision names; raise InputError if it is unknown."""
     told = _git(checkout, "rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}")
     if told.returncode:
         wanted = "wanted a commit, a branch or a tag, such as HEAD~1; `git log --oneline` lists them"
@@ -48,7 +47,13 @@ def resolve(checkout: Path, revision: str) -> str:
 
 
 def sides(checkout: Path, revision: str) -> tuple[Side, Side]:
-    """The checkout as it stands, uncommitted changes included, and the revision. Raises InputError."""
+    """Open the checkout with its uncommitted changes, and a revision; raise InputError on failure.
+
+    Args:
+        checkout: folder of the checkout.
+        revision: commit, branch or tag.
+    Returns: the checkout and the revision.
+    """
     commit = resolve(checkout, revision)
     tree = worktree(checkout, commit)
     name = f"revision {revision}" if commit.startswith(revision) else f"revision {revision} ({commit[:10]})"
@@ -56,7 +61,7 @@ def sides(checkout: Path, revision: str) -> tuple[Side, Side]:
 
 
 def worktree(checkout: Path, commit: str) -> Path:
-    """A clean worktree of a commit, from the cache or made there. Raises InputError."""
+    """Return a clean worktree of a commit, from the cache or newly created; raise InputError on failure."""
     tree = cache() / commit[:16]
     with _alone(cache()):
         _git(checkout, "worktree", "prune")
@@ -76,7 +81,7 @@ def worktree(checkout: Path, commit: str) -> Path:
 
 
 def _python(checkout: Path, tree: Path, name: str) -> Path:
-    """This interpreter where both want the same libraries, else that of an environment of the revision's own."""
+    """Return this interpreter if the required libraries are equal, else that of the revision's own environment."""
     if _wanted(checkout) == _wanted(tree):
         return Path(sys.executable)
     own = tree / ".venv"
@@ -97,7 +102,7 @@ def _python(checkout: Path, tree: Path, name: str) -> Path:
 
 
 def _wanted(tree: Path) -> Any:
-    """What decides about a tree's libraries."""
+    """Read the requirements of a worktree that determine its libraries."""
     try:
         project = tomllib.loads((tree / "pyproject.toml").read_text())["project"]
     except (OSError, KeyError, tomllib.TOMLDecodeError):
@@ -113,13 +118,13 @@ def _git(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def _last(said: str) -> str:
-    """The last line that a program said."""
+    """Return the last line of a program's output."""
     return next((line.strip() for line in reversed(said.splitlines()) if line.strip()), "it does not say why")
 
 
 @contextmanager
 def _alone(folder: Path) -> Generator[None]:
-    """One process at a time makes worktrees."""
+    """Lock the cache so that one process at a time creates worktrees."""
     folder.mkdir(parents=True, exist_ok=True)
     lock = open_lock(folder / ".lock")
     try:

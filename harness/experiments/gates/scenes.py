@@ -1,4 +1,4 @@
-"""Two solvers on one scene, in one process: the same steps, the same answer, and then a race."""
+"""Pair of solvers on one scene, in one process: the same steps, to be compared and timed."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from solvers.registry import SOLVERS, load
 CLOCKS: dict[Clock, Callable[[], float]] = {"cpu": time.process_time, "wall": time.perf_counter}
 
 Given = str | Mapping[str, Any] | Solver
-"""A solver: its name, a mapping of its name and parameters, or itself."""
+"""A solver: its name, a mapping of its name and parameters, or a solver object."""
 
 Work = Callable[[], Any]
-"""Does something once, and gives its answer."""
+"""Function that performs some work once and returns its answer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """The first steps of a scene with a solver, prepared; a call does them and gives the last positions [m]."""
+    """The first steps of a scene with a prepared solver; a call simulates them and returns the last positions [m]."""
 
     run: RunSpec
     frames: int
@@ -42,9 +42,16 @@ class Steps:
 
 
 def pair(scene: Path, solver: Given, against: Given, *, size: int | None = None, **options: Any) -> tuple[Steps, Steps]:
-    """The same steps by two solvers, as many of the scene's as make a call long enough, both done once.
+    """Prepare the same steps for two solvers, and run both once.
 
-    options: those of a run, such as iterations and tolerance. Raises InputError, Unsupported, NotPositiveDefinite.
+    The number of steps is chosen so that a call is long enough for a clock, at most the scene's.
+    Args:
+        scene: file of the scene.
+        solver: the candidate.
+        baseline: solver to compare with.
+        size: mesh size; the scene's default if omitted.
+        options: options of a run, such as iterations and tolerance.
+    Raises: InputError, Unsupported, NotPositiveDefinite.
     """
     both = [_steps(scene, given, size, options) for given in (solver, against)]
     once = min(seconds_of(steps) for steps in both)
@@ -79,7 +86,13 @@ def _steps(scene: Path, given: Given, size: int | None, options: dict[str, Any])
 
 
 def timed(work: Work, calls: int, clock: Clock) -> Timed:
-    """The seconds of so many calls, together."""
+    """Build a function that returns the time [s] of a number of calls together.
+
+    Args:
+        work: function to time.
+        num_calls: number of calls.
+        clock: "cpu" or "wall".
+    """
     now = CLOCKS[clock]
 
     def seconds() -> float:
@@ -92,12 +105,12 @@ def timed(work: Work, calls: int, clock: Clock) -> Timed:
 
 
 def seconds_of(work: Work) -> float:
-    """CPU seconds of one call, after one to warm up."""
+    """Measure the CPU seconds of one call, after a warm-up call."""
     work()
     return timed(work, 1, "cpu")()
 
 
 def calls_of(candidate: Work, yardstick: Work) -> int:
-    """How often two warm programs are to be called in a row, so that a call is long enough for a clock."""
+    """Choose the number of calls for a timed block of two warm programs, so that it is long enough for a clock."""
     once = min(timed(work, 1, "wall")() for work in (candidate, yardstick))
     return max(1, ceil(CALL / max(once, 1e-7)))

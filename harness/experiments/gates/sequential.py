@@ -1,19 +1,20 @@
-"""A sequential test on the ratio of two programs' times: it may look after every turn and stop when it knows.
+"""Sequential test on the ratio of two programs' times, which may be evaluated after every block and stop early.
 
-A turn runs A and B twice each, and gives one number:
+A block runs A and B twice each, and gives one number:
 
-    x = log((A_1 + A_2) / (B_1 + B_2))        in the order A B B A or B A A B, which a coin decides
+    x = log((A_1 + A_2) / (B_1 + B_2))        in the order A B B A or B A A B, chosen at random
 
-If A takes exp(m) times what B takes, then x - m is as likely above 0 as below, given all earlier turns and given
-|x - m|: the coin alone decided which places of the turn were A's. This holds however the machine behaves, in bursts
-or with a drift, and whatever the size of the disturbance; turns need be neither independent nor alike. So of n turns
-the number k that lie above m is that of n fair coins, and with the mixture martingale (Robbins 1970)
+If A takes exp(m) times as long as B, then x - m is positive or negative with equal probability, given all earlier
+blocks and |x - m|: the random order alone decided which positions of the block were A's. This holds for any behaviour
+of the machine, such as bursts or drift, and for disturbances of any size. Blocks need be neither independent nor
+identically distributed. So of n blocks the number k that lie above m is distributed as that of n fair coins. With the
+mixture martingale (Robbins 1970)
 
     M_n(k) = 2^n B(a + k, a + n - k) / B(a, a),        P(some n has M_n >= 1/alpha) <= alpha        (Ville 1939)
 
-the m that are not refused are a confidence sequence: an interval on the median of x, between two order statistics,
-which covers exp(m) at all n at once with probability 1 - alpha at least (Howard and Ramdas 2022, "Sequential estimation
-of quantiles with applications to A/B testing and best-arm identification").
+the m that are not rejected form a confidence sequence. It is an interval on the median of x, between two order
+statistics, which covers exp(m) at all n at once with probability 1 - alpha at least (Howard and Ramdas 2022,
+"Sequential estimation of quantiles with applications to A/B testing and best-arm identification").
 """
 
 from __future__ import annotations
@@ -29,15 +30,16 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import betaln
 
 ALPHA = 0.001
-"""The error of a test: the probability that its interval ever leaves out the true ratio."""
+"""Default error probability: the probability that the interval ever excludes the true ratio."""
 
 MIXTURE = 2.0
-"""The a above: between 60 and 1000 turns no other from 1 to 15 makes an interval narrower by more than 5 %, and with
-this one 16 turns that agree decide."""
+"""Parameter a of the mixture. Between 60 and 1000 blocks no other value from 1 to 15 makes an interval narrower by more
+than 5 %. With this value, 16 blocks that agree are sufficient for a decision.
+"""
 
 
 class Verdict(Enum):
-    """What a test says; the value is the exit code of a command that ends with it."""
+    """Decision of a test; the value is the exit code of a command that ends with it."""
 
     HOLDS = 0
     FAILS = 1
@@ -46,7 +48,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True)
 class RatioInterval:
-    """A ratio of times: the median over the turns, and the ends of the confidence sequence, 0 and inf where open."""
+    """A ratio of times: the median over the blocks, and the bounds of the confidence sequence, 0 and inf if open."""
 
     ratio: float
     low: float
@@ -55,9 +57,12 @@ class RatioInterval:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """When to stop: the ratio lies wholly above `limit` (fails) or below it (holds).
+    """Sequential test that stops when the ratio lies entirely above `max_ratio` (fail) or below it (pass).
 
-    alpha: the probability of a wrong answer. Raises ValueError for a limit or an alpha that cannot be.
+    max_ratio: limit of the ratio of times.
+    alpha: probability of a wrong decision.
+    Raises:
+        ValueError: for an invalid max_ratio or alpha.
     """
 
     limit: float
@@ -70,7 +75,7 @@ class Rule:
             raise ValueError(f"alpha: came {self.alpha}; wanted a probability between 0 and 1, such as {ALPHA}")
 
     def judge(self, log_ratios: ArrayLike) -> Verdict:
-        """The answer after the turns so far (n,)."""
+        """Decide after the blocks so far, given their log ratios (n,)."""
         x = np.asarray(log_ratios, float)
         needed = critical(len(x), self.alpha)
         if np.count_nonzero(x > log(self.limit)) >= needed:
@@ -78,9 +83,12 @@ class Rule:
         return Verdict.HOLDS if np.count_nonzero(x < log(self.limit)) >= needed else Verdict.UNDECIDED
 
     def first(self, log_ratios: ArrayLike) -> tuple[Verdict, int]:
-        """The first answer when looking after every turn (n,), and after how many turns it came; n where there is none.
+        """Find the first decision when the test is evaluated after every block.
 
-        The same as `judge` turn by turn, in one pass: for a replay of many recorded samples.
+        It equals `decide_verdict` block by block, but takes one pass, for a replay of many recorded samples.
+        Args:
+            log_ratios: log ratios of the blocks (n,).
+        Returns: the decision and its number of blocks, n if there is no decision.
         """
         x = np.asarray(log_ratios, float)
         needed = _critical_up_to(len(x), self.alpha)
@@ -93,30 +101,40 @@ class Rule:
 
 
 def turn(a: Sequence[float], b: Sequence[float]) -> float:
-    """The log ratio of a turn's times [s]."""
+    """Compute the log ratio of a block's times [s]."""
     return log(sum(a) / sum(b))
 
 
 def interval(log_ratios: ArrayLike, alpha: float = ALPHA) -> RatioInterval:
-    """The median ratio of the turns (n,), n >= 1, and the confidence sequence at this n."""
+    """Compute the median ratio of the blocks (n,), n >= 1, and the confidence sequence at this n.
+
+    Args:
+        log_ratios: log ratios of the blocks (n,).
+        alpha: error probability.
+    """
     x = np.sort(np.asarray(log_ratios, float))
     n, needed = len(x), critical(len(x), alpha)
     if needed > n:
         return RatioInterval(exp(float(np.median(x))), 0.0, float("inf"))
-    # At least `needed` turns lie above every m < x_(n - needed + 1), counted from 1: such m are refused.
+    # At least `needed` blocks lie above every m < x_(n - needed + 1), counted from 1: such m are rejected.
     return RatioInterval(exp(float(np.median(x))), exp(x[n - needed]), exp(x[needed - 1]))
 
 
 @lru_cache(maxsize=4096)
 def critical(n: int, alpha: float) -> int:
-    """The fewest of n turns on one side of m that refuse it; n + 1 where not even all of them do."""
+    """Compute the least number of n blocks on one side of m that rejects it, or n + 1 if all n are too few.
+
+    Args:
+        n: number of blocks.
+        alpha: error probability.
+    """
     k = np.arange(n // 2, n + 1)
     refused = n * log(2) + betaln(MIXTURE + k, MIXTURE + n - k) - betaln(MIXTURE, MIXTURE) >= -log(alpha)
     return n // 2 + int(np.argmax(refused)) if refused[-1] else n + 1
 
 
 def _critical_up_to(n: int, alpha: float) -> NDArray[np.int64]:
-    """`critical` of 1 to n turns."""
+    """List the critical counts of 1 to n blocks."""
     return _criticals(1 << n.bit_length(), alpha)[:n]  # so that a replay, which asks for many n, makes a few tables
 
 

@@ -1,9 +1,9 @@
-"""How often gates are wrong, and what they find: turns recorded once, and the gates' own rule replayed over them.
+"""Error rates of the performance tests: blocks are recorded once, and the tests are replayed over them.
 
-A record holds the four times of each turn of two processes of the same code, start after start. A replay draws
-stretches of successive turns, so that bursts stay bursts, strings them together to as many turns as a budget has room
-for, makes the candidate's times so much longer as is asked, and lets the rule look after every turn. Every PAIR seconds
-it goes on with another start's turns, and what fails it repeats with others, as a gate does.
+A record has the four times of each block of two processes of the same code, for several process pairs. A replay draws
+stretches of successive blocks, so that bursts of load are preserved, and concatenates them up to the budget. It
+multiplies the candidate's times by the slowdown and evaluates the test after every block. Every RESTART_SECONDS it
+continues with the blocks of another process pair. It confirms failures with further blocks, as the test itself does.
 """
 
 from __future__ import annotations
@@ -45,15 +45,20 @@ SCHEMA = columns.schema_of(COLUMNS)
 
 CONDITIONS = ("nothing", "busy", "bursty")
 STRETCH = 25
-"""Turns that a replay takes in one piece: seconds, as long as most bursts last."""
+"""Number of successive blocks of a stretch: some seconds, the duration of most bursts."""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class PairTurns:
-    """The turns of one pair of processes: log ratios (n,), the times of A and of B (n, 2) [s], wall [s] a turn, and the
-    machine's median load average."""
+    """Recorded blocks of one process pair.
+
+    log_ratios: (n,).
+    a, b: times of A and of B (n, 2) [s].
+    wall_seconds: mean wall time of a block [s].
+    load_average: median load average of the machine.
+    """
 
     log_ratios: Array
     a: Array
@@ -64,7 +69,7 @@ class PairTurns:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Of many replays: the parts that fail, hold and are undecided, and the median seconds to an answer."""
+    """Results of many replays: the rates of the three verdicts, and the median seconds until the decision."""
 
     fails: float
     holds: float
@@ -82,8 +87,18 @@ def record(
     starts: int,
     planted: float = 0.0,
 ) -> None:
-    """Record so many seconds of turns, of each request in its turn, in so many starts, beside what the condition says.
-    What was recorded so far is stored after each start, and what the file holds already is kept: starts count on."""
+    """Record blocks of the requests, alternating between them, under a background load.
+
+    The file is written after each process pair. Its earlier rows remain, and the numbering of the pairs continues.
+    Args:
+        path: Parquet file of the blocks.
+        checkout: folder of the checkout, which both programs run.
+        requests: work to record.
+        background_load: "nothing", "busy" or "bursty".
+        duration: total time [s].
+        num_process_pairs: number of starts of both processes.
+        injected_slowdown: extra work of A, as a fraction of its iterations.
+    """
     found = rows.read([path], SCHEMA).to_pylist() if path.exists() else []
     first = max((row["start"] for row in found), default=-1) + 1
     sides = Side("the one", checkout, extra=planted), Side("the other", checkout)
@@ -112,7 +127,7 @@ def record(
 
 @contextmanager
 def competing(condition: str) -> Generator[None]:
-    """One process on each core beside what is recorded: always at work (busy), now and then (bursty), or none."""
+    """Run a background load on each core inside the block: constant (busy), intermittent (bursty), or none."""
     if condition not in CONDITIONS:
         raise InputError(f"--condition: came {condition}; wanted one of {', '.join(CONDITIONS)}")
     with ExitStack() as cleanup:
@@ -127,7 +142,7 @@ def competing(condition: str) -> Generator[None]:
 
 
 def _compete(bursts: bool, seed: int, parent: int) -> None:
-    """Go through 16 MB again and again; in bursts of half a second to three, with pauses of one to six."""
+    """Sweep over 16 MB repeatedly; bursts last half a second to three, with pauses of one to six."""
     tie(parent)
     rng, memory = Random(seed), np.ones(2**21)
     while True:
@@ -139,7 +154,7 @@ def _compete(bursts: bool, seed: int, parent: int) -> None:
 
 
 def read(paths: Sequence[Path]) -> dict[tuple[str, str], list[PairTurns]]:
-    """The recorded starts by gate and condition. Raises InputError."""
+    """Read the recorded process pairs by test and background load; raise InputError."""
     table = rows.read(paths, SCHEMA).to_pylist()
     by: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for row in table:
@@ -158,7 +173,17 @@ def read(paths: Sequence[Path]) -> dict[tuple[str, str], list[PairTurns]]:
 
 
 def replay(starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float, replays: int, seed: int = 0) -> Found:
-    """What gates would have answered with A `slower` times as slow as it was, `replays` times over."""
+    """Replay tests with A slowed down by a factor.
+
+    Args:
+        recorded_blocks: recorded process pairs.
+        slowdown: factor on A's times.
+        sequential_test: test to evaluate.
+        budget: seconds of a test.
+        num_replays: number of replays.
+        seed: seed of the random generator.
+    Returns: rates of the verdicts.
+    """
     rng, answers, seconds = np.random.default_rng(seed), list[Verdict](), list[float]()
     for _ in range(replays):
         answer, spent = _race(rng, starts, slower, rule, budget)
@@ -174,7 +199,7 @@ def replay(starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
 def _race(
     rng: np.random.Generator, starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
 ) -> tuple[Verdict, float]:
-    """The answer on the turns of some starts, one every PAIR seconds, and the seconds that it took."""
+    """Replay one test over process pairs, one every RESTART_SECONDS; return its verdict and its duration [s]."""
     drawn, walls, left = list[Array](), list[Array](), budget
     while left > 0.0 or not drawn:
         start = starts[int(rng.integers(len(starts)))]
@@ -187,13 +212,16 @@ def _race(
 
 
 def _stretches(rng: np.random.Generator, length: int, turns: int) -> NDArray[np.int64]:
-    """The indices of stretches of successive turns, `turns` in all; a record is a ring."""
+    """Draw indices of stretches of successive blocks, num_blocks in total; a record is periodic."""
     begins = rng.integers(length, size=max(1, -(-turns // STRETCH)))
     return ((begins[:, None] + np.arange(STRETCH)) % length).ravel()[:turns]
 
 
 def _asv(new: Array, old: Array) -> bool:
-    """asv continuous with a factor of 1.05: the medians differ by it, and Mann and Whitney's test says p < .002."""
+    """Apply the rule of asv continuous with a factor of 1.05.
+
+    The medians differ by that factor, and the Mann-Whitney test gives p < .002.
+    """
     return float(np.median(new)) > 1.05 * float(np.median(old)) and float(mannwhitneyu(new, old).pvalue) < 0.002
 
 
@@ -202,7 +230,7 @@ OTHERS: dict[str, Callable[[Array, Array], bool]] = {
     "pytest-benchmark mean:5%": lambda new, old: float(new.mean()) > 1.05 * float(old.mean()),
     "asv continuous 1.05": _asv,
 }
-"""Comparisons of two sessions that ran one after the other: whether the new one is called slower."""
+"""Comparisons of two sessions that ran one after the other: whether the new one is classified as slower."""
 
 
 def replay_other(
@@ -212,7 +240,16 @@ def replay_other(
     seconds: float,
     replays: int,
 ) -> float:
-    """The part of comparisons that call A slower, each of two sessions of so many seconds, A's and then B's."""
+    """Compute the fraction of comparisons that classify A as slower.
+
+    Each comparison has two sessions of equal duration, A's and then B's.
+    Args:
+        is_slower: rule of the comparison, for the times of A and of B.
+        recorded_blocks: recorded process pairs.
+        slowdown: factor on A's times.
+        duration: seconds of one session.
+        num_replays: number of comparisons.
+    """
     rng, said = np.random.default_rng(0), 0
     for _ in range(replays):
         start = starts[int(rng.integers(len(starts)))]

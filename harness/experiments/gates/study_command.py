@@ -1,4 +1,4 @@
-"""`springbench gate-study`: record turns, replay the gates' rule over what was recorded, and hold real gates."""
+"""The command `springbench gate-study`: record blocks, replay the tests over them, and run real tests."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 study = typer.Typer(help="How often gates are wrong, and what they find.", no_args_is_help=True)
 
 CASES = ((1.0, 1.03), (1.1, 1.03), (1.05, 1.03), (1.02, 1.01))
-"""Slowdowns, the first of none, and the limits of the gates that are to see them."""
+"""Slowdowns, the first of none, and the limits of the tests that should detect them."""
 
 
 Config = Annotated[Path, typer.Argument(help="A scene or a sweep, whose runs take turns with themselves.")]
@@ -31,7 +31,7 @@ Planted = Annotated[float, typer.Option(help="Extra work of one of the two, as a
 
 
 def _asked(config: Path, sizes: list[int] | None, solvers: list[str] | None) -> tuple[Path, Sequence[Request]]:
-    """The checkout, and a request for each of the config's runs. Raises InputError."""
+    """Return the checkout, and a request for each of the config's runs; raise InputError."""
     from harness.experiments.gates import revisions
     from harness.experiments.gates.against import requests_of_config
     from harness.experiments.gates.pair import Side
@@ -52,7 +52,7 @@ def record(
     solvers: Solvers = None,
     planted: Planted = 0.0,
 ) -> None:
-    """Let two processes of this checkout take turns, and store every time."""
+    """Record the times of two processes of this checkout in interleaved blocks."""
     from harness.experiments.gates.study import record as record_turns
 
     checkout, requests = _asked(config, sizes, solvers)
@@ -72,7 +72,7 @@ def live(
     solvers: Solvers = None,
     planted: Planted = 0.0,
 ) -> None:
-    """Hold real gates, in processes started anew for each, and print how many failed, held and could not tell."""
+    """Run real tests with restarted processes, and print how many passed, failed and were inconclusive."""
     from rich.table import Table
 
     from harness.experiments.gates.against import Options
@@ -94,7 +94,7 @@ def replay(
     replays: Annotated[int, typer.Option(help="Comparisons of each kind.")] = 10_000,
     budget: Annotated[float, typer.Option(help="Seconds of a gate; 300 for slowdowns of 2 %.")] = 240.0,
 ) -> None:
-    """Print how often gates would have failed, held and not known, beside what others would have said."""
+    """Print the rates of the verdicts of replayed tests, compared with other benchmark tools."""
     from rich.table import Table
 
     from harness.experiments.gates import study as of

@@ -1,15 +1,15 @@
-"""A process that holds one revision's work and times it when asked: a script, run with the revision's tree on the path.
+"""Worker script of one revision: prepares its work and times it on request, with the revision's worktree on the path.
 
-It speaks JSON, a line a request and a line an answer, by standard input and output; whatever the work prints goes to
-standard error. It imports from the tree alone: what is timed is all the revision's own.
+It exchanges JSON by standard input and output, one line per request and per answer. Output of the work goes to standard
+error. All imports come from the worktree, so that only the revision's own code is timed.
 
     {"do": "runs", "config": "...", "asked": {...}}           -> {"runs": ["cloth 32 numba", ...]}
     {"do": "run", "config": "...", "asked": {...}, "index": i, "frames": n, "extra": 0.0, "positions": "..."}
     {"do": "gates"}                                           -> {"gates": ["numba-against-sparse-64", ...]}
     {"do": "gate", "name": "...", "positions": "..."}         -> {"facts": {...}, "clock": "cpu"}
     {"do": "time", "calls": n, "clock": "cpu"}                -> {"seconds": s}, all calls together
-    {"do": "renew"}                                           -> {}, the same work, made anew elsewhere in memory
-    {"do": "instructions"}                                    -> {"instructions": n}, null where they are hidden
+    {"do": "renew"}                                           -> {}, the same work, rebuilt at other addresses
+    {"do": "instructions"}                                    -> {"instructions": n}, null if they are hidden
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from typing import Any
 CLOCKS = {"cpu": time.process_time, "wall": time.perf_counter}
 
 ROOM = 2**20
-"""Bytes, at most, that move what is made anew."""
+"""Maximum number of bytes by which rebuilt work is shifted in memory."""
 
 
 class Worker:
-    """What is held between two requests."""
+    """Handler of the requests, with the prepared work as its state."""
 
     def __init__(self) -> None:
         self._make: Callable[[], Callable[[], Any]] | None = None
@@ -42,15 +42,22 @@ class Worker:
         self._threads = ExitStack()
 
     def runs(self, config: str, asked: dict[str, Any]) -> dict[str, Any]:
-        """The runs of a scene or a sweep, in words."""
+        """List the runs of a scene or a sweep by their titles."""
         return {"runs": [_title(run) for run in _sweep(config, asked)]}
 
     def run(
         self, config: str, asked: dict[str, Any], index: int, frames: int, extra: float, positions: str
     ) -> dict[str, Any]:
-        """Hold the first steps of a run; its facts, and its last positions [m] in a file.
+        """Prepare the first steps of a run, and write its last positions [m] to a file.
 
-        extra: so much more work than the run asks for, as a part of its iterations: a planted slowdown.
+        Args:
+            config: file of the scene or sweep.
+            run_options: options of the runs.
+            index: index of the run.
+            num_frames: maximum number of steps.
+            injected_slowdown: extra work, as a fraction of the run's iterations.
+            positions: path of the file.
+        Returns: deterministic counts, suitable clock and number of steps.
         """
         run = _sweep(config, asked)[index]
         threads = 1 if run.threads == "auto" else run.threads  # idle cores now are not idle cores later
@@ -60,25 +67,35 @@ class Worker:
         return {"facts": steps.facts(), "clock": "cpu" if threads == 1 else "wall", "frames": frames}
 
     def gates(self) -> dict[str, Any]:
-        """The names of the tree's own gates."""
+        """List the names of the worktree's own performance tests."""
         return {"gates": sorted(_gates())}
 
     def gate(self, name: str, positions: str) -> dict[str, Any]:
-        """Hold the candidate of one of the tree's own gates."""
+        """Prepare the candidate of one of the worktree's own performance tests.
+
+        Args:
+            name: name of the test.
+            positions: path of the file that receives the answer.
+        """
         self._pin(1)
         gate = _gates()[name]
         self._held(gate.candidate, positions)
         return {"facts": {}, "clock": gate.clock}
 
     def renew(self) -> dict[str, Any]:
-        """Make the work anew, while the old still takes its place, behind so much room as chance will have it."""
+        """Rebuild the work behind a random offset, while the old work still occupies its memory."""
         assert self._make is not None
         self._room = bytearray(random.randrange(ROOM))
         self._work = self._make()
         return {}
 
     def time(self, calls: int, clock: str) -> dict[str, Any]:
-        """The seconds of so many calls."""
+        """Time a number of calls together.
+
+        Args:
+            num_calls: number of calls.
+            clock: cpu or wall.
+        """
         now, work = CLOCKS[clock], self._work
         assert work is not None
         began = now()
@@ -87,7 +104,7 @@ class Worker:
         return {"seconds": now() - began}
 
     def instructions(self) -> dict[str, Any]:
-        """The instructions of one call; the counter is the one beside this script, whatever the tree has."""
+        """Count the instructions of one call, with the counter next to this script instead of the worktree's."""
         assert self._work is not None
         place = spec_from_file_location("springbench_instructions", Path(__file__).with_name("instructions.py"))
         assert place is not None
@@ -97,7 +114,7 @@ class Worker:
         return {"instructions": counter.count(self._work)}
 
     def _held(self, make: Callable[[], Any], positions: str) -> Any:
-        """The work, done once; its answer is in a file."""
+        """Build the work, run it once, and write its answer to a file."""
         import numpy as np
 
         work = make()
@@ -113,7 +130,7 @@ class Worker:
 
 
 class _Steps:
-    """The first steps of a run, as often as it is called."""
+    """The first steps of a run, simulated again by each call."""
 
     def __init__(self, run: Any, frames: int, extra: float) -> None:
         from harness.scenes.bind import build
@@ -138,7 +155,7 @@ class _Steps:
         return step.positions
 
     def facts(self) -> dict[str, int]:
-        """What the solver counts, and what the last call did."""
+        """Collect the solver's counts, and those of the last call."""
         counts = {name: int(value) for name, value in self._prepared.facts.items()}
         return counts | {"iterations": self._iterations, "steps": self._frames}
 
@@ -160,12 +177,12 @@ def _sweep(config: str, asked: dict[str, Any]) -> list[Any]:
 
 
 def _iterations(step: Any) -> int:
-    """Of a step; older revisions know those of its one unknown."""
+    """Count the iterations of a step; older revisions report them only in the solution."""
     return step.iterations if hasattr(step, "iterations") else step.solution.iterations
 
 
 def _title(run: Any) -> str:
-    """A run in words, the same in both trees."""
+    """Format the description of a run, which is the same in both worktrees."""
     given = [run.solver.name, f"{run.iterations} iterations", run.integrator, f"dt {run.scene.time_step:.4g}"]
     size = [f"size {run.size}"] if run.size else []
     threads = [f"{run.threads} threads"] if run.threads not in (1, "auto") else []
@@ -180,7 +197,7 @@ def _gates() -> dict[str, Any]:
 
 
 def main() -> None:
-    """Answer requests until there are no more."""
+    """Answer requests until standard input ends."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # what the work prints must not look like an answer
     worker = Worker()
