@@ -120,7 +120,7 @@ class CurveSpec:
         return ["curve", *self.case.identity(), self.moment, identity(self.solver.name), dict(self.solver.parameters)]
 
     def unit_id(self, machine: str) -> str:
-        """Compute 12 hex digits from all that determines result and timing."""
+        """Compute 12 hex digits from everything that determines result and timing."""
         how = [asdict(self.how), self.first_guesses, self.iterations, self.recordings]
         return _hash([machine, self.point(), how])
 
@@ -152,7 +152,7 @@ class WorkSpec:
         return ["work", *self.case.identity(), self.horizon, *solver, *stop]
 
     def unit_id(self, machine: str) -> str:
-        """Compute 12 hex digits from all that determines result and timing."""
+        """Compute 12 hex digits from everything that determines result and timing."""
         return _hash([machine, self.point(), asdict(self.how)])
 
     def label(self) -> str:

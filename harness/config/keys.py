@@ -31,7 +31,7 @@ Number = float | str
 
 
 class SceneKeys(TypedDict, total=False):
-    """Keys of a scene besides its mesh and effects, as in `harness.scenes.spec.SceneFields`."""
+    """Keys of a scene except its mesh and effects, as in `harness.scenes.spec.SceneFields`."""
 
     description: str
     mass: float | None

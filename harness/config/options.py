@@ -23,7 +23,7 @@ Rounds = Annotated[int, Field(ge=1, le=1000)]
 
 
 class Option(NamedTuple):
-    """Attributes of an option besides its type and description.
+    """Attributes of an option in addition to its type and description.
 
     short_format: format of its value in short descriptions.
     column: column of rows, "" for none.
@@ -56,8 +56,8 @@ class Chosen(Model):
         Option(
             "{}",
             "first_guess",
-            "null is `assignment` for JSON scenes, `motion` (where the motion so far leads) for integrators that take "
-            "forces at their unknowns, else `current`",
+            "null is `assignment` for JSON scenes, `motion` (extrapolated positions) for integrators that evaluate "
+            "forces at their stages, else `current`",
         ),
     ]
     """Initial guess of a step's iteration. coarse: the solution of the same step on a mesh of half the size, which is

@@ -181,7 +181,7 @@ class RunSpec(Kept, Chosen):
         return 1 if self.timing == "rough" else self.rounds + 2
 
     def identity(self) -> str:
-        """Build canonical JSON of all that determines the run's result and timing on one machine.
+        """Build canonical JSON of everything that determines the run's result and timing on one machine.
 
         Pictures are drawn later from the recording, and limits only determine when a run is stopped; both are excluded.
         """

@@ -6,8 +6,8 @@ work of both is therefore rebuilt at other addresses, in an eighth of the time (
 effect of the layout becomes noise with many samples. Properties that a process has all its life, such as the addresses
 of its compiled code, become noise likewise: both programs are restarted every RESTART_SECONDS. A slowdown is reported
 only if a second benchmark, with restarted programs, confirms it. The first benchmark alone excludes chance, so the
-second needs fewer blocks. The guarantee of the test is for the ratio of one pair of processes. For several pairs it
-holds only as far as their ratios agree; the study measures the error rate for these.
+second needs fewer blocks. The guarantee of the test is for the ratio of one pair of processes. For several pairs it is
+valid only as far as their ratios agree; the study measures the error rate for these.
 """
 
 from __future__ import annotations

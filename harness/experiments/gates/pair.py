@@ -25,8 +25,14 @@ WORKER = Path(__file__).with_name("worker.py")
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """A revision as it can be run. name: in messages; tree: the folder that holds it; python: its interpreter;
-    checkout: the folder whose revision it is; extra: work that is planted in it, as a part of its own."""
+    """A git revision that can be run.
+
+    name: name in messages.
+    worktree: folder of its files.
+    interpreter: its Python interpreter.
+    checkout: folder that the revision belongs to.
+    injected_slowdown: artificial extra work, as a fraction of its own.
+    """
 
     name: str
     tree: Path

@@ -5,7 +5,7 @@ A block runs A and B twice each, and gives one number:
     x = log((A_1 + A_2) / (B_1 + B_2))        in the order A B B A or B A A B, chosen at random
 
 If A takes exp(m) times as long as B, then x - m is positive or negative with equal probability, given all earlier
-blocks and |x - m|: the random order alone decided which positions of the block were A's. This holds for any behaviour
+blocks and |x - m|: the random order alone decided which positions of the block were A's. This is true for any behaviour
 of the machine, such as bursts or drift, and for disturbances of any size. Blocks need be neither independent nor
 identically distributed. So of n blocks the number k that lie above m is distributed as that of n fair coins. With the
 mixture martingale (Robbins 1970)

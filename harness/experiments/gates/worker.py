@@ -1,7 +1,7 @@
 """Worker script of one revision: prepares its work and times it on request, with the revision's worktree on the path.
 
-It exchanges JSON by standard input and output, one line per request and per answer. Output of the work goes to standard
-error. All imports come from the worktree, so that only the revision's own code is timed.
+It exchanges JSON by standard input and output, one line per request and per answer. The work prints to standard error.
+All imports come from the worktree, so that only the revision's own code is timed.
 
     {"do": "runs", "config": "...", "asked": {...}}           -> {"runs": ["cloth 32 numba", ...]}
     {"do": "run", "config": "...", "asked": {...}, "index": i, "frames": n, "extra": 0.0, "positions": "..."}
