@@ -27,7 +27,10 @@ def main() -> None:
 
 
 def _prepare_environment() -> None:
-    """Override environment settings that no command can use; exit with code 2 for an invalid one."""
+    """Override environment settings that no command can use.
+
+    Exit with code 2 for an invalid one.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # what a terminal cannot write is written as an escape sequence
             stream.reconfigure(errors="backslashreplace")

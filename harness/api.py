@@ -162,7 +162,7 @@ class Simulation:
         return self.positions
 
     def steps(self, count: int) -> NDArray[np.float64]:
-        """Advance by a number of steps and return the positions after each, (count, n, 3) [m]."""
+        """Advance by `count` steps and return all their positions, (count, n, 3) [m]."""
         return np.array([self.step() for _ in range(count)])
 
 

@@ -130,7 +130,10 @@ def _load_what_tells() -> None:
 
 
 def _told(sweep: Sweep, table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
-    """Print the summary of a sweep, draw its reports, and return a line for each failed run."""
+    """Report the results of a sweep, and return its failures.
+
+    It prints the summary and draws the reports. The failures are one line for each failed run.
+    """
     from harness.experiments.plan import of_other_code
     from harness.experiments.sweep import failures
     from harness.report.learned import closing

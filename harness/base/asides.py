@@ -51,7 +51,10 @@ def is_step(said: str) -> bool:
 
 @contextmanager
 def compiling_told(tick: Tick) -> Generator[None]:
-    """Report the compilation of kernels inside the block; kernels loaded from the cache are not reported."""
+    """Report the compilation of kernels inside the block.
+
+    Kernels loaded from the cache are not reported.
+    """
     from numba.core import event  # where nothing is compiled, nobody waits for it
 
     class Watch(event.Listener):

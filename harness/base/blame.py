@@ -11,9 +11,10 @@ from solvers import sources
 
 
 def said(error: BaseException) -> str:
-    """Return the type and the message of an error in one line of at most 300 characters.
+    """Format the type and the message of an error in one line.
 
-    An exception of user code may fail to produce its message; a placeholder then takes its place.
+    The message has at most 300 characters. An exception of user code may fail to produce its message; a placeholder
+    then takes its place.
     """
     try:
         words = " ".join(str(error).split())[:300]

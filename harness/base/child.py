@@ -31,14 +31,17 @@ _LENGTH = struct.Struct("<Q")
 
 @dataclass(frozen=True, slots=True)
 class Allowance:
-    """Limits of one call: processor time [s], and memory [bytes] beyond that in use at its start."""
+    """Limits of one call: processor time [s] and additional memory [bytes]."""
 
     seconds: float
     bytes: int
 
 
 class NoAnswer(Exception):
-    """The subprocess returned no result; the message gives the reason as the end of a sentence."""
+    """The subprocess returned no result.
+
+    The message gives the reason as the end of a sentence.
+    """
 
 
 def call(function: Callable[..., Any], *arguments: Any, limits: Allowance) -> Any:
@@ -125,7 +128,7 @@ class _Child:
             timer.cancel()
 
     def end(self) -> int:
-        """Stop the subprocess if it is still running, and return its exit code, negative for a signal."""
+        """Stop the subprocess if needed, and return its exit code, negative for a signal."""
         if self._owner != os.getpid():
             return 0
         for pipe in (self._process.stdin, self._process.stdout):
@@ -210,7 +213,7 @@ def memory_limited(bytes: int) -> Generator[None]:
 
 
 def reader() -> int:
-    """Return the process id of the sandbox of this process, or 0 if there is none."""
+    """Return the process id of this process's sandbox, or 0 without one."""
     return _Child.of_this_process()
 
 
@@ -220,8 +223,9 @@ def without_core_dumps() -> None:
 
 
 def limit(what: int, value: float) -> None:
-    """Set a soft resource limit and leave the hard limit, so that the next call can use another value.
+    """Set a soft resource limit and leave the hard limit unchanged.
 
+    The next call can therefore use another value.
     Args:
         resource_id: constant `resource.RLIMIT_*`.
         value: limit in the unit of the resource, or RLIM_INFINITY.
@@ -232,7 +236,10 @@ def limit(what: int, value: float) -> None:
 
 
 def data() -> int:
-    """Return the data size of this process as RLIMIT_DATA counts it [bytes], or 0 if unavailable."""
+    """Return the data size of this process [bytes], or 0 if unavailable.
+
+    RLIMIT_DATA limits this size.
+    """
     with suppress(OSError), open("/proc/self/status") as file:
         return next((1024 * int(line.split()[1]) for line in file if line.startswith("VmData:")), 0)
     return 0

@@ -1,7 +1,8 @@
-"""Ownership of results folders: each belongs to one config, so that two of one name cannot overwrite each other.
+"""Ownership of results folders: each belongs to one config.
 
-The folder stores the relative path of its config. A config that was moved together with its results remains the owner,
-and so does one that is still at its old path.
+Two configs of one name therefore cannot overwrite each other's results. The folder stores the relative path of its
+config. A config that was moved together with its results remains the owner, and so does one that is still at its old
+path.
 """
 
 from __future__ import annotations
@@ -21,7 +22,10 @@ _LONGEST = 4096
 
 
 def config_of(folder: Path) -> Path | None:
-    """Return the resolved path of the config that owns a folder, or None if it cannot be found."""
+    """Return the config that owns a folder, or None if it cannot be found.
+
+    All symbolic links of the path are resolved.
+    """
     note = folder / NAME
     with suppress(OSError, ValueError):  # what a folder from elsewhere says may be no path at all
         if note.is_file():

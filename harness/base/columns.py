@@ -301,7 +301,7 @@ _BY_NAME = {column.name: column for column in COLUMNS}
 
 
 def as_in_runs(*names: str) -> tuple[Column, ...]:
-    """Return columns of other tables that have the same definition as in the rows of runs."""
+    """Return columns that have the same definition as in the rows of runs."""
     return tuple(_BY_NAME[name] for name in names)
 
 

@@ -37,7 +37,10 @@ Peers = Annotated[bool, typer.Option("--peers", help="With --error: time other l
 
 
 class Commands(TyperGroup):
-    """A command group that reports the project's errors and system errors as a message and an exit code."""
+    """Command group that reports expected errors as a message and an exit code.
+
+    These are the project's own errors and those of the system.
+    """
 
     def invoke(self, ctx: Any) -> Any:
         show_log()

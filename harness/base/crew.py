@@ -103,7 +103,10 @@ def done_by(
 
 
 def _next(left: dict[int, Hashable], member: _Member, others: list[Hashable]) -> int:
-    """Select the next task: of the worker's own group, else of a group that no other worker runs, else any."""
+    """Select the next task for a worker.
+
+    A task of the worker's own group comes first, then one of a group that no other worker runs, then any.
+    """
     grouped = {number: group for number, group in left.items() if group is not None}
     own = (number for number, group in grouped.items() if group == member.group)
     new = (number for number, group in grouped.items() if group not in others)

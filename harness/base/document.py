@@ -52,7 +52,7 @@ UNOPENED = OwnCode(opens=False)
 
 @dataclass(slots=True)
 class Document:
-    """A config as plain data, with the line of each key and the mistakes found so far.
+    """A config as plain data, with line numbers and the mistakes found so far.
 
     user_code: policy for code that the config names.
     """
@@ -64,7 +64,10 @@ class Document:
     own: OwnCode = IMPORTED
 
     def report(self, problem: str, at: Key = ()) -> None:
-        """Add a mistake at a key; a key that is not in the file gets the line of its parent mapping."""
+        """Add a mistake at a key.
+
+        A key that is not in the file gets the line of its parent mapping.
+        """
         line = next((self.lines[at[:k]] for k in range(len(at), -1, -1) if at[:k] in self.lines), None)
         self.mistakes.append(Mistake(problem, self.path, line, key_text(at)))
 
@@ -151,7 +154,10 @@ def quote(value: object) -> str:
 
 
 def _place(detail: ErrorDetails, data: Any) -> Key:
-    """Return the key that a validation error refers to, without the names of union members in its location."""
+    """Return the key that a validation error refers to.
+
+    The names of union members in its location are omitted.
+    """
     key: Key = ()
     for step in detail["loc"]:
         if _holds(data, step):
@@ -185,7 +191,10 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], key: Key) -> str:
 
 
 def _models_at(model: type[BaseModel], location: Key) -> list[type[BaseModel]]:
-    """Return the models at an error's location, where a union member is selected by its kind; else all members."""
+    """Return the models at an error's location.
+
+    A member of a union is selected by its kind; without a kind all members are returned.
+    """
     members = [model]
     for step in location:
         if isinstance(step, int):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 class SpringbenchError(Exception):
-    """Base of the errors that the command line reports as a message instead of a traceback."""
+    """Base of the errors that the command line reports without a traceback."""
 
     exit_code = 1
 

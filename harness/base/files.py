@@ -15,7 +15,10 @@ from harness.base.errors import InputError, Mistake, SpringbenchError
 
 
 class CannotWrite(SpringbenchError):
-    """A file cannot be written, for example because the disk is full; the run itself is valid and may be repeated."""
+    """A file cannot be written, for example because the disk is full.
+
+    The run itself is valid and may be repeated.
+    """
 
 
 _STEM = 100
@@ -93,7 +96,7 @@ def _kind(mode: int) -> str:
 
 
 def is_file_name(text: str) -> bool:
-    """Return whether a text is a valid name of a file or folder, and not a path."""
+    """Return whether a text is a valid file name, and not a path."""
     size = len(text.encode(errors="surrogateescape"))
     return 0 < size <= 240 and "/" not in text and "\0" not in text and text not in (".", "..")
 
@@ -127,8 +130,10 @@ def cannot_write(path: Path, error: Exception) -> CannotWrite:
 
 
 def reason(error: Exception) -> str:
-    """Describe the cause of an error in the system's words, such as `No space left on device`, else in its own
-    words."""
+    """Describe the cause of an error.
+
+    The system's words are used if possible, such as `No space left on device`, else the error's own.
+    """
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else " ".join(str(error).split()) or type(error).__name__
 

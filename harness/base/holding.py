@@ -1,4 +1,7 @@
-"""Locks on a results folder: exclusive for one process, or shared by processes that claim units one by one."""
+"""Locks on a results folder: exclusive for one process, or shared by several.
+
+Processes that share a folder claim its units one by one.
+"""
 
 from __future__ import annotations
 
@@ -102,8 +105,9 @@ os.register_at_fork(after_in_child=_let_go)
 
 
 class Claims:
-    """Claims of this process on units of a shared folder; the first process to claim a unit computes it.
+    """Claims of this process on units of a shared folder.
 
+    The first process to claim a unit computes it.
     A claim is a lock on one byte of `.claims` (POSIX record locks, which work on network file systems too). It is
     released when its process ends, however that happens. Units are files of rows. A unit whose file has changed since
     the start was finished by another process.
@@ -129,7 +133,7 @@ class Claims:
         return _state(unit) != self._units[unit]
 
     def wait(self, units: Sequence[Path], look: Callable[[], object] = int) -> None:
-        """Wait until another process has finished one of the units, or until one can be claimed.
+        """Wait until one of the units is finished elsewhere or can be claimed.
 
         Args:
             units: row files of the units.
@@ -145,7 +149,7 @@ class Claims:
 
 
 def _state(path: Path) -> tuple[int, int] | None:
-    """Return the inode and modification time [ns] of a file, or None if it is missing."""
+    """Return inode and modification time [ns] of a file, or None if missing."""
     try:
         there = path.stat()
     except OSError:

@@ -1,5 +1,6 @@
-"""Interrupt handling: after Ctrl-C a command ends with one message and exit code 130, at any time.
+"""Interrupt handling: Ctrl-C ends a command with one message and exit code 130.
 
+This holds from the first import to the last picture.
 * During an import the interrupt is deferred, because extension modules turn a KeyboardInterrupt into an ImportError and
   print it.
 * If a callback or a destructor swallows the KeyboardInterrupt, it is raised again.

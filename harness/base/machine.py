@@ -57,7 +57,10 @@ def describe() -> Machine:
 
 @cache
 def node() -> str:
-    """Compute 12 hexadecimal digits that identify this computer among others of its kind, without its name."""
+    """Compute 12 hexadecimal digits that identify this computer.
+
+    They distinguish computers of the same kind, and do not reveal its name.
+    """
     return hashlib.sha256(f"springbench {platform.node()}".encode()).hexdigest()[:12]
 
 
@@ -85,7 +88,10 @@ def _cores() -> int:
 
 @cache
 def versions(*more: str) -> dict[str, str]:
-    """Collect the versions of Python, the standard set of libraries and more packages; absent ones are omitted."""
+    """Collect the versions of Python, the standard set of libraries and more packages.
+
+    Absent ones are omitted.
+    """
     found = {"python": platform.python_version()}
     for name in (*_LIBRARIES, *more):
         try:
@@ -118,7 +124,10 @@ def commit(root: Path = _ROOT) -> str:
 
 @cache
 def code_hash(root: Path = _ROOT) -> str:
-    """Hash the paths and contents of the project's Python sources to 12 hexadecimal digits of SHA-256."""
+    """Hash the project's Python sources to 12 hexadecimal digits.
+
+    It is SHA-256 over their paths and contents.
+    """
     digest = hashlib.sha256()
     sources = (path for package in _PACKAGES for path in (root / package).rglob("*.py"))
     for name, path in sorted((path.relative_to(root).as_posix(), path) for path in sources):
@@ -136,13 +145,19 @@ class Threads:
 
 
 def threads(asked: int | Literal["auto"]) -> Threads:
-    """Return the requested number of threads; for "auto" the number of idle cores, constant within a process."""
+    """Return the requested number of threads.
+
+    For "auto" the number of idle cores, constant within a process.
+    """
     return _idle() if asked == "auto" else Threads(asked)
 
 
 @cache
 def _idle() -> Threads:
-    """Count the cores that other processes leave idle; computed once, so that all runs use the same number."""
+    """Count the cores that other processes leave idle.
+
+    Computed once, so that all runs use the same number.
+    """
     import psutil  # as long to load as the rest of this module
 
     usable = _usable()

@@ -72,7 +72,10 @@ class Turn:
         return _held("used", fcntl.LOCK_SH, self._tick) if self._exclusive else beside(self._tick)
 
     def look(self) -> None:
-        """Release the timing priority after the timing, or if there is none, and lock for shared computation."""
+        """End the priority for timing, and lock for shared computation.
+
+        It is called after the timing, or if the run will not be timed.
+        """
         self._coming.close()
         self._looking.close()
         self._looking.enter_context(beside(self._tick))
@@ -80,8 +83,9 @@ class Turn:
 
 @contextmanager
 def own_cores(number: int, tick: Tick) -> Generator[list[int]]:
-    """Compute with the threads of this process pinned to cores that no other process has reserved.
+    """Compute on cores that no other process has reserved.
 
+    All threads of this process are pinned to them.
     Args:
         number: number of cores.
         tick: progress callback, which reports the waiting time.
@@ -162,7 +166,11 @@ def _let_go(*locks: int) -> None:
 
 
 def _opened(name: str) -> int:
-    """Open a lock file that all users of the machine may lock; raise InputError if that fails."""
+    """Open a lock file that all users of the machine may lock.
+
+    Raises:
+        InputError: if that fails.
+    """
     path = Path(os.environ.get("SPRINGBENCH_LOCKS") or tempfile.gettempdir()) / f"springbench-{name}.lock"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

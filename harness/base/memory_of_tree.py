@@ -8,7 +8,7 @@ from contextlib import suppress
 
 
 class TreeMemory:
-    """Monitor of the memory of all descendants of a process, beyond what they use at the start.
+    """Monitor of the additional memory of all descendants of a process.
 
     root: process id.
     gib: limit of their sum [GiB].
@@ -20,7 +20,10 @@ class TreeMemory:
 
     @property
     def exceeded(self) -> bool:
-        """Whether the limit is exceeded, counting processes started since; earlier ones have limits of their own."""
+        """Whether the limit is exceeded, counting processes started since.
+
+        Earlier ones have limits of their own.
+        """
         new = set(found := list(_below(self._root))) - self._before.keys()
         if not new:
             return False

@@ -55,7 +55,10 @@ def read_numbers(path: Path, name: str) -> NDArray[np.float64]:
 
 
 def _extracted(path: Path, name: str) -> NDArray[np.float64]:
-    """Extract an array in the sandbox; raise InputError, or errors of the standard library for a broken file."""
+    """Extract an array in the sandbox.
+
+    Raise InputError, or errors of the standard library for a broken file.
+    """
     try:
         with zipfile.ZipFile(path) as packed:
             names = [info.filename.removesuffix(".npy") for info in packed.infolist()]

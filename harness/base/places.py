@@ -58,7 +58,10 @@ def everything(context: typer.Context, value: Path | str) -> Path:
 
 
 def rows_alone(value: Path | str) -> Path:
-    """Download the rows of results for a command that writes nothing, and return the local folder."""
+    """Download the rows of results, and return the local folder.
+
+    It is for a command that writes nothing.
+    """
     if isinstance(value, Path):
         return value
     place = Place.of(value)
@@ -85,7 +88,11 @@ class Place:
 
     @classmethod
     def of(cls, url: str) -> Place:
-        """Create the storage of a URL; raise InputError if its scheme is unknown or its package is missing."""
+        """Create the storage of a URL.
+
+        Raises:
+            InputError: if its scheme is unknown or its package is missing.
+        """
         from fsspec.core import url_to_fs
 
         try:
@@ -174,7 +181,7 @@ class Place:
         return {name: _token(about) for name, about in files.items() if _is_safe(name)}
 
     def _here(self, name: str) -> str:
-        """Return a token that changes when a local file does, or "" if it is missing."""
+        """Return a token that changes with a local file, "" if it is missing."""
         try:
             about = (self.folder / name).stat()
         except FileNotFoundError:

@@ -228,7 +228,10 @@ def left_in_words(seconds: float | None) -> str:
 
 
 def _at_hand(going: Sequence[_Running]) -> str:
-    """Describe the first running run that does not wait, and the number of other runs, in one short line."""
+    """Describe the first active run and the number of others in one line.
+
+    A run that does not wait is preferred.
+    """
     run = min(going, key=lambda one: bool(one.aside))
     others = f"; {len(going) - 1} more at hand" if len(going) > 1 else ""
     return f"{run.title}: {run.doing}, {100 * run.done:.0f} %{others}"
@@ -295,7 +298,10 @@ class Bars:
 
 
 class Lines:
-    """One line for each finished run with the remaining time, and a status line after a period without output."""
+    """One line for each finished run, with the remaining time.
+
+    After a period without output a status line is printed.
+    """
 
     def __init__(self, console: Console) -> None:
         self._console, self._pace, self._printed = console, Pace(), monotonic()

@@ -1,4 +1,6 @@
-"""Quantities that tables, pictures, figures and pages report of a run, each with one definition and one name.
+"""Quantities of a run in tables, pictures, figures and pages.
+
+Each has one definition and one name.
 
     ms a step         median wall time of the timed steps, over all frames and rounds [ms]
     least             the smallest of the same times [ms]
@@ -35,12 +37,15 @@ SQL = {
 
 
 def ms_per_step(seconds: Sequence[float]) -> float:
-    """Compute the median ms a step from the wall times [s] of all frames and rounds."""
+    """Compute the median ms a step from wall times [s].
+
+    The times are those of all frames and rounds.
+    """
     return 1e3 * float(np.median(seconds))
 
 
 def times_as_long(run: float, other: float) -> float:
-    """Compute how many times as long a run takes as another one, from their ms a step."""
+    """Compute the ratio of two runs' times from their ms a step."""
     return run / other
 
 

@@ -121,7 +121,7 @@ RANGES: dict[str, Range] = {
 
 
 class Invalid(NamedTuple):
-    """An invalid value: the index of its row, its column, the value and a description of valid ones."""
+    """An invalid value: its row, its column, the value and the expected values."""
 
     row: int
     column: str

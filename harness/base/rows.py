@@ -136,8 +136,9 @@ def read_each(
     promote: union.Promote = "default",
     named: bool = False,
 ) -> pa.Table:
-    """Read rows by pyarrow, file by file; this is the reference for the verification of written rows.
+    """Read rows by pyarrow, file by file.
 
+    This is the reference for the verification of written rows.
     The parameters are those of `read_rows`.
     """
     return _valid(paths, *_each(paths, schema, needed, promote), None, named=named)
@@ -151,7 +152,10 @@ def _valid(
     *,
     named: bool,
 ) -> pa.Table:
-    """Remove the rows of units with invalid values; number (n,) is the index of each row's unit."""
+    """Remove the rows of units with invalid values.
+
+    Number (n,) is the index of each row's unit.
+    """
     bad: dict[int, Mistake] = {}
     what = "it is left out" if left_out else "take it out of the results"
     for one in invalid(table):
@@ -200,7 +204,11 @@ def _joined(
 
 
 def _packed(paths: Sequence[Path]) -> dict[Path, pa.Table]:
-    """Read the rows of packed units, each packed file once; raise InputError for a damaged one."""
+    """Read the rows of packed units, each packed file once.
+
+    Raises:
+        InputError: for a damaged one.
+    """
     names: dict[Path, list[str]] = {}
     for path in paths:
         if not os.path.lexists(path) and path.stem in shelf.packed_units(path.parent):
@@ -298,7 +306,11 @@ def _file(path: Path) -> pa.Table:
 
 
 def _within_limits(content: BinaryIO) -> pa.Table:
-    """Read the rows of a file; raise OSError if it exceeds the maximum number of rows or bytes."""
+    """Read the rows of a file.
+
+    Raises:
+        OSError: if it exceeds the maximum number of rows or bytes.
+    """
     with pq.ParquetFile(content) as file:
         told, fields = file.metadata, list[Any](file.schema_arrow)
     names = [field.name for field in fields]

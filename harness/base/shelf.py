@@ -1,10 +1,11 @@
 # pyright: reportUnknownMemberType=false
 # pyarrow's stubs have incomplete types of columns, and of files that Parquet is read from.
-"""Row store: each unit has its own file, `rows/<unit>.parquet`, or many units share one packed file.
+"""Row store: a file for each unit, or one packed file for many units.
 
-The packed file `rows.parquet` is next to the folder, and its column `file` names the unit (`springbench compact`). A
-path under `rows/` identifies a unit wherever its rows are stored. Its own file has priority over packed rows. Therefore
-no unit appears twice or is missing at any moment of packing, and a repeated run replaces its packed rows.
+A unit's own file is `rows/<unit>.parquet`. The packed file `rows.parquet` is next to the folder, and its column `file`
+names the unit (`springbench compact`). A path under `rows/` identifies a unit wherever its rows are stored. Its own
+file has priority over packed rows. Therefore no unit appears twice or is missing at any moment of packing, and a
+repeated run replaces its packed rows.
 """
 
 from __future__ import annotations
@@ -30,12 +31,15 @@ _END = 2**15
 
 
 def packed_file(folder: Path) -> Path:
-    """Return the path of the packed file of a folder of rows; it may not exist."""
+    """Return the path of the packed file of a folder of rows.
+
+    It may not exist.
+    """
     return folder.with_name(f"{folder.name}.parquet")
 
 
 def folders(above: Path, name: str, depth: str = "**/") -> list[Path]:
-    """Find the folders of rows of a given name, including those whose units are all packed.
+    """Find the folders of rows of a given name, including completely packed ones.
 
     Args:
         above: folder to search.
@@ -48,7 +52,10 @@ def folders(above: Path, name: str, depth: str = "**/") -> list[Path]:
 
 
 def own_files(folder: Path) -> set[str]:
-    """List the units of a folder that have a file of their own, or something else at its path."""
+    """List the units of a folder that have a file of their own.
+
+    Anything else at the path of such a file counts too.
+    """
     try:
         with os.scandir(folder) as entries:
             return {e.name[:-8] for e in entries if e.name.endswith(".parquet") and not e.name.startswith(".")}
@@ -57,7 +64,11 @@ def own_files(folder: Path) -> set[str]:
 
 
 def packed_units(folder: Path) -> frozenset[str]:
-    """List the units in the packed file of a folder; raise InputError if it is damaged."""
+    """List the units in the packed file of a folder.
+
+    Raises:
+        InputError: if it is damaged.
+    """
     path = packed_file(folder)
     try:
         there = path.stat()
@@ -147,9 +158,10 @@ def schema(part: Part) -> pa.Schema:
 
 
 def _kind(path: str) -> bytes | None:
-    """Read a key that files of one schema share, from the end of the file only.
+    """Read a key that files of one schema share.
 
-    It is the schema as pyarrow stores it there, or the path for files of other writers. None for other files.
+    Only the end of the file is read. It is the schema as pyarrow stores it there, or the path for files of other
+    writers. None for other files.
     """
     try:
         if not os.path.isfile(path):  # a pipe would be waited for

@@ -1,4 +1,7 @@
-"""Metadata of solvers as columns of rows, so that reports need not import solvers, which may be user code."""
+"""Metadata of solvers as columns of rows.
+
+Reports therefore need not import the solvers, which may be user code.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,10 @@ def packages(solver: str) -> tuple[str, ...]:
 
 
 def stated(solver: str) -> dict[str, Any]:
-    """Read the columns `family`, `reference`, `minimises` and `own_steps` of a solver; empty for an unknown name."""
+    """Read the columns `family`, `reference`, `minimises` and `own_steps` of a solver.
+
+    Empty for an unknown name.
+    """
     if solver not in EVERY:
         return {}
     method = load(EVERY[solver])

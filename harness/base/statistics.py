@@ -32,15 +32,18 @@ class Interval(NamedTuple):
 
 
 def ratio(theirs: ArrayLike, ours: ArrayLike) -> Interval:
-    """Estimate the ratio theirs / ours of paired times, both (rounds,), by the median over the rounds."""
+    """Estimate the ratio theirs / ours of paired times.
+
+    Both are (rounds,); the estimate is the median over the rounds.
+    """
     return _resampled((np.asarray(theirs, float) / np.asarray(ours, float),), np.median)
 
 
 def added(more: ArrayLike) -> Interval:
-    """Estimate the time that a frame adds: the mean over frames of the median over rounds.
+    """Estimate the time that a frame adds.
 
-    The rounds of each frame are resampled separately. Only the drift of the machine couples the rounds of two frames,
-    and it should count as noise.
+    It is the mean over frames of the median over rounds. The rounds of each frame are resampled separately. Only the
+    drift of the machine couples the rounds of two frames, and it should count as noise.
     Args:
         more: added times (rounds, frames).
     Returns: estimate and interval, in the unit of the times.
@@ -67,7 +70,10 @@ def least(steps: Iterable[tuple[int, float]]) -> dict[int, float]:
 
 
 def changed(new: Mapping[int, float], old: Mapping[int, float]) -> Interval:
-    """Estimate the ratio new / old of times by frame, over the common frames, of which there is at least one."""
+    """Estimate the ratio new / old of times by frame.
+
+    The estimate is over the common frames, of which there is at least one.
+    """
     frames = sorted(set(new) & set(old))
     logs = np.log([new[frame] / old[frame] for frame in frames])
     return Interval(*(float(np.exp(end)) for end in _resampled((logs,), np.median)))

@@ -78,7 +78,10 @@ class _Supervisor:
         self._left_out = 0
 
     def run(self, signals: set[signal.Signals]) -> NoReturn:
-        """Relay the worker's output until it ends, then end with the same exit code or signal."""
+        """Relay the worker's output until it ends, then end likewise.
+
+        The exit code or the signal is the same.
+        """
         signal.signal(signal.SIGTERM, self._stop)
         signal.signal(DUMP, lambda number, frame: os.kill(self._worker, DUMP))
         ended = os.pidfd_open(self._worker)
@@ -101,7 +104,10 @@ class _Supervisor:
         os._exit(0)
 
     def _passed_on(self, ended: int | None, seconds: float) -> bool:
-        """Relay pending output, wait for it at most the given seconds, and return whether the worker has ended."""
+        """Relay pending output, and return whether the worker has ended.
+
+        The call waits at most the given seconds.
+        """
         poll = select.poll()
         poll.register(self._output, select.POLLIN)
         if ended is not None:

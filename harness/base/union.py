@@ -1,10 +1,10 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 # pyarrow's stubs have incomplete types of columns, and of files that Parquet is read from.
-"""Queries over the rows of many units, by DuckDB on their Parquet files, grouped by schema.
+"""Queries over the rows of many units, by DuckDB on Parquet files.
 
-DuckDB's `union_by_name` would do the same for files of any schema, but takes 140 kB of memory per file. Units that
-cannot be read together raise `SchemaMismatch`. The caller then reads unit by unit and can name the invalid one. A path
-that DuckDB would interpret as a pattern raises it too.
+Files of one schema are read together. DuckDB's `union_by_name` would do the same for files of any schema, but takes 140
+kB of memory per file. Units that cannot be read together raise `SchemaMismatch`. The caller then reads unit by unit and
+can name the invalid one. A path that DuckDB would interpret as a pattern raises it too.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Unfit(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Union:
-    """Groups of units, the schema of all their rows, and the SQL of each group's rows."""
+    """Groups of units, with their common schema and the SQL of their rows."""
 
     parts: list[Part]
     schema: pa.Schema
@@ -70,8 +70,9 @@ class Union:
 
 @contextmanager
 def connected(memory: int = MEMORY) -> Generator[DuckDBPyConnection]:
-    """Open a DuckDB connection that reads only Parquet files, on one thread because other runs may be timed.
+    """Open a DuckDB connection that reads only Parquet files.
 
+    It uses one thread because other runs may be timed.
     Raises:
         SchemaMismatch: for an error of DuckDB, Arrow or the system inside the block.
     """
@@ -137,8 +138,11 @@ _PATTERN = re.compile(r"[*?\[\\\ud800-\udfff]")
 
 
 def _literal(files: Sequence[str]) -> list[str]:
-    """Return absolute paths, because DuckDB interprets `~` and `file:` at the start; raise SchemaMismatch for a
-    pattern."""
+    """Return absolute paths, because DuckDB interprets `~` and `file:` at the start.
+
+    Raises:
+        SchemaMismatch: for a pattern.
+    """
     found = [os.path.abspath(file) for file in files]
     if bad := next((file for file in found if _PATTERN.search(file)), None):
         raise Unfit(f"{bad!a} would be read as a pattern")
@@ -249,7 +253,10 @@ def _types(connection: DuckDBPyConnection, schema: pa.Schema) -> dict[str, str]:
 
 
 def _column(field: pa.Field[Any], own: pa.Schema, type: str) -> str:
-    """Format the select expression of a column for a group that may lack it or have another type."""
+    """Format the select expression of a column for one group.
+
+    The group may lack the column, or have another type.
+    """
     name = _quoted(field.name)
     at = own.get_field_index(field.name)
     if at >= 0 and own.field(at).type == field.type:

@@ -125,7 +125,10 @@ def serve(
 
 
 def tie(parent: int, how: signal.Signals = signal.SIGKILL) -> None:
-    """In a child process: end by a signal when the parent ends, and be the first to be killed when memory runs out."""
+    """End this child process by a signal when its parent ends.
+
+    It is also the first to be killed when memory runs out.
+    """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PARENT_DIES, how)
         if os.getppid() != parent:

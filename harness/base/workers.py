@@ -1,9 +1,10 @@
-"""Isolated worker: runs user code in a process that may crash, hang or exhaust memory without affecting this one.
+"""Isolated worker: runs user code in a process of its own.
 
-Between both is a supervisor (`harness.execution.worker_supervisor`), which reads the worker's output and ends its
-processes. One worker runs all tasks one after the other, so modules stay imported and kernels compiled. It is replaced
-after a failure, or if a task left threads behind. It is a fork of this process, which repeats none of that cost, as
-long as nothing was started here that does not survive a fork, such as OpenMP's threads. Otherwise it is spawned.
+The code may crash, hang or exhaust memory without affecting this process. Between both is a supervisor
+(`harness.execution.worker_supervisor`), which reads the worker's output and ends its processes. One worker runs all
+tasks one after the other, so modules stay imported and kernels compiled. It is replaced after a failure, or if a task
+left threads behind. It is a fork of this process, which repeats none of that cost, as long as nothing was started here
+that does not survive a fork, such as OpenMP's threads. Otherwise it is spawned.
 
 Files are read in a sandbox likewise (`harness.execution.sandbox`), which shares nothing with this process.
 """
@@ -162,7 +163,10 @@ class _Worker:
 
     @property
     def alive(self) -> bool:
-        """Whether a task can be submitted: an idle worker's pipe has nothing to read, not even its end."""
+        """Whether a task can be submitted.
+
+        The pipe of an idle worker has nothing to read, not even its end.
+        """
         return self._process.is_alive() and not self._calls.poll()
 
     def ask(self, piece: Piece, tick: Tick, limits: Limits) -> Generator[Connection, None, PieceOutcome]:
@@ -214,8 +218,10 @@ class _Worker:
         return Lost("failed", f"crashed by {name} {at}{heard}")
 
     def kill(self, listen: Callable[[], object] = int) -> None:
-        """Kill the worker and all its processes at once; `listen` receives the output that the supervisor still
-        relays."""
+        """Kill the worker and all its processes at once.
+
+        `listen` receives the output that the supervisor still relays.
+        """
         if self._process.is_alive():
             self._process.terminate()
             with suppress(OSError):
@@ -283,8 +289,10 @@ class _Heard:
             self.listen()
 
     def _take(self, said: bytes) -> None:
-        """Show and store output; bytes that may be the start of the end marker are held back until the next ones
-        arrive."""
+        """Show and store output.
+
+        Bytes that may be the start of the end marker are held back until the next ones arrive.
+        """
         self._held += said
         at = self._held.find(self.end)
         self._ended = self._ended or at >= 0

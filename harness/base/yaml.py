@@ -25,7 +25,11 @@ MAX_BYTES, MAX_NODES, MAX_DEPTH = 2**18, 100_000, 32
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read the content of a config; raise InputError if it is missing, irregular, unreadable or too large."""
+    """Read the content of a config.
+
+    Raises:
+        InputError: if it is missing, irregular, unreadable or too large.
+    """
     try:
         if path.exists() and not path.is_file():
             raise InputError(Mistake("is not a file; give a scene or a sweep (*.yaml, *.json)", path))
@@ -42,7 +46,10 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_yaml(path: Path) -> Document:
-    """Read a YAML file that holds one mapping; raise InputError with the line for anything else."""
+    """Read a YAML file that holds one mapping.
+
+    Raise InputError with the line for anything else.
+    """
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -122,13 +129,16 @@ def _integer(text: str) -> int:
 
 
 def _number(text: str) -> float | int:
-    """Parse a float; 1e5, a whole number without a decimal point, may also be used as an integer."""
+    """Parse a float.
+
+    1e5, a whole number without a decimal point, may also be used as an integer.
+    """
     value = float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
     return int(value) if "." not in text and abs(value) < 2**53 and value.is_integer() else value
 
 
 def scalar(text: str) -> Any:
-    """Parse a text as a plain YAML value (number, null or boolean), else return the text."""
+    """Parse a text as a plain YAML value: number, null, boolean or text."""
     tag = YAML(typ="safe", pure=True).resolver.resolve(ScalarNode, text, (True, False))
     try:
         return _SCALARS[str(tag).removeprefix(_CORE)](text)

@@ -1,4 +1,7 @@
-"""Models of a validated accuracy config: convergence curves on step snapshots, and work of whole trajectories."""
+"""Models of a validated accuracy config: convergence curves and work studies.
+
+Curves are measured on step snapshots, work on whole trajectories.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +80,10 @@ class AccuracyFields(Model):
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A scene at a mesh size, with an integrator and a time step (that of `scene`)."""
+    """A scene at a mesh size, with an integrator and a time step.
+
+    The time step is that of `scene`.
+    """
 
     scene_name: str
     scene: SceneSpec
@@ -105,7 +111,7 @@ class How:
 
 @dataclass(frozen=True, slots=True)
 class CurveSpec:
-    """Specification of the curves of one solver on one step snapshot, named as in the config."""
+    """Specification of the curves of one solver on one step snapshot."""
 
     case: Case
     moment: str | int
@@ -137,7 +143,10 @@ class CurveSpec:
 
 @dataclass(frozen=True, slots=True)
 class WorkSpec:
-    """Specification of one simulation up to t_end [s]; options: the values of `STEP_OPTIONS`, in their order."""
+    """Specification of one simulation up to t_end [s].
+
+    Options: the values of `STEP_OPTIONS`, in their order.
+    """
 
     case: Case
     horizon: float

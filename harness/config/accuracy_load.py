@@ -1,4 +1,7 @@
-"""Loader of accuracy configs: validation and expansion into units of work, with all mistakes reported at once."""
+"""Loader of accuracy configs: validation, and expansion into units of work.
+
+All mistakes are reported at once.
+"""
 
 from __future__ import annotations
 
@@ -71,8 +74,9 @@ def _load(path: Path, own: OwnCode) -> Accuracy:
 def expand(
     document: Document, fields: AccuracyFields, scenes: Mapping[str, SceneSpec], solvers: Sequence[SolverSpec]
 ) -> Accuracy:
-    """Expand a config into its units of work; the settings of the first study apply to duplicates.
+    """Expand a config into its units of work.
 
+    The settings of the first study apply to duplicates.
     Args:
         document: config, which collects mistakes.
         fields: validated fields of the config.
@@ -153,7 +157,10 @@ class _Expansion:
         return found
 
     def _sizes(self, name: str, study: Study, at: Key) -> Sequence[int]:
-        """Return the study's mesh sizes, else the scene's default; 0 for a mesh from a file."""
+        """Return the study's mesh sizes, else the scene's default.
+
+        0 for a mesh from a file.
+        """
         scene = self.scenes[name]
         if not isinstance(scene.mesh, Generator):
             return (0,)

@@ -1,4 +1,7 @@
-"""Expansion of a sweep into its runs: the grid of all combinations without `exclude`, plus `include`."""
+"""Expansion of a sweep into its runs.
+
+They are the grid of all combinations without `exclude`, plus `include`.
+"""
 
 from __future__ import annotations
 
@@ -81,7 +84,10 @@ class Expansion:
             )
 
     def _sizes(self, scene_name: str) -> Sequence[int]:
-        """Return the sweep's mesh sizes, else the scene's default; 0 for a mesh from a file."""
+        """Return the sweep's mesh sizes, else the scene's default.
+
+        0 for a mesh from a file.
+        """
         scene = self.scenes[scene_name]
         if not isinstance(scene.mesh, Generator):
             return (0,)
@@ -128,7 +134,7 @@ class Expansion:
                             self.document.report(problem, (part, i, key))
 
     def _check_chosen(self) -> None:
-        """Check that an error target is not combined with options that it selects, or with verification."""
+        """Check that options do not conflict with an error target or with verification."""
         options = self.fields.options
         if None not in options.accuracy:
             for name in OF_ERROR:

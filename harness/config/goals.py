@@ -1,4 +1,4 @@
-"""Performance targets of `springbench goals`: error bounds, a baseline for each, and the target ratio of cost."""
+"""Performance targets of `springbench goals`: errors, baselines and target ratios of cost."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ from harness.scenes.spec import IntegratorName, SceneSpec, Size
 
 
 class Goal(Model):
-    """A performance target: an error of scenes at t_end, and the baseline whose cheapest variant is compared."""
+    """A performance target: an error at t_end, and the baseline of its cost.
+
+    The cheapest variant of the baseline is compared.
+    """
 
     scene: Many[str]
     """Names of scenes, the stems of their files."""

@@ -1,4 +1,7 @@
-"""Loader of scenes and sweeps from their files; all mistakes of a sweep and its scenes are reported at once."""
+"""Loader of scenes and sweeps from their files.
+
+All mistakes of a sweep and its scenes are reported at once.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +66,7 @@ class Sweep:
 def load_any(
     path: Path, *, solvers: Sequence[str] = (), sizes: Sequence[int] = (), opens: bool = True, **options: Any
 ) -> Sweep:
-    """Load a sweep from a file, or build a sweep of the one scene in it.
+    """Load a sweep from a file, or build one of a single scene.
 
     The keyword arguments apply to scenes only; a sweep defines its own. A YAML scene without a stop rule gets
     `DEFAULT_STOP_RULE`, and an assignment's scene gets the defaults of a sweep.
@@ -105,7 +108,11 @@ def _any(path: Path, solvers: Sequence[str], sizes: Sequence[int], options: dict
 
 
 def load_sweep(path: Path) -> Sweep:
-    """Load a sweep from a YAML file, validate its scenes and expand its grid; raise InputError."""
+    """Load a sweep from a YAML file, validate its scenes and expand its grid.
+
+    Raises:
+        InputError: if that fails.
+    """
     return sweep_of(read_yaml(path))
 
 
@@ -221,8 +228,9 @@ _PARTS = {"mesh": (mesh_names.EVERY, OwnMesh), "effect": (effect_names.EVERY, Ow
 
 
 def _part(document: Document, what: str, data: Any, at: Key, own: dict[str, tuple[Plugin, dict[str, Any]]]) -> Any:
-    """Build a mesh or an effect by the class of its `kind`; only that class is imported.
+    """Build a mesh or an effect by the class of its `kind`.
 
+    Only that class is imported.
     Args:
         document: config, which collects mistakes.
         part_kind: "mesh" or "effect".
@@ -309,8 +317,9 @@ def require_stated(runs: Iterable[RunSpec]) -> None:
 
 
 def misfits_of(document: Document, name: str, scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:
-    """Find mistakes of a scene as `find_scene_mistakes`, but import user code only if the policy allows it.
+    """Find mistakes between the parts of a scene, if the policy permits.
 
+    A scene with user code is checked only if that code is imported.
     Args:
         document: config with the policy for user code.
         name: name of the scene in messages.
@@ -324,7 +333,10 @@ def misfits_of(document: Document, name: str, scene: SceneSpec, sizes: Sequence[
 
 
 def misfits(scene: SceneSpec, sizes: Sequence[int]) -> list[Mistake]:
-    """Find mistakes between the parts of a scene by building it at the smallest of the sizes."""
+    """Find mistakes between the parts of a scene.
+
+    The scene is built at the smallest of the sizes.
+    """
     try:
         if sizes:
             build(scene, min(sizes))

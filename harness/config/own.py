@@ -1,4 +1,7 @@
-"""User code in a config: it is identified by its file, and tried in a worker process before anything runs."""
+"""User code in a config: resolution, fingerprints and a trial load.
+
+It is identified by its file, and tried in a worker process before anything runs.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,8 @@ class Most(NamedTuple):
 
 MOST = Most(60.0, 2.0)
 """Limits for importing and binding user code before a command starts. A config may set a shorter time, or another
-amount of memory.
+amount of
+memory.
 """
 
 T = TypeVar("T")
@@ -33,8 +37,9 @@ Load = Callable[[OwnCode], T]
 
 
 def chosen(document: Document, table: Table, data: Any, tag: str, at: Key) -> tuple[str, dict[str, Any]] | None:
-    """Split a mapping into the name under its tag and its other keys; user code becomes a Plugin.
+    """Split a mapping into the name under its tag and its other keys.
 
+    User code becomes a Plugin.
     Args:
         document: config, which collects mistakes.
         table: known names.
@@ -115,7 +120,10 @@ def _elsewhere(piece: Callable[[Tick], Any], limits: Most, names: list[Plugin]) 
 
 
 def within(seconds: float | None, gib: float | None) -> Most:
-    """Build the load limits from a config's time [s] and memory [GiB], bounded by the default time."""
+    """Build the load limits from a config's time [s] and memory [GiB].
+
+    The time is bounded by the default.
+    """
     return Most(min(MOST.seconds, seconds or MOST.seconds), gib or MOST.gib)
 
 

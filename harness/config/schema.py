@@ -1,6 +1,6 @@
-"""JSON Schema (draft 2020-12) of scenes, sweeps, accuracy configs and performance targets, generated from their models.
+"""JSON Schema (draft 2020-12) of all configs, generated from their models.
 
-Editors use it for completion and validation.
+Configs are scenes, sweeps, accuracy configs and performance targets. Editors use it for completion and validation.
 """
 
 from __future__ import annotations
@@ -53,7 +53,10 @@ def schema() -> dict[str, Any]:
 
 
 def _one_of(models: dict[str, type[Model]], tag: str) -> Any:
-    """Build a union of models, discriminated by a required key that has the name of the model."""
+    """Build a union of models, discriminated by a required key.
+
+    The key has the name of the model.
+    """
     make: Any = create_model  # the name of a field is known at run time alone
     tagged: list[Any] = [
         make(name, __base__=model, __doc__=model.__doc__, **{tag: (Literal[name], ...)})

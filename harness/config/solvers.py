@@ -1,8 +1,9 @@
-"""Solvers of a config with all of their parameters, which are the fields of a solver's dataclass.
+"""Solvers of a config with all of their parameters.
 
-Importing a solver also imports Numba and its kernels, which would be most of the time of `springbench list`. The
-parameters of shipped solvers are therefore cached for the user, by the digest of all sources of solvers. Any change of
-the sources invalidates the entry, and checkouts with other sources have entries of their own.
+The parameters are the fields of a solver's dataclass. Importing a solver also imports Numba and its kernels, which
+would be most of the time of `springbench list`. The parameters of shipped solvers are therefore cached for the user, by
+the digest of all sources of solvers. Any change of the sources invalidates the entry, and checkouts with other sources
+have entries of their own.
 """
 
 from __future__ import annotations
@@ -34,7 +35,10 @@ _KEPT_FOR = 30 * 86400.0
 
 
 def solvers_of(document: Document) -> list[SolverSpec]:
-    """Read the solvers listed under `solvers`, with all of their parameters; mistakes are added to the document."""
+    """Read the solvers listed under `solvers`, with all of their parameters.
+
+    Mistakes are added to the document.
+    """
     listed: Any = document.data.get("solvers")
     found = [
         _solver(document, entry, ("solvers", i))
@@ -113,7 +117,10 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def _stated(solver: type, parameters: Model) -> dict[str, Any]:
-    """Select the parameters for rows and hashes: all except those that the solver omits at their default."""
+    """Select the parameters for rows and hashes.
+
+    Those that the solver omits at their default are excluded.
+    """
     unstated: frozenset[str] = getattr(solver, "unstated", frozenset())
     usual = {name for name in unstated if getattr(parameters, name, None) == getattr(solver, name, None)}
     return parameters.model_dump(mode="json", exclude=usual)

@@ -54,7 +54,8 @@ class Kept(Model):
     meshes."""
     timing: Literal["exclusive", "shared", "rough"] = "exclusive"
     """exclusive: while a run is timed, no other springbench process computes on the machine; shared: several runs are
-    timed concurrently, each on reserved cores, and their rows state that; rough: there is no timed pass, the steps are
+    timed
+    concurrently, each on reserved cores, and their rows state that; rough: there is no timed pass, the steps are
     computed once with instrumentation, and the times include it. rough is for questions other than times, without
     recordings.
     """
@@ -69,13 +70,16 @@ class Options(Kept, Varied):
 
 
 def _without_defaults(schema: dict[str, Any]) -> None:
-    """Remove the defaults of a sweep, which do not apply to omitted keys of an entry."""
+    """Remove the defaults of a sweep, which do not apply to entries."""
     for described in schema["properties"].values():
         described.pop("default", None)
 
 
 class Include(Varied):
-    """Runs in addition to the grid; an omitted key selects every scene, every solver, or an option's first value."""
+    """Runs in addition to the grid.
+
+    An omitted key selects every scene, every solver, or an option's first value.
+    """
 
     model_config = ConfigDict(json_schema_extra=_without_defaults)
 
@@ -196,7 +200,10 @@ class RunSpec(Kept, Chosen):
         return json.dumps(settings, sort_keys=True, separators=(",", ":"))
 
     def run_id(self, machine: str) -> str:
-        """Compute the run's id on a machine, 12 hex digits of SHA-256, independent of the names of sweep and scene."""
+        """Compute the run's id on a machine, 12 hex digits of SHA-256.
+
+        It is independent of the names of sweep and scene.
+        """
         return hashlib.sha256(f"{machine} {self.identity()}".encode()).hexdigest()[:12]
 
     def label(self, machine: str) -> str:

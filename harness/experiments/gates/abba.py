@@ -1,9 +1,10 @@
-"""Interleaved paired benchmark (ABBA) of two programs, until the sequential test decides or the budget ends.
+"""Interleaved paired benchmark (ABBA) of two programs with a sequential test.
 
-The order of each block, A B B A or B A A B, is random. A test detects any difference between two running programs. Two
-programs of the same code differ slightly by the memory layout of their data (Mytkowicz et al. 2009). Between blocks the
-work of both is therefore rebuilt at other addresses, in an eighth of the time (after Curtsinger and Berger 2013). The
-effect of the layout becomes noise with many samples. Properties that a process has all its life, such as the addresses
+It ends when the test decides, or with the time budget. The order of each block, A B B A or B A A B, is random. A test
+detects any difference between two running programs. Two programs of the same code differ slightly by the memory layout
+of their data (Mytkowicz et al. 2009). Between blocks the work of both is therefore rebuilt at other addresses, in an
+eighth of the time (after Curtsinger and Berger 2013). The effect of the layout becomes noise with many samples.
+Properties that a process has all its life, such as the addresses
 of its compiled code, become noise likewise: both programs are restarted every RESTART_SECONDS. A slowdown is reported
 only if a second benchmark, with restarted programs, confirms it. The first benchmark alone excludes chance, so the
 second needs fewer blocks. The guarantee of the test is for the ratio of one pair of processes. For several pairs it is
@@ -35,8 +36,9 @@ change them by 3 to 7 %. Some twenty layouts are therefore as good as hundreds; 
 
 PAIR = 30.0
 """Benchmark time [s] after which both programs are restarted. Two processes of the same code can differ by up to 1 %
-all their lives, and a restart samples that difference again. Most benchmarks end earlier, and a start takes two or
-three seconds.
+all
+their lives, and a restart samples that difference again. Most benchmarks end earlier, and a start takes two or three
+seconds.
 """
 
 CONFIRMS = 0.05
@@ -77,7 +79,10 @@ class Renewing:
     _earned: float = 0.0
 
     def after(self, seconds: float) -> None:
-        """Rebuild the work after a block of the given duration [s], if the share of the time permits."""
+        """Rebuild the work after a block, if the share of the time permits.
+
+        seconds: duration of the block.
+        """
         self._earned += SHARE / (1.0 - SHARE) * seconds
         if self.renew and self._earned >= 0.0:
             began = perf_counter()

@@ -1,7 +1,8 @@
-"""Comparison of this checkout with a git revision: `springbench gate --against REVISION`, in one run on one machine.
+"""Comparison of this checkout with a git revision.
 
-Both must give the same answer before anything is timed. Deterministic counts (iterations, entries, bytes) are compared
-exactly. Then two processes are benchmarked by interleaved blocks.
+`springbench gate --against REVISION` runs it, in one run on one machine. Both must give the same answer before anything
+is timed. Deterministic counts (iterations, entries, bytes) are compared exactly. Then two processes are benchmarked by
+interleaved blocks.
 """
 
 from __future__ import annotations
@@ -57,8 +58,9 @@ class Options:
 
 
 def requests_of_config(sides: Sequence[Side], config: Path, asked: dict[str, Any]) -> list[Request]:
-    """Build a request for each run of a scene or sweep, for which both revisions must list the same runs.
+    """Build a request for each run of a scene or sweep.
 
+    Both revisions must list the same runs.
     Args:
         revisions: the two revisions.
         config: file of the scene or sweep.
@@ -120,7 +122,7 @@ def run_gates(
 
 
 def exit_code(answers: Sequence[Verdict]) -> int:
-    """Return 1 if a verdict is a failure, else 3 if one is inconclusive, else 0."""
+    """Return 1 for any failure, else 3 for any inconclusive verdict, else 0."""
     return next((a.value for a in (Verdict.FAILS, Verdict.UNDECIDED) if a in answers), 0)
 
 
@@ -128,8 +130,9 @@ def exit_code(answers: Sequence[Verdict]) -> int:
 def started(
     sides: tuple[Side, Side], request: Request, options: Options, say: Callable[[str], None]
 ) -> Generator[Racers]:
-    """Start both revisions in their own processes, warm them up, and check that their answers agree.
+    """Start both revisions, warm them up, and check that their answers agree.
 
+    Each runs in its own process.
     Args:
         revisions: this checkout, then the revision.
         request: work to prepare.

@@ -30,7 +30,10 @@ from solvers.problem import NotPositiveDefinite, Unsupported
 
 
 class Gate(Model):
-    """A performance test: a solver may take at most a given multiple of a baseline's time on a scene's steps."""
+    """A performance test of a solver against a baseline on a scene's steps.
+
+    The solver may take at most a given multiple of the baseline's time.
+    """
 
     scene: str
     """The scene's file (*.yaml, or *.json of the assignment), relative to the table."""

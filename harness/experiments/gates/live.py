@@ -44,8 +44,9 @@ def hold(
     planted: float,
     say: Callable[[str], None],
 ) -> None:
-    """Run performance tests of each request, and store each result at once; earlier results in the file remain.
+    """Run performance tests of each request, and store each result at once.
 
+    Earlier results in the file remain.
     Args:
         path: Parquet file of the results.
         checkout: folder of the checkout.
@@ -73,7 +74,10 @@ def hold(
 
 
 def summary(path: Path) -> list[tuple[str, ...]]:
-    """Summarise the stored results by kind of test: its conditions, and the number of each verdict."""
+    """Summarise the stored results by kind of test.
+
+    A row has the conditions of the test, and the number of each verdict.
+    """
     by: dict[tuple[str, str, float, float], list[dict[str, Any]]] = {}
     for row in rows.read([path], SCHEMA).to_pylist():
         by.setdefault((row["gate"], row["condition"], row["planted"], row["limit"]), []).append(row)

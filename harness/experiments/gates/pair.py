@@ -41,7 +41,10 @@ class Side:
     extra: float = 0.0
 
     def own(self, file: Path) -> Path:
-        """Return the revision's version of a file of the checkout; other and missing files are returned unchanged."""
+        """Return the revision's version of a file of the checkout.
+
+        Other and missing files are returned unchanged.
+        """
         if self.checkout and file.is_relative_to(self.checkout):
             there = self.tree / file.relative_to(self.checkout)
             return there if there.exists() else file
@@ -151,7 +154,10 @@ class RevisionProcess:
 
 
 def _path(side: Side) -> str:
-    """Build the path: the worktree first, then existing entries, mapped from the checkout to the worktree."""
+    """Build the Python path of a revision.
+
+    The worktree comes first, then existing entries, mapped from the checkout to the worktree.
+    """
     given = [Path(entry).resolve() for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry]
     mapped = [
         side.tree / entry.relative_to(side.checkout) if side.checkout and entry.is_relative_to(side.checkout) else entry

@@ -56,8 +56,9 @@ class Race:
         error: float | None = None,
         **told: Any,
     ) -> Result | None:
-        """Fail the test if the candidate takes more than max_ratio times as long as the baseline.
+        """Fail the test if the candidate is too slow compared with the baseline.
 
+        It may take at most max_ratio times as long.
         Args:
             candidate: function without arguments.
             baseline: function without arguments.
@@ -160,7 +161,10 @@ def _told(result: Result, calls: int, clock: str) -> dict[str, Any]:
 
 @pytest.fixture
 def race(benchmark: BenchmarkFixture, request: pytest.FixtureRequest) -> Race:
-    """Compare the times of two programs, or of two solvers on a scene, after a check of their answers."""
+    """Compare the times of two programs, or of two solvers on a scene.
+
+    Their answers are checked first.
+    """
     return Race(benchmark, request.node)
 
 

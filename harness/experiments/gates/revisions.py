@@ -61,7 +61,11 @@ def sides(checkout: Path, revision: str) -> tuple[Side, Side]:
 
 
 def worktree(checkout: Path, commit: str) -> Path:
-    """Return a clean worktree of a commit, from the cache or newly created; raise InputError on failure."""
+    """Return a clean worktree of a commit, from the cache or newly created.
+
+    Raises:
+        InputError: on failure.
+    """
     tree = cache() / commit[:16]
     with _alone(cache()):
         _git(checkout, "worktree", "prune")
@@ -81,7 +85,10 @@ def worktree(checkout: Path, commit: str) -> Path:
 
 
 def _python(checkout: Path, tree: Path, name: str) -> Path:
-    """Return this interpreter if the required libraries are equal, else that of the revision's own environment."""
+    """Prepare the Python interpreter of a revision.
+
+    It is this interpreter if the required libraries are equal, else that of the revision's own environment.
+    """
     if _wanted(checkout) == _wanted(tree):
         return Path(sys.executable)
     own = tree / ".venv"

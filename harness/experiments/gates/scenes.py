@@ -1,4 +1,7 @@
-"""Pair of solvers on one scene, in one process: the same steps, to be compared and timed."""
+"""Pair of solvers on the same steps of one scene, in one process.
+
+Their answers can be compared, and their times measured.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,10 @@ Work = Callable[[], Any]
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """The first steps of a scene with a prepared solver; a call simulates them and returns the last positions [m]."""
+    """The first steps of a scene with a prepared solver.
+
+    A call simulates them and returns the last positions [m].
+    """
 
     run: RunSpec
     frames: int
@@ -111,6 +117,9 @@ def seconds_of(work: Work) -> float:
 
 
 def calls_of(candidate: Work, yardstick: Work) -> int:
-    """Choose the number of calls for a timed block of two warm programs, so that it is long enough for a clock."""
+    """Choose the number of calls that are timed together.
+
+    Both programs are warm. The calls together are long enough for a clock.
+    """
     once = min(timed(work, 1, "wall")() for work in (candidate, yardstick))
     return max(1, ceil(CALL / max(once, 1e-7)))

@@ -1,6 +1,7 @@
-"""Sequential test on the ratio of two programs' times, which may be evaluated after every block and stop early.
+"""Sequential test on the ratio of two programs' times.
 
-A block runs A and B twice each, and gives one number:
+It may be evaluated after every block, and stops as soon as it decides. A block runs A and B twice each, and gives one
+number:
 
     x = log((A_1 + A_2) / (B_1 + B_2))        in the order A B B A or B A A B, chosen at random
 
@@ -39,7 +40,10 @@ than 5 %. With this value, 16 blocks that agree are sufficient for a decision.
 
 
 class Verdict(Enum):
-    """Decision of a test; the value is the exit code of a command that ends with it."""
+    """Decision of a test.
+
+    The value is the exit code of a command that ends with it.
+    """
 
     HOLDS = 0
     FAILS = 1
@@ -48,7 +52,10 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True)
 class RatioInterval:
-    """A ratio of times: the median over the blocks, and the bounds of the confidence sequence, 0 and inf if open."""
+    """A ratio of times: the median over the blocks, with its bounds.
+
+    The bounds are those of the confidence sequence, 0 and inf if open.
+    """
 
     ratio: float
     low: float
@@ -57,8 +64,9 @@ class RatioInterval:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Sequential test that stops when the ratio lies entirely above `max_ratio` (fail) or below it (pass).
+    """Sequential test of whether a ratio of times exceeds a limit.
 
+    It stops when the ratio lies entirely above `max_ratio` (fail) or below it (pass).
     max_ratio: limit of the ratio of times.
     alpha: probability of a wrong decision.
     Raises:
@@ -106,7 +114,7 @@ def turn(a: Sequence[float], b: Sequence[float]) -> float:
 
 
 def interval(log_ratios: ArrayLike, alpha: float = ALPHA) -> RatioInterval:
-    """Compute the median ratio of the blocks (n,), n >= 1, and the confidence sequence at this n.
+    """Compute the median ratio of n >= 1 blocks, and the confidence sequence.
 
     Args:
         log_ratios: log ratios of the blocks (n,).
@@ -122,8 +130,9 @@ def interval(log_ratios: ArrayLike, alpha: float = ALPHA) -> RatioInterval:
 
 @lru_cache(maxsize=4096)
 def critical(n: int, alpha: float) -> int:
-    """Compute the least number of n blocks on one side of m that rejects it, or n + 1 if all n are too few.
+    """Compute how many blocks on one side of m reject it.
 
+    It is the least such number, or n + 1 if all n are too few.
     Args:
         n: number of blocks.
         alpha: error probability.

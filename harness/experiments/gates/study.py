@@ -1,4 +1,4 @@
-"""Error rates of the performance tests: blocks are recorded once, and the tests are replayed over them.
+"""Error rates of the performance tests, by replay of recorded blocks.
 
 A record has the four times of each block of two processes of the same code, for several process pairs. A replay draws
 stretches of successive blocks, so that bursts of load are preserved, and concatenates them up to the budget. It
@@ -69,7 +69,7 @@ class PairTurns:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Results of many replays: the rates of the three verdicts, and the median seconds until the decision."""
+    """Rates of the three verdicts of many replays, and the median duration [s]."""
 
     fails: float
     holds: float
@@ -127,7 +127,10 @@ def record(
 
 @contextmanager
 def competing(condition: str) -> Generator[None]:
-    """Run a background load on each core inside the block: constant (busy), intermittent (bursty), or none."""
+    """Run a background load on each core inside the block.
+
+    It is constant (busy), intermittent (bursty) or absent (nothing).
+    """
     if condition not in CONDITIONS:
         raise InputError(f"--condition: came {condition}; wanted one of {', '.join(CONDITIONS)}")
     with ExitStack() as cleanup:
@@ -142,7 +145,10 @@ def competing(condition: str) -> Generator[None]:
 
 
 def _compete(bursts: bool, seed: int, parent: int) -> None:
-    """Sweep over 16 MB repeatedly; bursts last half a second to three, with pauses of one to six."""
+    """Sweep over 16 MB repeatedly.
+
+    Bursts last half a second to three, with pauses of one to six.
+    """
     tie(parent)
     rng, memory = Random(seed), np.ones(2**21)
     while True:
@@ -199,7 +205,10 @@ def replay(starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
 def _race(
     rng: np.random.Generator, starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
 ) -> tuple[Verdict, float]:
-    """Replay one test over process pairs, one every RESTART_SECONDS; return its verdict and its duration [s]."""
+    """Replay one test over process pairs, one every RESTART_SECONDS.
+
+    Return its verdict and its duration [s].
+    """
     drawn, walls, left = list[Array](), list[Array](), budget
     while left > 0.0 or not drawn:
         start = starts[int(rng.integers(len(starts)))]

@@ -1,7 +1,8 @@
-"""Worker script of one revision: prepares its work and times it on request, with the revision's worktree on the path.
+"""Worker script of one revision: prepares its work and times it on request.
 
-It exchanges JSON by standard input and output, one line per request and per answer. The work prints to standard error.
-All imports come from the worktree, so that only the revision's own code is timed.
+It runs with the revision's worktree on the path. It exchanges JSON by standard input and output, one line per request
+and per answer. The work prints to standard error. All imports come from the worktree, so that only the revision's own
+code is timed.
 
     {"do": "runs", "config": "...", "asked": {...}}           -> {"runs": ["cloth 32 numba", ...]}
     {"do": "run", "config": "...", "asked": {...}, "index": i, "frames": n, "extra": 0.0, "positions": "..."}
@@ -48,7 +49,7 @@ class Worker:
     def run(
         self, config: str, asked: dict[str, Any], index: int, frames: int, extra: float, positions: str
     ) -> dict[str, Any]:
-        """Prepare the first steps of a run, and write its last positions [m] to a file.
+        """Prepare the first steps of a run, and store its last positions [m].
 
         Args:
             config: file of the scene or sweep.
@@ -104,7 +105,10 @@ class Worker:
         return {"seconds": now() - began}
 
     def instructions(self) -> dict[str, Any]:
-        """Count the instructions of one call, with the counter next to this script instead of the worktree's."""
+        """Count the instructions of one call.
+
+        The counter is the module next to this script, not the worktree's.
+        """
         assert self._work is not None
         place = spec_from_file_location("springbench_instructions", Path(__file__).with_name("instructions.py"))
         assert place is not None
