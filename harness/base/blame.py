@@ -45,6 +45,7 @@ def place(dump: str) -> str:
     """Return `file:line in function` from a dump of `faulthandler`.
 
     The dump lists the innermost frame first. The first frame in user code is preferred, else the first frame is used.
+
     Returns: the location, or "" if the dump has no frames.
     """
     frames = re.findall(r'File "(.+?)", line (\d+) in (\S+)', dump)

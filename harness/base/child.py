@@ -116,6 +116,7 @@ class _Child:
         """Receive the next message.
 
         The subprocess is killed after the given number of seconds.
+
         Raises:
             EOFError: if the subprocess ends before the message.
         """
@@ -200,6 +201,7 @@ def memory_limited(bytes: int) -> Generator[None]:
     """Limit the additional memory of this process inside the block.
 
     A larger allocation raises MemoryError, or the error of a library.
+
     Args:
         memory_bytes: allowed bytes beyond those in use now.
     """
@@ -226,6 +228,7 @@ def limit(what: int, value: float) -> None:
     """Set a soft resource limit and leave the hard limit unchanged.
 
     The next call can therefore use another value.
+
     Args:
         resource_id: constant `resource.RLIMIT_*`.
         value: limit in the unit of the resource, or RLIM_INFINITY.

@@ -46,6 +46,7 @@ def narrow(table: Table, beside: int = 1, width: int = WIDTH) -> Group:
 
     Each part repeats the first key_columns columns and adds as many others as fit. Columns without values are omitted.
     A column that is too wide by itself is folded.
+
     Args:
         table: table to split.
         key_columns: number of leading columns that each part repeats.

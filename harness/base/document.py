@@ -75,6 +75,7 @@ class Document:
         """Validate data with a model and add its mistakes to the document.
 
         The data is validated as strict JSON. A list may represent a tuple, but no boolean or text a number.
+
         Args:
             model: pydantic model.
             data: plain data.

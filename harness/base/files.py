@@ -57,6 +57,7 @@ def open_lock(path: Path, access: int = os.O_RDWR, *, otherwise: str = "") -> in
     """Open a lock file and create it if it is missing.
 
     Symbolic links are not followed, and the call does not block.
+
     Args:
         path: lock file.
         access: flag of `os.open`, for reading or writing.

@@ -47,6 +47,7 @@ def together(folder: Path) -> Generator[None]:
     """Lock a results folder together with other processes.
 
     The first and the last process remove incomplete files.
+
     Raises:
         InputError: if one process has locked the folder exclusively.
     """

@@ -106,6 +106,7 @@ def commit(root: Path = _ROOT) -> str:
     """Read the commit of a checkout, with `-dirty` if tracked files differ.
 
     The default is the project's own checkout, independent of the working directory. This function never fails.
+
     Returns: the commit, or "unknown" outside a checkout.
     """
     # An explicit repository keeps git from using one that merely contains the project.
@@ -147,7 +148,7 @@ class Threads:
 def threads(asked: int | Literal["auto"]) -> Threads:
     """Return the requested number of threads.
 
-    For "auto" the number of idle cores, constant within a process.
+    For "auto" it is the number of idle cores, constant within a process.
     """
     return _idle() if asked == "auto" else Threads(asked)
 
@@ -156,7 +157,7 @@ def threads(asked: int | Literal["auto"]) -> Threads:
 def _idle() -> Threads:
     """Count the cores that other processes leave idle.
 
-    Computed once, so that all runs use the same number.
+    It is computed once, so that all runs use the same number.
     """
     import psutil  # as long to load as the rest of this module
 
@@ -182,6 +183,7 @@ def pinned_threads(threads: int) -> Generator[None]:
     """Limit BLAS and Numba's parallel kernels to `threads` threads each inside the block.
 
     The previous limits are restored afterwards.
+
     Raises:
         InputError: if this process may not use that many threads.
     """

@@ -86,6 +86,7 @@ def own_cores(number: int, tick: Tick) -> Generator[list[int]]:
     """Compute on cores that no other process has reserved.
 
     All threads of this process are pinned to them.
+
     Args:
         number: number of cores.
         tick: progress callback, which reports the waiting time.

@@ -66,6 +66,7 @@ def store(path: Path, content: bytes) -> None:
     """Write a file atomically: write a temporary file, flush it to disk, and rename it.
 
     After a kill or an error the file is complete or absent.
+
     Raises:
         WriteError: if the file cannot be written.
     """
@@ -87,6 +88,7 @@ def read(
     """Read all rows of units, in the order of their paths.
 
     Rows of an older schema get nulls in new columns.
+
     Args:
         paths: row files of the units.
         schema: columns that the result has at least.
@@ -112,6 +114,7 @@ def memory_for(units: Sequence[Path]) -> Generator[None]:
     """Limit the memory for reading units inside the block.
 
     A file of some kB can claim any number of GB.
+
     Args:
         units: row files of the units; their sizes determine the limit.
     Raises:

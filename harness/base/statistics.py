@@ -44,6 +44,7 @@ def added(more: ArrayLike) -> Interval:
 
     It is the mean over frames of the median over rounds. The rounds of each frame are resampled separately. Only the
     drift of the machine couples the rounds of two frames, and it should count as noise.
+
     Args:
         more: added times (rounds, frames).
     Returns: estimate and interval, in the unit of the times.

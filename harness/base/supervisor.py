@@ -33,6 +33,7 @@ def supervise(
     """Start a worker (`harness.execution.worker_process.serve_tasks`), and end as it ends.
 
     It is the main function of the supervisor, a child of the command.
+
     Args:
         calls: pipe of tasks and results.
         ticks: pipe of progress events.

@@ -73,6 +73,7 @@ def connected(memory: int = MEMORY) -> Generator[DuckDBPyConnection]:
     """Open a DuckDB connection that reads only Parquet files.
 
     It uses one thread because other runs may be timed.
+
     Raises:
         SchemaMismatch: for an error of DuckDB, Arrow or the system inside the block.
     """
@@ -93,6 +94,7 @@ def union(
     """Build the union of units for DuckDB; the schema's columns come first.
 
     Values come only from inside the files: a folder called `size=64` sets no column.
+
     Args:
         connection: open connection, in which variables of the given name are set.
         name: prefix of the variables.
@@ -208,6 +210,7 @@ def heads(
     """Query columns of the first row of each unit.
 
     Units without rows, or without a required column, are omitted.
+
     Args:
         paths: row files of the units.
         columns: columns to return.

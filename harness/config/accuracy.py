@@ -131,7 +131,10 @@ class CurveSpec:
         return _hash([machine, self.point(), how])
 
     def label(self) -> str:
-        """Build the stem of its file, which is the same for other measurement settings."""
+        """Build the stem of its file.
+
+        It is the same for other measurement settings, so that a new measurement replaces the file.
+        """
         solver = safe_name(self.solver.name)
         return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{solver}-{_hash(self.point())}"
 
@@ -165,7 +168,10 @@ class WorkSpec:
         return _hash([machine, self.point(), asdict(self.how)])
 
     def label(self) -> str:
-        """Build the stem of its file, which is the same for other measurement settings."""
+        """Build the stem of its file.
+
+        It is the same for other measurement settings, so that a new measurement replaces the file.
+        """
         return f"{self.case.scene_name}-{self.case.size}-work-{safe_name(self.solver.name)}-{_hash(self.point())}"
 
 

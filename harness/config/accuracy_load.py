@@ -77,6 +77,7 @@ def expand(
     """Expand a config into its units of work.
 
     The settings of the first study apply to duplicates.
+
     Args:
         document: config, which collects mistakes.
         fields: validated fields of the config.

@@ -17,6 +17,7 @@ def taking(*names: str) -> type[TyperCommand]:
     """Build a command class that also accepts options of a run.
 
     The values are parsed as in a file and passed in `obj` of the command's context.
+
     Args:
         names: options to add; all of them if empty.
     """

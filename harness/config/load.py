@@ -70,6 +70,7 @@ def load_any(
 
     The keyword arguments apply to scenes only; a sweep defines its own. A YAML scene without a stop rule gets
     `DEFAULT_STOP_RULE`, and an assignment's scene gets the defaults of a sweep.
+
     Args:
         path: file of a sweep or a scene.
         solvers: names of solvers; the default solver if empty.
@@ -231,6 +232,7 @@ def _part(document: Document, what: str, data: Any, at: Key, own: dict[str, tupl
     """Build a mesh or an effect by the class of its `kind`.
 
     Only that class is imported.
+
     Args:
         document: config, which collects mistakes.
         part_kind: "mesh" or "effect".
@@ -320,6 +322,7 @@ def misfits_of(document: Document, name: str, scene: SceneSpec, sizes: Sequence[
     """Find mistakes between the parts of a scene, if the policy permits.
 
     A scene with user code is checked only if that code is imported.
+
     Args:
         document: config with the policy for user code.
         name: name of the scene in messages.

@@ -45,8 +45,7 @@ class Chosen(Model):
     """Iteration limit of a step."""
     tolerance: Annotated[Tolerance | Literal["auto"], Option("tol. {}", "tolerance")] = None
     """Relative tolerance of a step's iterations; null performs all of them. auto: the remaining residual adds at most a
-    tenth
-    to the step's own local error, estimated by an embedded method or by differences of the velocity.
+    tenth to the step's own local error, estimated by an embedded method or by differences of the velocity.
     """
     integrator: Annotated[IntegratorName, Option("{}", "integrator")] = "implicit-euler"
     """Time integrator."""
@@ -62,8 +61,7 @@ class Chosen(Model):
         ),
     ]
     """Initial guess of a step's iteration. coarse: the solution of the same step on a mesh of half the size, which is
-    solved
-    first, within the step's time.
+    solved first, within the step's time.
     """
     threads: Annotated[Threads | Literal["auto"], Option("{} thr.", "threads")] = 1
     """Threads of Numba and of BLAS; auto: the number of idle cores."""
@@ -73,8 +71,7 @@ class Chosen(Model):
     """Number of repetitions of the timed part."""
     accuracy: Annotated[Error, Option("error {}", "asked")] = None
     """Target for the relative error of the final positions. It selects integrator, steps and tolerance for the solver;
-    null
-    uses the given values.
+    null uses the given values.
     """
 
 

@@ -28,8 +28,7 @@ class Most(NamedTuple):
 
 MOST = Most(60.0, 2.0)
 """Limits for importing and binding user code before a command starts. A config may set a shorter time, or another
-amount of
-memory.
+amount of memory.
 """
 
 T = TypeVar("T")
@@ -40,6 +39,7 @@ def chosen(document: Document, table: Table, data: Any, tag: str, at: Key) -> tu
     """Split a mapping into the name under its tag and its other keys.
 
     User code becomes a Plugin.
+
     Args:
         document: config, which collects mistakes.
         table: known names.
@@ -79,6 +79,7 @@ def tried(
 
     The trial imports and binds the user code, finds mistakes, and reads the metadata of solvers. It is omitted for a
     config without user code.
+
     Args:
         load: loads the config with a given policy; it must pickle.
         find_plugins: lists the user code of a loaded config.

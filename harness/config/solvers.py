@@ -96,6 +96,7 @@ def parameters_model(name: str, solver: type) -> type[Model]:
     """Build the model of a solver's parameters from the fields of its frozen dataclass.
 
     For user code the fields may have any type, including types that no file can contain, such as arrays.
+
     Args:
         name: name of the solver.
         solver: dataclass of the solver.

@@ -54,8 +54,7 @@ class Kept(Model):
     meshes."""
     timing: Literal["exclusive", "shared", "rough"] = "exclusive"
     """exclusive: while a run is timed, no other springbench process computes on the machine; shared: several runs are
-    timed
-    concurrently, each on reserved cores, and their rows state that; rough: there is no timed pass, the steps are
+    timed concurrently, each on reserved cores, and their rows state that; rough: there is no timed pass, the steps are
     computed once with instrumentation, and the times include it. rough is for questions other than times, without
     recordings.
     """

@@ -4,11 +4,11 @@ It ends when the test decides, or with the time budget. The order of each block,
 detects any difference between two running programs. Two programs of the same code differ slightly by the memory layout
 of their data (Mytkowicz et al. 2009). Between blocks the work of both is therefore rebuilt at other addresses, in an
 eighth of the time (after Curtsinger and Berger 2013). The effect of the layout becomes noise with many samples.
-Properties that a process has all its life, such as the addresses
-of its compiled code, become noise likewise: both programs are restarted every RESTART_SECONDS. A slowdown is reported
-only if a second benchmark, with restarted programs, confirms it. The first benchmark alone excludes chance, so the
-second needs fewer blocks. The guarantee of the test is for the ratio of one pair of processes. For several pairs it is
-valid only as far as their ratios agree; the study measures the error rate for these.
+Properties that a process has all its life, such as the addresses of its compiled code, become noise likewise: both
+programs are restarted every RESTART_SECONDS. A slowdown is reported only if a second benchmark, with restarted
+programs, confirms it. The first benchmark alone excludes chance, so the second needs fewer blocks. The guarantee of the
+test is for the ratio of one pair of processes. For several pairs it is valid only as far as their ratios agree; the
+study measures the error rate for these.
 """
 
 from __future__ import annotations
@@ -36,9 +36,8 @@ change them by 3 to 7 %. Some twenty layouts are therefore as good as hundreds; 
 
 PAIR = 30.0
 """Benchmark time [s] after which both programs are restarted. Two processes of the same code can differ by up to 1 %
-all
-their lives, and a restart samples that difference again. Most benchmarks end earlier, and a start takes two or three
-seconds.
+all their lives, and a restart samples that difference again. Most benchmarks end earlier, and a start takes two or
+three seconds.
 """
 
 CONFIRMS = 0.05
@@ -183,6 +182,7 @@ def playing(
     """Run a paired benchmark as a generator, for a caller that times A itself.
 
     Each `yield` expects the seconds of one call of A; the generator returns the result.
+
     Args:
         b: times one call of B.
         sequential_test: test on the ratio A / B.
@@ -228,6 +228,7 @@ def confirmed(start: Start, rule: Rule, *, budget: float = BUDGET) -> Result:
 
     The confirmation has an error probability of its own, CONFIRMATION_ALPHA. If it disagrees, the result is
     inconclusive.
+
     Args:
         start_programs: starts both programs.
         sequential_test: test on the ratio A / B.

@@ -61,6 +61,7 @@ def requests_of_config(sides: Sequence[Side], config: Path, asked: dict[str, Any
     """Build a request for each run of a scene or sweep.
 
     Both revisions must list the same runs.
+
     Args:
         revisions: the two revisions.
         config: file of the scene or sweep.
@@ -133,6 +134,7 @@ def started(
     """Start both revisions, warm them up, and check that their answers agree.
 
     Each runs in its own process.
+
     Args:
         revisions: this checkout, then the revision.
         request: work to prepare.

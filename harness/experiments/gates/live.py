@@ -47,6 +47,7 @@ def hold(
     """Run performance tests of each request, and store each result at once.
 
     Earlier results in the file remain.
+
     Args:
         path: Parquet file of the results.
         checkout: folder of the checkout.

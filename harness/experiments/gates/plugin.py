@@ -59,6 +59,7 @@ class Race:
         """Fail the test if the candidate is too slow compared with the baseline.
 
         It may take at most max_ratio times as long.
+
         Args:
             candidate: function without arguments.
             baseline: function without arguments.

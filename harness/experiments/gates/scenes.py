@@ -51,6 +51,7 @@ def pair(scene: Path, solver: Given, against: Given, *, size: int | None = None,
     """Prepare the same steps for two solvers, and run both once.
 
     The number of steps is chosen so that a call is long enough for a clock, at most the scene's.
+
     Args:
         scene: file of the scene.
         solver: the candidate.

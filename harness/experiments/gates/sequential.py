@@ -67,8 +67,10 @@ class Rule:
     """Sequential test of whether a ratio of times exceeds a limit.
 
     It stops when the ratio lies entirely above `max_ratio` (fail) or below it (pass).
+
     max_ratio: limit of the ratio of times.
     alpha: probability of a wrong decision.
+
     Raises:
         ValueError: for an invalid max_ratio or alpha.
     """
@@ -94,6 +96,7 @@ class Rule:
         """Find the first decision when the test is evaluated after every block.
 
         It equals `decide_verdict` block by block, but takes one pass, for a replay of many recorded samples.
+
         Args:
             log_ratios: log ratios of the blocks (n,).
         Returns: the decision and its number of blocks, n if there is no decision.
@@ -133,6 +136,7 @@ def critical(n: int, alpha: float) -> int:
     """Compute how many blocks on one side of m reject it.
 
     It is the least such number, or n + 1 if all n are too few.
+
     Args:
         n: number of blocks.
         alpha: error probability.

@@ -90,6 +90,7 @@ def record(
     """Record blocks of the requests, alternating between them, under a background load.
 
     The file is written after each process pair. Its earlier rows remain, and the numbering of the pairs continues.
+
     Args:
         path: Parquet file of the blocks.
         checkout: folder of the checkout, which both programs run.
@@ -147,7 +148,7 @@ def competing(condition: str) -> Generator[None]:
 def _compete(bursts: bool, seed: int, parent: int) -> None:
     """Sweep over 16 MB repeatedly.
 
-    Bursts last half a second to three, with pauses of one to six.
+    Bursts last 0.5 to 3 s, with pauses of 1 to 6 s.
     """
     tie(parent)
     rng, memory = Random(seed), np.ones(2**21)
@@ -205,9 +206,9 @@ def replay(starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
 def _race(
     rng: np.random.Generator, starts: Sequence[PairTurns], slower: float, rule: Rule, budget: float
 ) -> tuple[Verdict, float]:
-    """Replay one test over process pairs, one every RESTART_SECONDS.
+    """Replay one test, and return its verdict and its duration [s].
 
-    Return its verdict and its duration [s].
+    It draws another process pair every RESTART_SECONDS.
     """
     drawn, walls, left = list[Array](), list[Array](), budget
     while left > 0.0 or not drawn:
@@ -252,6 +253,7 @@ def replay_other(
     """Compute the fraction of comparisons that classify A as slower.
 
     Each comparison has two sessions of equal duration, A's and then B's.
+
     Args:
         is_slower: rule of the comparison, for the times of A and of B.
         recorded_blocks: recorded process pairs.
